@@ -39,19 +39,18 @@ from benchmarks.frames import (
     without_occluded,
 )
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.frames.frame import DepthMap, is_dense
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.frames.uncertainty import uncertainty
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
+from pnpdepth_cli.settings import PAPER, Settings
 
-MASKED = MethodOptions(target="masked")
-METHODS: Mapping[str, MethodOptions | RefineSettings] = {
-    "aligned": MethodOptions(iterations=0, align="auto"),
-    "paper": RefineSettings(),
-    "tuned": MethodOptions(),
+MASKED = Settings(target="masked")
+METHODS: Mapping[str, Settings] = {
+    "aligned": Settings(iterations=0, align="auto"),
+    "paper": PAPER,
+    "tuned": Settings(),
     "masked": MASKED,
     "masked-40": replace(MASKED, iterations=40),
 }
@@ -63,14 +62,13 @@ COUNTS = (20, 100, 500)
 def by_method(network: Network, name: str, inputs: Inputs, seed: int) -> tuple[DepthMap, DepthMap]:
     """The plain and the refined depth."""
     method = METHODS[name]
-    if isinstance(method, RefineSettings):
+    if method is PAPER:
         own = network.definition.default_alignment
         layer, settings = resolve_layer(network.definition, None), replace(method, align=own)
     else:
         layer = resolve_layer(network.definition, method.layer)
-        settings = resolve_settings(
-            network.definition, method, HoldOut(seed=seed), dense=is_dense(inputs.points)
-        )
+        method, dense = replace(method, seed=seed), is_dense(inputs.points)
+        settings = resolve_settings(network.definition, method, dense=dense)
     result = refined(network, layer, settings, inputs)
     return result.before, (result.after if settings.iterations else result.before)
 

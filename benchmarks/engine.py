@@ -22,20 +22,22 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from benchmarks.frames import print_row
 from benchmarks.hand_cuts import ZOO, Case
-from pnpdepth_cli.core.refine import RefineSettings, refine
+from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.precision import lower
 from pnpdepth_cli.pipeline.bench import in_turn, peak_mb
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import PAPER
 
 ITERATIONS, STEP, POINTS = 5, 0.01, 500
-SETTINGS = RefineSettings(iterations=ITERATIONS, lr=STEP)
+SETTINGS = replace(PAPER, iterations=ITERATIONS, lr=STEP)
 CPU = torch.device("cpu")
 COMPARED = ("by hand", "ours", "ours, one frame", "by hook", "paper's code")
 """What gives the same, bit for bit."""

@@ -13,19 +13,18 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.completion.image_registration import estimated, evidence
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.refine import RefineSettings
-from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.frame import Refined, tensor_of
 from pnpdepth_cli.frames.refine import refine_frame
+from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.pipeline.batch.frames import registering
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import refiner_of
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Points, occluded_in_map
+from pnpdepth_cli.settings import Settings
 
 Depth = NDArray[np.float32]
 
@@ -178,7 +177,7 @@ def registered(
 
 def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> Inputs:
     """A frame in memory, as the program reads one from files."""
-    return Inputs(rgb=rgb, points=points, gt=gt, sparse_scale=None, record={}, notes=())
+    return Inputs(rgb=tensor_of(rgb), points=points, own=points, gt=gt)
 
 
 def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Inputs:
@@ -187,10 +186,10 @@ def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Inputs:
     return frame_inputs(frame.rgb, points, frame.gt)
 
 
-def refined(network: Network, layer: str, settings: RefineSettings, inputs: Inputs) -> RefinedFrame:
+def refined(network: Network, layer: str, settings: Settings, inputs: Inputs) -> Refined:
     """The refinement of a frame with all of its points."""
     with network.cut_at(layer) as split:
-        return refine_frame(network, split, settings, inputs.frame())
+        return refine_frame(network, split, settings, inputs.registered())
 
 
 WEIGHTS = {
@@ -208,11 +207,10 @@ def opened(name: str, data: Path) -> Network:
     return load_network(name, data / "weights" / WEIGHTS[name] if name in WEIGHTS else None)
 
 
-def by_default(network: Network, inputs: Inputs, seed: int = 0) -> RefinedFrame:
+def by_default(network: Network, inputs: Inputs, seed: int = 0) -> Refined:
     """The frame as `pnpdepth refine` gives it by default."""
-    refiner = refiner_of(RefineRequest.from_fields(seed=seed), [network], inputs)
-    with refiner.opened() as open_refiner:
-        return refiner.refine(open_refiner, inputs)
+    with Refiner(network, Settings(seed=seed)) as refiner:
+        return refiner.refine_frame(inputs)
 
 
 def with_outliers(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:

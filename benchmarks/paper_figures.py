@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, WHOLE, Protocol
+from pnpdepth_cli.settings import PAPER
 
-SETTING = RefineSettings(iterations=5, lr=0.01, loss="l1", update="sign")
+SETTING = PAPER
 """Section "Implementation Details": for all experiments."""
 
 MEASURES = ("rmse", "mae", "mre", "delta1", "delta2", "delta3")

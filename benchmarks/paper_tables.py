@@ -39,13 +39,12 @@ from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, TableFrame, rendered
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import PnpDepthError, UsageError
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import names
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
+from pnpdepth_cli.settings import Settings
 
 KINDS = {"rgb": "rgb", "sparse": "sd", "rgb+sparse": "rgb + sd"}  # as the paper writes them
 ROOM_FRAMES = 96  # of streets, which are three times as wide, a quarter
@@ -58,7 +57,7 @@ class Entry:
 
     row: PaperRow
     network: Network
-    settings: dict[str, tuple[str, RefineSettings]]
+    settings: dict[str, tuple[str, Settings]]
 
     @property
     def name(self) -> str:
@@ -71,7 +70,7 @@ def entry_of(row: PaperRow, network: Network) -> Entry:
     definition = network.definition
     # One factor, as in the evaluation of networks that know depth up to one; "auto" might take two.
     align = "scale" if definition.output_scale == "scale" else definition.default_alignment
-    tuned = resolve_settings(definition, MethodOptions(align=align))
+    tuned = resolve_settings(definition, Settings(align=align))
     paper = replace(SETTING, align=align)
     settings = {"paper": (row.layer, paper), "tuned": (resolve_layer(definition, None), tuned)}
     return Entry(row=row, network=network, settings=settings)

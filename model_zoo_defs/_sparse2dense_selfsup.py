@@ -20,7 +20,7 @@ from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Multiple,
     Normalisation,
-    RefineDefaults,
+    Settings,
 )
 
 NEAREST = 0.9  # metres
@@ -75,5 +75,5 @@ definition = ModelDefinition(
     normalisation=Normalisation(std=(BYTE, BYTE, BYTE)),
     build=SelfSupervisedSparseToDense,
     layers=("conv6", "convt5", "convt4", "convt3", "convt2"),
-    defaults=RefineDefaults(),
+    defaults=Settings(),
 )

@@ -26,13 +26,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model_zoo_defs._same_padding import same_padding
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Settings
 
 FILTERS = (8, 16, 32)
 KERNELS = (11, 5, 3)
 STRIDE = 2
 ITERATIONS = 10
-TUNED = RefineDefaults(layer="solve", lr="3%", update="adam")  # of `-tiny`
+TUNED = Settings(layer="solve", lr="3%", update="adam")  # of `-tiny`
 BIAS_SCALE = 1e-3  # stored biases are a thousand times the thresholds
 
 Three = tuple[Tensor, Tensor, Tensor]
@@ -191,7 +191,7 @@ def _definition(name: str, summary: str) -> ModelDefinition:
         size=Multiple(1),
         build=Adnn,
         layers=(f"solve.step#{ITERATIONS // 2}[0][2]", "solve", "layers.2", "layers.1"),
-        defaults=TUNED if own else RefineDefaults(layer="solve"),
+        defaults=TUNED if own else Settings(layer="solve"),
         checkpoint=weights if own else None,
         read_checkpoint=from_tensorflow,
     )

@@ -62,7 +62,7 @@ from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Multiple,
     Normalisation,
-    RefineDefaults,
+    Settings,
 )
 
 PROPAGATED = ("s4", "s2")
@@ -264,7 +264,7 @@ definitions = {
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
         output_kind="depth",
         layers=("decoder.s32", "decoder.s16", "decoder.s8", "decoder.s4", "decoder.s2"),
-        defaults=RefineDefaults(layer="decoder.s8", iterations=2, lr="5%", schedule="linear"),
+        defaults=Settings(layer="decoder.s8", iterations=2, lr="5%", schedule="linear"),
         build=Compact,
         checkpoint=Path(__file__).parent / "weights" / "compact.safetensors",
     ),

@@ -26,7 +26,7 @@ from pnpdepth_cli.models.definition import (
     Fixed,
     ModelDefinition,
     Normalisation,
-    RefineDefaults,
+    Settings,
 )
 
 NYU = (228, 304)
@@ -137,7 +137,7 @@ def read_two_files(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 LAYERS = ("coarse.conv2", "coarse.conv3", "coarse.conv4", "coarse.conv5", "coarse.fc1", "coarse")
 PAPER = "Eigen et al., Depth Map Prediction from a Single Image, NIPS 2014"
-DEFAULTS = RefineDefaults(layer="coarse.conv5")
+DEFAULTS = Settings(layer="coarse.conv5")
 TINY = Path(__file__).parent / "weights" / "eigen-tiny.safetensors"
 
 definitions = {
@@ -177,7 +177,7 @@ definitions = {
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
         output_kind="log",
         layers=LAYERS,
-        defaults=RefineDefaults(layer="coarse.conv5", update="adam", lr="10%", iterations=20),
+        defaults=Settings(layer="coarse.conv5", update="adam", lr="10%", iterations=20),
         build=partial(Eigen, channels=(40, 80, 112, 112, 64), hidden=128, fine=48),
         checkpoint=TINY,
     ),

@@ -31,7 +31,7 @@ from pnpdepth_cli.models.definition import (
     Fixed,
     ModelDefinition,
     Normalisation,
-    RefineDefaults,
+    Settings,
 )
 
 SIZE = (228, 304)
@@ -215,7 +215,7 @@ def module_of(layer: str) -> str:
 
 LAYERS = ("res4f", "res5c", "layer1_BN", *UP_PROJECTIONS[:3])
 PAPER = "Laina et al., Deeper Depth Prediction with Fully Convolutional Residual Networks, 3DV 2016"
-DEFAULTS = RefineDefaults(layer="layer1_BN")
+DEFAULTS = Settings(layer="layer1_BN")
 TINY = Path(__file__).parent / "weights" / "fcrn-tiny.safetensors"
 
 definitions = {
@@ -241,7 +241,7 @@ definitions = {
         size=Fixed(SIZE[0] // 2, SIZE[1] // 2),
         normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
         layers=LAYERS,
-        defaults=RefineDefaults(layer="layer1_BN", update="adam", lr="10%", iterations=20),
+        defaults=Settings(layer="layer1_BN", update="adam", lr="10%", iterations=20),
         build=partial(FCRN, width=9),
         checkpoint=TINY,
     ),

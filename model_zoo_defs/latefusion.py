@@ -25,11 +25,11 @@ from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Multiple,
     Normalisation,
-    RefineDefaults,
+    Settings,
 )
 
 FARTHEST = 200.0  # metres; our choice, so that depth stays finite
-TUNED = RefineDefaults(layer="decoder.s8", lr="10%")  # of `-tiny`, for 500 points
+TUNED = Settings(layer="decoder.s8", lr="10%")  # of `-tiny`, for 500 points
 LEVELS = ("s16", "s8", "s4", "s2")
 
 
@@ -258,7 +258,7 @@ def _definition(name: str, summary: str, width: int, cells: int) -> ModelDefinit
         normalisation=Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
         build=partial(LateFusion, width, cells),
         layers=("fuse", "decoder.s16", "decoder.s8", "decoder.s4", "decoder.s2"),
-        defaults=TUNED if own else RefineDefaults(layer="decoder.s8"),
+        defaults=TUNED if own else Settings(layer="decoder.s8"),
         checkpoint=weights if own else None,
     )
 

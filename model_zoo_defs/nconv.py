@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Settings
 
 _TINY = 1e-20  # as published: the sum of the confidences is 0 far from any point
 
@@ -98,6 +98,6 @@ definitions = {
         size=Multiple(8),
         build=NConv,
         layers=("nconv1[0]", "nconv2#1[0]", "nconv6[0]"),
-        defaults=RefineDefaults(),
+        defaults=Settings(),
     ),
 }

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model_zoo_defs.nconv import NormalisedConv, NormalisedUNet
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Settings
 
 
 class SoftplusNormalisedConv(NormalisedConv):
@@ -137,6 +137,6 @@ definitions = {
         size=Multiple(8),
         build=Pncnn,
         layers=("conf_estimator.down3", "conf_estimator.up4", "conf_estimator"),
-        defaults=RefineDefaults(),
+        defaults=Settings(),
     ),
 }

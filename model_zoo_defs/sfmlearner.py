@@ -18,7 +18,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, RefineDefaults
+from pnpdepth_cli.models.definition import (
+    Fixed,
+    ModelDefinition,
+    Normalisation,
+    Settings,
+)
 
 GAIN, FLOOR = 10.0, 0.01  # disparity is between FLOOR and GAIN + FLOOR
 DOWN = (1, 2, 4, 8, 16, 16, 16)  # channels of conv1 … conv7, in units of `width`
@@ -137,7 +142,7 @@ definitions = {
         output_kind="inverse",
         output_scale="scale",
         layers=LAYERS,
-        defaults=RefineDefaults(),
+        defaults=Settings(),
         build=DispNet,
         read_checkpoint=read_published,
     ),
@@ -152,7 +157,7 @@ definitions = {
         output_kind="inverse",
         output_scale="scale",
         layers=LAYERS,
-        defaults=RefineDefaults(layer="iconv5", lr="10%", iterations=20),
+        defaults=Settings(layer="iconv5", lr="10%", iterations=20),
         build=lambda: DispNet(width=6),
         checkpoint=TINY,
     ),

@@ -25,7 +25,12 @@ from torch import Tensor, nn
 
 from model_zoo_defs import _sparse2dense_selfsup
 from model_zoo_defs._resnet import WIDTH, stages
-from pnpdepth_cli.models.definition import Fixed, InputKind, ModelDefinition, RefineDefaults
+from pnpdepth_cli.models.definition import (
+    Fixed,
+    InputKind,
+    ModelDefinition,
+    Settings,
+)
 
 Decoder = Literal["deconv2", "deconv3", "upconv", "upproj"]
 DECODERS: tuple[Decoder, ...] = ("deconv2", "deconv3", "upconv", "upproj")
@@ -127,7 +132,7 @@ class SparseToDense(nn.Module):
 
 
 SIZES = {"": Fixed(228, 304), "-kitti": Fixed(228, 912, "crop")}
-TUNED = RefineDefaults(layer="bn2", lr="3%")  # of `-tiny`, for 500 points
+TUNED = Settings(layer="bn2", lr="3%")  # of `-tiny`, for 500 points
 SCENES = {"": "rendered rooms", "-kitti": "rendered streets"}
 MODALITIES: dict[str, InputKind] = {"": "rgb+sparse", "-rgb": "rgb", "-d": "sparse"}
 LAYERS = ("bn2", "decoder.layer1", "decoder.layer2", "decoder.layer3")
@@ -145,7 +150,7 @@ def published(depth: int, decoder: Decoder, modality: str, scene: str) -> ModelD
         size=SIZES[scene],
         build=partial(SparseToDense, depth, decoder, MODALITIES[modality]),
         layers=LAYERS,
-        defaults=RefineDefaults(),
+        defaults=Settings(),
     )
 
 

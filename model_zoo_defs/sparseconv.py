@@ -24,11 +24,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Settings
 
 KERNELS = (11, 7, 5, 3, 3)
 CHANNELS = 16
-TUNED = RefineDefaults(layer="sparse_convs.1[0]", lr="3%", update="adam")  # of `-tiny`
+TUNED = Settings(layer="sparse_convs.1[0]", lr="3%", update="adam")  # of `-tiny`
 MIN_COUNT = 1e-5  # what the port divides by where nothing is known
 EPSILON = 1e-8  # what the paper's form adds to the number of known pixels
 VARIABLES = {  # of Super-LiDAR
@@ -124,7 +124,7 @@ def _definition(name: str, summary: str, with_mask: bool = True) -> ModelDefinit
         size=Multiple(1),
         build=partial(SparseConvNet, with_mask=with_mask),
         layers=tuple(f"sparse_convs.{index}[0]" for index in range(len(KERNELS))),
-        defaults=TUNED if own else RefineDefaults(),
+        defaults=TUNED if own else Settings(),
         checkpoint=weights if own else None,
         read_checkpoint=None if with_mask else from_tensorflow,
     )

@@ -18,13 +18,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.api import Refined as Refined
-    from pnpdepth_cli.api import Refiner as Refiner
     from pnpdepth_cli.api import load_network as load_network
     from pnpdepth_cli.api import refine as refine
     from pnpdepth_cli.api import score as score
     from pnpdepth_cli.core.metrics import Scores as Scores
-    from pnpdepth_cli.core.refine import RefineSettings as RefineSettings
     from pnpdepth_cli.core.split import Split as Split
     from pnpdepth_cli.errors import CheckpointError as CheckpointError
     from pnpdepth_cli.errors import DeviceError as DeviceError
@@ -36,30 +33,28 @@ if TYPE_CHECKING:
     from pnpdepth_cli.errors import PnpDepthError as PnpDepthError
     from pnpdepth_cli.errors import SizeError as SizeError
     from pnpdepth_cli.errors import UsageError as UsageError
+    from pnpdepth_cli.frames.frame import Refined as Refined
+    from pnpdepth_cli.frames.refiner import Refiner as Refiner
     from pnpdepth_cli.models.network import Network as Network
     from pnpdepth_cli.points import SparsePoints as SparsePoints
+    from pnpdepth_cli.settings import Settings as Settings
 
 _HOMES = {
-    "load_network": "api",
-    "refine": "api",
-    "Refiner": "api",
-    "Refined": "api",
-    "score": "api",
+    **dict.fromkeys(("load_network", "refine", "score"), "api"),
+    "Refiner": "frames.refiner",
+    "Refined": "frames.frame",
+    "Settings": "settings",
     "Scores": "core.metrics",
-    "RefineSettings": "core.refine",
     "Split": "core.split",
     "Network": "models.network",
     "SparsePoints": "points",
-    "PnpDepthError": "errors",
-    "UsageError": "errors",
-    "InputError": "errors",
-    "SizeError": "errors",
-    "NoPointsError": "errors",
-    "ModelError": "errors",
-    "LayerError": "errors",
-    "CheckpointError": "errors",
-    "DivergedError": "errors",
-    "DeviceError": "errors",
+    **dict.fromkeys(
+        (
+            *("PnpDepthError", "UsageError", "InputError", "SizeError", "NoPointsError"),
+            *("ModelError", "LayerError", "CheckpointError", "DivergedError", "DeviceError"),
+        ),
+        "errors",
+    ),
 }
 """The module of each public name."""
 
@@ -75,4 +70,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

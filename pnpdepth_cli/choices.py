@@ -135,7 +135,7 @@ ALIGNMENTS: tuple[Align, ...] = get_args(Align)
 """How the network's output is fitted to the sparse points."""
 
 PRESETS = ("paper",)
-"""Methods by one name: `pnpdepth_cli.pipeline.refinement.method.PRESETS`."""
+"""Methods by one name: `pnpdepth_cli.settings.PAPER`."""
 
 Space = Literal["depth", "inverse", "log"]
 SPACES: tuple[Space, ...] = get_args(Space)

@@ -13,13 +13,14 @@ from pnpdepth_cli.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
-GROUND_FLOOR = {"errors", "choices", "points", "budget", "scan_pattern"}
+GROUND_FLOOR = {"errors", "choices", "points", "budget", "scan_pattern", "settings"}
 MAY_IMPORT = {
     "errors": set(),
     "choices": {"errors"},
     "budget": {"errors"},
     "points": {"errors"},
     "scan_pattern": {"errors"},
+    "settings": {"errors", "choices"},
     "core": GROUND_FLOOR,
     "sensors": GROUND_FLOOR,
     "io": GROUND_FLOOR,
@@ -28,7 +29,7 @@ MAY_IMPORT = {
     "frames": {*GROUND_FLOOR, "core", "completion", "models"},
     "pipeline": {*GROUND_FLOOR, "core", "completion", "models", "frames", "sensors", "io"},
     "cli": {*GROUND_FLOOR, "pipeline"},
-    "api": {*GROUND_FLOOR, "core", "models", "pipeline"},
+    "api": {*GROUND_FLOOR, "core", "models", "frames"},
 }
 
 

@@ -14,8 +14,8 @@ from pnpdepth_cli.completion import baselines, propagations
 from pnpdepth_cli.core import losses, update_rules
 from pnpdepth_cli.core.step_sizes import SCHEDULES
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.models.precision import dtype_of
-from pnpdepth_cli.pipeline.refinement.resolve import NORMALISATIONS
 
 
 @pytest.fixture

@@ -30,8 +30,8 @@ def frame() -> Frame:
 def test_the_public_names_are_these() -> None:
     assert sorted(pnp.__all__) == [
         "CheckpointError", "DeviceError", "DivergedError", "InputError", "LayerError", "ModelError",
-        "Network", "NoPointsError", "PnpDepthError", "RefineSettings", "Refined", "Refiner",
-        "Scores", "SizeError", "SparsePoints", "Split", "UsageError", "__version__",
+        "Network", "NoPointsError", "PnpDepthError", "Refined", "Refiner",
+        "Scores", "Settings", "SizeError", "SparsePoints", "Split", "UsageError", "__version__",
         "load_network", "refine", "score",
     ]  # fmt: skip
     assert all(getattr(pnp, name) is not None for name in pnp.__all__)
@@ -76,7 +76,7 @@ def test_maps_rows_and_points_are_the_same(network: pnp.Network, frame: Frame) -
         depth=torch.from_numpy(rows[:, 2].astype(np.float32)),
         size=sparse.shape,
     )
-    settings = pnp.RefineSettings(iterations=1)
+    settings = pnp.Settings(iterations=1)
     with pnp.Refiner(network, settings=settings) as refiner:
         depths = [
             refiner.refine(rgb, sparse_depth).depth for sparse_depth in (sparse, rows, points)
@@ -88,7 +88,7 @@ def test_maps_rows_and_points_are_the_same(network: pnp.Network, frame: Frame) -
 def test_integer_images_are_scaled(network: pnp.Network, frame: Frame) -> None:
     rgb, sparse = frame
     coarse = np.round(rgb * 255).astype(np.uint8)
-    settings = pnp.RefineSettings(iterations=0)
+    settings = pnp.Settings(iterations=0)
     ours = pnp.refine(network, coarse, sparse, settings=settings).depth
     as_float = (coarse / 255).astype(np.float32)
     assert np.array_equal(ours, pnp.refine(network, as_float, sparse, settings=settings).depth)

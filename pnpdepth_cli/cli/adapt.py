@@ -42,18 +42,13 @@ def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **value
     the smallest loss at its hidden points are written, with a model card beside them.
     """
     from pnpdepth_cli.cli.progress import progress_bar
-    from pnpdepth_cli.pipeline.adapt import Progress
     from pnpdepth_cli.pipeline.adapt import adapt as adapt_network
 
     own = options.taken(AdaptRequest, values)
     refine = options.request_of(values, sample=parse_sample(sample))
     request = AdaptRequest(source=source, output=output, refine=refine, **own)
     with progress_bar("adapt", "update") as show:
-        progress = Progress(
-            say=lambda text: click.echo(printable(text), err=True),
-            step=lambda done, of, text: show(done, of, text),
-        )
-        adapted = adapt_network(request, progress)
+        adapted = adapt_network(request, lambda text: click.echo(printable(text), err=True), show)
     if as_json:
         click.echo(json.dumps(asdict(adapted), indent=2))
         return

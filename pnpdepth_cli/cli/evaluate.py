@@ -67,7 +67,6 @@ def _choice(flag: str, names: Sequence[str], text: str) -> Callable[[Any], Any]:
         "Input": (
             *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--pred-crop"),
             *("--mask", "--calib", "--layout-protocol", "--sparse", "--sparse-scale", "--workers"),
-            "--max-pixels",
         ),
         "Protocol": (
             *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
@@ -130,7 +129,6 @@ def _choice(flag: str, names: Sequence[str], text: str) -> Callable[[Any], Any]:
 @click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
 @click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
 @options.channel
-@options.max_pixels
 @_choice("--resize", RESIZES, "Resize predictions to the size of the ground truth.")
 @click.option(
     "--pred-crop",

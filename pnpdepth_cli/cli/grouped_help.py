@@ -14,33 +14,19 @@ import click
 OTHER = "Other"
 """Title of the options that no group lists."""
 
-LIDAR = (
-    *(
-        "--calib",
-        "--extrinsics",
-        "--inverse-extrinsics",
-        "--camera",
-        "--range",
-        "--keep-occluded",
-        "--min-range",
-        "--max-range",
-    ),
-    "--point-fields",
-)
-COLMAP = ("--unit-scale", "--min-track", "--max-reprojection")
+LIDAR = ("--calib", "--extrinsics", "--camera", "--scan")
+COLMAP = ("--colmap",)
 FILE_READING = (
-    *("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok", "--registration"),
-    "--max-pixels",
+    *("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok"),
+    "--registration",
 )
 NETWORK = (
-    *("--model", "--checkpoint", "--layer", "--align", "--align-every", "--output-kind"),
+    *("--model", "--checkpoint", "--layer", "--align", "--output-kind"),
     *("--normalise", "--precision", "--device", "--tile"),
 )
 METHOD = (
-    *("--preset", "--time-budget", "--iterations", "--lr", "--loss", "--update", "--schedule"),
-    *("--blur", "--target", "--parameters", "--mask", "--mask-fraction", "--mask-scale"),
-    *("--proximity", "--line-search", "--keep-best", "--propagate"),
-    *("--holdout", "--seed"),
+    *("--preset", "--time-budget", "--iterations", "--lr", "--loss", "--update"),
+    *("--target", "--propagate", "--set", "--holdout", "--seed"),
 )
 OUTPUT = (
     *("--output", "--format", "--output-scale", "--ply", "--fov", "--colors", "--previews"),

@@ -14,6 +14,7 @@ from typing import NoReturn
 import click
 
 from pnpdepth_cli import __version__
+from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.cli.printable import printable, shortened
 from pnpdepth_cli.cli.streams import INTERRUPTED, StdoutError, drop_stdout, guard_streams
 from pnpdepth_cli.errors import DeviceError, InputError, ModelError, OutputError, PnpDepthError
@@ -88,8 +89,15 @@ class _Commands(click.Group):
     cls=_Commands, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]}
 )
 @click.version_option(__version__, prog_name="pnpdepth")
-def cli() -> None:
+@click.option(
+    "--max-pixels",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Largest image to read; files may have 4 N bytes.  [default: memory / 64, at most 2^28]",
+)
+def cli(max_pixels: int | None) -> None:
     """Refine the depth of any depth network with sparse depth, without training."""
+    set_max_pixels(max_pixels)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:

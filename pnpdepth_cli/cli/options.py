@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import OptionField, options_of, parse_file
 from pnpdepth_cli.pipeline.refinement.request import (
-    LARGEST_SEED,
     FrameFiles,
     HoldOut,
-    MethodOptions,
     NetworkChoice,
     OutputOptions,
     RefineRequest,
+    parse_file,
 )
 from pnpdepth_cli.pipeline.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.settings import LARGEST_SEED, OptionField, Settings, options_of
 
 FILE = click.Path(path_type=Path)
 SEED = click.IntRange(0, LARGEST_SEED)
@@ -35,19 +34,6 @@ class Address(click.Path):
         return parse_file(text) if isinstance(text, str) else text
 
 
-class Renamed(click.Option):
-    """An option whose former spelling is still accepted and not shown in the help."""
-
-    def __init__(self, *args: Any, alias: str, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.alias = alias
-
-    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
-        """Adds both spellings."""
-        super().add_to_parser(parser, ctx)
-        parser.add_option(obj=self, opts=[self.alias], dest=self.name, action="store")
-
-
 def click_option(each: OptionField) -> Callable[[Any], Any]:
     """Returns the click option of a field of a request."""
     option = each.option
@@ -58,20 +44,57 @@ def click_option(each: OptionField) -> Callable[[Any], Any]:
         details["type"] = _type_of(each)
     if option.value_if_bare is not None:
         details |= {"is_flag": False, "flag_value": option.value_if_bare}
-    if option.show_default:
-        details["show_default"] = True
-    if option.hidden:
-        details["hidden"] = True
-    if option.alias is not None:
-        details |= {"cls": Renamed, "alias": option.alias}
     return click.option(
         each.flag,
         each.name,
         default=each.default,
         metavar=option.metavar,
         help=option.help,
+        show_default=option.show_default,
         **details,
     )
+
+
+_ASSIGNED = "_assigned"
+"""Ending of the parameters of options that take several fields."""
+_HELP_OF_GROUPS = {
+    "--set": "Less common settings, as in blur=1,keep-best.",
+    "--scan": "How a LiDAR scan is read.",
+    "--colmap": "Which points of a COLMAP model are used, and their unit.",
+    "--bag": "Which messages of a ROS bag make a frame.",
+}
+
+
+def _assigning(flag: str, members: Sequence[OptionField]) -> Callable[[Any], Any]:
+    """The click option that takes values of these fields, as in `blur=1,keep-best`."""
+    by_name = {each.name_within: each for each in members}
+
+    def parse(text: str) -> dict[str, Any]:
+        chosen: dict[str, Any] = {}
+        for part in text.split(","):
+            name, equals, value = part.strip().partition("=")
+            each = by_name.get(name)
+            if each is None:
+                raise UsageError(f"{flag} {name}: choose from {', '.join(by_name)}")
+            if (each.type == "bool") == bool(equals):
+                raise UsageError(f"{flag} {part} must be {_assignment(each)}")
+            kind = click.types.convert_type(bool if each.type == "bool" else _type_of(each))
+            chosen[each.name] = kind(value or "true")
+        return chosen
+
+    described = " · ".join(f"{_assignment(each)}: {each.option.help}" for each in members)
+    return click.option(
+        flag,
+        flag.strip("-") + _ASSIGNED,
+        type=parse,
+        multiple=True,
+        metavar="NAME=VALUE,…",
+        help=f"{_HELP_OF_GROUPS[flag]}  {described}",
+    )
+
+
+def _assignment(each: OptionField) -> str:
+    return each.name_within if each.type == "bool" else f"{each.name_within}={each.placeholder}"
 
 
 def _type_of(each: OptionField) -> Any:
@@ -96,9 +119,12 @@ def options_of_groups(
     """
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        wanted = [each for group in groups for each in options_of(group)]
+        wanted = [e for group in groups for e in options_of(group) if e.name not in without]
+        within = {each.option.within: None for each in wanted if each.option.within is not None}
+        for flag in within:
+            command = _assigning(flag, [e for e in wanted if e.option.within == flag])(command)
         for each in reversed(wanted):
-            if each.name not in without:
+            if each.option.within is None:
                 command = click_option(each)(command)
         return command
 
@@ -107,12 +133,15 @@ def options_of_groups(
 
 def refinement(command: Callable[..., Any]) -> Callable[..., Any]:
     """Adds the options of how a frame is refined, named as the fields of a `RefineRequest`."""
-    groups = (FrameFiles, ColmapOptions, NetworkChoice, MethodOptions, HoldOut, OutputOptions)
+    groups = (FrameFiles, ColmapOptions, NetworkChoice, Settings, HoldOut, OutputOptions)
     return models(options_of_groups(*groups, without=["model"])(command))
 
 
-def _only(group: type, name: str) -> Callable[[Any], Any]:
-    return click_option(next(each for each in options_of(group) if each.name == name))
+def _only(group: type, name: str, flag: str | None = None) -> Callable[[Any], Any]:
+    """The option of one field, on its own also where another option takes it with others."""
+    each = next(each for each in options_of(group) if each.name == name)
+    own = replace(each.option, within=None, flag=flag or each.option.flag)
+    return click_option(replace(each, option=own))
 
 
 _MODEL = next(each for each in options_of(NetworkChoice) if each.name == "model")
@@ -128,30 +157,16 @@ models = click.option(
 checkpoint = _only(NetworkChoice, "checkpoint")
 precision = _only(NetworkChoice, "precision")
 device = _only(NetworkChoice, "device")
-layer = _only(MethodOptions, "layer")
-target = _only(MethodOptions, "target")
+layer = _only(Settings, "layer")
+target = _only(Settings, "target")
 depth_scale = _only(FrameFiles, "depth_scale")
 channel = _only(FrameFiles, "channel")
-seed = _only(HoldOut, "seed")
+seed = _only(Settings, "seed")
 overwrite = _only(OutputOptions, "overwrite")
 camera = _only(ScanOptions, "camera")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 
 
-def _allow_pixels(
-    context: click.Context, parameter: click.Parameter, max_pixels: int | None
-) -> None:
-    set_max_pixels(max_pixels)
-
-
-max_pixels = click.option(
-    "--max-pixels",
-    type=click.IntRange(1),
-    metavar="N",
-    expose_value=False,
-    callback=_allow_pixels,
-    help="Largest image to read; files may have 4 N bytes.  [default: memory / 64, at most 2^28]",
-)
 sample = click.option(
     "--sample",
     metavar="[PATTERN:]N|P%",
@@ -159,11 +174,7 @@ sample = click.option(
 )
 
 
-def scan(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the options of a LiDAR scan, and `--max-pixels`."""
-    return options_of_groups(ScanOptions)(max_pixels(command))
-
-
+scan = options_of_groups(ScanOptions)
 sparse_output = click.option(
     "-o",
     "--output",
@@ -201,6 +212,9 @@ no_groups = click.option(
 
 def taken(group: type, values: dict[str, Any]) -> dict[str, Any]:
     """Returns the options of this group by name; they are removed from `values`."""
+    for name in [name for name in values if name.endswith(_ASSIGNED)]:
+        for chosen in values.pop(name):
+            values |= chosen
     names = [each.name for each in options_of(group)]
     return {name: values.pop(name) for name in names if name in values}
 

@@ -51,7 +51,13 @@ def project(
 
     target = SparseTarget(output=output, overlay=overlay, overwrite=overwrite)
     height_and_width = options.height_and_width(size) if size else None
-    record = project_scan(scan, ScanOptions(**values), target, image=image, size=height_and_width)
+    record = project_scan(
+        scan,
+        ScanOptions(**options.taken(ScanOptions, values)),
+        target,
+        image=image,
+        size=height_and_width,
+    )
     _print(record, as_json=as_json)
 
 
@@ -76,7 +82,6 @@ def project(
 )
 @options.depth_scale
 @options.channel
-@options.max_pixels
 @options.sparse_output
 @options.overwrite
 @options.as_json
@@ -142,7 +147,6 @@ def sample(
 @_seed
 @options.depth_scale
 @options.channel
-@options.max_pixels
 @options.sparse_output
 @options.overwrite
 @options.as_json

@@ -80,8 +80,7 @@ _SCAN_DETAILS = ("inverse_extrinsics", "euclidean", "keep_occluded", "point_fiel
     "--cost", is_flag=True, help="Add the time of the refinement to tables, and a plot over it."
 )
 @options.options_of_groups(ScanOptions, without=_SCAN_DETAILS)
-@options.max_pixels
-@options.options_of_groups(FrameFiles, NetworkChoice, without=["tile"])
+@options.options_of_groups(FrameFiles, NetworkChoice)
 @options.as_json
 def sweep(
     vary: tuple[str, ...],

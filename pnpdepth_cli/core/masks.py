@@ -7,17 +7,19 @@ where the depth between a LiDAR's lines is wanted.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 BLOCKS = 8
 """Blocks along each side of the frame."""
 LINES = 64
 """Bands of rows, about one for each scan line of a LiDAR."""
+SET_ASIDE = 0.1
+"""Fraction of the points never shown; the step that is best there is taken."""
 LEAST_SET_ASIDE = 4
 """Points set aside at least; with fewer than four times as many points, a quarter."""
 
@@ -46,22 +48,6 @@ MASKS: dict[str, Groups] = {"points": _points, "blocks": _blocks, "lines": _line
 """The kinds of mask; `choices.MASKS` lists their names."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MaskSettings:
-    """Which points are hidden from the network's input, and which decide how many steps count."""
-
-    kind: str = "points"
-    """What is hidden as a whole, one of `choices.MASKS`."""
-    fraction: float = 0.5
-    """Fraction hidden at every step."""
-    set_aside: float = 0.1
-    """Fraction never shown during the steps; the step that is best there is taken."""
-    scale: float = 1.0
-    """Side of the image during the steps, as a fraction of the side that the network takes."""
-    seed: int = 0
-    """Of the masks, and of the random start of low-rank weights."""
-
-
 class Masks:
     """Masks of one frame's points, one for each step.
 
@@ -70,17 +56,17 @@ class Masks:
 
     Args:
         points: The N points that may be hidden.
-        settings: Kind and fraction; a fraction of 1/3 makes three parts. Above 1/2, one part is
-            shown and all others are hidden.
+        settings: `mask` and `mask_fraction`, which are not open. A fraction of 1/3 makes three
+            parts; above 1/2, one part is shown and all others are hidden.
         generator: Of the parts.
     """
 
     def __init__(
-        self, points: SparsePoints, settings: MaskSettings, generator: torch.Generator
+        self, points: SparsePoints, settings: Settings, generator: torch.Generator
     ) -> None:
         self._points, self._settings, self._generator = points, settings, generator
-        self._shows_one = settings.fraction > 0.5
-        smaller = 1 - settings.fraction if self._shows_one else settings.fraction
+        self._shows_one = settings.mask_fraction > 0.5
+        smaller = 1 - settings.mask_fraction if self._shows_one else settings.mask_fraction
         self._parts = max(2, round(1 / smaller))
         self._part, self._next = torch.empty(0), self._parts
 
@@ -97,7 +83,7 @@ class Masks:
     def _divided(self) -> Tensor:
         """(N,) the part of each point; no part is empty if there are enough points."""
         _, group = torch.unique(
-            MASKS[self._settings.kind](self._points, self._generator), return_inverse=True
+            MASKS[self._settings.mask](self._points, self._generator), return_inverse=True
         )
         if int(group.max()) + 1 < self._parts:  # too few blocks or lines
             group = torch.arange(len(self._points))

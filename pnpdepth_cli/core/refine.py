@@ -20,13 +20,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.refinement import DepthOf, FrameRefinement, Refinement, RefineSettings
+from pnpdepth_cli.core.refinement import DepthOf, FrameRefinement, Refinement
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
 from pnpdepth_cli.errors import BatchError, LayerError, PnpDepthError
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
-__all__ = ["DepthOf", "RefineSettings", "Refinement", "frame_parts", "refine", "refine_from"]
+__all__ = ["DepthOf", "Refinement", "frame_parts", "refine", "refine_from"]
 
 _LOSS_SCALE = 1024.0
 """Factor on the loss where float16 is involved, whose smallest number exceeds many gradients."""
@@ -36,7 +37,7 @@ def refine(
     split: Split,
     arguments: Sequence[Tensor],
     points: SparsePoints,
-    settings: RefineSettings,
+    settings: Settings,
     *,
     depth_of: DepthOf,
     keep_depths: Collection[int] = (),
@@ -79,7 +80,7 @@ def refine_from(
     split: Split,
     z: Tensor,
     points: Sequence[SparsePoints],
-    settings: RefineSettings,
+    settings: Settings,
     *,
     depth_of: Sequence[DepthOf],
     keep_depths: Collection[int] = (),
@@ -101,6 +102,7 @@ def refine_from(
     Raises:
         BatchError: z or the output does not have one part per frame; refine them one at a time.
     """
+    settings = settings.complete()
     frames = [
         FrameRefinement(settings, z0, at, read, keep_depths)
         for z0, at, read in zip(frame_parts(z, len(points)), points, depth_of, strict=True)

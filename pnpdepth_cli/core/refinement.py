@@ -8,67 +8,16 @@ from typing import Any
 
 from torch import Tensor
 
-from pnpdepth_cli.choices import LOSSES, PARAMETERS, UPDATES
+from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.losses import Loss, proximity_loss
-from pnpdepth_cli.core.masks import MaskSettings
 from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, blurred, step_size
 from pnpdepth_cli.core.update_rules import Update
 from pnpdepth_cli.errors import DivergedError, ModelError, PnpDepthError
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 DepthOf = Callable[[Any], Tensor]
 """Turns the network's output for one frame into depth (1, 1, h, w) in metres, differentiably."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefineSettings:
-    """What is updated and how; the defaults are the paper's."""
-
-    iterations: int = 5
-    """Number of updates; 0 gives the plain prediction."""
-    lr: float | str = 0.01
-    """Step size α: a number, or a text such as "3%" of the standard deviation of z_0."""
-    loss: str = "l1"
-    """L, one of `choices.LOSSES`."""
-    update: str = "sign"
-    """U, one of `choices.UPDATES`."""
-    schedule: str = "constant"
-    """How α changes over the updates, one of `choices.SCHEDULES`."""
-    blur: float = 0.0
-    """Standard deviation of the blur of the gradient, in mean spacings of the points."""
-    parameters: str = "elements"
-    """What is updated: "elements" or "channels" of z, "weights", or "lora:R"."""
-    target: str = "given"
-    """Which points L is taken at, one of `choices.TARGETS`."""
-    mask: MaskSettings = field(default_factory=MaskSettings)
-    """With target "masked": which points are hidden from the input."""
-    time_budget_s: float | None = None
-    """Seconds after which no update of weights begins; None sets no limit."""
-    proximity: float = 0.0
-    """Weight of the proximity loss in L."""
-    line_search: bool = False
-    """Whether an update that raised L is repeated from the best z with half the step."""
-    keep_best: bool = False
-    """Whether the result is the depth of the lowest loss instead of the last."""
-    align: str = "none"
-    """How `depth_of` fits the network's output to the points, one of `choices.ALIGNMENTS`."""
-    align_every: bool = False
-    """Whether `depth_of` repeats that fit at every update."""
-
-    @property
-    def moves_weights(self) -> bool:
-        """Whether weights of the network are updated instead of z."""
-        return self.parameters not in PARAMETERS
-
-    @property
-    def masked(self) -> bool:
-        """Whether L is taken at points hidden from the network's input."""
-        return self.target == "masked"
-
-    @property
-    def gives_best(self) -> bool:
-        """Whether the result is the depth of the lowest loss; with a line search it always is."""
-        return self.keep_best or self.line_search
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +55,7 @@ class FrameRefinement:
 
     def __init__(
         self,
-        settings: RefineSettings,
+        settings: Settings,
         z0: Tensor,
         points: SparsePoints,
         depth_of: DepthOf,

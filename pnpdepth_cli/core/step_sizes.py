@@ -86,7 +86,7 @@ class Channels:
         if z0.ndim < 3:
             raise LayerError(
                 f"z of shape {tuple(z0.shape)} has no channels to scale and shift; update its"
-                " elements (--parameters elements)"
+                " elements (--set parameters=elements)"
             )
         self._dims = (1,) if z0.ndim == 3 else tuple(range(2, z0.ndim))
         centred = z0 - z0.mean(dim=self._dims, keepdim=True)

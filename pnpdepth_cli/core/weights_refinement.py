@@ -23,14 +23,15 @@ from torch import Tensor
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.losses import Loss
-from pnpdepth_cli.core.masks import Masks, set_aside
-from pnpdepth_cli.core.refinement import DepthOf, Refinement, RefineSettings, bad_prediction
+from pnpdepth_cli.core.masks import SET_ASIDE, Masks, set_aside
+from pnpdepth_cli.core.refinement import DepthOf, Refinement, bad_prediction
 from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
 from pnpdepth_cli.core.update_rules import Update
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError, LayerError
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 MIN_POINTS = 30
 """With fewer points no step is made: what a few hidden points ask does not hold for a frame."""
@@ -64,7 +65,7 @@ class FrameOfPoints:
 def refine_weights(
     frame: FrameOfPoints,
     weights: MovingWeights,
-    settings: RefineSettings,
+    settings: Settings,
     *,
     carried: MovingWeights | None = None,
     on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
@@ -122,17 +123,16 @@ class WeightsRefinement:
         settings: What is updated and how.
     """
 
-    def __init__(
-        self, frame: FrameOfPoints, weights: MovingWeights, settings: RefineSettings
-    ) -> None:
+    def __init__(self, frame: FrameOfPoints, weights: MovingWeights, settings: Settings) -> None:
+        settings = settings.complete()
         self._frame, self._weights, self._settings = frame, weights, settings
         self._loss: Loss = LOSSES[settings.loss]
-        generator = torch.Generator().manual_seed(settings.mask.seed)
+        generator = torch.Generator().manual_seed(settings.seed)
         masked = settings.masked
-        fraction = settings.mask.set_aside if masked else 0.0
+        fraction = SET_ASIDE if masked else 0.0
         aside = set_aside(frame.inliers, fraction, generator)
         self._shown, self._aside = frame.inliers.select(~aside), frame.inliers.select(aside)
-        self._masks = Masks(self._shown, settings.mask, generator)
+        self._masks = Masks(self._shown, settings, generator)
         self._rules: list[Update] = []
         self._steps: list[float] = []
         self._errors: dict[int, float] = {}
@@ -277,7 +277,7 @@ class WeightsRefinement:
         if not self._weights.theta:
             raise LayerError(
                 "no weight can move: the prediction depends on no parameter behind the cut; take"
-                " --parameters elements, or cut at an earlier layer"
+                " --set parameters=elements, or cut at an earlier layer"
             )
         self._checked = {0: list(self._weights.theta)}
         lr, update = self._settings.lr, self._settings.update

@@ -20,7 +20,7 @@ from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.completion.residual_field import Kernel
 from pnpdepth_cli.errors import PnpDepthError
-from pnpdepth_cli.frames.frame import Check, Frame, RefinedFrame
+from pnpdepth_cli.frames.frame import Check, Frame, Refined
 from pnpdepth_cli.frames.fuse import Fused, Fusion, Member, weighted_mean
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_lines
@@ -73,7 +73,7 @@ def refine_default(
     propagation: str = "gp",
     seed: int = 0,
     until: float | None = None,
-) -> RefinedFrame:
+) -> Refined:
     """Returns the frame refined by the default method.
 
     Args:
@@ -116,7 +116,7 @@ def refine_default(
 
 
 def check_fixed(
-    refined: RefinedFrame, again: RefinedFrame, hidden: SparsePoints, kept: SparsePoints
+    refined: Refined, again: Refined, hidden: SparsePoints, kept: SparsePoints
 ) -> Check:
     """Returns the check of a fixed method, which was run again without the hidden points.
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,14 +13,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import Alignment
-from pnpdepth_cli.completion.image_registration import ImageRegistration
+from pnpdepth_cli.completion.image_registration import ImageRegistration, estimated, evidence
 from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.core.weights import MovingWeights
-from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.errors import DivergedError, UsageError
 from pnpdepth_cli.models.definition import DENSE_SPACING
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
+METRES = "m"
 DepthMap = NDArray[np.float32]
+Registration = str | tuple[float, float, float]
+"""What the user says of the registration: "auto", "off", or zoom, right and down in pixels."""
+Register = ImageRegistration | Literal["auto"] | None
+"""How an image is to be moved into the frame of the points; "auto": as the points say."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +36,15 @@ class Frame:
     rgb: Tensor | None
     """(3, H, W) float32 in 0…1. None without an image."""
     points: SparsePoints
-    """Sparse depth in the image frame."""
+    """Sparse depth in the image frame, on the CPU."""
+    gt: DepthMap | None = None
+    """(H, W) metres, 0 = unknown. None without ground truth."""
+    held_out: SparsePoints | None = None
+    """Points that are kept out, to score at."""
+    unit: str = METRES
+    """Of all depths: "m", or "model units" of a COLMAP model without scale."""
+    register: Register = None
+    """How `rgb` is to be moved into the frame of the points."""
     outliers: SparsePoints | None = None
     """Points that were left out as outliers, for networks that weigh their points."""
     prior: Tensor | None = None
@@ -41,6 +57,27 @@ class Frame:
     def size(self) -> tuple[int, int]:
         """(H, W) of the image frame."""
         return self.points.size
+
+    @property
+    def image(self) -> NDArray[np.float32] | None:
+        """(H, W, 3) float32 in 0…1. None without an image."""
+        return None if self.rgb is None else np.ascontiguousarray(self.rgb.permute(1, 2, 0))
+
+    @functools.cached_property
+    def _registration_of_points(self) -> ImageRegistration | None:
+        """How the points say that the image is moved: asked for more than once of most frames."""
+        assert self.image is not None
+        return estimated([evidence(self.image, self.points)])
+
+    def registered(self) -> Frame:
+        """Returns the frame with its image moved into the frame of the points, if it has to be."""
+        image, how = self.image, self.register
+        if image is None or how is None:
+            return self
+        how = self._registration_of_points if how == "auto" else how
+        if how is None:
+            return replace(self, register=None)
+        return replace(self, rgb=tensor_of(how.applied(image)), register=None, registration=how)
 
     def with_points(self, points: SparsePoints) -> Frame:
         """Returns the same image with other sparse depth."""
@@ -65,7 +102,7 @@ class WarmStart:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinedFrame:
+class Refined:
     """A refined frame, all in the image frame."""
 
     before: DepthMap
@@ -97,9 +134,19 @@ class RefinedFrame:
     registration: ImageRegistration | None = None
     """How the image was moved into the frame of the points. None: it was not."""
     in_window: bool = False
-    """Whether it was refined as a frame of a window, which may begin where the one before ended."""
+    """Whether it may have begun where the frame before it in a window ended."""
     carried: WarmStart | None = None
     """What the next frame of the window may begin with; dropped once that has begun."""
+
+    @property
+    def depth(self) -> DepthMap:
+        """The refined depth, `after`."""
+        return self.after
+
+    @property
+    def losses(self) -> tuple[float, ...]:
+        """Loss at the points before the first update and after each update."""
+        return self.refinement.losses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +192,25 @@ class Check:
         mean = (share * gain).sum()
         deviation = (share.square() * (gain - mean).square()).sum().sqrt()
         return float(mean / deviation.clamp_min(1e-12))
+
+
+def registration_to_make(registration: Registration, settings: Settings) -> Register:
+    """Returns how images are to be moved. The paper's preset moves none unless numbers are given.
+
+    Raises:
+        UsageError: There is no such registration.
+    """
+    if not isinstance(registration, str):
+        zoom, right, down = registration
+        return ImageRegistration(zoom=zoom, right=right, down=down)
+    if registration not in ("auto", "off"):
+        raise UsageError(f"registration must be auto, off or three numbers, got {registration!r}")
+    return "auto" if registration == "auto" and settings.preset is None else None
+
+
+def tensor_of(image: NDArray[np.float32]) -> Tensor:
+    """Returns an image (H, W, 3) as a tensor (3, H, W)."""
+    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
 
 
 def is_dense(points: SparsePoints) -> bool:

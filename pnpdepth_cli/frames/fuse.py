@@ -19,12 +19,12 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.completion.outliers import outliers
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import PnpDepthError
-from pnpdepth_cli.frames.frame import Frame, RefinedFrame, is_dense
+from pnpdepth_cli.frames.frame import Frame, Refined, is_dense
 from pnpdepth_cli.frames.opened import OpenNetwork
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 FEW_POINTS = 50
 """With fewer points networks that take them are not updated, as it gains nothing, and their depth
@@ -49,9 +49,9 @@ class Member:
     network: Network
     layer: str
     """Layer to cut at."""
-    settings: RefineSettings
+    settings: Settings
     """How its output is aligned and z is updated."""
-    hidden_points: RefineSettings | None = None
+    hidden_points: Settings | None = None
     """How its weights are updated by points hidden from its input, where there is time for it."""
 
     @property
@@ -69,7 +69,7 @@ class Member:
 class Fused:
     """A frame refined by all networks and fused; the residual is not propagated."""
 
-    alone: Mapping[Member, RefinedFrame]
+    alone: Mapping[Member, Refined]
     """What the networks give without another one's prior, the user's first."""
     before: Tensor
     """(H, W) metres, 0 = unknown: fused before the updates of z."""
@@ -79,7 +79,7 @@ class Fused:
     """Kept steps by hidden points, by network."""
 
     @property
-    def user(self) -> RefinedFrame:
+    def user(self) -> Refined:
         """What the user's network gives."""
         return next(iter(self.alone.values()))
 
@@ -117,7 +117,7 @@ class Fusion:
         for opened in self._opened.values():
             opened.next_image()
 
-    def without_outliers(self, frame: Frame) -> tuple[Frame, RefinedFrame]:
+    def without_outliers(self, frame: Frame) -> tuple[Frame, Refined]:
         """Returns the frame with its outliers set aside, and what the user's network gives for it.
 
         Outliers are inconsistent with their neighbours beside what the user's network predicts from
@@ -146,7 +146,7 @@ class Fusion:
         self,
         frame: Frame,
         *,
-        user: RefinedFrame | None = None,
+        user: Refined | None = None,
         rejected: Collection[Member] = (),
         updates: bool = True,
         until: float | None = None,
@@ -170,7 +170,7 @@ class Fusion:
         first, *others = self.members
         if user is None or (until is not None and first.hidden_points is not None):
             user = self._refined(first, frame, updates=updates, until=until)
-        alone, guided = {first: user}, list[RefinedFrame]()
+        alone, guided = {first: user}, list[Refined]()
         for member in others:
             if not member.takes_prior:
                 self._add(alone, member, frame, updates, until)
@@ -181,7 +181,7 @@ class Fusion:
         for member in self.members:
             for guide in guides if member.takes_prior else ():
                 prior = torch.from_numpy(alone[guide].before)
-                one: dict[Member, RefinedFrame] = {}
+                one: dict[Member, Refined] = {}
                 self._add(one, member, replace(frame, prior=prior), updates, until)
                 guided += one.values()
         parts = _weighted(alone, guided)
@@ -192,13 +192,13 @@ class Fusion:
             steps=self._steps,
         )
 
-    def refine_alone(self, member: Member, frame: Frame) -> RefinedFrame:
+    def refine_alone(self, member: Member, frame: Frame) -> Refined:
         """Returns the frame refined by one network without a prior and without updates of z."""
         return self._refined(member, frame, updates=False)
 
     def _add(
         self,
-        to: dict[Member, RefinedFrame],
+        to: dict[Member, Refined],
         member: Member,
         frame: Frame,
         updates: bool,
@@ -209,7 +209,7 @@ class Fusion:
 
     def _refined(
         self, member: Member, frame: Frame, *, updates: bool = True, until: float | None = None
-    ) -> RefinedFrame:
+    ) -> Refined:
         moved = self._by_hidden_points(member, frame, until)
         if moved is not None:
             return moved
@@ -220,7 +220,7 @@ class Fusion:
 
     def _by_hidden_points(
         self, member: Member, frame: Frame, until: float | None
-    ) -> RefinedFrame | None:
+    ) -> Refined | None:
         """The frame after steps by hidden points; None where none are to be made or they fail."""
         left_s = 0.0 if until is None else until - time.monotonic()
         if member.hidden_points is None or left_s <= 0:
@@ -254,8 +254,8 @@ def weighted_mean(depths: Sequence[tuple[Tensor, float]]) -> Tensor:
 
 
 def _weighted(
-    alone: Mapping[Member, RefinedFrame], guided: Sequence[RefinedFrame]
-) -> list[tuple[RefinedFrame, float]]:
+    alone: Mapping[Member, Refined], guided: Sequence[Refined]
+) -> list[tuple[Refined, float]]:
     """The depths to fuse, with weights whose sum is 1.
 
     A network that takes the points but no prior has its say as a prior. Where none takes a prior,
@@ -279,7 +279,7 @@ def _weighted(
     return [(refined, weight / len(group)) for group, weight in groups for refined in group]
 
 
-def _guides(member: Member, refined: RefinedFrame) -> bool:
+def _guides(member: Member, refined: Refined) -> bool:
     """Whether a network's depth is worth something to one that takes the points and a prior."""
     if member.takes_prior:
         return False

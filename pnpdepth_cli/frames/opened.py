@@ -15,16 +15,17 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
+from pnpdepth_cli.core.refine import Refinement, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import PnpDepthError
-from pnpdepth_cli.frames.frame import Frame, RefinedFrame
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import refine_frame_weights, to_refined_frame
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.settings import Settings
 
 
 class SplitCache:
@@ -93,7 +94,7 @@ class OpenNetwork:
         self._z0 = self._output = None
         self._encoded = {}
 
-    def refine(self, frame: Frame, settings: RefineSettings) -> RefinedFrame:
+    def refine(self, frame: Frame, settings: Settings) -> Refined:
         """Returns the frame refined by this network, its residual not propagated.
 
         Args:
@@ -103,6 +104,7 @@ class OpenNetwork:
         Raises:
             PnpDepthError: The refinement fails.
         """
+        settings = settings.complete()
         with out_of_memory_is_a_device_error(self.network.device):
             prepared = prepare(self.network, frame)
             if not len(prepared.points):
@@ -123,7 +125,7 @@ class OpenNetwork:
         return refined
 
     def _updated(
-        self, prepared: PreparedFrame, reader: AlignedDepth, settings: RefineSettings
+        self, prepared: PreparedFrame, reader: AlignedDepth, settings: Settings
     ) -> Refinement | PnpDepthError:
         split, z0 = self._cut.at(self.layer), self._z0
         if z0 is None:
@@ -144,7 +146,7 @@ class OpenNetwork:
             return replace(result, before=before, after=reader(split.rear(result.z)))
 
     def _plain(
-        self, prepared: PreparedFrame, reader: AlignedDepth, settings: RefineSettings
+        self, prepared: PreparedFrame, reader: AlignedDepth, settings: Settings
     ) -> Refinement:
         """The same without updates: a pass of the whole network, which need not be cut."""
         output = self._output

@@ -9,7 +9,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import Alignment
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.models.aligned import AlignedDepth
@@ -17,6 +16,7 @@ from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,9 +73,7 @@ class PreparedFrame:
         arguments = self.network.arguments_of(image, points, prior)
         return replace(self, image=image, points=points, prior=prior, arguments=arguments)
 
-    def depth_reader(
-        self, settings: RefineSettings, alignment: Alignment | None = None
-    ) -> AlignedDepth:
+    def depth_reader(self, settings: Settings, alignment: Alignment | None = None) -> AlignedDepth:
         """Returns a new reader of the network's output in metres, (1, 1, h, w).
 
         Args:

@@ -12,16 +12,17 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.outliers import outliers
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
+from pnpdepth_cli.core.refine import Refinement, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.core.weights_refinement import FrameOfPoints, Predict, refine_weights
 from pnpdepth_cli.errors import BatchError, DivergedError, PnpDepthError
-from pnpdepth_cli.frames.frame import DepthMap, Frame, RefinedFrame, no_points
+from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined, no_points
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 MIN_POINTS_FOR_OUTLIERS = 50
 """Of fewer points, one inconsistent with the others may be all that is seen of an object."""
@@ -33,12 +34,12 @@ OnIteration = Callable[[int, float], None]
 def refine_frame(
     network: Network,
     split: Split,
-    settings: RefineSettings,
+    settings: Settings,
     frame: Frame,
     *,
     propagation: str = "none",
     on_iteration: OnIteration = lambda done, loss: None,
-) -> RefinedFrame:
+) -> Refined:
     """Returns one refined frame. A divergence with a last good depth is returned in it.
 
     Args:
@@ -64,12 +65,12 @@ def refine_frame(
 def refine_frames(
     network: Network,
     split: Split,
-    settings: RefineSettings,
+    settings: Settings,
     frames: Sequence[Frame],
     *,
     propagation: str = "none",
     on_iteration: OnIteration = lambda done, loss: None,
-) -> list[RefinedFrame | PnpDepthError]:
+) -> list[Refined | PnpDepthError]:
     """Returns frames refined in one pass of the network; an error in place of a failed frame.
 
     Arguments as of `refine_frame`; `on_iteration` gets the mean loss.
@@ -77,6 +78,7 @@ def refine_frames(
     Raises:
         BatchError: The network does not take these frames together, or they differ in size.
     """
+    settings = settings.complete()
     with out_of_memory_is_a_device_error(network.device):
         prepared = [prepare(network, frame) for frame in frames]
         seen = [each for each in prepared if len(each.points)]
@@ -106,7 +108,7 @@ def refine_frames(
 
 def refine_frame_weights(
     split: Split,
-    settings: RefineSettings,
+    settings: Settings,
     frame: PreparedFrame,
     reader: AlignedDepth,
     on_iteration: OnIteration = lambda done, loss: None,
@@ -120,9 +122,9 @@ def refine_frame_weights(
         reader: Reads depth from the network's output.
         on_iteration: As of `refine_frame`.
     """
-    weights = MovingWeights(frame.network.module, settings.parameters, settings.mask.seed)
+    weights = MovingWeights(frame.network.module, settings.parameters, settings.seed)
     try:
-        with opened_frame(split, frame, reader, settings.mask.scale) as seen:
+        with opened_frame(split, frame, reader, settings.mask_scale) as seen:
             return refine_weights(
                 seen,
                 weights,
@@ -196,7 +198,7 @@ def to_refined_frame(
     result: Refinement | PnpDepthError,
     *,
     propagation: str = "none",
-) -> RefinedFrame | PnpDepthError:
+) -> Refined | PnpDepthError:
     """Returns the result in the image frame, its residual propagated; an error if there is none.
 
     Args:
@@ -211,7 +213,7 @@ def to_refined_frame(
     if isinstance(result, PnpDepthError):
         return result
     used = prepared.frame.points
-    return RefinedFrame(
+    return Refined(
         before=prepared.to_image(result.before),
         after=with_propagation(prepared.frame, prepared.to_image(result.after), propagation),
         used=used,

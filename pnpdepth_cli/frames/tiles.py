@@ -15,12 +15,12 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.frames.frame import DepthMap, Frame, RefinedFrame, no_points
+from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined, no_points
 from pnpdepth_cli.frames.refine import OnIteration, refine_frame, with_propagation
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 OVERLAP = 0.25
 """Smallest overlap of two tiles, as a fraction of a tile's side."""
@@ -85,13 +85,13 @@ def tiles_of(size: tuple[int, int], side: int) -> list[Tile]:
 def refine_tiled(
     network: Network,
     split: Split,
-    settings: RefineSettings,
+    settings: Settings,
     frame: Frame,
     side: int,
     *,
     propagation: str = "none",
     on_iteration: OnIteration = lambda done, loss: None,
-) -> RefinedFrame:
+) -> Refined:
     """Returns the frame refined in tiles of at most side × side pixels.
 
     A frame of one tile is refined as it is. For others, the whole frame is refined at reduced size

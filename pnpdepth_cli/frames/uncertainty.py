@@ -27,7 +27,7 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points
 from pnpdepth_cli.frames.default import RESULT
-from pnpdepth_cli.frames.frame import Check, DepthMap, RefinedFrame
+from pnpdepth_cli.frames.frame import Check, DepthMap, Refined
 from pnpdepth_cli.points import SparsePoints
 
 MIN_INLIER_WEIGHT = 0.05
@@ -62,7 +62,7 @@ class Uncertainty:
     """How it was calibrated."""
 
 
-def uncertainty(frame: RefinedFrame) -> Uncertainty:
+def uncertainty(frame: Refined) -> Uncertainty:
     """Returns the standard deviation of the depth of a refined frame with its check."""
     points, depth = frame.used, frame.after
     network = torch.from_numpy(frame.before)

@@ -13,27 +13,28 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine_from
+from pnpdepth_cli.core.refine import Refinement, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.core.weights_refinement import refine_weights
 from pnpdepth_cli.errors import DivergedError, PnpDepthError
-from pnpdepth_cli.frames.frame import Frame, RefinedFrame, WarmStart
+from pnpdepth_cli.frames.frame import Frame, Refined, WarmStart
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import opened_frame, to_refined_frame
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.settings import Settings
 
 
 def refine_next(
     network: Network,
     split: Split,
-    settings: RefineSettings,
+    settings: Settings,
     frame: Frame,
     carried: WarmStart,
     *,
     propagation: str = "none",
-) -> RefinedFrame:
+) -> Refined:
     """Returns one refined frame of a window, with what the next one may take over.
 
     Args:
@@ -47,6 +48,7 @@ def refine_next(
     Raises:
         PnpDepthError: The frame cannot be refined.
     """
+    settings = settings.complete()
     with out_of_memory_is_a_device_error(network.device):
         prepared = prepare(network, frame)
         if not len(prepared.points):
@@ -62,7 +64,7 @@ def refine_next(
 
 
 def _with_z(
-    split: Split, settings: RefineSettings, frame: PreparedFrame, carried: WarmStart
+    split: Split, settings: Settings, frame: PreparedFrame, carried: WarmStart
 ) -> tuple[Refinement | PnpDepthError, AlignedDepth, WarmStart]:
     """The refinement by updates of z, what read its depth, and what the next frame may take."""
     reader = frame.depth_reader(settings)
@@ -89,18 +91,18 @@ def _with_z(
     return last, reader, WarmStart(change=last.z - z0, alignment=reader.alignment)
 
 
-def _loss(frame: PreparedFrame, settings: RefineSettings, depth: Tensor) -> float:
+def _loss(frame: PreparedFrame, settings: Settings, depth: Tensor) -> float:
     return float(LOSSES[settings.loss](frame.points.sample(depth), frame.points.depth))
 
 
 def _with_weights(
-    split: Split, settings: RefineSettings, frame: PreparedFrame, carried: WarmStart
+    split: Split, settings: Settings, frame: PreparedFrame, carried: WarmStart
 ) -> tuple[Refinement | PnpDepthError, AlignedDepth, WarmStart]:
     """The same by updates of weights."""
     reader = frame.depth_reader(settings)
-    weights = MovingWeights(frame.network.module, settings.parameters, settings.mask.seed)
+    weights = MovingWeights(frame.network.module, settings.parameters, settings.seed)
     try:
-        with opened_frame(split, frame, reader, settings.mask.scale) as seen:
+        with opened_frame(split, frame, reader, settings.mask_scale) as seen:
             result = refine_weights(seen, weights, settings, carried=carried.weights)
     except PnpDepthError as error:
         return error, reader, WarmStart()

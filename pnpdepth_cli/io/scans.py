@@ -123,7 +123,8 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
             " as float32) nor of 20 (nuScenes); it is cut short or no such scan"
         )
     raise FileFormatError(
-        f"{path} may hold 4 numbers a point (KITTI) or 5 (nuScenes); say which with --point-fields"
+        f"{path} may hold 4 numbers a point (KITTI) or 5 (nuScenes); say which with"
+        " --scan point-fields"
     )
 
 

@@ -29,7 +29,6 @@ sense raises ModelError as soon as the object is made.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -37,9 +36,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import choices
-from pnpdepth_cli.choices import Align, Fit, Mask, OutputKind, OutputScale, Schedule
+from pnpdepth_cli.choices import Fit, OutputKind, OutputScale
 from pnpdepth_cli.choices import InputKind as InputKind  # for definition files
 from pnpdepth_cli.models import validity
+from pnpdepth_cli.settings import Settings as Settings  # for definition files
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -53,9 +53,7 @@ class Fixed:
     """The network takes images of one size only."""
 
     height: int
-    """Rows."""
     width: int
-    """Columns."""
     fit: Fit = "stretch"
     """How an image of another size is brought to it.
 
@@ -74,7 +72,7 @@ class Multiple:
     """The network takes any image whose sides are multiples of a number."""
 
     of: int
-    """The number. Other images are padded at the right and the bottom by repeating edge pixels."""
+    """Other images are padded at the right and the bottom by repeating edge pixels."""
     longest: int | None = None
     """Images with a longer side, in pixels, are shrunk to it first; None shrinks none."""
 
@@ -89,7 +87,6 @@ class Near:
     """The image is resized to sides that are multiples of a number, nearly in its aspect ratio."""
 
     of: int
-    """The number."""
     height: int | None = None
     """Rows to approach, or None. Of height and width, the one that needs less resizing is taken."""
     width: int | None = None
@@ -107,71 +104,15 @@ class Normalisation:
     """The network's input is (rgb − mean) / std with rgb in 0…1; by default rgb itself."""
 
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of red, green and blue."""
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Of red, green and blue, each above 0; 1/255 each makes the input 0…255."""
+    """Above 0; 1/255 of each channel makes the input 0…255."""
 
     def __post_init__(self) -> None:
         validity.per_channel(self, "mean")
         validity.per_channel(self, "std", positive=True)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RefineDefaults:
-    """The network's settings of refinement where no option sets them.
-
-    The defaults here are the paper's. See `pnpdepth_cli.core.refine.RefineSettings`.
-    """
-
-    layer: str | None = None
-    """Where to cut; None is the first of the definition's layers."""
-    iterations: int = 5
-    """Number of updates of z, K."""
-    lr: float | str = 0.01
-    """Step size, α: a number, or a text such as "3%" of the standard deviation of z_0."""
-    loss: str = "l1"
-    """Loss at the sparse points, L: a name in `choices.LOSSES`."""
-    update: str = "sign"
-    """Update rule, U: a name in `choices.UPDATES`."""
-    schedule: Schedule = "constant"
-    """How the step size changes over the updates."""
-    blur: float = 0.0
-    """Standard deviation, in mean spacings of the points, of the blur of the gradient."""
-    parameters: str = "elements"
-    """What is updated: "elements" or "channels" of z, "weights", or "lora:R"."""
-    mask: Mask = "points"
-    """What is hidden as a whole where the loss is taken at hidden points."""
-    mask_fraction: float = 0.5
-    """Fraction of the points hidden there at every update, between 0 and 1."""
-    mask_scale: float = 1.0
-    """Side of the image there during the updates, as a fraction, 1 at most."""
-    align: Align | None = None
-    """How the output is fitted to the points; None is "none" for metric networks, else "auto"."""
-    spread: float | None = None
-    """Deprecated name of `blur`."""
-
-    def __post_init__(self) -> None:
-        if self.spread is not None:
-            warnings.warn("RefineDefaults.spread is now blur", DeprecationWarning, stacklevel=3)
-            object.__setattr__(self, "blur", self.spread)
-            object.__setattr__(self, "spread", None)
-        if self.layer is not None:
-            validity.instance(self, "layer", str, "the name of a layer")
-        validity.whole(self, "iterations", least=0)
-        validity.step(self, "lr")
-        validity.one_of(self, "loss", choices.LOSSES)
-        validity.one_of(self, "update", choices.UPDATES)
-        validity.one_of(self, "schedule", choices.SCHEDULES)
-        validity.at_least_zero(self, "blur")
-        validity.instance(self, "parameters", str, "the name of what is updated")
-        validity.one_of(self, "mask", choices.MASKS)
-        validity.fraction(self, "mask_fraction")
-        validity.fraction(self, "mask_scale", most=True)
-        if self.align is not None:
-            validity.one_of(self, "align", choices.ALIGNMENTS)
-
-
-UNTUNED_DEFAULTS = RefineDefaults(
+UNTUNED_DEFAULTS = Settings(
     iterations=20, lr="25%", loss="cauchy", update="normalised", schedule="linear", blur=1.0
 )
 """For networks that nobody here has tuned: steps that follow the feature map's own scale.
@@ -179,7 +120,7 @@ UNTUNED_DEFAULTS = RefineDefaults(
 Chosen with FastDepth on rendered rooms; Adam with steps of 3 % left a quarter more of the error.
 """
 
-WEIGHTS_DEFAULTS = RefineDefaults(
+WEIGHTS_DEFAULTS = Settings(
     iterations=16,
     lr=5e-4,
     loss="log",
@@ -198,7 +139,7 @@ DENSE_SPACING = 10.0
 """Mean spacing of the points in pixels below which they are dense, as those of a LiDAR are."""
 
 WEIGHTS_DENSE_DEFAULTS = replace(WEIGHTS_DEFAULTS, iterations=8, lr=2e-4)
-"""The same for dense points, of which half a frame's tell more: more steps follow their noise."""
+"""The same for dense points, whose noise more steps would follow."""
 
 MASKED_DENSE_DEFAULTS = replace(MASKED_DEFAULTS, iterations=6, lr=3e-4, mask_scale=0.5)
 """The same for dense points hidden from the input."""
@@ -243,11 +184,11 @@ class ModelDefinition:
     layers: tuple[str, ...] = ()
     """Names of the submodules worth cutting at, from shallow to deep; `pnpdepth layers` lists all.
     Without any, they are suggested by the shapes of the feature maps."""
-    defaults: RefineDefaults = RefineDefaults()
+    defaults: Settings = Settings()
     """Its settings of refinement where no option sets them."""
-    masked: RefineDefaults = MASKED_DEFAULTS
+    masked: Settings = MASKED_DEFAULTS
     """The same where weights are updated by points hidden from the input."""
-    masked_dense: RefineDefaults = MASKED_DENSE_DEFAULTS
+    masked_dense: Settings = MASKED_DENSE_DEFAULTS
     """The same for points that lie closer than `DENSE_SPACING`."""
     checkpoint: Path | None = None
     """The weights that come with the definition; None if the user names them."""
@@ -269,8 +210,6 @@ class ModelDefinition:
     static_graph: bool = False
     """True if the network runs the same submodules in the same order for all images of one size,
     even where values of tensors reach Python code. Then the cut is learned only once."""
-    same_path: bool = False
-    """Deprecated name of `static_graph`."""
     read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
     """Renames or reshapes the tensors of a published checkpoint into the network's state dict."""
     arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
@@ -287,12 +226,6 @@ class ModelDefinition:
     """What was assumed where no definition was given; it is printed."""
 
     def __post_init__(self) -> None:
-        if self.same_path:
-            warnings.warn(
-                "ModelDefinition.same_path is now static_graph", DeprecationWarning, stacklevel=3
-            )
-            object.__setattr__(self, "static_graph", True)
-            object.__setattr__(self, "same_path", False)
         validity.instance(self, "name", str, "a text")
         validity.one_of(self, "input_kind", choices.INPUT_KINDS)
         size = "Fixed(height, width), Multiple(of) or Near(of=…)"
@@ -304,7 +237,7 @@ class ModelDefinition:
         validity.one_of(self, "output_scale", choices.OUTPUT_SCALES)
         validity.names(self, "layers")
         for settings in ("defaults", "masked", "masked_dense"):
-            validity.instance(self, settings, RefineDefaults, "RefineDefaults(…)")
+            validity.instance(self, settings, Settings, "Settings(…)")
         if self.image_encoder is not None:
             validity.instance(self, "image_encoder", str, "the name of a submodule")
         if self.checkpoint is not None:

@@ -41,6 +41,7 @@ class Network:
     module: nn.Module
     device: torch.device
     checkpoint: Path | None
+    precision: str = "fp32"
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -87,12 +88,7 @@ class Network:
     def image_of(self, frame: FrameMap, rgb: Tensor | None) -> Tensor | None:
         """Returns the image as the network takes it, (1, 3, h, w); None if it takes none.
 
-        Args:
-            frame: As of `arguments`.
-            rgb: As of `arguments`.
-
-        Raises:
-            UsageError: As of `arguments`.
+        Arguments and errors are those of `arguments`.
         """
         if "rgb" not in self.definition.input_kind:
             return None
@@ -147,11 +143,7 @@ class Network:
         return (str(note),) if note else ()
 
     def depth_of(self, output: Any) -> Tensor:
-        """Returns depth (1, 1, h, w) in float32, for a network whose output needs no alignment.
-
-        Args:
-            output: What the module returns.
-        """
+        """Returns depth (1, 1, h, w) of what a module returns whose output needs no alignment."""
         tensor = self.raw_of(output)
         if self.definition.output_kind == "inverse":
             return tensor.clamp_min(1 / FARTHEST_DEPTH).reciprocal()
@@ -159,9 +151,6 @@ class Network:
 
     def raw_of(self, output: Any) -> Tensor:
         """Returns the prediction (1, 1, h, w) in float32, in the network's own numbers.
-
-        Args:
-            output: What the module returns.
 
         Raises:
             ModelError: It holds no prediction, or several tensors that `output` of the definition
@@ -239,7 +228,7 @@ def load_network(
             f"network {definition.name!r} comes with its weights; --checkpoint does not go with it"
         )
     if definition.complete:
-        notes = []
+        pass
     elif path is not None:
         notes = load_checkpoint(module, definition, path)
     elif untrained:
@@ -260,6 +249,7 @@ def load_network(
         module=module,
         device=torch_device,
         checkpoint=path,
+        precision=precision,
         notes=tuple(notes),
     )
     if definition.layers or definition.defaults.layer:

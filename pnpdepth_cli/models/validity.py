@@ -37,31 +37,6 @@ def whole(owner: object, field: str, *, least: int) -> None:
         refuse(owner, field, f"is not a whole number of at least {least}")
 
 
-def at_least_zero(owner: object, field: str) -> None:
-    """Checks that the field is a finite number of at least 0."""
-    value = getattr(owner, field)
-    if not _is_number(value) or value < 0:
-        refuse(owner, field, "is not a number of at least 0")
-
-
-def fraction(owner: object, field: str, *, most: bool = False) -> None:
-    """Checks that the field is a number above 0 and below 1, or 1 at most."""
-    value = getattr(owner, field)
-    if not _is_number(value) or not (0 < value < 1 or (most and value == 1)):
-        refuse(owner, field, "is not a fraction between 0 and 1")
-
-
-def step(owner: object, field: str) -> None:
-    """Checks that the field is a positive number, or a text such as "0.5" or "3%"."""
-    value = getattr(owner, field)
-    try:
-        number = float(str(value).strip().removesuffix("%"))
-    except ValueError:
-        number = math.nan
-    if not 0 < number < math.inf:
-        refuse(owner, field, "is not a step size; give a positive number, or a text like '3%'")
-
-
 def per_channel(owner: object, field: str, *, positive: bool = False) -> None:
     """Checks that the field holds three finite numbers, for red, green and blue."""
     value = getattr(owner, field)

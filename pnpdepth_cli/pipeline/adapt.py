@@ -21,7 +21,6 @@ from pnpdepth_cli import __version__
 from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.masks import Masks
-from pnpdepth_cli.core.refinement import RefineSettings
 from pnpdepth_cli.core.split import InputSplit
 from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
 from pnpdepth_cli.core.update_rules import Update
@@ -31,6 +30,10 @@ from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError
 from pnpdepth_cli.frames.frame import is_dense
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import opened_frame
+from pnpdepth_cli.frames.resolve import (
+    resolve_definition,
+    resolve_settings,
+)
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path
 from pnpdepth_cli.io.layouts import list_frames
 from pnpdepth_cli.models.network import Network, load_network
@@ -38,11 +41,7 @@ from pnpdepth_cli.pipeline.adapt_request import AdaptRequest
 from pnpdepth_cli.pipeline.batch.frames import Task, task_of
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import (
-    resolve_definition,
-    resolve_settings,
-)
+from pnpdepth_cli.settings import Settings
 
 VALIDATED = 10
 """One frame in this many is for validation; of fewer frames, the last."""
@@ -88,18 +87,13 @@ class Adapted:
         return self.losses[self.kept] / self.losses[0] - 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class Progress:
-    """Receives the progress of an adaptation."""
-
-    say: Callable[[str], None]
-    """Receives notes, one line each."""
-    step: OnStep
-    """Called after the updates of each visit of a frame."""
-
-
-def adapt(request: AdaptRequest, progress: Progress) -> Adapted:
+def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) -> Adapted:
     """Writes the adapted weights and their card; returns what was learnt.
+
+    Args:
+        request: The frames and the network.
+        say: Receives notes, one line each.
+        on_step: Called after the updates of each visit of a frame.
 
     Raises:
         InputError: There are fewer than two frames, or a file cannot be used.
@@ -108,29 +102,28 @@ def adapt(request: AdaptRequest, progress: Progress) -> Adapted:
         OutputError: A file cannot be written.
     """
     tasks = _tasks(request)
-    choice, seed = request.refine.network, request.refine.hold_out.seed
+    choice, seed = request.refine.network, request.refine.method.seed
     network = load_network(choice.model, choice.checkpoint, choice.device)
     first = read_inputs(tasks[0].request)
-    network = resolve_definition(network, first.frame(), choice)
-    options = MethodOptions(
+    network = resolve_definition(network, first.registered())
+    options = Settings(
         target="masked",
         iterations=request.steps,
         lr=str(request.lr),
         update="adam",
         schedule="cosine",
+        seed=seed,
     )
-    settings = resolve_settings(
-        network.definition, options, HoldOut(seed=seed), dense=is_dense(first.points)
-    )
+    settings = resolve_settings(network.definition, options, dense=is_dense(first.points))
     for note in (*first.notes, *network.notes):
-        progress.say(note)
+        say(note)
     adaptation = _Adaptation(network, settings, tasks)
-    progress.say(
+    say(
         f"frames to learn from: {len(adaptation.training)}; for validation:"
         f" {len(adaptation.validation)}"
     )
     with network.cut_at_points() as split:
-        losses = adaptation.run(split, progress)
+        losses = adaptation.run(split, on_step)
     adapted = Adapted(
         network=network.definition.name,
         checkpoint=None if choice.checkpoint is None else str(choice.checkpoint),
@@ -143,7 +136,7 @@ def adapt(request: AdaptRequest, progress: Progress) -> Adapted:
         lr=request.lr,
         seed=seed,
         loss=settings.loss,
-        hidden=settings.mask.fraction,
+        hidden=settings.mask_fraction,
         losses=losses,
     )
     _write(request, adapted, network.module, adaptation.best.values())
@@ -175,7 +168,7 @@ class _Adaptation:
         tasks: The frames.
     """
 
-    def __init__(self, network: Network, settings: RefineSettings, tasks: Sequence[Task]) -> None:
+    def __init__(self, network: Network, settings: Settings, tasks: Sequence[Task]) -> None:
         every = list(range(len(tasks)))
         validation = every[VALIDATED - 1 :: VALIDATED] or every[-1:]
         chosen = np.linspace(0, len(validation) - 1, min(MOST_VALIDATED, len(validation)))
@@ -183,13 +176,13 @@ class _Adaptation:
         self.training = [index for index in every if index not in set(validation)]
         self._network, self._settings = network, settings
         self._prepared = lru_cache(_IN_MEMORY)(lambda index: _prepared(network, tasks[index]))
-        self._generator = torch.Generator().manual_seed(settings.mask.seed)
+        self._generator = torch.Generator().manual_seed(settings.seed)
         self._weights = MovingWeights(network.module, "weights")
         self._rules: list[Update] = []
         self._alphas: list[float] = []
         self.best, self.kept = self._weights, 0
 
-    def run(self, split: InputSplit, progress: Progress) -> dict[int, float]:
+    def run(self, split: InputSplit, on_step: OnStep) -> dict[int, float]:
         """Makes all updates. Returns the validation loss by the number of updates."""
         of, updates = self._settings.iterations, 0
         losses = {0: self._validated(split)}
@@ -199,7 +192,7 @@ class _Adaptation:
             loss = self._visited(split, index, updates, visit)
             checked = (updates + visit) * CHECKS // of > updates * CHECKS // of
             updates += visit
-            progress.step(updates, of, f"loss {loss:.4f}")
+            on_step(updates, of, f"loss {loss:.4f}")
             if checked:
                 losses[updates] = self._validated(split)
                 if losses[updates] < losses[self.kept]:
@@ -219,7 +212,7 @@ class _Adaptation:
         """Updates the weights on a frame. Returns the mean loss."""
         total = 0.0
         with self._frame(split, index) as frame:
-            masks = Masks(frame.inliers, self._settings.mask, self._generator)
+            masks = Masks(frame.inliers, self._settings, self._generator)
             for step in range(first, first + steps):
                 hidden = masks.next()
                 with torch.enable_grad(), self._weights.in_place(requires_grad=True) as theta:
@@ -250,9 +243,9 @@ class _Adaptation:
         """The mean loss at hidden points of the validation frames, the same each time."""
         losses = []
         for index in self.validation:
-            generator = torch.Generator().manual_seed(self._settings.mask.seed)
+            generator = torch.Generator().manual_seed(self._settings.seed)
             with self._frame(split, index) as frame, torch.no_grad(), self._weights.in_place():
-                hidden = Masks(frame.inliers, self._settings.mask, generator).next()
+                hidden = Masks(frame.inliers, self._settings, generator).next()
                 losses.append(float(self._loss(frame, hidden)))
         return float(np.mean(losses))
 
@@ -266,12 +259,12 @@ class _Adaptation:
     def _frame(self, split: InputSplit, index: int) -> Iterator[FrameOfPoints]:
         prepared = self._prepared(index)
         reader = prepared.depth_reader(self._settings)
-        with opened_frame(split, prepared, reader, self._settings.mask.scale) as frame:
+        with opened_frame(split, prepared, reader, self._settings.mask_scale) as frame:
             yield frame
 
 
 def _prepared(network: Network, task: Task) -> PreparedFrame:
-    frame = prepare(network, read_inputs(task.request).frame())
+    frame = prepare(network, read_inputs(task.request).registered())
     if len(frame.points) < 2:
         raise NoPointsError(f"{task.name}: {len(frame.points)} points; hiding some needs 2")
     return frame

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.pipeline.batch.request import FrameSelection
-from pnpdepth_cli.pipeline.options import option
+from pnpdepth_cli.settings import option
 
 SUFFIX = ".safetensors"
 

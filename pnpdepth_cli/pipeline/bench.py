@@ -6,7 +6,7 @@ import ctypes
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -15,18 +15,18 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.core.refine import RefineSettings, refine
+from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import synthetic_frame
 from pnpdepth_cli.models.network import load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.models.rank_layers import default_layer
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.stopwatch import versions
+from pnpdepth_cli.settings import Settings
 
 DEFAULT_SIZE = (480, 640)
 FIRST_FRAME = "refinement, first frame"
@@ -122,11 +122,11 @@ def run_bench(
     rgb, points = synthetic_frame(request.size or own, request.points)
     layer = request.layer or default_layer(network, points.size, len(points))
     layer = resolve_layer(network.definition, layer)
-    method = MethodOptions(
-        iterations=request.iterations,
-        # the output of random weights has no relation to the points
-        align=None if network.checkpoint or network.definition.complete else "none",
-    )
+    method = Settings()
+    if request.iterations is not None:
+        method = replace(method, iterations=request.iterations)
+    if not (network.checkpoint or network.definition.complete):
+        method = replace(method, align="none")  # random weights have no relation to the points
     settings = resolve_settings(network.definition, method)
     prepared = prepare(network, Frame(rgb=rgb[0], points=points))
     if not len(prepared.points):
@@ -169,7 +169,7 @@ def run_bench(
 
 
 def _parts(
-    split: Split, layer: str, prepared: PreparedFrame, settings: RefineSettings
+    split: Split, layer: str, prepared: PreparedFrame, settings: Settings
 ) -> dict[str, Callable[[], object]]:
     """The network, its front and rear, and the refinement; tensors in, tensors out."""
     network, arguments, no_grad = prepared.network, prepared.arguments, torch.no_grad()

@@ -122,7 +122,7 @@ def _is_fit(name: Any) -> bool:
 
 
 def _check_one_unit(frames: Sequence[ExportFrame]) -> None:
-    units = sorted({f"{frame.unit} (--unit-scale {frame.unit_scale:g})" for frame in frames})
+    units = sorted({f"{frame.unit} (unit-scale {frame.unit_scale:g})" for frame in frames})
     if len(units) > 1:
         raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
 

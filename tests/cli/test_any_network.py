@@ -41,7 +41,7 @@ def test_align_every_fits_at_each_update(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fits = {}
-    for more in ([], ["--align-every"]):
+    for more in ([], ["--set", "align-every"]):
         arguments = [*refine(frame, "--align", "scale", "--json", "--overwrite", *more)]
         assert code_of(arguments) == 0
         record = json.loads(capsys.readouterr().out)

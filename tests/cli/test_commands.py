@@ -51,7 +51,7 @@ def test_json_prints_the_record_and_nothing_else_on_stdout(
 
 
 EXITS = [
-    (["--iterations", "-2"], 2, "negative"),
+    (["--iterations", "-2"], 2, "iterations must be"),
     (["--loss", "l3"], 2, "l3"),
     (["--nonsense"], 2, "--nonsense"),
     (["--gt", "missing.png"], 3, "missing.png"),

@@ -53,9 +53,9 @@ def test_the_help_of_refine_is_at_most_60_lines_in_four_groups() -> None:
     assert len(short.splitlines()) <= 60
     titles = [line for line in short.splitlines() if line.endswith(":") and line[0] != " "]
     assert titles == ["Input:", "Network:", "Method:", "Output:", "Help:"]
-    assert "--line-search" not in short
+    assert "--set" not in short
     assert "--help-all" in short
-    assert "--line-search" in help_of("refine", "--help-all")
+    assert "line-search" in help_of("refine", "--help-all")
 
 
 @pytest.mark.parametrize("arguments", [("refine",), ("models", "check")])

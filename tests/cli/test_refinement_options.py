@@ -5,21 +5,22 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any
 
+import click
 import pytest
-from click.testing import CliRunner
 
+from pnpdepth_cli.cli.batch import batch
+from pnpdepth_cli.cli.options import taken
 from pnpdepth_cli.cli.refine import refine
 from pnpdepth_cli.cli.sweep import sweep
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
-from pnpdepth_cli.pipeline.options import options_of
-from pnpdepth_cli.pipeline.refinement.request import MethodOptions, RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
+from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS
+from pnpdepth_cli.settings import PAPER, Settings, options_of
 from tests.core.networks import UNet
 
-METHOD = MethodOptions()
+METHOD = Settings()
 STRANGER = ModelDefinition(
     name="stranger", input_kind="rgb", size=Multiple(8), build=UNet, defaults=UNTUNED_DEFAULTS
 )
@@ -30,16 +31,12 @@ def test_without_a_word_the_settings_are_the_networks() -> None:
     for name in ("iterations", "lr", "loss", "update", "schedule", "blur"):
         assert getattr(settings, name) == getattr(UNTUNED_DEFAULTS, name)
     plain = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=UNet)
-    assert resolve_settings(plain, METHOD) == RefineSettings()
+    assert resolve_settings(plain, METHOD) == PAPER
 
 
 def test_another_update_starts_from_the_papers_step() -> None:
     settings = resolve_settings(STRANGER, replace(METHOD, update="sign"))
-    paper = RefineSettings()
     assert (settings.lr, settings.schedule, settings.blur) == (0.01, "constant", 0)
-    assert (settings.lr, settings.schedule, settings.blur) == (
-        paper.lr, paper.schedule, paper.blur,
-    )  # fmt: skip
     assert (settings.iterations, settings.loss) == (
         UNTUNED_DEFAULTS.iterations,
         UNTUNED_DEFAULTS.loss,
@@ -61,16 +58,30 @@ def test_the_users_options_override_the_definition() -> None:
     assert resolve_settings(STRANGER, replace(METHOD, blur=0)).blur == 0
 
 
-@pytest.mark.parametrize("blur", [-0.1, float("nan"), float("inf")])
-def test_a_blur_that_is_no_distance_is_refused(blur: float) -> None:
-    with pytest.raises(UsageError, match="no distance"):
-        resolve_settings(STRANGER, replace(METHOD, blur=blur))
+@pytest.mark.parametrize("command", [refine, batch, sweep])
+def test_names_and_values_reach_the_settings(command: click.Command) -> None:
+    arguments = ["a", "-o", "b", "--set", "blur=2,keep-best", "--set", "mask-scale=0.5"]
+    arguments += {"refine": ["--sparse", "s"], "sweep": ["--vary", "points=1"]}.get(
+        str(command.name), []
+    )
+    values = taken(Settings, dict(command.make_context("command", arguments).params))
+    assert (values["blur"], values["keep_best"], values["mask_scale"]) == (2.0, True, 0.5)
+    assert "line_search" not in values
 
 
-@pytest.mark.parametrize("proximity", [-0.1, float("nan"), float("inf")])
-def test_what_is_no_weight_is_refused(proximity: float) -> None:
-    with pytest.raises(UsageError, match="is no weight; give 0 or more"):
-        resolve_settings(STRANGER, replace(METHOD, proximity=proximity))
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lr=1", "choose from schedule, blur"),
+        ("blur", "--set blur must be blur=S"),
+        ("keep-best=1", "must be keep-best"),
+        ("mask=all", "'all' is not one of"),
+        ("blur=x", "'x' is not a valid float"),
+    ],
+)
+def test_what_is_no_name_or_no_value_is_refused(text: str, message: str) -> None:
+    with pytest.raises((UsageError, click.UsageError), match=message):
+        refine.make_context("refine", ["a.png", "--sparse", "s.png", "--set", text])
 
 
 def test_every_field_belongs_to_one_group() -> None:
@@ -82,19 +93,14 @@ def test_every_option_of_a_request_is_an_option_of_refine() -> None:
     spelled = {name for option in refine.params for name in option.opts}
     for group in fields(RefineRequest()):
         for each in options_of(type(_group(group.name))):
-            assert each.flag in spelled
+            assert each.flag.split()[0] in spelled
 
 
 def test_a_sweep_varies_or_sets_what_decides_a_depth_and_nothing_else() -> None:
     names = {option.name for option in sweep.params}
-    assert {each.name.replace("_", "-") for each in fields(MethodOptions)} <= PARAMETERS.keys()
-    assert not names & {"auto", "holdout", "uncertainty", "format", "overwrite", "tile"}
-
-
-def test_former_spellings_are_accepted_and_not_shown() -> None:
-    context = refine.make_context("refine", ["a.png", "--sparse", "s.png", "--spread", "2"])
-    assert context.params["blur"] == 2.0
-    assert "--spread" not in CliRunner().invoke(refine, ["--help"]).output
+    own = {each.name_within for each in options_of(Settings)}
+    assert own - PARAMETERS.keys() == {"tile", "time-budget-s"}
+    assert not names & {"holdout", "uncertainty", "format", "overwrite"}
 
 
 def _group(name: str) -> Any:

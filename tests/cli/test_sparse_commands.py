@@ -22,7 +22,7 @@ def test_project_reports_dropped_points_and_written_files(
 ) -> None:
     sparse = frame.folder / "sparse.png"
     arguments = ["project", str(frame.scan), "--calib", str(frame.calib), "-o", str(sparse)]
-    assert code_of([*arguments, "--image", str(frame.image), "--max-range", "4.8"]) == 0
+    assert code_of([*arguments, "--image", str(frame.image), "--scan", "max-range=4.8"]) == 0
     out, err = capsys.readouterr()
     assert out == ""
     assert "KITTI scan of 150 points" in err
@@ -37,9 +37,9 @@ def test_project_reports_dropped_points_and_written_files(
     [
         (["--size", "48"], 2, "HxW"),
         (["--size", "48x64", "--camera", "1"], 2, "leave out --camera"),
-        (["--size", "48x64", "--min-range", "9", "--max-range", "2"], 2, "is empty"),
+        (["--size", "48x64", "--scan", "min-range=9,max-range=2"], 2, "is empty"),
         (["--image", "missing.png"], 3, "missing.png"),
-        (["--size", "48x64", "--min-range", "90"], 3, "none of the scan's"),
+        (["--size", "48x64", "--scan", "min-range=90"], 3, "none of the scan's"),
     ],
 )
 def test_the_exit_code_of_project_is_that_of_the_kind_of_error(
@@ -117,7 +117,7 @@ def test_refine_takes_a_scan_with_its_calibration(
     arguments.append("--overwrite")
     assert code_of(arguments) == 2
     assert "needs --calib" in capsys.readouterr().err
-    assert code_of([*arguments[:3], str(scan.gt), *arguments[4:], "--max-range", "9"]) == 2
+    assert code_of([*arguments[:3], str(scan.gt), *arguments[4:], "--scan", "max-range=9"]) == 2
     assert "is no scan" in capsys.readouterr().err
 
 
@@ -125,7 +125,7 @@ def test_max_pixels_refuses_and_allows_an_image_by_its_size(
     frame: ScanOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["sample", str(frame.gt), "--count", "5", "-o", str(frame.folder / "few.png")]
-    assert code_of([*arguments, "--max-pixels", "10"]) == 3
+    assert code_of(["--max-pixels", "10", *arguments]) == 3
     assert "pixels, more than 10; make it smaller" in capsys.readouterr().err
     assert code_of(arguments) == 0
 
@@ -137,7 +137,7 @@ def test_point_fields_sets_how_the_points_of_a_scan_are_stored(
     wide = frame.folder / "wide.bin"
     np.column_stack([scan, scan[:, :2]]).astype("<f4").tofile(wide)
     arguments = ["project", str(wide), "--calib", str(frame.calib), "--image", str(frame.image)]
-    arguments += ["-o", str(frame.folder / "sparse.png"), "--point-fields"]
-    assert code_of([*arguments, "6"]) == 0
+    arguments += ["-o", str(frame.folder / "sparse.png"), "--scan"]
+    assert code_of([*arguments, "point-fields=6"]) == 0
     assert "scan of 6 fields a point" in capsys.readouterr().err
     assert json.loads((frame.folder / "sparse.json").read_text())["point_fields"] == 6

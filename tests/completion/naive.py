@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 
 @contextmanager
@@ -48,11 +48,11 @@ def naive_refine(
     layer: str,
     x: Tensor,
     points: SparsePoints,
-    settings: RefineSettings,
+    settings: Settings,
     depth_of: Callable[[Any], Tensor],
 ) -> tuple[Tensor, list[float]]:
     """(depth of z_K, L(z_0) … L(z_K))."""
-    name = LayerName.parse(layer)
+    name, settings = LayerName.parse(layer), settings.complete()
     loss_of, update = LOSSES[settings.loss], UPDATES[settings.update]()
     z: Tensor | None = None
 

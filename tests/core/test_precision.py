@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
+from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 
 class InHalf(nn.Module):
@@ -37,7 +38,7 @@ def refined(network: nn.Module, *, per_unit: float = 1.0, **settings: object) ->
             split,
             (image,),
             points(),
-            RefineSettings(**settings),  # type: ignore[arg-type]
+            Settings(**settings),  # type: ignore[arg-type]
             depth_of=lambda output: per_unit * output.float(),
         )
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, frame_parts, refine, refine_from
+from pnpdepth_cli.core.refine import Refinement, frame_parts, refine, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
     BatchError,
@@ -25,6 +25,7 @@ from pnpdepth_cli.errors import (
     PnpDepthError,
 )
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 from tests.completion.naive import naive_refine, plain
 from tests.core.networks import NETWORKS, build, conv, depth_of, image
 
@@ -62,7 +63,7 @@ CUTS = {
 }
 
 
-def refined(network: nn.Module, layer: str, settings: RefineSettings, **more: Any) -> Refinement:
+def refined(network: nn.Module, layer: str, settings: Settings, **more: Any) -> Refinement:
     points = more.pop("points", POINTS)
     with Split(network, layer) as split:
         return refine(split, (image(),), points, settings, depth_of=depth_of, **more)
@@ -83,8 +84,8 @@ def test_five_updates_are_those_of_running_the_whole_network_every_time(
     name: str, layer: str, update: str
 ) -> None:
     network = build(name)
-    settings = RefineSettings(iterations=5, lr=0.02, update=update)
-    depth, losses = naive_refine(network, layer, image(), POINTS, settings, depth_of)
+    settings = Settings(iterations=5, lr=0.02, update=update)
+    depth, losses = naive_refine(network, layer, image(), POINTS, settings.complete(), depth_of)
     result = refined(network, layer, settings)
     assert torch.equal(result.after, depth)
     assert list(result.losses) == losses
@@ -106,7 +107,7 @@ def test_points_that_agree_with_the_prediction_change_nothing(loss: str, update:
     network = build("unet")
     predicted = plain(network, image())
     points = SparsePoints(xy=POINTS.xy, depth=POINTS.sample(predicted), size=(16, 16))
-    settings = RefineSettings(loss=loss, update=update)
+    settings = Settings(loss=loss, update=update)
     result = refined(network, "bottleneck", settings, points=points)
     assert torch.equal(result.after, predicted)
     assert result.losses == (0.0,) * 6
@@ -117,7 +118,7 @@ def test_pixels_that_no_point_reaches_keep_their_bits(update: str) -> None:
     torch.manual_seed(0)
     network = nn.Sequential(conv(3, 4), conv(4, 4), nn.ReLU(inplace=True), conv(4, 1))
     one = POINTS.select(torch.tensor([True, False, False, False, False]))  # at (3, 4)
-    result = refined(network, "0", RefineSettings(update=update, lr=0.1), points=one)
+    result = refined(network, "0", Settings(update=update, lr=0.1), points=one)
     changed = (result.after != result.before)[0, 0]
     assert bool(changed[4, 3])
     rows, columns = changed.any(1).nonzero().flatten(), changed.any(0).nonzero().flatten()
@@ -133,7 +134,7 @@ def test_the_loss_goes_down_and_iterations_are_updates_of_z() -> None:
     result = refined(
         network,
         "bottleneck",
-        RefineSettings(iterations=7, lr=0.05),
+        Settings(iterations=7, lr=0.05),
         on_iteration=lambda iteration, loss: seen.append((iteration, loss)),
     )
     assert [iteration for iteration, _ in seen] == list(range(7))
@@ -142,7 +143,7 @@ def test_the_loss_goes_down_and_iterations_are_updates_of_z() -> None:
     assert result.losses[-1] < result.losses[0]
 
 
-def doubled(pixels: int, depth: list[float], settings: RefineSettings) -> Refinement:
+def doubled(pixels: int, depth: list[float], settings: Settings) -> Refinement:
     """`Doubling` refined in a row of pixels with a point on each, from depth 6 everywhere."""
     xy = torch.stack([torch.arange(float(pixels)), torch.zeros(pixels)], dim=1)
     points = SparsePoints(xy=xy, depth=torch.tensor(depth), size=(1, pixels))
@@ -152,7 +153,7 @@ def doubled(pixels: int, depth: list[float], settings: RefineSettings) -> Refine
 
 
 def test_one_update_by_hand() -> None:
-    result = doubled(2, [5.0, 9.0], RefineSettings(iterations=1, lr=0.25))
+    result = doubled(2, [5.0, 9.0], Settings(iterations=1, lr=0.25))
     assert result.before.flatten().tolist() == [6.0, 6.0]
     assert result.after.flatten().tolist() == [5.5, 6.5]
     assert result.losses == (2.0, 1.5)
@@ -164,7 +165,7 @@ def test_grad_mode_and_random_state_of_the_caller_stay_and_change_nothing() -> N
     before, results = torch.get_rng_state(), []
     for mode in (True, False):
         with torch.set_grad_enabled(mode):
-            results.append(refined(network, "bottleneck", RefineSettings()))
+            results.append(refined(network, "bottleneck", Settings()))
             assert torch.is_grad_enabled() is mode
             assert not results[-1].after.requires_grad
             assert not results[-1].before.requires_grad
@@ -174,12 +175,12 @@ def test_grad_mode_and_random_state_of_the_caller_stay_and_change_nothing() -> N
 
 @pytest.mark.parametrize("keep_best", [False, True])
 def test_depths_are_kept_after_the_chosen_numbers_of_updates(keep_best: bool) -> None:
-    settings = RefineSettings(iterations=5, lr=0.05, keep_best=keep_best)
+    settings = Settings(iterations=5, lr=0.05, keep_best=keep_best)
     result = refined(build("unet"), "bottleneck", settings, keep_depths=(0, 2, 5, 9))
     assert list(result.depths) == [0, 2, 5]
     assert result.depths[0] is result.before
     for updates in (2, 5):
-        shorter = RefineSettings(iterations=updates, lr=0.05)
+        shorter = Settings(iterations=updates, lr=0.05)
         alone = refined(build("unet"), "bottleneck", shorter)
         assert torch.equal(result.depths[updates], alone.after)
 
@@ -191,11 +192,11 @@ def test_a_per_cent_step_is_that_fraction_of_the_standard_deviation_of_z0() -> N
     network = build("unet")
     with Split(network, "bottleneck") as split, torch.no_grad():
         std = float(split.front(image()).std(correction=0))
-    assert refined(network, "bottleneck", RefineSettings(lr="3%")).step == pytest.approx(0.03 * std)
+    assert refined(network, "bottleneck", Settings(lr="3%")).step == pytest.approx(0.03 * std)
 
 
 def test_a_linear_schedule_is_k_single_updates_with_falling_steps() -> None:
-    settings = RefineSettings(iterations=4, lr=0.25, schedule="linear")
+    settings = Settings(iterations=4, lr=0.25, schedule="linear")
     moved = 2 * 0.25 * (1 + 0.75 + 0.5 + 0.25)
     assert doubled(2, [50.0, 90.0], settings).after.flatten().tolist() == [6 + moved, 6 + moved]
 
@@ -204,7 +205,7 @@ def test_a_blurred_gradient_moves_what_no_point_reaches() -> None:
     torch.manual_seed(0)
     network = nn.Sequential(conv(3, 4), conv(4, 4), nn.ReLU(inplace=True), conv(4, 1))
     one = POINTS.select(torch.tensor([True, False, False, False, False]))
-    settings = RefineSettings(update="normalised", lr=0.1, blur=0.5)
+    settings = Settings(update="normalised", lr=0.1, blur=0.5)
     result = refined(network, "0", settings, points=one)
     assert bool((result.after != result.before).all())
     assert result.losses[-1] < result.losses[0]
@@ -227,7 +228,7 @@ class Doubling(nn.Module):
 @pytest.mark.parametrize("name", ["resnet", "unet", "midas"])
 @pytest.mark.parametrize("lr", [0.02, 1.0])
 def test_the_kept_iterate_has_the_lowest_loss_of_the_trajectory(name: str, lr: float) -> None:
-    settings = RefineSettings(iterations=6, lr=lr, update="sign")
+    settings = Settings(iterations=6, lr=lr, update="sign")
     last, best = (
         refined(build(name), CUTS[name][0], replace(settings, keep_best=keep))
         for keep in (False, True)
@@ -243,7 +244,7 @@ def test_the_kept_iterate_has_the_lowest_loss_of_the_trajectory(name: str, lr: f
 
 
 def test_channels_are_scaled_and_shifted_and_nothing_else() -> None:
-    settings = RefineSettings(parameters="channels", update="adam", lr=0.05)
+    settings = Settings(parameters="channels", update="adam", lr=0.05)
     seen: list[Tensor] = []
 
     class Watched(nn.Module):
@@ -270,7 +271,7 @@ def test_a_proximity_weight_adds_the_squared_change_of_log_depth_and_holds_it_ba
     def change(result: Refinement) -> float:
         return float((result.after.log() - result.before.log()).square().mean())
 
-    settings = RefineSettings(iterations=8, lr=0.05, update="normalised")
+    settings = Settings(iterations=8, lr=0.05, update="normalised")
     free, held = (
         refined(build("unet"), "bottleneck", replace(settings, proximity=proximity))
         for proximity in (0.0, 10.0)
@@ -282,7 +283,7 @@ def test_a_proximity_weight_adds_the_squared_change_of_log_depth_and_holds_it_ba
 
 
 def test_a_line_search_takes_back_what_raises_the_loss_and_goes_half_as_far() -> None:
-    result = doubled(1, [7.0], RefineSettings(iterations=4, lr=2.0, line_search=True))
+    result = doubled(1, [7.0], Settings(iterations=4, lr=2.0, line_search=True))
     # 6 → 10, back and half as far: 8, which is no worse than 6; on from there to 6; again 7
     assert result.losses == (1.0, 3.0, 1.0, 1.0, 1.0)
     assert result.kept == 4
@@ -290,7 +291,7 @@ def test_a_line_search_takes_back_what_raises_the_loss_and_goes_half_as_far() ->
 
 @pytest.mark.parametrize("update", UPDATES)
 def test_the_result_of_a_line_search_is_the_best_of_its_trajectory(update: str) -> None:
-    settings = RefineSettings(iterations=8, lr=0.5, update=update, line_search=True)
+    settings = Settings(iterations=8, lr=0.5, update=update, line_search=True)
     result = refined(build("unet"), "bottleneck", settings)
     at_points = (POINTS.sample(result.after) - POINTS.depth).abs().mean()
     assert min(result.losses) == result.losses[result.kept] == pytest.approx(float(at_points))
@@ -324,11 +325,11 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_depth(
     with pytest.raises(
         DivergedError, match=f"loss is not finite after {iteration} update"
     ) as error:
-        refined(network, "cut", RefineSettings(), keep_depths=range(6))
+        refined(network, "cut", Settings(), keep_depths=range(6))
     assert error.value.exit_code == 5
     assert list(error.value.last_good.depths) == list(range(iteration))
     network.n = 0
-    good = refined(network, "cut", RefineSettings(iterations=iteration - 1))
+    good = refined(network, "cut", Settings(iterations=iteration - 1))
     assert torch.equal(error.value.last_good.after, good.after)
     assert torch.equal(error.value.last_good.before, good.before)
     assert error.value.last_good.losses == good.losses
@@ -337,7 +338,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_depth(
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_prediction_that_is_not_finite_to_begin_with_is_the_networks_fault(bad: float) -> None:
     with pytest.raises(ModelError, match="the network's prediction is not finite at") as error:
-        refined(Breaking(1, bad), "cut", RefineSettings())
+        refined(Breaking(1, bad), "cut", Settings())
     assert f"at {len(POINTS)} of {len(POINTS)} sparse points" in str(error.value)
     assert error.value.exit_code == 4
     assert "\n" not in str(error.value)
@@ -345,7 +346,7 @@ def test_a_prediction_that_is_not_finite_to_begin_with_is_the_networks_fault(bad
 
 def test_a_first_loss_that_only_overflows_is_no_fault_of_the_prediction() -> None:
     with pytest.raises(DivergedError, match="loss is not finite after 0 updates"):
-        refined(Breaking(1, 1e30), "cut", RefineSettings(loss="l2"))
+        refined(Breaking(1, 1e30), "cut", Settings(loss="l2"))
 
 
 def test_a_gradient_that_is_not_finite_stops_with_the_depth_it_came_from() -> None:
@@ -358,13 +359,13 @@ def test_a_gradient_that_is_not_finite_stops_with_the_depth_it_came_from() -> No
             return self.cut(x[:, :1] * 0).sqrt() + 1
 
     with pytest.raises(DivergedError, match="gradient is not finite after 0 updates") as error:
-        refined(Root(), "cut", RefineSettings(loss="l1"))
+        refined(Root(), "cut", Settings(loss="l1"))
     assert torch.equal(error.value.last_good.after, torch.ones(1, 1, 16, 16))
     assert len(error.value.last_good.losses) == 1
 
 
 def test_a_bad_prediction_without_updates_is_handed_over_as_it_is() -> None:
-    result = refined(Breaking(1, float("nan")), "cut", RefineSettings(iterations=0))
+    result = refined(Breaking(1, float("nan")), "cut", Settings(iterations=0))
     assert bool(result.after.isnan().all())
 
 
@@ -372,7 +373,7 @@ def test_a_step_far_too_large_diverges_and_leaves_the_network_as_it_was() -> Non
     network = build("unet")
     before = plain(network, image())
     with pytest.raises(DivergedError, match="try a smaller --lr"):
-        refined(network, "bottleneck", RefineSettings(lr=1e38, update="sgd", loss="l2"))
+        refined(network, "bottleneck", Settings(lr=1e38, update="sgd", loss="l2"))
     assert torch.equal(plain(network, image()), before)
 
 
@@ -438,7 +439,7 @@ def test_a_layer_without_a_gradient_back_to_it_is_refused_on_one_line(
     make: Callable[[], nn.Module], kind: type[PnpDepthError], message: str
 ) -> None:
     with pytest.raises(kind, match=message) as error:
-        refined(make(), "cut", RefineSettings())
+        refined(make(), "cut", Settings())
     assert error.value.exit_code == 4
     assert "\n" not in str(error.value)
 
@@ -455,7 +456,7 @@ IMAGES = torch.cat([image(), image().flip(-1) * 2, image() - 1])
 
 
 def refined_at_once(
-    network: nn.Module, layer: str, settings: RefineSettings, *, read: Any = depth_of, **more: Any
+    network: nn.Module, layer: str, settings: Settings, *, read: Any = depth_of, **more: Any
 ) -> list[Refinement | PnpDepthError]:
     reads = read if isinstance(read, list) else [read] * 3
     with Split(network, layer) as split:
@@ -464,9 +465,7 @@ def refined_at_once(
         return refine_from(split, z0, OTHERS, settings, depth_of=reads, **more)
 
 
-def refined_alone(
-    network: nn.Module, layer: str, settings: RefineSettings, index: int
-) -> Refinement:
+def refined_alone(network: nn.Module, layer: str, settings: Settings, index: int) -> Refinement:
     with Split(network, layer) as split:
         x = (IMAGES[index : index + 1],)
         return refine(split, x, OTHERS[index], settings, depth_of=depth_of)
@@ -475,9 +474,9 @@ def refined_alone(
 @pytest.mark.parametrize(
     "settings",
     [
-        RefineSettings(iterations=0),
-        RefineSettings(lr="3%", update="adam", loss="log"),
-        RefineSettings(
+        Settings(iterations=0),
+        Settings(lr="3%", update="adam", loss="log"),
+        Settings(
             lr="20%",
             update="normalised",
             loss="cauchy",
@@ -492,7 +491,7 @@ def refined_alone(
     [("resnet", "layer2"), ("unet", "bottleneck"), ("vit", "encoder[last]"), ("midas", "unit1")],
 )
 def test_frames_refined_at_once_are_those_refined_alone(
-    name: str, layer: str, settings: RefineSettings
+    name: str, layer: str, settings: Settings
 ) -> None:
     torch.manual_seed(0)
     network = build(name)
@@ -521,7 +520,7 @@ class PerPixel(nn.Module):
 @pytest.mark.parametrize("update", UPDATES)
 @pytest.mark.parametrize("blur", [0.0, 0.7])
 def test_at_once_is_alone_bit_for_bit_where_the_network_is(update: str, blur: float) -> None:
-    settings = RefineSettings(lr="5%", update=update, schedule="linear", blur=blur)
+    settings = Settings(lr="5%", update=update, schedule="linear", blur=blur)
     network = PerPixel()
     for index, together in enumerate(refined_at_once(network, "cut", settings)):
         assert isinstance(together, Refinement)
@@ -538,7 +537,7 @@ def test_a_frame_that_diverges_does_not_touch_the_others() -> None:
 
     calls: list[int] = []
     seen: list[float] = []
-    settings, network = RefineSettings(lr="5%"), PerPixel()
+    settings, network = Settings(lr="5%"), PerPixel()
     good = refined_at_once(network, "cut", settings)
     mixed = refined_at_once(
         network, "cut", settings, read=[depth_of, bad, depth_of],
@@ -562,10 +561,10 @@ def test_an_error_of_one_frames_reading_stays_its_own() -> None:
     def none(output: Tensor) -> Tensor:
         raise NoPointsError("too few to align")
 
-    results = refined_at_once(PerPixel(), "cut", RefineSettings(), read=[none, depth_of, depth_of])
+    results = refined_at_once(PerPixel(), "cut", Settings(), read=[none, depth_of, depth_of])
     assert isinstance(results[0], NoPointsError)
     assert all(isinstance(result, Refinement) for result in results[1:])
-    nobody = refined_at_once(PerPixel(), "cut", RefineSettings(), read=none)
+    nobody = refined_at_once(PerPixel(), "cut", Settings(), read=none)
     assert [type(result) for result in nobody] == [NoPointsError] * 3
 
 
@@ -588,22 +587,18 @@ def test_a_network_without_one_part_per_frame_is_refused_and_works_one_at_a_time
 ) -> None:
     network = Sequence(dropping=dropping)
     with pytest.raises(BatchError, match="not one part for each of 3 frames") as error:
-        refined_at_once(network, layer, RefineSettings(), read=lambda y: y)
+        refined_at_once(network, layer, Settings(), read=lambda y: y)
     assert error.value.exit_code == 4
     with Split(network, layer) as split:
-        alone = refine(split, (image(),), POINTS, RefineSettings(), depth_of=lambda y: y)
+        alone = refine(split, (image(),), POINTS, Settings(), depth_of=lambda y: y)
     assert alone.losses[-1] < alone.losses[0]
-
-
-def test_settings_are_the_papers() -> None:
-    assert RefineSettings() == RefineSettings(iterations=5, lr=0.01, loss="l1", update="sign")
 
 
 @pytest.mark.slow
 def test_a_refinement_does_not_import_the_compiler() -> None:
     code = (
         "import sys; from tests.core.test_refine import *;"
-        "refined(build('unet'), 'bottleneck', RefineSettings());"
+        "refined(build('unet'), 'bottleneck', Settings());"
         "assert 'torch._dynamo' not in sys.modules"
     )
     root = Path(__file__).parents[2]

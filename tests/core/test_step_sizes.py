@@ -112,5 +112,5 @@ def test_a_channel_that_is_the_same_everywhere_is_shifted_only() -> None:
 
 
 def test_a_z_without_channels_is_refused() -> None:
-    with pytest.raises(LayerError, match="--parameters elements"):
+    with pytest.raises(LayerError, match="--set parameters=elements"):
         Channels(torch.zeros(1, 8))

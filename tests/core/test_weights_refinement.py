@@ -13,18 +13,19 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnpdepth_cli.core import weights_refinement
-from pnpdepth_cli.core.masks import Masks, MaskSettings, set_aside
-from pnpdepth_cli.core.refine import Refinement, RefineSettings
+from pnpdepth_cli.core.masks import Masks, set_aside
+from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.weights import MovingWeights, rank_of
 from pnpdepth_cli.core.weights_refinement import MIN_POINTS, FrameOfPoints, refine_weights
 from pnpdepth_cli.errors import DivergedError, LayerError, UsageError
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 from tests.completion.naive import plain
 from tests.core.networks import build, conv, depth_of, image
 from tests.core.split.test_split import Failing, same, state_of
 
-SETTINGS = RefineSettings(
+SETTINGS = Settings(
     iterations=4, lr=0.01, loss="log", update="sgd", parameters="weights", target="masked"
 )
 
@@ -53,7 +54,7 @@ def points(count: int = 40, seed: int = 0) -> SparsePoints:
 
 
 def refined(
-    network: nn.Module, settings: RefineSettings = SETTINGS, at: SparsePoints | None = None
+    network: nn.Module, settings: Settings = SETTINGS, at: SparsePoints | None = None
 ) -> Refinement:
     at, rgb = at or points(), image()
     with InputSplit(network) as split:
@@ -65,7 +66,7 @@ def refined(
             predict_in_steps=lambda shown: split.again(rgb, shown.scatter()),
             depth_of=lambda output: output,
         )
-        weights = MovingWeights(network, settings.parameters, settings.mask.seed)
+        weights = MovingWeights(network, settings.parameters, settings.seed)
         return refine_weights(frame, weights, settings)
 
 
@@ -73,7 +74,7 @@ def naive(network: nn.Module, at: SparsePoints) -> Tensor:
     """The last step's depth by plain gradient descent on a copy of the network."""
     network, generator = copy.deepcopy(network).eval(), torch.Generator().manual_seed(0)
     shown = at.select(~set_aside(at, 0.1, generator))
-    masks = Masks(shown, SETTINGS.mask, generator)
+    masks = Masks(shown, SETTINGS.complete(), generator)
     moved = [*network.enter.parameters(), *network.head.parameters()]
     network.encoder.requires_grad_(False)
     for _ in range(SETTINGS.iterations):
@@ -147,8 +148,8 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
     assert not torch.equal(results[0], results[2])
 
 
-def _seeded(seed: int) -> RefineSettings:
-    return replace(SETTINGS, mask=MaskSettings(seed=seed))
+def _seeded(seed: int) -> Settings:
+    return replace(SETTINGS, seed=seed)
 
 
 def test_a_step_that_makes_held_out_points_worse_is_not_taken() -> None:
@@ -273,7 +274,7 @@ def test_of_a_single_point_nothing_is_hidden() -> None:
 
 
 def _masks(at: SparsePoints, kind: str, fraction: float) -> Masks:
-    mask = MaskSettings(kind=kind, fraction=fraction)
+    mask = Settings(mask=kind, mask_fraction=fraction)
     return Masks(at, mask, torch.Generator().manual_seed(0))
 
 

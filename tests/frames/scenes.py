@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.fuse import Member
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 SIZE = (96, 128)
 
@@ -69,7 +69,7 @@ class Nearest(nn.Module):
 
 
 def member(
-    build: type[nn.Module], *, settings: RefineSettings | None = None, **of_definition: Any
+    build: type[nn.Module], *, settings: Settings | None = None, **of_definition: Any
 ) -> Member:
     """The network as a member of the default method, by default without updates and alignment."""
     kind = "rgb" if build is Brightness else "rgb+sparse"
@@ -86,5 +86,5 @@ def member(
         device=torch.device("cpu"),
         checkpoint=None,
     )
-    settings = settings or RefineSettings(iterations=0, align="none")
+    settings = settings or Settings(iterations=0, align="none")
     return Member(network=network, layer="layer", settings=settings)

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames import default
 from pnpdepth_cli.frames.default import FOLDS, MIN_POINTS, refine_default, split_hidden
-from pnpdepth_cli.frames.frame import Check, Frame, RefinedFrame
+from pnpdepth_cli.frames.frame import Check, Frame, Refined
 from pnpdepth_cli.frames.fuse import Fusion, Member, weighted_mean
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 from tests.frames.scenes import (
     SIZE,
     Brightness,
@@ -29,10 +29,10 @@ from tests.frames.scenes import (
     member,
 )
 
-UPDATES = RefineSettings(iterations=3, lr="5%", update="sign", align="scale")
+UPDATES = Settings(iterations=3, lr="5%", update="sign", align="scale")
 
 
-def refined(frame: Frame, *members: Member, seed: int = 0) -> RefinedFrame:
+def refined(frame: Frame, *members: Member, seed: int = 0) -> Refined:
     """The frame by the default method with these networks."""
     with Fusion(members) as fusion:
         return refine_default(fusion, frame, seed=seed)
@@ -130,7 +130,7 @@ def test_a_point_without_weight_decides_nothing() -> None:
 def compact() -> Member:
     """`compact` without updates of z."""
     network = load_network("compact", None)
-    return Member(network=network, layer="decoder.s8", settings=RefineSettings(iterations=0))
+    return Member(network=network, layer="decoder.s8", settings=Settings(iterations=0))
 
 
 def test_an_image_that_does_not_belong_to_its_points_is_used_less() -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.frames import fuse
 from pnpdepth_cli.frames.frame import Frame
@@ -17,12 +16,13 @@ from pnpdepth_cli.frames.fuse import FEW_POINTS, IMAGE_WEIGHT, PRIOR_WEIGHT, Fus
 from pnpdepth_cli.frames.opened import OpenNetwork, SplitCache
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.settings import Settings
 from tests.core.split.test_split import same, state_of
 from tests.frames.scenes import SIZE, Brightness, Nearest, TwicePrior, frame_in_memory, member
 
-UPDATES = RefineSettings(iterations=3, lr="5%", update="sign", align="none")
-ALIGNED = RefineSettings(iterations=0, align="affine")
-HIDDEN = RefineSettings(
+UPDATES = Settings(iterations=3, lr="5%", update="sign", align="none")
+ALIGNED = Settings(iterations=0, align="affine")
+HIDDEN = Settings(
     iterations=2, lr=1e-4, loss="log", update="adam", parameters="weights", target="masked"
 )
 
@@ -119,7 +119,7 @@ def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stay
     before = state_of(network.module)
     first = next(network.module.encoder.children())
     handle = first.register_forward_hook(lambda *_: runs.append(1))
-    frame, settings = frame_in_memory(60), RefineSettings(iterations=1, lr="5%")
+    frame, settings = frame_in_memory(60), Settings(iterations=1, lr="5%")
     fewer = frame.with_points(frame.points.select(torch.arange(60) < 55))
     with OpenNetwork(network, "decoder.s8") as opened:
         opened.refine(frame, settings)
@@ -166,7 +166,7 @@ def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
 
 def test_steps_by_hidden_points_are_made_while_there_is_time() -> None:
     network = load_network("compact", None)
-    settings = RefineSettings(iterations=0)
+    settings = Settings(iterations=0)
     compact = fuse.Member(
         network=network, layer="decoder.s8", settings=settings, hidden_points=HIDDEN
     )
@@ -188,7 +188,7 @@ def test_steps_that_fail_leave_the_networks_own_depth() -> None:
     compact = fuse.Member(
         network=network,
         layer="decoder.s8",
-        settings=RefineSettings(iterations=0),
+        settings=Settings(iterations=0),
         hidden_points=wild,
     )
     frame = frame_in_memory(60)

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import BatchError, DivergedError, NoPointsError, PnpDepthError
-from pnpdepth_cli.frames.frame import Frame, RefinedFrame
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.refine import refine_frame, refine_frames
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 from tests.pipeline.frames import frame_on_disk
 
-SETTINGS = RefineSettings(iterations=4, lr="5%", update="adam")
+SETTINGS = Settings(iterations=4, lr="5%", update="adam")
 
 
 @pytest.fixture
@@ -40,14 +40,14 @@ def frame_of(seed: int, height: int = 46, width: int = 62, depth: float = 2.0) -
     return Frame(rgb=torch.from_numpy(rgb).permute(2, 0, 1).contiguous(), points=points)
 
 
-def alone(network: Network, settings: RefineSettings, one: Frame) -> RefinedFrame:
+def alone(network: Network, settings: Settings, one: Frame) -> Refined:
     with Split(network.module, "middle") as split:
         return refine_frame(network, split, settings, one)
 
 
 def together(
-    network: Network, settings: RefineSettings, frames: list[Frame], layer: str = "middle"
-) -> list[RefinedFrame | PnpDepthError]:
+    network: Network, settings: Settings, frames: list[Frame], layer: str = "middle"
+) -> list[Refined | PnpDepthError]:
     with Split(network.module, layer) as split:
         return refine_frames(network, split, settings, frames)
 
@@ -57,7 +57,7 @@ def test_frames_at_once_are_those_of_one_at_a_time(network: Network, align: str)
     settings = replace(SETTINGS, align=align)
     frames = [frame_of(seed, depth=seed + 1) for seed in range(3)]
     for one, frame in zip(frames, together(network, settings, frames), strict=True):
-        assert isinstance(frame, RefinedFrame)
+        assert isinstance(frame, Refined)
         expected = alone(network, settings, one)
         np.testing.assert_allclose(frame.before, expected.before, rtol=1e-5)
         np.testing.assert_allclose(frame.after, expected.after, rtol=1e-4)
@@ -76,8 +76,8 @@ def test_a_frame_that_fails_does_not_lose_the_others(network: Network) -> None:
     frames = [frame_of(0), frame_of(1).with_points(outside), frame_of(2)]
     first, failed, last = together(network, SETTINGS, frames)
     assert isinstance(failed, NoPointsError)
-    assert isinstance(first, RefinedFrame)
-    assert isinstance(last, RefinedFrame)
+    assert isinstance(first, Refined)
+    assert isinstance(last, Refined)
     np.testing.assert_allclose(last.after, alone(network, SETTINGS, frames[2]).after, rtol=1e-4)
     (nothing,) = together(network, SETTINGS, frames[1:2])
     assert isinstance(nothing, NoPointsError)
@@ -88,7 +88,7 @@ def test_a_frame_that_fails_does_not_lose_the_others(network: Network) -> None:
 def test_a_divergence_comes_with_its_last_good_depth(network: Network) -> None:
     settings = replace(SETTINGS, lr=1e38, update="sgd", loss="l2")
     for frame in together(network, settings, [frame_of(0), frame_of(1)], "decode"):
-        assert isinstance(frame, RefinedFrame)
+        assert isinstance(frame, Refined)
         assert isinstance(frame.diverged, DivergedError)
         assert "after 1 update" in str(frame.diverged)
         np.testing.assert_array_equal(frame.after, frame.before)

@@ -13,20 +13,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from pnpdepth_cli.core.refine import RefineSettings
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError
 from pnpdepth_cli.frames import tiles
-from pnpdepth_cli.frames.frame import Frame, RefinedFrame
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.frames.tiles import MIN_POINTS, OVERLAP, refine_tiled, tiles_of
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 from tests.pipeline.frames import frame_on_disk
 
 CPU = torch.device("cpu")
-PLAIN = RefineSettings(iterations=0)
+PLAIN = Settings(iterations=0)
 SIDE = 64
 
 
@@ -70,9 +70,7 @@ def everywhere(size: tuple[int, int], step: int = 8) -> Frame:
     return frame_of(xy, [2.0 if x < size[1] // 2 else 2.4 for x, _ in xy], size)
 
 
-def tiled(
-    module: nn.Module, settings: RefineSettings, one: Frame, propagation: str = "none"
-) -> RefinedFrame:
+def tiled(module: nn.Module, settings: Settings, one: Frame, propagation: str = "none") -> Refined:
     with Split(module, "features") as split:
         return refine_tiled(network(module), split, settings, one, SIDE, propagation=propagation)
 
@@ -131,7 +129,7 @@ def test_a_network_that_sees_pixels_alone_gives_the_same_in_tiles_as_in_one_piec
 def test_a_frame_no_larger_than_a_tile_is_refined_in_one_piece() -> None:
     torch.manual_seed(0)
     module, one = PixelByPixel(), everywhere((60, 64))
-    settings = RefineSettings(iterations=3)
+    settings = Settings(iterations=3)
     with Split(module, "features") as split:
         whole = refine_frame(network(module), split, settings, one)
     refined = tiled(module, settings, one)
@@ -141,7 +139,7 @@ def test_a_frame_no_larger_than_a_tile_is_refined_in_one_piece() -> None:
 
 def test_the_depths_of_tiles_run_into_each_other_without_a_step() -> None:
     torch.manual_seed(0)
-    settings = RefineSettings(iterations=60, lr=0.01)
+    settings = Settings(iterations=60, lr=0.01)
     after = tiled(OneNumber(), settings, everywhere((64, 400))).after
     assert after.max() / after.min() > 1.15
     # the difference between two tiles is distributed evenly over their overlap
@@ -154,7 +152,7 @@ def test_tiles_with_too_few_points_have_the_depth_of_the_whole_frame() -> None:
     torch.manual_seed(0)
     module = OneNumber()
     one = frame_of([(x, 10 + x) for x in range(10)], [3.0] * 10, (64, 300))
-    refined = tiled(module, RefineSettings(iterations=200, lr=0.01), one)
+    refined = tiled(module, Settings(iterations=200, lr=0.01), one)
     assert np.unique(refined.after[:, 100:]).size <= 3  # one number, to the last bit of a division
     np.testing.assert_allclose(refined.after[:, 100:], refined.after[0, 299], rtol=1e-6)
     for count, left in ((10, 5), (MIN_POINTS, 5), (MIN_POINTS - 1, 6)):
@@ -168,7 +166,7 @@ def test_tiles_with_too_few_points_have_the_depth_of_the_whole_frame() -> None:
 def test_a_divergence_in_one_tile_is_one_of_the_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     error, calls = DivergedError("in the first tile"), list[int]()
 
-    def diverging(*arguments: Any, **more: Any) -> RefinedFrame:
+    def diverging(*arguments: Any, **more: Any) -> Refined:
         calls.append(len(calls))
         refined = refine_frame(*arguments, **more)
         return replace(refined, diverged=error) if len(calls) == 2 else refined
@@ -195,7 +193,7 @@ def test_the_split_is_as_before_for_the_next_frame(
 ) -> None:
     frame = frame_on_disk(tmp_path_factory.mktemp("frame"))
     loaded, one = load_network(str(frame.model), frame.checkpoint), everywhere((100, 150))
-    settings = RefineSettings(iterations=3)
+    settings = Settings(iterations=3)
     with Split(loaded.module, "middle") as split:
         first = refine_tiled(loaded, split, settings, one, SIDE)
         small = refine_frame(loaded, split, settings, everywhere((60, 64)))

@@ -229,7 +229,7 @@ def test_a_kitti_scan_whose_size_also_fits_nuscenes_stays_kittis(tmp_path: Path)
 def test_an_ambiguous_scan_is_refused_until_the_number_of_fields_is_given(tmp_path: Path) -> None:
     path = tmp_path / "zeros.bin"
     path.write_bytes(bytes(80))
-    with pytest.raises(FileFormatError, match="--point-fields"):
+    with pytest.raises(FileFormatError, match="--scan point-fields"):
         read_scan(path)
     assert len(read_scan(path, 4).points) == 5
     assert len(read_scan(path, 5).points) == 4

@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.refine import RefineSettings, refine
+from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 
 
 def built(definition: ModelDefinition) -> Network:
@@ -57,7 +58,7 @@ def assert_the_cut_changes_nothing_and_a_step_does(
     with torch.no_grad(), Split(network.module, layer) as split:
         z = split.front(*arguments)
         assert torch.equal(split.rear(z), network.module(*arguments))
-        once = RefineSettings(iterations=1)
+        once = Settings(iterations=1)
         refinement = refine(split, arguments, POINTS, once, depth_of=network.depth_of)
     assert not torch.equal(refinement.before, refinement.after)
     return z

@@ -14,16 +14,15 @@ import pytest
 import torch
 from torch import nn
 
-from pnpdepth_cli.core.step_sizes import step_size
-from pnpdepth_cli.errors import ModelError, UsageError
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import (
     Fixed,
     ModelDefinition,
     Multiple,
     Near,
     Normalisation,
-    RefineDefaults,
 )
+from pnpdepth_cli.settings import Settings
 
 
 def definition(**more: object) -> ModelDefinition:
@@ -36,7 +35,7 @@ def definition(**more: object) -> ModelDefinition:
 def test_the_default_layer_is_the_one_named_or_the_first() -> None:
     assert definition().default_layer is None
     assert definition(layers=("a", "b")).default_layer == "a"
-    assert definition(layers=("a", "b"), defaults=RefineDefaults(layer="b")).default_layer == "b"
+    assert definition(layers=("a", "b"), defaults=Settings(layer="b")).default_layer == "b"
 
 
 def test_arguments_come_in_the_order_of_the_input_kind() -> None:
@@ -52,11 +51,6 @@ def test_arguments_come_in_the_order_of_the_input_kind() -> None:
 def test_a_missing_input_is_not_passed_over(kind: str) -> None:
     with pytest.raises(ValueError, match="needs all of its inputs"):
         definition(input_kind=kind).call_arguments(None, torch.zeros(1))
-
-
-def test_the_defaults_are_the_papers() -> None:
-    paper = RefineDefaults(layer=None, iterations=5, lr=0.01, loss="l1", update="sign")
-    assert RefineDefaults() == paper
 
 
 def test_reading_a_definition_needs_no_torch() -> None:
@@ -113,32 +107,6 @@ def test_a_deviation_is_above_zero_and_a_mean_need_not_be() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        *(("iterations", value) for value in ("5", -1, 2.0, None)),
-        *(("lr", value) for value in ("x%", "", 0, -1, NAN, INF, "inf", None)),
-        *(("blur", value) for value in (-1, NAN, INF, "1", None)),
-        *((field, "foo") for field in ("loss", "update", "schedule", "align")),
-        *((field, None) for field in ("loss", "update", "schedule")),
-        ("align", ["auto"]),
-        ("layer", 3),
-    ],
-)
-def test_a_default_that_refinement_could_not_use_is_refused(field: str, value: Any) -> None:
-    assert "RefineDefaults: " in refused(RefineDefaults, **{field: value})
-
-
-@pytest.mark.parametrize("lr", ["x%", "", "0%", "3 %", "3%", "0.5", 0.1, 1, True, None])
-def test_a_definition_takes_those_steps_that_refinement_takes(lr: Any) -> None:
-    try:
-        step_size(lr, torch.randn(8))
-    except UsageError:
-        refused(RefineDefaults, lr=lr)
-    else:
-        assert RefineDefaults(lr=lr).lr == lr
-
-
-@pytest.mark.parametrize(
     ("field", "value", "message"),
     [
         ("name", 5, "a text is expected"),
@@ -151,7 +119,7 @@ def test_a_definition_takes_those_steps_that_refinement_takes(lr: Any) -> None:
         ("output_scale", "relative", "'unknown'; relative depth is 'scale' (up to a factor) or"),
         ("layers", "encoder", "is not a tuple of texts"),
         ("layers", ("a", 3), "is not a tuple of texts"),
-        ("defaults", {"lr": 1}, "RefineDefaults(…) is expected"),
+        ("defaults", {"lr": 1}, "Settings(…) is expected"),
         ("checkpoint", "net.pt", "a pathlib.Path is expected"),
         *((f, "x", "cannot be called") for f in ("read_checkpoint", "arguments", "output")),
         ("verify", "x", "cannot be called"),
@@ -169,13 +137,5 @@ def test_a_long_value_is_shortened() -> None:
 
 def test_numbers_of_numpy_and_lists_are_as_good() -> None:
     assert Multiple(np.int64(8)).of == 8  # type: ignore[arg-type]
-    assert RefineDefaults(lr=np.float32(0.5), iterations=np.int32(3)).iterations == 3  # type: ignore[arg-type]
     Normalisation(mean=[0.5, 0.5, 0.5], std=np.ones(3))  # type: ignore[arg-type]
     assert definition(layers=["a"], checkpoint=Path("x.pt"), normalisation=None).layers == ["a"]
-
-
-def test_former_names_of_fields_are_accepted_for_one_version() -> None:
-    with pytest.warns(DeprecationWarning, match="static_graph"):
-        assert definition(same_path=True) == definition(static_graph=True)
-    with pytest.warns(DeprecationWarning, match="blur"):
-        assert RefineDefaults(spread=0.5) == RefineDefaults(blur=0.5)

@@ -19,7 +19,7 @@ from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 NETWORK = """
 import torch
 from torch import nn
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, RefineDefaults
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Settings
 
 class Net(nn.Module):
     def __init__(self):
@@ -34,7 +34,7 @@ class Net(nn.Module):
 
 definition = ModelDefinition(
     name="tiny", input_kind="rgb", size=Multiple(4), build=Net, layers=("encode", "middle"),
-    defaults=RefineDefaults(layer="middle"),
+    defaults=Settings(layer="middle"),
 )
 """
 

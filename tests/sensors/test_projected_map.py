@@ -13,7 +13,7 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.request import FrameFiles, MethodOptions, RefineRequest
+from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import camera_of
 from pnpdepth_cli.sensors import (
@@ -27,6 +27,7 @@ from pnpdepth_cli.sensors import (
     sample_points,
 )
 from pnpdepth_cli.sensors.projection import interleaved
+from pnpdepth_cli.settings import Settings
 
 SIZE = (240, 640)
 INTRINSICS = np.array([[700.0, 0, 320], [0, 700, 120], [0, 0, 1]])
@@ -99,11 +100,11 @@ def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: 
     read = read_inputs(RefineRequest(files=files))
     count = read.record["sparse"]["dropped"]["hidden by foreground"]
     assert len(read.points) == len(points) - count < len(points)
-    assert sum("--keep-occluded" in note for note in read.notes) == 1
+    assert sum("--scan keep-occluded" in note for note in read.notes) == 1
     kept = read_inputs(RefineRequest(files=replace(files, scan=ScanOptions(keep_occluded=True))))
     assert len(kept.points) == len(points)
     assert not any("occluded" in note for note in kept.notes)
-    paper = RefineRequest(files=files, method=MethodOptions(preset="paper"))
+    paper = RefineRequest(files=files, method=Settings(preset="paper"))
     assert len(read_inputs(paper).points) == len(points)
 
 

@@ -35,7 +35,6 @@ from pnpdepth_cli.pipeline.batch.summary import (
     write_summaries,
 )
 from pnpdepth_cli.pipeline.ordered_pool import in_order
-from pnpdepth_cli.pipeline.refinement.method import resolve_method
 
 if TYPE_CHECKING:
     from pnpdepth_cli.pipeline.report.batch import BatchReport
@@ -303,15 +302,15 @@ class _Batch:
     def _head(self, tally: Tally) -> dict[str, Any]:
         """The summary without its frames."""
         request, found = self.request, self.found
-        frames, method = len(found.frames) + len(found.refused), resolve_method(request.refine)
+        frames, fixed_by = len(found.frames) + len(found.refused), request.refine.method.fixed_by
         head = {
             "command": "batch",
             "source": str(request.source),
             "output": str(request.output),
             "layout": found.layout,
             "method": {
-                "kind": "default" if method.is_default else "fixed",
-                "reason": method.reason,
+                "kind": "fixed" if fixed_by else "default",
+                "reason": fixed_by or "default",
             },
             "settings": settings_of(request.refine, self.model),
             "counts": {

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import option
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
+from pnpdepth_cli.settings import option
 
 LOCAL = "local"
 """The address of a Ray cluster of this machine's devices, which ends with the command."""

@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
     BatchError,
     InputError,
@@ -26,7 +25,8 @@ from pnpdepth_cli.errors import (
     StorageError,
     UsageError,
 )
-from pnpdepth_cli.frames.frame import RefinedFrame, WarmStart
+from pnpdepth_cli.frames.frame import Refined, WarmStart
+from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.fingerprint import Fingerprint
 from pnpdepth_cli.pipeline.batch.frames import Task, reference_frames, registering, task_of
@@ -35,9 +35,7 @@ from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.state import BatchState, Row
 from pnpdepth_cli.pipeline.ordered_pool import in_order
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.refine import write_refined
-from pnpdepth_cli.pipeline.refinement.refiner import Opened, Refiner
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner, write_refined
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch
 
 _ROUNDING = 1e-3
@@ -83,8 +81,8 @@ def opened_network(
         yield None
         return
     refiner = _load(request, references, say)
-    with refiner.opened() as opened:
-        yield OpenNetwork(refiner, opened, request.batch_size, say)
+    with refiner:
+        yield OpenNetwork(refiner, request.batch_size, say)
 
 
 def _load(request: BatchRequest, references: References, say: Callable[[str], None]) -> Refiner:
@@ -101,15 +99,15 @@ def _load(request: BatchRequest, references: References, say: Callable[[str], No
     refiner = load_refiner(task.request, first, others)
     for note in refiner.network.notes:
         say(note)
-    if first.registration == "auto":
-        refiner = refiner.with_registration_of(readable(references.registering))
+    if first.register == "auto":
+        refiner.share_registration(readable(references.registering))
         for (height, width), registration in refiner.registrations.items():
             if registration is not None:
                 say(
                     f"images of {width}×{height} are moved into the frame of the points by"
                     f" {registration}; --registration off leaves them"
                 )
-    if refiner.method.is_default:
+    if refiner.is_default:
         names = " and ".join(member.network.definition.name for member in refiner.members)
         say(f"method: the default, with {names}")
     else:
@@ -142,7 +140,7 @@ class FrameInMemory:
     inputs: Inputs | None = None
     fingerprints: dict[str, Fingerprint] = field(default_factory=dict)
     watch: Stopwatch = field(default_factory=Stopwatch)
-    result: RefinedFrame | Exception | None = None
+    result: Refined | Exception | None = None
     """An error that occurred while it was read or refined. None before."""
 
 
@@ -178,7 +176,7 @@ def refine_tasks(
                 return
             _refine(group, network)
             for frame in group:
-                worked |= isinstance(frame.result, RefinedFrame)
+                worked |= isinstance(frame.result, Refined)
                 fatal = StorageError if worked else (StorageError, ModelError, UsageError)
                 if isinstance(frame.result, fatal):
                     raise frame.result
@@ -220,7 +218,7 @@ def _refine(group: Sequence[FrameInMemory], network: OpenNetwork | None) -> None
     """Sets the results of the frames that were read."""
     frames = [frame for frame in group if frame.inputs is not None]
     start = time.perf_counter()
-    results: Sequence[RefinedFrame | Exception]
+    results: Sequence[Refined | Exception]
     if network is None:
         error = InputError("no frame could be read when the batch began; run it again")
         results = [error] * len(frames)
@@ -234,22 +232,20 @@ def _refine(group: Sequence[FrameInMemory], network: OpenNetwork | None) -> None
 class OpenNetwork:
     """Refines frames of one size, several together where the user asks for it."""
 
-    def __init__(
-        self, refiner: Refiner, opened: Opened, batch_size: int, say: Callable[[str], None]
-    ) -> None:
-        self.refiner, self._opened, self._say = refiner, opened, say
+    def __init__(self, refiner: Refiner, batch_size: int, say: Callable[[str], None]) -> None:
+        self.refiner, self._say = refiner, say
         self._carried: dict[str, WarmStart] = {}  # of the last frame, by the first of its window
         fixed = (
-            isinstance(opened, Split)
+            not refiner.is_default
             and not refiner.settings.moves_weights
-            and refiner.request.network.tile is None
+            and refiner.settings.tile is None
         )
         if batch_size > 1 and not fixed:
             say("batch size: 1; only frames of a fixed network without tiles go together")
         self.batch_size = batch_size if fixed else 1
         self._checked = False
 
-    def refine(self, group: Sequence[Inputs]) -> Sequence[RefinedFrame | Exception]:
+    def refine(self, group: Sequence[Inputs]) -> Sequence[Refined | Exception]:
         """Returns the refined frames, all of one size; for one that fails, its error."""
         if len(group) > 1 and not any(inputs.window for inputs in group):
             try:
@@ -260,37 +256,36 @@ class OpenNetwork:
                     self.batch_size = 1
         return [self._alone(inputs) for inputs in group]
 
-    def _together(self, group: Sequence[Inputs]) -> list[RefinedFrame | Exception]:
+    def _together(self, group: Sequence[Inputs]) -> list[Refined | Exception]:
         """The frames refined in one pass. PnpDepthError if the network does not take them so."""
-        assert isinstance(self._opened, Split)
-        frames = self.refiner.refine_together(self._opened, group, self.refiner.settings)
+        frames = self.refiner.refine_together(group)
         if not self._checked:
             self._check_independent(group[0], frames[0])
         note = f"refined together with {len(group) - 1} others, which alters the last bits"
         return [
-            replace(frame, notes=(*frame.notes, note)) if isinstance(frame, RefinedFrame) else frame
+            replace(frame, notes=(*frame.notes, note)) if isinstance(frame, Refined) else frame
             for frame in frames
         ]
 
-    def _check_independent(self, inputs: Inputs, together: RefinedFrame | PnpDepthError) -> None:
+    def _check_independent(self, inputs: Inputs, together: Refined | PnpDepthError) -> None:
         """Raises BatchError if the frames of a group influence each other."""
         alone = self._alone(inputs)
-        if not isinstance(alone, RefinedFrame) or not isinstance(together, RefinedFrame):
+        if not isinstance(alone, Refined) or not isinstance(together, Refined):
             return
         self._checked = True
-        assert isinstance(self._opened, Split)
-        if not self._opened.static_graph:
+        split = self.refiner.split
+        if split is None or not split.static_graph:
             raise BatchError("the network's control flow depends on image values")
         if not np.allclose(alone.before, together.before, rtol=_ROUNDING, atol=0):
             raise BatchError("frames that go together influence each other")
 
-    def _alone(self, inputs: Inputs) -> RefinedFrame | Exception:
+    def _alone(self, inputs: Inputs) -> Refined | Exception:
         try:
             if not inputs.window:
-                return self.refiner.refine(self._opened, inputs)
+                return self.refiner.refine_frame(inputs)
             first, begins = inputs.window[0], len(inputs.window) == 1
             carried = WarmStart() if begins else self._carried.pop(first, WarmStart())
-            frame = self.refiner.refine_next(self._opened, inputs, carried)
+            frame = self.refiner.refine_next(inputs, carried)
         except Exception as error:  # concerns this frame only
             return error
         self._carried = {first: frame.carried or WarmStart()}
@@ -310,7 +305,7 @@ def _read(task: Task) -> FrameInMemory:
 def _write(frame: FrameInMemory, network: OpenNetwork | None, state: BatchState) -> Row:
     """Writes a frame's results, or why there are none; returns the summary's row."""
     inputs, result = frame.inputs, frame.result
-    if isinstance(result, RefinedFrame) and network is not None and inputs is not None:
+    if isinstance(result, Refined) and network is not None and inputs is not None:
         refiner = network.refiner
         try:
             return state.write(

@@ -14,7 +14,6 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset.frame import Frame, Neighbour
 from pnpdepth_cli.io.poses import read_oxts_poses, read_poses
 from pnpdepth_cli.pipeline.evaluation.dependence import groups_by_name
-from pnpdepth_cli.pipeline.refinement.method import needs_check, resolve_method
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 KnownPose = tuple[NDArray[np.float64], str]
@@ -52,12 +51,13 @@ def in_windows(frames: Sequence[Frame]) -> list[list[Frame]]:
 
 def check_warm_start(request: RefineRequest) -> None:
     """Raises UsageError if the method cannot begin where the frame before ended."""
-    if resolve_method(request).is_default or needs_check(request):
+    checked = request.hold_out.baselines or request.hold_out.uncertainty
+    if checked or not request.method.fixed_by:
         raise UsageError(
             "--warm-start goes with a fixed method, not with the default one; give --propagate gp,"
             " or another option of the method"
         )
-    if request.network.tile is not None:
+    if request.method.tile is not None:
         raise UsageError("--warm-start does not go with --tile")
 
 

@@ -32,7 +32,7 @@ def _listed(definition: ModelDefinition, family: str, variant: bool) -> dict[str
     # On the meta device counting needs no memory.
     with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
-    defaults = definition.defaults
+    defaults = definition.defaults.complete()
     return {
         "name": definition.name,
         "family": family,

@@ -28,16 +28,11 @@ class FrameCamera:
     """The camera that took a frame."""
 
     camera: Camera
-    """Intrinsics and lens, in pixels of the frame."""
-
     source: str
     """Where it is from, for a person."""
-
     pose: NDArray[np.float64] | None = None
     """(3, 4) x_world = pose · (x, 1), in the unit of the depth. None: unknown."""
-
     notes: tuple[str, ...] = ()
-    """What was assumed."""
 
     def in_part(self, protocol: Protocol, size: tuple[int, int]) -> FrameCamera:
         """Returns the camera of the part that a protocol keeps of an image of (H, W)."""
@@ -115,13 +110,7 @@ def camera_of_frame(
 def camera_of_file(
     path: Path, number: int | None, size: tuple[int, int], image: Path | None = None
 ) -> FrameCamera:
-    """Returns the camera of a calibration file for an image of (H, W).
-
-    Args:
-        path: As `read_calibration` takes it.
-        number: Which camera of the file.
-        size: (H, W) of the image.
-        image: Its file, for messages.
+    """Returns the camera of a calibration file for an image (H, W) of this file.
 
     Raises:
         InputError: The file is no calibration.

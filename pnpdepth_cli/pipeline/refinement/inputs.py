@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import functools
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.completion.image_registration import ImageRegistration, estimated, evidence
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.frame import METRES, Frame, Register, registration_to_make, tensor_of
 from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source
 from pnpdepth_cli.io.dataset.reading import check_same_view, depth_of, masked, moved_to, rgb_of
 from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, metres, read_depth
@@ -21,19 +19,16 @@ from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.pipeline.refinement.frame_camera import FrameCamera, camera_of_frame
-from pnpdepth_cli.pipeline.refinement.method import PAPER
 from pnpdepth_cli.pipeline.refinement.neighbours import (
     read_neighbours,
     with_moved_points,
 )
-from pnpdepth_cli.pipeline.refinement.points import split_points
 from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.pipeline.sparse.colmap import read_colmap_points
-from pnpdepth_cli.pipeline.sparse.options import METRES, ColmapOptions, ScanOptions
+from pnpdepth_cli.pipeline.sparse.options import ColmapOptions, ScanOptions
 from pnpdepth_cli.pipeline.sparse.scans import read_scan_points
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import (
-    NeighbourScan,
     Points,
     as_depth_image,
     occluded_in_map,
@@ -42,88 +37,39 @@ from pnpdepth_cli.sensors import (
 
 ImageArray = NDArray[np.float32]
 
-_LEAK_FRACTION = 0.5
-"""Of the ground truth's pixels; as much in common with the sparse depth gives a warning."""
-
-
-_FAR = 1000.0
-"""Times the median depth; no point of an image is farther."""
-
-_OTHER_SCALE = 1.5
-"""Ratio of ground truth to sparse depth that no noise explains."""
-
-_MIN_COMPARED = 10
-"""Fewer points decide nothing."""
+_LEAK_FRACTION = 0.5  # of the ground truth's pixels equal to the sparse depth gives a warning
+_FAR = 1000.0  # times the median depth; no point of an image is farther
+_OTHER_SCALE = 1.5  # ratio of ground truth to sparse depth that no noise explains
+_MIN_COMPARED = 10  # fewer points decide nothing
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inputs:
-    """A frame as it was read."""
+class Inputs(Frame):
+    """A frame as it was read; `points` are those to use, with the neighbours'."""
 
-    rgb: ImageArray | None
-    """(H, W, 3) float32 in 0…1. None without an image."""
-    points: SparsePoints
-    """Sparse depth in the image frame, on the CPU."""
-    gt: ImageArray | None
-    """(H, W) float32 metres, 0 = unknown. None without ground truth."""
-    sparse_scale: float | None
+    request: RefineRequest = field(default_factory=RefineRequest)
+    own: SparsePoints
+    """All points of the frame's own files, also those held out."""
+    sparse_scale: float | None = None
     """Integers per metre of the sparse depth file. None if it holds metres."""
-    record: dict[str, Any]
+    record: dict[str, Any] = field(default_factory=dict)
     """Files and digests, for a record."""
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     """What was assumed, and warnings."""
-    unit: str = METRES
-    """Of all depths: "m", or "model units" of a COLMAP model without scale."""
     camera: FrameCamera | None = None
     """The camera in pixels of the image frame. None: unknown."""
-    neighbours: tuple[NeighbourScan, ...] = ()
-    """Points of other frames of the sequence; then the camera is known."""
-    window: tuple[str, ...] = ()
-    """As in the request."""
-    registration: ImageRegistration | Literal["auto"] | None = None
-    """How the image is moved into the frame of the points; "auto": as the points tell."""
+    has_neighbours: bool = False
+    """Whether `points` have those of other frames of the sequence."""
 
     @property
-    def size(self) -> tuple[int, int]:
-        """(H, W) of the image frame."""
-        return self.points.size
+    def window(self) -> tuple[str, ...]:
+        """Names of the frames of its window up to this one; empty outside of windows."""
+        return self.request.files.window
 
-    def frame(self, points: SparsePoints | None = None) -> Frame:
-        """Returns the image, and points (None: all) with those of the neighbours, as tensors."""
-        points = self.points if points is None else points
-        if self.neighbours and self.camera is not None:
-            points = with_moved_points(points, self.neighbours, self.camera.camera)
-        registration = self.registration_by(points)
-        rgb = self.registered(registration)
-        if rgb is not None:
-            rgb = np.ascontiguousarray(rgb.transpose(2, 0, 1))
-        return Frame(
-            rgb=None if rgb is None else torch.from_numpy(rgb),
-            points=points,
-            registration=registration,
-        )
-
-    def registration_by(self, points: SparsePoints) -> ImageRegistration | None:
-        """Returns how the image is moved into the frame of the points; None if it is not."""
-        if self.rgb is None:
-            return None
-        if self.registration != "auto":
-            return self.registration
-        if len(points) == len(self.points):  # a selection of as many is all of them
-            return self._registration_by_all
-        return estimated([evidence(self.rgb, points)])
-
-    @functools.cached_property
-    def _registration_by_all(self) -> ImageRegistration | None:
-        """How all points say that the image is moved: asked for more than once of most frames."""
-        assert self.rgb is not None
-        return estimated([evidence(self.rgb, self.points)])
-
-    def registered(self, registration: ImageRegistration | None) -> ImageArray | None:
-        """Returns the image moved so; None without an image."""
-        if self.rgb is None or registration is None:
-            return self.rgb
-        return registration.applied(self.rgb)
+    @property
+    def own_used(self) -> int:
+        """Number of its own points that are used."""
+        return len(self.own) - (0 if self.held_out is None else len(self.held_out))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +81,7 @@ class _Part:
     whole: tuple[int, int]
     """(H, W) before the protocol's crop."""
     record: dict[str, Any]
-    """Of its file."""
     notes: tuple[str, ...] = ()
-    """What was assumed."""
     scale: float | None = None
     """Integers per metre of its file."""
 
@@ -147,15 +91,11 @@ class _Sparse:
     """The sparse depth of the frame."""
 
     points: SparsePoints
-    """In the image frame."""
     scale: float | None
     """Integers per metre of its file."""
     record: dict[str, Any]
-    """Of its file."""
     notes: tuple[str, ...]
-    """What was assumed."""
     unit: str = METRES
-    """Of the depth."""
     camera: FrameCamera | None = None
     """The camera of the whole image, where it came with the points."""
 
@@ -173,23 +113,20 @@ def read_inputs(request: RefineRequest) -> Inputs:
     if ground_truth is not None:
         _check_ground_truth(files, ground_truth, whole)
     if files.sparse is None:
-        sparse = _sampled(files, image, ground_truth, request.hold_out.seed)
+        sparse = _sampled(files, image, ground_truth, request.method.seed)
     else:
         sparse = _read_sparse(request, files.sparse, whole)
     sparse = _without_far_points(sparse)
     if ground_truth is not None and sparse.unit != METRES:
         raise UsageError(
             f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
-            " --unit-scale, or leave out --gt"
+            " --colmap unit-scale, or leave out --gt"
         )
     if ground_truth is not None and ground_truth.values.shape != sparse.points.size:
         raise _size_error(files, ground_truth.values.shape, sparse.points.size)
     size = whole or (None if ground_truth is None else ground_truth.whole) or sparse.points.size
     camera = camera_of_frame(request, sparse.camera, size)
-    held_out = request.hold_out
-    used, _ = split_points(
-        sparse.points, held_out.holdout if files.neighbours else 0, held_out.seed
-    )
+    used, held_out = split_points(sparse.points, request.hold_out.holdout, request.method.seed)
     neighbours = read_neighbours(
         files, used, camera, lambda other: _points_of(request, other, size)
     )
@@ -199,9 +136,16 @@ def read_inputs(request: RefineRequest) -> Inputs:
         notes += _leak_warning(sparse.points, ground_truth.values)
         notes += _scale_warning(sparse.points, ground_truth.values)
     notes += (*(() if camera is None else camera.notes), *neighbours.notes)
+    points = used
+    if neighbours.scans and camera is not None:
+        points = with_moved_points(used, neighbours.scans, camera.camera)
     return Inputs(
-        rgb=None if image is None else image.values,
-        points=sparse.points,
+        request=request,
+        rgb=None if image is None else tensor_of(image.values),
+        points=points,
+        own=sparse.points,
+        held_out=held_out,
+        register=_register(request),
         gt=None if ground_truth is None else ground_truth.values,
         sparse_scale=sparse.scale,
         record={name: part.record for name, part in parts.items() if part is not None}
@@ -209,25 +153,42 @@ def read_inputs(request: RefineRequest) -> Inputs:
         notes=tuple(notes),
         unit=sparse.unit,
         camera=camera,
-        neighbours=neighbours.scans,
-        window=files.window,
-        registration=registration_of(request),
+        has_neighbours=bool(neighbours.scans),
     )
 
 
-def registration_of(request: RefineRequest) -> ImageRegistration | Literal["auto"] | None:
-    """Returns how the image is to be moved into the frame of the points, as in `Inputs`.
-
-    A calibrated scan and SfM points are registered; the paper's setting moves no image.
-    """
+def _register(request: RefineRequest) -> Register:
+    """How the image is to be moved. A calibrated scan and SfM points are registered."""
     files = request.files
-    if files.registration == "off":
-        return None
-    if not isinstance(files.registration, str):
-        zoom, right, down = files.registration
-        return ImageRegistration(zoom=zoom, right=right, down=down)
     calibrated = files.sparse is not None and (files.sparse.is_dir() or files.is_scan(files.sparse))
-    return None if calibrated or request.method.preset == PAPER else "auto"
+    if calibrated and files.registration == "auto":
+        return None
+    return registration_to_make(files.registration, request.method)
+
+
+def split_points(
+    points: SparsePoints, holdout: float, seed: int
+) -> tuple[SparsePoints, SparsePoints]:
+    """Returns (points to use, points held out).
+
+    Args:
+        points: All points.
+        holdout: Fraction of the points to hold out at random; at least one unless it is 0.
+        seed: Of the choice.
+
+    Raises:
+        UsageError: The fraction is not in 0…1, or there are too few points for it.
+    """
+    if not 0 <= holdout < 1:
+        raise UsageError(f"--holdout must be a fraction, 0 <= F < 1, got {holdout}")
+    mask = torch.zeros(len(points), dtype=torch.bool)
+    if holdout > 0:
+        if len(points) < 2:
+            raise UsageError("holdout needs at least two sparse points")
+        count = min(max(1, round(holdout * len(points))), len(points) - 1)
+        order = np.random.default_rng(seed).permutation(len(points))
+        mask[torch.from_numpy(order[:count])] = True
+    return points.select(~mask), points.select(mask)
 
 
 def _points_of(request: RefineRequest, files: FrameFiles, size: tuple[int, int]) -> SparsePoints:
@@ -236,7 +197,7 @@ def _points_of(request: RefineRequest, files: FrameFiles, size: tuple[int, int])
         return _read_sparse(replace(request, files=files), files.sparse, size).points
     image = None if files.image is None else _read_image(files, files.image)
     ground_truth = None if files.gt is None else _read_ground_truth(files, files.gt, size)
-    return _sampled(files, image, ground_truth, request.hold_out.seed).points
+    return _sampled(files, image, ground_truth, request.method.seed).points
 
 
 def _read_sparse(request: RefineRequest, path: Path, size: tuple[int, int] | None) -> _Sparse:
@@ -245,13 +206,10 @@ def _read_sparse(request: RefineRequest, path: Path, size: tuple[int, int] | Non
     if path.is_dir():
         return _read_colmap(files, path, size)
     if files.colmap != ColmapOptions():
-        raise UsageError(
-            f"{path} is no COLMAP model, so --unit-scale, --min-track and --max-reprojection do not"
-            " apply"
-        )
+        raise UsageError(f"{path} is no COLMAP model, so --colmap does not apply")
     if files.is_scan(path):
         return _read_scan(files, path, size)
-    keep = files.scan.keep_occluded or request.method.preset == PAPER
+    keep = files.scan.keep_occluded or request.method.preset is not None
     return _read_points(files, path, size, keep_occluded=keep)
 
 
@@ -452,7 +410,7 @@ def _visible(points: Points, keep_occluded: bool) -> tuple[Points, dict[str, Any
     count = int(hidden.sum())
     note = (
         f"sparse: a projected LiDAR scan; dropped {count:,} points occluded from the camera by"
-        " nearer ones; --keep-occluded keeps them"
+        " nearer ones; --scan keep-occluded keeps them"
     )
     return points.select(~hidden), {"dropped": {"hidden by foreground": count}}, [note]
 

@@ -1,8 +1,8 @@
-"""Which files are written for a refined frame, planned before it is computed."""
+"""Which files are written for a refined frame, planned before it is computed. Imports no torch."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,8 @@ class Outputs:
     """Paths of a frame's results. All but the depth are None when only a depth file is wanted."""
 
     depth: Path
-    """Refined depth."""
     sigma: Path | None = None
-    """Standard deviation of the depth."""
     sigma_preview: Path | None = None
-    """Image of the standard deviation."""
     valid: Path | None = None
     """Mask of the pixels whose depth is valid."""
     preview: Path | None = None
@@ -36,7 +33,6 @@ class Outputs:
     improvement: Path | None = None
     """Image of what became better and worse."""
     cloud: Path | None = None
-    """Point cloud of the depth."""
     view: Path | None = None
     """3D view for a report."""
     record: Path | None = None
@@ -69,18 +65,8 @@ class Outputs:
 
     def by_kind(self) -> dict[str, Path]:
         """Returns every file that will be written, by its kind."""
-        kinds = {
-            "depth": self.depth,
-            "sigma": self.sigma,
-            "sigma_preview": self.sigma_preview,
-            "valid": self.valid,
-            "preview": self.preview,
-            "improvement": self.improvement,
-            "cloud": self.cloud,
-            "view": self.view,
-            "record": self.record,
-        }
-        return {kind: path for kind, path in kinds.items() if path is not None}
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {kind: path for kind, path in values.items() if isinstance(path, Path)}
 
     def paths(self) -> list[Path]:
         """Returns every file that will be written."""
@@ -91,8 +77,8 @@ class Outputs:
         images = (self.preview, self.improvement, self.sigma_preview)
         return [path for path in images if path is not None and self.previews != "all"]
 
-    def of_result(self, *, worse: bool) -> Outputs:
-        """Returns the files to write for a result.
+    def without_previews(self, *, worse: bool) -> Outputs:
+        """Returns the files to write for a result, without the images that it does not get.
 
         Args:
             worse: Whether it is worse than linear interpolation.

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pnpdepth_cli.errors import DivergedError
-from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.refiner import Refiner
+from pnpdepth_cli.frames.resolve import redefined
 from pnpdepth_cli.io.atomic import all_or_none
+from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs, plan_outputs
-from pnpdepth_cli.pipeline.refinement.output_range import within_range
-from pnpdepth_cli.pipeline.refinement.outputs import write_outputs
+from pnpdepth_cli.pipeline.refinement.outputs import within_range, write_outputs
 from pnpdepth_cli.pipeline.refinement.record import record_of
-from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.stopwatch import Stopwatch, peak_memory_mb
 
@@ -52,17 +52,45 @@ def refine_image(
         inputs = read_inputs(request)
     with watch("load network"):
         refiner = load_refiner(request, inputs)
-    with watch("refine"):
+    with watch("refine"), refiner:
         of = refiner.settings.iterations
-        with refiner.opened() as opened:
-            frame = refiner.refine(
-                opened, inputs, on_iteration=lambda done, loss: on_iteration(done, of, loss)
-            )
+        frame = refiner.refine_frame(
+            inputs, on_iteration=lambda done, loss: on_iteration(done, of, loss)
+        )
     return write_refined(outputs, refiner, inputs, frame, watch)
 
 
+def load_refiner(
+    request: RefineRequest, first: Frame, more: Callable[[], Sequence[Frame]] = tuple
+) -> Refiner:
+    """Returns the refiner that is asked for; this first frame decides what networks leave open.
+
+    Args:
+        request: What is asked for.
+        first: The first frame.
+        more: Gives further frames, which decide as well; called only if a network needs it.
+
+    Raises:
+        UsageError: The request combines what cannot be combined.
+        ModelError: The network cannot be loaded.
+    """
+    choice, hold_out = request.network, request.hold_out
+    networks = [
+        load_network(spec, checkpoint, choice.device, precision=choice.precision)
+        for spec, checkpoint in (
+            (choice.model, choice.checkpoint),
+            *((spec, None) for spec in choice.more_models),
+        )
+    ]
+    networks[0] = redefined(networks[0], choice.output_kind, choice.normalise)
+    refiner = Refiner(
+        networks, request.method, uncertainty=hold_out.uncertainty, check=hold_out.baselines
+    )
+    return refiner.decide(first, more)
+
+
 def write_refined(
-    outputs: Outputs, refiner: Refiner, inputs: Inputs, frame: RefinedFrame, watch: Stopwatch
+    outputs: Outputs, refiner: Refiner, inputs: Inputs, frame: Refined, watch: Stopwatch
 ) -> RefineOutcome:
     """Scores the refined frame and writes it with its record.
 
@@ -70,7 +98,7 @@ def write_refined(
     """
     frame = within_range(outputs, inputs, frame)
     record = record_of(refiner, inputs, frame)
-    planned, outputs = outputs, outputs.of_result(worse=bool(record["linear"]["worse"]))
+    planned, outputs = outputs, outputs.without_previews(worse=bool(record["linear"]["worse"]))
     with all_or_none(outputs.paths()):
         with watch("write"):
             record |= write_outputs(outputs, inputs, frame)

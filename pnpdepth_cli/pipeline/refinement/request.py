@@ -1,28 +1,26 @@
 """What the user asks of a refinement, in groups. None means the network's own default.
 
-Each field is declared here once. Command line options, sweep axes and batch cache keys are derived
-from these declarations (`pnpdepth_cli.pipeline.options`). Imports neither numpy nor torch.
+Command line options, sweep axes and batch cache keys are derived from these declarations
+(`pnpdepth_cli.settings`). Imports neither numpy nor torch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import Axis, option
+from pnpdepth_cli.io.remote.address import path_of
 from pnpdepth_cli.pipeline.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.settings import Settings, option
 
 if TYPE_CHECKING:
     from pnpdepth_cli.io.calibration import Calibration
     from pnpdepth_cli.io.dataset.frame import Pose, Source
     from pnpdepth_cli.io.dataset.protocols import Protocol
     from pnpdepth_cli.sensors import SamplePattern
-
-LARGEST_SEED = 2**32 - 1
 
 
 def _whole_frame() -> Protocol:
@@ -31,16 +29,9 @@ def _whole_frame() -> Protocol:
     return WHOLE
 
 
-def parse_seconds(text: str) -> float:
-    """Returns the seconds of `5`, `5s` or `500ms`. Raises UsageError for any other text."""
-    number, unit = (text[:-2], 1e-3) if text.endswith("ms") else (text.removesuffix("s"), 1.0)
-    try:
-        seconds = float(number) * unit
-    except ValueError:
-        seconds = -1.0
-    if not 0 < seconds < float("inf"):
-        raise UsageError(f"time budget {text!r} is not a duration; give seconds, such as 5s")
-    return seconds
+def parse_file(text: str) -> Path:
+    """Returns the path of a local file, or of one in a store. Raises UsageError as `path_of`."""
+    return path_of(text)
 
 
 def parse_codes_per_metre(text: str) -> float:
@@ -74,19 +65,18 @@ class FrameFiles:
     """The files of a frame and how they are read."""
 
     image: Source | None = None
-    """Input image. None for a network that takes sparse depth alone."""
+    """None for a network that takes sparse depth alone."""
     sparse: Path | None = None
     """Sparse depth, a LiDAR scan, or a COLMAP model. None: `sample` takes points of the ground
     truth."""
     gt: Source | None = None
-    """Ground truth depth."""
     depth_scale: float | None = option(
         None,
         "Integer depth files hold metres × S.  [default: from the file, else 256]",
         metavar="S",
     )
     sparse_scale: float | None = None
-    """The same for the sparse depth, over `depth_scale`."""
+    """Of the sparse depth, over `depth_scale`."""
     gt_scale: float | None = option(None, "--depth-scale of the ground truth.", metavar="S")
     channel: str | None = option(
         None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
@@ -103,20 +93,16 @@ class FrameFiles:
         show_default=True,
     )
     colmap: ColmapOptions = field(default_factory=ColmapOptions)
-    """Which points are used where `sparse` is a COLMAP model."""
     scan: ScanOptions = field(default_factory=ScanOptions)
-    """How `sparse` is projected where it is a LiDAR scan."""
     calibration: Calibration | None = None
     """Of a LiDAR scan, where the data set gives it instead of a file."""
     camera_file: Path | None = None
     """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
     camera_number: int | None = None
-    """Which camera of `camera_file`."""
     neighbours: tuple[NeighbourFiles, ...] = ()
     """Other frames of the sequence, whose points are moved into this one."""
     window: tuple[str, ...] = ()
-    """Names of the frames of its window up to this one, which may begin where the last but one
-    ended. Empty for a frame outside of windows."""
+    """Names of the frames of its window up to this one. Empty for a frame outside of windows."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False
@@ -124,7 +110,6 @@ class FrameFiles:
     sample: SamplePattern | None = None
     """Which pixels of the ground truth serve as sparse depth."""
     protocol: Protocol = field(default_factory=_whole_frame)
-    """Which part of the frame is used."""
 
     def is_scan(self, sparse: Path) -> bool:
         """Returns whether sparse depth is a scan that is projected.
@@ -144,13 +129,12 @@ class NeighbourFiles:
     """Another frame of the sequence, whose points are moved into this one."""
 
     files: FrameFiles
-    """Its files."""
     motion: Pose | None
     """(3, 4) from the other camera's frame to this one's, metres. None: it is estimated."""
     poses: str
     """Where the motion is from, for a person."""
     apart: int
-    """Frames between the two, at least 1."""
+    """Distance in frames, at least 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,12 +165,6 @@ class NetworkChoice:
         "RGB range of the network's input: 0…1, ImageNet's mean and std, −1…1, 0…255.",
         choices=choices.NORMALISATIONS,
     )
-    tile: int | None = option(
-        None,
-        "Refine larger frames in overlapping tiles of this side length, to save memory.",
-        metavar="PIXELS",
-        least=64,
-    )
     precision: str = option(
         "fp32",
         "Precision of convolutions and matrix products; z, loss and updates stay in fp32.",
@@ -202,143 +180,14 @@ class NetworkChoice:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MethodOptions:
-    """Where the network is cut, how z is updated, and what follows.
-
-    Without any of these, the default method is taken; see `method.resolve_method`.
-    """
-
-    preset: str | None = option(
-        None,
-        "paper: the paper's setting and nothing else.  [default: the networks refined, fused and"
-        " propagated]",
-        choices=choices.PRESETS,
-    )
-    layer: str | None = option(
-        None,
-        "Layer to cut at: the name of a submodule (NAME#2: its second call, NAME[KEY]: one of its"
-        " outputs), or a fraction of the network's depth, 0 the shallowest layer.",
-        metavar="NAME|0..1",
-        axis=Axis(title="layer cut at (0 first, 1 last)"),
-    )
-    iterations: int | None = option(
-        None,
-        "Number of updates; 0 is no refinement.",
-        metavar="K",
-        axis=Axis(title="updates"),
-    )
-    lr: str | None = option(
-        None,
-        "Step size: absolute, or % of the std of z.",
-        metavar="NUMBER|P%",
-        axis=Axis(title="step", title_percent="step (% of the deviation of z)", log=True),
-    )
-    loss: str | None = option(
-        None,
-        "Loss at the sparse points.",
-        choices=choices.LOSSES,
-        axis=Axis(title="loss"),
-    )
-    update: str | None = option(
-        None,
-        "Update rule; another than the network's resets --lr, --schedule and --blur.",
-        choices=choices.UPDATES,
-        axis=Axis(title="update rule"),
-    )
-    schedule: str | None = option(
-        None,
-        "Step size over the updates; linear and cosine decay to 0.",
-        choices=choices.SCHEDULES,
-        axis=Axis(title="schedule of the step"),
-    )
-    blur: float | None = option(
-        None,
-        "Blur the gradient over S times the spacing of the points; 0 is off.",
-        alias="--spread",
-        metavar="S",
-        axis=Axis(title="blur of the gradient (spacings of the points)"),
-    )
-    target: str = option(
-        "given",
-        "Take the loss at the points that the network was given, or at points hidden from its"
-        " input, others at every step.",
-        choices=choices.TARGETS,
-        show_default=True,
-        axis=Axis(title="points of the loss"),
-    )
-    parameters: str | None = option(
-        None,
-        "What is updated: elements of z, a scale and a shift of its channels, the weights behind"
-        " the cut, or low-rank additions to them, lora:R.  [default: elements; weights with"
-        " --target masked]",
-        metavar="|".join((*choices.PARAMETERS, "weights", "lora:R")),
-        axis=Axis(title="what is updated"),
-    )
-    mask: str | None = option(
-        None,
-        "With --target masked: hide single points, blocks of the frame, or scan lines.",
-        choices=choices.MASKS,
-        axis=Axis(title="what is hidden"),
-    )
-    mask_fraction: float | None = option(
-        None,
-        "With --target masked: the fraction of the points hidden at every step.",
-        metavar="F",
-        axis=Axis(title="hidden fraction of the points"),
-    )
-    mask_scale: float | None = option(
-        None,
-        "With --target masked: reduce the image to this fraction of its sides during the updates;"
-        " 0.5 takes a third of the time.",
-        metavar="F",
-        axis=Axis(title="scale of the image during the updates"),
-    )
-    proximity: float = option(
-        0.0,
-        "Add W times the mean squared change of log depth to the loss.",
-        alias="--anchor",
-        metavar="W",
-        axis=Axis(title="weight of staying near the network"),
-    )
-    line_search: bool = option(False, "Undo updates that raise the loss and halve the step.")
-    keep_best: bool = option(False, "Return the depth with the lowest loss, not the last.")
-    align: str | None = option(
-        None,
-        "Fit the network's output to the points by scale, or scale and shift."
-        "  [default: the network's own]",
-        choices=choices.ALIGNMENTS,
-        axis=Axis(title="alignment"),
-    )
-    align_every: bool = option(False, "Repeat the alignment at every update of z.")
-    propagate: str | None = option(
-        None,
-        "Propagate the residuals at the points to all pixels: Gaussian process or edge-aware"
-        " diffusion.  [default: none, with other options of the method]",
-        choices=("none", *choices.PROPAGATIONS),
-        axis=Axis(title="propagation of the residual"),
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
 class HoldOut:
     """Which points are held out, and what is measured by them."""
 
-    time_budget_s: float | None = option(
-        None,
-        "Time of a frame, such as 30s: networks that take the points make steps by points hidden"
-        " from their input while it lasts. No step begins that would not end in time.",
-        flag="--time-budget",
-        metavar="SECONDS",
-        parse=parse_seconds,
-    )
     baselines: bool = option(False, "Also print every baseline, such as linear interpolation.")
     uncertainty: bool = option(
         False, "Write the depth's standard deviation and a mask of valid depth."
     )
     holdout: float = option(0.0, "Hold out this fraction of the points to score at.", metavar="F")
-    seed: int = option(
-        0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,7 +228,6 @@ class OutputOptions:
         "all",
         "Which frames get preview and improvement images: all, worst (those worse than linear"
         " interpolation), or none.",
-        alias="--pictures",
         choices=choices.PREVIEWS,
         show_default=True,
     )
@@ -391,14 +239,13 @@ class OutputOptions:
         return self.ply or self.view_3d
 
 
-_PLACES = {"image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"} | {
-    "camera_file",
-    "camera_number",
-}
-"""Fields that say where something lies. A cache key has digests of what lies there instead."""
-
-_ADDED = {"ply", "view_3d"}
-"""Fields that add a file and change no other. A cache key does without: the file exists or not."""
+_NOT_IN_DIGEST = frozenset(
+    {
+        *("image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"),
+        *("camera_file", "camera_number", "ply", "view_3d"),
+    }
+)
+"""Fields that say where something lies, whose content is compared instead, or that add a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -406,15 +253,10 @@ class RefineRequest:
     """Everything the user asks of the refinement of one frame."""
 
     files: FrameFiles = field(default_factory=FrameFiles)
-    """The frame."""
     network: NetworkChoice = field(default_factory=NetworkChoice)
-    """The network."""
-    method: MethodOptions = field(default_factory=MethodOptions)
-    """The refinement."""
+    method: Settings = field(default_factory=Settings)
     hold_out: HoldOut = field(default_factory=HoldOut)
-    """The points held out."""
     outputs: OutputOptions = field(default_factory=OutputOptions)
-    """The results."""
 
     @classmethod
     def from_fields(cls, **values: Any) -> RefineRequest:
@@ -438,17 +280,13 @@ class RefineRequest:
         Args:
             *groups: Names of groups. None: all of them.
         """
-        chosen = [getattr(self, each.name) for each in fields(self) if _wanted(each.name, groups)]
+        chosen = [getattr(self, e.name) for e in fields(self) if not groups or e.name in groups]
         return {
             each.name: getattr(group, each.name)
             for group in chosen
             for each in fields(group)
-            if each.name not in _PLACES | _ADDED
+            if each.name not in _NOT_IN_DIGEST
         }
-
-
-def _wanted(name: str, names: Collection[str]) -> bool:
-    return not names or name in names
 
 
 def count_or_fraction(text: str) -> tuple[int | None, float | None]:

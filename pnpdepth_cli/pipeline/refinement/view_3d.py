@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.frames.frame import RefinedFrame
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.io.colours import depth_scale
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
@@ -26,7 +26,9 @@ _RAY_NODES = 64
 """Nodes of the grid of directions along the longer side: exact to 1e-4 of it for strong lenses."""
 
 
-def write_view(path: Path, inputs: Inputs, frame: RefinedFrame) -> None:
+def write_view(
+    path: Path, image: NDArray[np.float32] | None, inputs: Inputs, frame: Refined
+) -> None:
     """Writes the depth before and after, the ground truth if known, the colours and the camera.
 
     Every depth is cut at its edges, as a cloud is. An image of more pixels than `LARGEST_VIEW` is
@@ -34,6 +36,7 @@ def write_view(path: Path, inputs: Inputs, frame: RefinedFrame) -> None:
 
     Args:
         path: A JSON file. Depths are base64 of uint16, 0 = unknown, else logarithmic over `range`.
+        image: (H, W, 3) in 0…1, in the frame of the points. None without an image.
         inputs: The frame as it was read, with its camera.
         frame: The refined frame.
 
@@ -69,7 +72,7 @@ def write_view(path: Path, inputs: Inputs, frame: RefinedFrame) -> None:
             "unit": inputs.unit,
             "rays": {"size": [rays.shape[1], rays.shape[0]], "values": _text(rays, "<f4")},
             "depths": {name: _text(_codes(d, near, far), "<u2") for name, d in depths.items()},
-            "colours": _text(_colours(inputs, frame)[thinned], "|u1"),
+            "colours": _text(_colours(image, frame)[thinned], "|u1"),
         },
     )
 
@@ -98,10 +101,10 @@ def _rays(camera: Camera, size: tuple[int, int]) -> NDArray[np.float64]:
     return points[:, :2].reshape(xy.shape)
 
 
-def _colours(inputs: Inputs, frame: RefinedFrame) -> NDArray[np.uint8]:
+def _colours(image: NDArray[np.float32] | None, frame: Refined) -> NDArray[np.uint8]:
     """(H, W, 3) of the image, or of the depth where there is none."""
-    if inputs.rgb is not None:
-        return np.rint(np.clip(inputs.rgb, 0, 1) * 255).astype(np.uint8)
+    if image is not None:
+        return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
     return depth_scale(frame.after).paint(frame.after)
 
 

@@ -84,7 +84,7 @@ def read_colmap_points(
     lost = describe_dropped(points.dropped)
     notes += [f"sparse: dropped {lost}"] if lost else []
     if unit == MODEL_UNITS:
-        notes.append("unit: depth is in model units; --unit-scale gives metres per unit")
+        notes.append("unit: depth is in model units; --colmap unit-scale=M gives metres per unit")
     return ColmapPointsOfImage(
         points=points.resized(*size),
         camera=_resized(_eye(camera), camera.size, size),
@@ -135,7 +135,7 @@ def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
     if not len(depth):
         raise NoPointsError(
             f"none of the {len(known):,} points of {name!r} in {model.folder} is left ({drops});"
-            " relax --min-track or --max-reprojection"
+            " relax --colmap min-track or max-reprojection"
         )
     return Points(
         xy=xy.astype(np.float32),

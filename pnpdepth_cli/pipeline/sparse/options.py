@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import option, options_of
+from pnpdepth_cli.settings import option, options_of
 
 METRES, MODEL_UNITS = "m", "model units"
 
@@ -26,17 +26,28 @@ class ScanOptions:
         "Pose of the scanner in the camera's frame: matrix, quaternion or tf.",
         metavar="FILE",
     )
-    inverse_extrinsics: bool = option(False, "The pose maps the camera to the scanner.")
+    inverse_extrinsics: bool = option(
+        False, "The pose maps the camera to the scanner.", within="--scan"
+    )
     camera: int | None = option(
         None, "Camera number of KITTI (0 to 3) or Kalibr.  [default: 2; 0]", metavar="N"
     )
-    euclidean: bool = option(False, "Depth is the distance from the camera, not z.", flag="--range")
-    keep_occluded: bool = option(False, "Keep LiDAR points that are occluded from the camera.")
-    min_range: float = option(0.0, "Drop points nearer than M metres.", metavar="M")
-    max_range: float | None = option(None, "Drop points farther than M metres.", metavar="M")
+    euclidean: bool = option(
+        False, "Depth is the distance from the camera, not z.", within="--scan"
+    )
+    keep_occluded: bool = option(
+        False, "Keep LiDAR points that are occluded from the camera.", within="--scan"
+    )
+    min_range: float = option(
+        0.0, "Drop points nearer than M metres.", within="--scan", metavar="M"
+    )
+    max_range: float | None = option(
+        None, "Drop points farther than M metres.", within="--scan", metavar="M"
+    )
     point_fields: int | None = option(
         None,
         "Float32 numbers of a point in a .bin: KITTI 4, nuScenes 5.  [default: recognised]",
+        within="--scan",
         metavar="N",
         least=3,
         most=64,
@@ -73,11 +84,13 @@ class ColmapOptions:
     unit_scale: float | None = option(
         None,
         "Metres per unit of a COLMAP model.  [default: depth is in model units]",
+        within="--colmap",
         metavar="M",
     )
     min_track: int = option(
         3,
         "Drop points of a COLMAP model that fewer images observe.",
+        within="--colmap",
         metavar="N",
         least=1,
         show_default=True,
@@ -85,15 +98,16 @@ class ColmapOptions:
     max_reprojection: float = option(
         2.0,
         "Drop points of a COLMAP model with a larger mean reprojection error.",
+        within="--colmap",
         metavar="PIXELS",
         show_default=True,
     )
 
     def __post_init__(self) -> None:
         if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
-            raise UsageError(f"--unit-scale must be metres per unit, got {self.unit_scale:g}")
+            raise UsageError(f"unit-scale must be above 0 metres per unit, got {self.unit_scale:g}")
         if self.min_track < 1 or not self.max_reprojection > 0:
-            raise UsageError("--min-track must be 1 or more, and --max-reprojection above 0")
+            raise UsageError("min-track must be >= 1, and max-reprojection above 0")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -234,7 +234,7 @@ def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int,
         return []
     text = (
         f"the extrinsics put {inside:,} of {len(scan):,} scan points into the image, their inverse"
-        f" {inverted:,}; if they map the camera to the scanner, add --inverse-extrinsics"
+        f" {inverted:,}; if they map the camera to the scanner, add --scan inverse-extrinsics"
     )
     if inside < _NEXT_TO_NONE * inverted:
         raise UsageError(text)

@@ -12,14 +12,10 @@ import torch
 
 from pnpdepth_cli.core.step_sizes import step_size
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.options import Axis as Shown
-from pnpdepth_cli.pipeline.options import OptionField, options_of
-from pnpdepth_cli.pipeline.refinement.request import (
-    LARGEST_SEED,
-    MethodOptions,
-    count_or_fraction,
-)
+from pnpdepth_cli.pipeline.refinement.request import count_or_fraction
 from pnpdepth_cli.pipeline.sweep.points import read_sampling
+from pnpdepth_cli.settings import LARGEST_SEED, OptionField, Settings, options_of
+from pnpdepth_cli.settings import Axis as Shown
 
 Cell = Mapping[str, str]
 """Parameters: name to value, as the user wrote it."""
@@ -186,6 +182,8 @@ def _of_points(title: str, value: Callable[[str], Any], **shown: Any) -> Paramet
     return Parameter(shown=Shown(title=title, **shown), value=value, of_points=True)
 
 
+_OWN = ("tile", "time_budget_s", "seed")
+"""Settings that a sweep does not vary, or varies itself."""
 _OF_THOSE = "sparse points (% of those there are)"
 PARAMETERS: Mapping[str, Parameter] = {
     "points": _of_points("sparse points", _points, title_percent=_OF_THOSE, log=True),
@@ -195,7 +193,9 @@ PARAMETERS: Mapping[str, Parameter] = {
     "outliers": _of_points("outliers among the points (fraction)", _number(float, 1)),
     "jitter": _of_points("jitter of the points (px)", _number(float)),
     "rotation-noise": _of_points("rotation noise of the scanner (°)", _number(float, 360)),
-    **{each.name.replace("_", "-"): _of_method(each) for each in options_of(MethodOptions)},
+    **{
+        each.name_within: _of_method(each) for each in options_of(Settings) if each.name not in _OWN
+    },
     "model": Parameter(shown=Shown(title="network"), value=str),
     "seed": Parameter(shown=Shown(title="seed of the points"), value=_number(int, LARGEST_SEED)),
 }

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.core.refine import RefineSettings
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.io.remote.address import RemotePath
@@ -17,11 +17,10 @@ from pnpdepth_cli.io.remote.store import status_of
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.pipeline.batch.frames import Task
 from pnpdepth_cli.pipeline.batch.settings import model_identity, settings_of
-from pnpdepth_cli.pipeline.refinement.method import with_preset
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.pipeline.sweep.axes import Cell, values_of
 from pnpdepth_cli.pipeline.sweep.points import OWN, Sampling
+from pnpdepth_cli.settings import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,13 +28,13 @@ class Method:
     """A refinement and the propagation of its residuals."""
 
     layer: str
-    settings: RefineSettings
+    settings: Settings
     """`iterations` is 0 unless the schedule of the step depends on it."""
     propagate: str = "none"
 
     def record(self) -> dict[str, Any]:
         """Returns all that decides the depth after a number of updates."""
-        return {"layer": self.layer, **asdict(self.settings), "propagate": self.propagate}
+        return asdict(self.settings) | {"layer": self.layer, "propagate": self.propagate}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +76,8 @@ class Plan:
         """
         varied = values_of(cell, of_points=False)
         varied = {name: value for name, value in varied.items() if name not in ("model", "seed")}
-        options = with_preset(replace(self.base.method, **varied))
-        settings = resolve_settings(self.definition, options)
+        options = replace(self.base.method, **varied).with_preset()
+        settings = resolve_settings(self.definition, options).opened("layer", "propagate", "preset")
         settings = replace(settings, lr=_one_spelling(settings.lr))
         iterations = settings.iterations
         if settings.schedule == "constant":  # more updates then begin as fewer do
@@ -91,7 +90,7 @@ class Plan:
         sampling = self.sampling.with_values(values_of(cell, of_points=True))
         if "seed" in cell:
             return sampling, (int(cell["seed"]),)
-        own = self.base.hold_out.seed
+        own = self.base.method.seed
         return sampling, range(own, own + (self.seeds if sampling.is_random else 1))
 
     def runs(self, cells: Sequence[Cell], tasks: Sequence[tuple[Task, Frame]]) -> Runs:

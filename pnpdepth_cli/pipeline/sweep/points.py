@@ -154,7 +154,7 @@ def frame_points(
     try:
         if sampling.is_pattern:
             pattern = sampling.pattern()
-            drawn = sample_points(inputs.gt, pattern, seed, image=inputs.rgb, noise=noise)
+            drawn = sample_points(inputs.gt, pattern, seed, image=inputs.image, noise=noise)
             return drawn.tensors()
         if sampling.lidar is not None:
             points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)

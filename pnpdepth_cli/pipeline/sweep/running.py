@@ -14,7 +14,7 @@ from torch import Tensor
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.core.refine import Refinement, RefineSettings, refine
+from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DeviceError, DivergedError, PnpDepthError, StorageError
 from pnpdepth_cli.frames.opened import SplitCache
@@ -26,6 +26,7 @@ from pnpdepth_cli.pipeline.batch.reading import read_frame
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.sweep.plan import Method, Run
 from pnpdepth_cli.pipeline.sweep.points import frame_points
+from pnpdepth_cli.settings import Settings
 
 T = TypeVar("T")
 Scores = dict[str, Any]
@@ -95,7 +96,7 @@ def refined(
     They equal those of a refinement of each number alone if the step is constant. After a
     divergence they are those of the last finite depth. The network is cut at the method's layer.
     """
-    prepared = prepare(network, inputs.frame())
+    prepared = prepare(network, inputs.registered())
     if not len(prepared.points):
         raise prepared.no_points_error()
     settings = replace(method.settings, iterations=max(wanted))
@@ -124,7 +125,7 @@ def refined(
         def after(k: int, propagation: str) -> Scores:
             depth = prepared.map.depth_to_image(seen[k]).cpu()
             if propagation != "none":
-                frame = inputs.frame()
+                frame = inputs.registered()
                 depth = propagate(depth, inputs.points, frame.rgb, kind=propagation).depth
             return _score(depth, network, inputs)
 
@@ -148,7 +149,7 @@ def _until(moments: Sequence[float], updates: int) -> float:
     return last_pass + (done[min(updates, len(done)) - 1] - began if updates and done else 0.0)
 
 
-def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> int:
+def _kept(losses: Sequence[float], updates: int, settings: Settings) -> int:
     """The index of z that a refinement of so many updates returns: the last, or of least loss."""
     if not settings.gives_best:
         return updates
@@ -157,12 +158,11 @@ def _kept(losses: Sequence[float], updates: int, settings: RefineSettings) -> in
 
 def _weights_result(network: Network, run: Run, method: Method, inputs: Inputs) -> dict[str, Any]:
     """The same where weights move; each number of updates is refined for itself."""
-    mask = replace(method.settings.mask, seed=run.seed)
-    frame, scores, plain, diverged = inputs.frame(), {}, Scores(), None
+    frame, scores, plain, diverged = inputs.registered(), {}, Scores(), None
     cut = network.cut_at_points() if method.settings.masked else network.cut_at(method.layer)
     with cut as split:
         for k in run.iterations:
-            settings = replace(method.settings, iterations=k, mask=mask)
+            settings = replace(method.settings, iterations=k, seed=run.seed)
             began = time.perf_counter()
             one = refine_frame(network, split, settings, frame, propagation=method.propagate)
             updates = min(k, len(one.refinement.losses))

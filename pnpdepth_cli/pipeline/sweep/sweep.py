@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.frames.refiner import Refiner
+from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
@@ -19,10 +21,8 @@ from pnpdepth_cli.pipeline.batch.frames import Task, find_frames, reference_fram
 from pnpdepth_cli.pipeline.batch.reading import read_frame
 from pnpdepth_cli.pipeline.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.method import with_preset
-from pnpdepth_cli.pipeline.refinement.refiner import Refiner
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
+from pnpdepth_cli.pipeline.refinement.record import model_record
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner
 from pnpdepth_cli.pipeline.sweep.axes import Cell, Study, values_of
 from pnpdepth_cli.pipeline.sweep.journal import Journal
 from pnpdepth_cli.pipeline.sweep.plan import Plan, Runs
@@ -68,6 +68,8 @@ class SweepRequest(FrameSelection):
 class _Network:
     """A network of the sweep and its runs."""
 
+    spec: str
+    """What the user called it."""
     refiner: Refiner
     plan: Plan
     base: dict[str, Any]
@@ -199,14 +201,14 @@ def _network(
         (replace(task, request=task.request.with_fields(**named)), frame) for task, frame in tasks
     ]
     layer = next((cell["layer"] for cell in cells if "layer" in cell), refine.method.layer)
-    refiner = _resolved(layer, refine.hold_out.seed, tasks, listener)
+    refiner = _resolved(layer, refine.method.seed, tasks, listener)
     definition = refiner.network.definition
     if layer is None or definition.default_layer is None:  # where `refine` cuts the first frame
         defaults = replace(definition.defaults, layer=refiner.layer)
         definition = replace(definition, defaults=defaults)
     plan = Plan(definition=definition, base=refine, sampling=sampling, seeds=request.seeds)
-    settings, method = resolve_settings(definition, with_preset(refine.method)), plan.method({})[0]
-    base = {"layer": method.layer, **asdict(settings), "propagate": method.propagate}
+    settings, method = resolve_settings(definition, refine.method.with_preset()), plan.method({})[0]
+    base = asdict(settings) | {"layer": method.layer, "propagate": method.propagate}
     listener.say(
         f"network: {definition.name}; where not varied: cut at {base['layer']},"
         f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step {base['lr']})"
@@ -215,7 +217,7 @@ def _network(
     for each in dict.fromkeys(run.method.layer for run in runs.values() if run.method):
         with refiner.network.cut_at(each):
             pass  # reports an unknown layer before anything is computed
-    return _Network(refiner=refiner, plan=plan, base=base, runs=runs)
+    return _Network(spec=model[0], refiner=refiner, plan=plan, base=base, runs=runs)
 
 
 def _resolved(
@@ -288,8 +290,8 @@ def _write(
         "command": "sweep",
         "source": str(request.source),
         "output": str(request.output),
-        "model": first.refiner.model_record,
-        **({"more_models": [each.refiner.model_record for each in others]} if others else {}),
+        "model": _record_of(first),
+        **({"more_models": [_record_of(each) for each in others]} if others else {}),
         "frames": list(names),
         "seeds": request.seeds,
         "base": first.base | asdict(sampling),
@@ -297,6 +299,10 @@ def _write(
     }
     write_sweep(request.output, record, rows)
     return record
+
+
+def _record_of(network: _Network) -> dict[str, Any]:
+    return model_record(network.refiner.network, network.spec)
 
 
 def _rows(

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from pnpdepth_cli.core.refine import RefineSettings, refine
+from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.aligned import AlignedDepth
@@ -19,6 +19,7 @@ from pnpdepth_cli.models.formats.hugging_face import hf_definition
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 from tests.models.weights.files import little
 
 transformers = pytest.importorskip("transformers", reason="needs the extra [hf]")
@@ -171,7 +172,7 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
     with Split(network.module, definition.layers[0]) as split:
         with torch.no_grad():
             assert torch.equal(network.raw_of(split.rear(split.front(*arguments))), whole)
-        settings = RefineSettings(iterations=4, lr="30%", update="adam")
+        settings = Settings(iterations=4, lr="30%", update="adam")
         result = refine(split, arguments, at, settings, depth_of=depth_of)
     assert not torch.equal(result.before, result.after)
     assert min(result.losses[1:]) < result.losses[0]

@@ -16,6 +16,7 @@ import pytest
 from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
+from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.batch import reading as batch_reading
 from pnpdepth_cli.pipeline.batch import running as batch_running
@@ -24,7 +25,6 @@ from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.batch.summary import _SCORES, Tally
 from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import refine_image
-from pnpdepth_cli.pipeline.refinement.refiner import Refiner
 from pnpdepth_cli.pipeline.report.batch import BatchReport
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.sensors import SamplePattern
@@ -210,7 +210,7 @@ def test_a_divergence_keeps_the_last_good_depth_and_is_counted(root: Path) -> No
 def test_a_mistake_that_concerns_all_frames_stops_the_batch_at_once(root: Path) -> None:
     with pytest.raises(LayerError, match="did you mean middle"):
         batch(root, refine={"layer": "midle"})
-    with pytest.raises(UsageError, match="not a step size"):
+    with pytest.raises(UsageError, match="lr must be a step size"):
         batch(root, refine={"lr": "fast"})
     with pytest.raises(UsageError, match="is no scan"):
         batch(root, refine={"scan": ScanOptions(max_range=10)})
@@ -520,7 +520,7 @@ def test_reading_and_writing_go_on_while_the_network_runs(
     read: set[str] = set()
     second_is_read, second_is_refined = threading.Event(), threading.Event()
     refined = 0
-    refine, write = Refiner.refine, batch_running.write_refined
+    refine, write = Refiner.refine_frame, batch_running.write_refined
 
     def reading(request: Any) -> Any:
         read.add(str(request.files.image))
@@ -528,14 +528,14 @@ def test_reading_and_writing_go_on_while_the_network_runs(
             second_is_read.set()
         return read_inputs(request)
 
-    def refining(self: Refiner, split: Any, inputs: Any) -> Any:
+    def refining(self: Refiner, inputs: Any) -> Any:
         nonlocal refined
         assert threading.current_thread() is threading.main_thread()
         assert second_is_read.wait(60), "the second frame is not read while the first is refined"
         refined += 1
         if refined == 2:
             second_is_refined.set()
-        return refine(self, split, inputs)
+        return refine(self, inputs)
 
     def writing(*arguments: Any) -> Any:
         assert second_is_refined.wait(60), "the second frame waits until the first is written"
@@ -543,7 +543,7 @@ def test_reading_and_writing_go_on_while_the_network_runs(
 
     monkeypatch.setattr(batch_reading, "read_inputs", reading)
     monkeypatch.setattr(batch_running, "write_refined", writing)
-    monkeypatch.setattr(Refiner, "refine", refining)
+    monkeypatch.setattr(Refiner, "refine_frame", refining)
     assert batch(root, workers=1).summary["counts"]["done"] == 4
 
 

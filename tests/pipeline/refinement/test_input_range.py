@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.errors import NoPointsError
+from pnpdepth_cli.frames import resolve
 from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.resolve import NORMALISATIONS, chosen_input_range
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement import resolve
-from pnpdepth_cli.pipeline.refinement.resolve import NORMALISATIONS, chosen_input_range
 from tests.pipeline.batches import batch, pairs_on_disk
 
 

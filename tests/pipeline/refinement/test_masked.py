@@ -7,10 +7,10 @@ import torch
 
 from pnpdepth_cli import Refiner, load_network
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.definition import MASKED_DEFAULTS, WEIGHTS_DENSE_DEFAULTS
-from pnpdepth_cli.pipeline.refinement.request import HoldOut, MethodOptions
-from pnpdepth_cli.pipeline.refinement.resolve import resolve_settings
+from pnpdepth_cli.settings import Settings
 from tests.core.split.test_split import same, state_of
 from tests.pipeline.frames import FrameOnDisk, run
 
@@ -25,9 +25,8 @@ def test_masked_points_change_the_depth_and_are_recorded(frame: FrameOnDisk) -> 
     record = run(frame, gt=frame.gt, **MASKED).record
     settings = record["settings"]
     assert (settings["target"], settings["parameters"]) == ("masked", "weights")
-    assert settings["mask"] == {
-        "kind": "points", "fraction": 0.5, "set_aside": 0.1, "scale": 0.5, "seed": 0
-    }  # fmt: skip
+    masks = [settings[name] for name in ("mask", "mask_fraction", "mask_scale", "seed")]
+    assert masks == ["points", 0.5, 0.5, 0]
     assert (settings["iterations"], settings["update"]) == (3, MASKED_DEFAULTS.update)
     assert len(record["loss"]) == 3
     assert record["scores"]["before"] != record["scores"]["after"]
@@ -68,7 +67,7 @@ def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> 
     network = load_network("compact")
     before = state_of(network.module)
     rgb, sparse = torch.rand(46, 62, 3).numpy(), read_depth(frame.sparse).values
-    with Refiner(network, target="masked") as refiner:
+    with Refiner(network, Settings(target="masked")) as refiner:
         refined = refiner.refine(rgb, sparse)
     assert same(before, state_of(network.module))
     assert 0 < len(refined.losses) <= MASKED_DEFAULTS.iterations
@@ -81,10 +80,10 @@ def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> 
         ({"parameters": "lora:0"}, "none of elements, channels, weights"),
         ({"layer": "decoder.s8"}, "--layer is where z is"),
         ({"preset": "paper"}, "--preset paper updates z"),
-        ({"line_search": True}, "--line-search is for updates of z"),
-        ({"mask_fraction": 1.0}, "not between 0 and 1"),
-        ({"mask_scale": 1.5}, "not above 0 and 1 at most"),
-        ({"target": "given", "mask": "lines"}, "--mask is for points hidden"),
+        ({"line_search": True}, "--set line-search is for updates of z"),
+        ({"mask_fraction": 1.0}, "mask-fraction must be between 0 and 1, got 1.0"),
+        ({"mask_scale": 1.5}, "mask-scale must be above 0 and at most 1"),
+        ({"target": "given", "mask": "lines"}, "--set mask is for points hidden"),
     ],
 )
 def test_what_does_not_go_together_is_refused(
@@ -101,9 +100,9 @@ def test_points_cannot_be_hidden_from_a_network_of_images(frame: FrameOnDisk) ->
 
 def test_dense_points_have_defaults_of_their_own(frame: FrameOnDisk) -> None:
     definition = load_network("compact").definition
-    method = MethodOptions(target="masked")
+    method = Settings(target="masked")
     settings = resolve_settings(definition, method, dense=True)
-    assert (settings.iterations, settings.lr, settings.mask.scale) == (6, 3e-4, 0.5)
+    assert (settings.iterations, settings.lr, settings.mask_scale) == (6, 3e-4, 0.5)
     assert run(frame, **MASKED | {"iterations": None}).record["settings"]["lr"] == 3e-4
 
 
@@ -112,16 +111,15 @@ def test_weights_moved_by_given_points_keep_their_defaults(
     dense: bool, expected: tuple[int, float]
 ) -> None:
     definition = load_network("compact").definition
-    settings = resolve_settings(definition, MethodOptions(parameters="weights"), dense=dense)
+    settings = resolve_settings(definition, Settings(parameters="weights"), dense=dense)
     assert (settings.iterations, settings.lr) == expected
     assert (settings.update, settings.schedule, settings.loss) == ("adam", "cosine", "log")
-    assert (settings.target, settings.mask.scale) == ("given", 1.0)
+    assert (settings.target, settings.mask_scale) == ("given", 1.0)
 
 
 def test_seed_and_budget_reach_the_settings() -> None:
     definition = load_network("compact").definition
-    settings = resolve_settings(
-        definition, MethodOptions(target="masked"), HoldOut(seed=5, time_budget_s=2.0)
-    )
-    assert (settings.mask.seed, settings.time_budget_s) == (5, 2.0)
-    assert resolve_settings(definition, MethodOptions()).time_budget_s is None
+    asked = Settings(target="masked", seed=5, time_budget_s=2.0)
+    settings = resolve_settings(definition, asked)
+    assert (settings.seed, settings.time_budget_s) == (5, 2.0)
+    assert resolve_settings(definition, Settings()).time_budget_s is None

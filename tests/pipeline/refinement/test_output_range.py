@@ -13,11 +13,11 @@ from PIL import Image
 
 from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.frames.frame import RefinedFrame, no_points
+from pnpdepth_cli.frames.frame import Refined, no_points
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.pipeline.refinement.output_files import Outputs
-from pnpdepth_cli.pipeline.refinement.output_range import output_scale, within_range
+from pnpdepth_cli.pipeline.refinement.outputs import output_scale, within_range
 from pnpdepth_cli.pipeline.refinement.request import parse_codes_per_metre
 from pnpdepth_cli.points import SparsePoints
 from tests.pipeline.frames import frame_on_disk, run
@@ -28,12 +28,12 @@ PNG = Outputs(depth=Path("depth.png"))
 def inputs_at(*depths: float, scale: float | None = None) -> Inputs:
     xy = torch.tensor([[float(column), 0.0] for column in range(len(depths))])
     points = SparsePoints(xy=xy, depth=torch.tensor(depths), size=(1, 4))
-    return Inputs(rgb=None, points=points, gt=None, sparse_scale=scale, record={}, notes=())
+    return Inputs(rgb=None, points=points, own=points, sparse_scale=scale)
 
 
-def refined_to(*depths: float, inputs: Inputs) -> RefinedFrame:
+def refined_to(*depths: float, inputs: Inputs) -> Refined:
     depth = np.array([depths], np.float32)
-    return RefinedFrame(
+    return Refined(
         before=depth,
         after=depth,
         used=inputs.points,

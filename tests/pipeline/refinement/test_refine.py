@@ -231,11 +231,11 @@ def test_a_layer_can_be_a_share_of_the_definitions_layers(frame: FrameOnDisk) ->
 
 
 BAD = [
-    ({"iterations": -1}, UsageError, "negative"),
-    ({"lr": "nan"}, UsageError, "not a step size"),
-    ({"lr": "0"}, UsageError, "not a step size"),
-    ({"lr": "fast"}, UsageError, "not a step size"),
-    ({"holdout": 1.0}, UsageError, "not a fraction"),
+    ({"iterations": -1}, UsageError, "iterations must be a whole number >= 0, got -1"),
+    ({"lr": "nan"}, UsageError, "lr must be a step size above 0"),
+    ({"lr": "0"}, UsageError, "lr must be a step size above 0"),
+    ({"lr": "fast"}, UsageError, "lr must be a step size above 0"),
+    ({"holdout": 1.0}, UsageError, "--holdout must be a fraction"),
     ({"layer": "1.5"}, UsageError, "between 0 and 1"),
     ({"layer": "midle"}, LayerError, "did you mean middle"),
     ({"layer": "unused"}, LayerError, "never runs"),

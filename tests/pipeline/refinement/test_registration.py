@@ -17,9 +17,9 @@ from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.pipeline.batch.request import BatchRequest
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.refine import refine_image
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner, refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest, parse_registration
+from pnpdepth_cli.settings import Settings
 from tests.completion.unregistered import SIZE, UNREGISTERED, frame
 from tests.pipeline.batches import RecordingListener
 from tests.pipeline.frames import FrameOnDisk, run
@@ -94,8 +94,8 @@ def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> Non
     files = write_frame(tmp_path, 0, 800)
     inputs = read_inputs(RefineRequest.from_fields(**files))
     record = refined(tmp_path, frame, count=800, holdout=0.5, seed=3)
-    assert inputs.rgb is not None
-    all_points = evidence(inputs.rgb, inputs.points)
+    assert inputs.image is not None
+    all_points = evidence(inputs.image, inputs.points)
     assert all_points is not None
     whole = estimated([all_points])
     assert whole is not None
@@ -153,7 +153,8 @@ def test_of_frames_that_say_nothing_three_are_read(frame: FrameOnDisk) -> None:
             read.append(number)
             yield few
 
-    refiner = load_refiner(request, inputs).with_registration_of(group())
+    refiner = load_refiner(request, inputs)
+    refiner.share_registration(group())
     assert read == [0, 1, 2]
     assert refiner.registrations == {}
 
@@ -165,8 +166,8 @@ def test_a_batch_leaves_images_where_it_is_told_to(tmp_path: Path, frame: FrameO
 def test_arrays_in_memory_are_registered_too() -> None:
     rgb, points = frame(0, UNREGISTERED)
     network = load_network("compact")
-    with Refiner(network, propagate="none") as auto, Refiner(network, registration="off",
-                                                             propagate="none") as off:  # fmt: skip
+    fixed = Settings(propagate="none")
+    with Refiner(network, fixed) as auto, Refiner(network, fixed, registration="off") as off:
         assert any("moved into the frame" in note for note in auto.refine(rgb, points).notes)
         assert not any("moved into" in note for note in off.refine(rgb, points).notes)
 

@@ -175,7 +175,7 @@ def test_a_pose_with_one_number_that_is_none_is_refused(project: Path, position:
 
 
 def test_an_image_without_points_left_is_one_line(project: Path) -> None:
-    with pytest.raises(NoPointsError, match="relax --min-track or --max-reprojection"):
+    with pytest.raises(NoPointsError, match="relax --colmap min-track or max-reprojection"):
         read(project, max_reprojection=0.1)
 
 
@@ -233,5 +233,5 @@ def test_a_network_of_metres_is_scaled_to_model_units(tmp_path: Path, project: P
 
 
 def test_options_of_a_model_are_refused_for_other_sparse_depth(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"s\.png is no COLMAP model, so --unit-scale"):
+    with pytest.raises(UsageError, match=r"s\.png is no COLMAP model, so --colmap"):
         run(frame_on_disk(tmp_path), colmap=ColmapOptions(unit_scale=1.0))

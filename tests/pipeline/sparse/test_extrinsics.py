@@ -65,7 +65,7 @@ def test_the_extrinsics_are_not_replaced_by_the_output(scene: ScanOnDisk) -> Non
 
 def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> None:
     wrong = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "inverse.txt")
-    with pytest.raises(UsageError, match=r"put 0 of 150 scan .* add --inverse-extrinsics"):
+    with pytest.raises(UsageError, match=r"put 0 of 150 scan .* add --scan inverse-extrinsics"):
         read_scan_points(scene.scan, wrong, (HEIGHT, WIDTH))
     right = ScanOptions(
         calib=scene.calib, extrinsics=scene.folder / "inverse.txt", inverse_extrinsics=True
@@ -97,4 +97,4 @@ def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> 
         assert check_direction(scan, right, (375, 1242)) == []
         assert check_direction(scan, portrait, (1242, 375)) == []
         (warning,) = check_direction(scan, wrong, (375, 1242))
-        assert "if they map the camera to the scanner, add --inverse-extrinsics" in warning
+        assert "if they map the camera to the scanner, add --scan inverse-extrinsics" in warning

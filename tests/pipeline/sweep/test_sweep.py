@@ -24,12 +24,11 @@ from pnpdepth_cli.errors import (
     PnpDepthError,
     UsageError,
 )
+from pnpdepth_cli.frames import refiner as refining
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
-from pnpdepth_cli.pipeline.refinement import load_refiner as refining
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.load_refiner import load_refiner
-from pnpdepth_cli.pipeline.refinement.refine import refine_image
+from pnpdepth_cli.pipeline.refinement.refine import load_refiner, refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of

@@ -16,7 +16,7 @@ pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
 import onnx
 from onnx import helper, numpy_helper
 
-from pnpdepth_cli.core.refine import RefineSettings, refine
+from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.models.aligned import AlignedDepth
@@ -24,6 +24,7 @@ from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph
 from pnpdepth_cli.models.formats.onnx.operators import OPERATORS
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
 from tests.models.formats.onnx.onnx_files import write_network
 from tests.models.weights.files import little
 
@@ -100,7 +101,7 @@ def test_an_inverse_depth_of_either_sign_is_aligned_and_refined(
     depth_of = AlignedDepth(network, points, "auto")
     with Split(network.module, network.definition.layers[0]) as split:
         result = refine(
-            split, (image(1, 3, 32, 48),), points, RefineSettings(iterations=3),
+            split, (image(1, 3, 32, 48),), points, Settings(iterations=3),
             depth_of=depth_of,
         )  # fmt: skip
     assert depth_of.alignment is not None
@@ -124,7 +125,7 @@ def test_fastdepth_reproduces_its_published_prediction_and_is_refined(shared_dat
         xy=torch.stack([chosen % 224, chosen // 224], dim=1).float(),
         depth=gt.flatten()[chosen], size=(224, 224),
     )  # fmt: skip
-    settings = RefineSettings(iterations=5, lr="3%", update="adam")
+    settings = Settings(iterations=5, lr="3%", update="adam")
     with Split(network.module, network.definition.layers[0]) as split:
         result = refine(split, (rgb,), points, settings, depth_of=network.depth_of)
     before, after = (float((d[0, 0] - gt).abs().mean()) for d in (result.before, result.after))

@@ -1,0 +1,351 @@
+"""One method for any number of frames in memory.
+
+This is what `refine`, `batch`, Ray workers and the Python API call; reading and writing are around
+it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from types import MappingProxyType
+
+import torch
+from numpy.typing import ArrayLike
+
+from pnpdepth_cli.completion.image_registration import (
+    Evidence,
+    ImageRegistration,
+    estimated,
+    evidence,
+)
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
+from pnpdepth_cli.frames.arrays import frame_of_arrays
+from pnpdepth_cli.frames.default import check_fixed, refine_default, split_hidden
+from pnpdepth_cli.frames.frame import (
+    METRES,
+    Frame,
+    Refined,
+    Registration,
+    WarmStart,
+    is_dense,
+    no_points,
+    registration_to_make,
+)
+from pnpdepth_cli.frames.fuse import Fusion, Member
+from pnpdepth_cli.frames.refine import OnIteration, refine_frames
+from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
+from pnpdepth_cli.frames.tiles import refine_tiled
+from pnpdepth_cli.frames.uncertainty import uncertainty
+from pnpdepth_cli.frames.warm_start import refine_next
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.models.rank_layers import default_layer
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
+
+COMPANION = "compact"
+"""The network that is fused with the user's, where there is an image."""
+UPDATES = 5
+"""Most updates of z in the default method. More fit what propagation fits anyway."""
+HIDDEN_POINT_STEPS = 40
+"""Most steps by hidden points; of dense points the network's own number."""
+_TRIED = 3
+"""After so many frames that say nothing of the registration, no more are read."""
+
+
+class Refiner:
+    """Refines frames with one network, or several that are fused; a context manager.
+
+    The networks stay cut open from frame to frame and are as before when it closes. What their
+    definitions leave open (such as the RGB range of an ONNX file) is decided by the first frame.
+
+    Args:
+        network: From `load_network`; several are fused by the default method.
+        settings: What is left open, the network decides. With any setting of the method, `network`
+            alone is refined by it; without, by the default method.
+        uncertainty: Whether the standard deviation of the depth is estimated too.
+        check: Whether the result is checked at hidden points also with a fixed method.
+        registration: Whether images are moved into the frame of the points: "auto", if their depth
+            edges show that they are not registered; "off"; or by (zoom, right, down), pixels.
+
+    Raises:
+        UsageError: The settings contradict each other.
+    """
+
+    def __init__(
+        self,
+        network: Network | Sequence[Network],
+        settings: Settings | None = None,
+        *,
+        uncertainty: bool = False,
+        check: bool = False,
+        registration: Registration = "auto",
+    ) -> None:
+        self._networks = (network,) if isinstance(network, Network) else tuple(network)
+        self.asked = settings or Settings()
+        self.is_default = not self.asked.fixed_by
+        self._uncertainty, self._check = uncertainty, check or uncertainty
+        self._register = registration_to_make(registration, self.asked)
+        self.members: tuple[Member, ...] = ()
+        self.registrations: Mapping[tuple[int, int], ImageRegistration | None] = MappingProxyType(
+            {}
+        )
+        self._stack = ExitStack()
+        self._opened: Split | Fusion | None = None
+        of_weights = self.asked.masked or self.asked.moves_weights
+        if self.asked.time_budget_s is not None and not (self.is_default or of_weights):
+            raise UsageError(
+                f"--time-budget caps steps by hidden points, but {self.asked.fixed_by} makes none"
+            )
+        if len(self._networks) > 1 and not self.is_default:
+            raise UsageError(
+                f"several --model are fused, but {self.asked.fixed_by} fixes one network"
+            )
+        if self._check and of_weights:
+            raise UsageError(
+                "--baselines and --uncertainty go with updates of z; leave out --target and"
+                " --set parameters"
+            )
+
+    def __enter__(self) -> Refiner:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Restores the networks."""
+        self._opened = None
+        self._stack.close()
+
+    @property
+    def network(self) -> Network:
+        """The user's network; with nothing left open after `decide`."""
+        return self.members[0].network
+
+    @property
+    def layer(self) -> str:
+        """Where the user's network is cut."""
+        return self.members[0].layer
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the user's network, with nothing left open."""
+        return self.members[0].settings
+
+    @property
+    def split(self) -> Split | None:
+        """The user's network, cut and open; None with the default method, or while closed."""
+        return self._opened if isinstance(self._opened, Split) else None
+
+    def refine(self, image: ArrayLike | None, sparse: ArrayLike | SparsePoints) -> Refined:
+        """Returns one frame of arrays refined.
+
+        Args:
+            image: RGB (H, W, 3), uint8, uint16, or float in 0..1. None for a network that takes
+                sparse depth only.
+            sparse: Depth map (H, W) in metres with 0 for unknown, rows (N, 3) of x, y and depth
+                (pixel centres at whole numbers), or SparsePoints.
+
+        Raises:
+            InputError: Image or points cannot be used.
+            DivergedError: The loss became non-finite; `last_good` is the Refined before that.
+        """
+        refined = self.refine_frame(frame_of_arrays(image, sparse, self._register))
+        refined = replace(refined, notes=(*self.network.notes, *refined.notes))
+        if refined.diverged is not None:
+            raise DivergedError(str(refined.diverged), refined)
+        return refined
+
+    def refine_frame(
+        self, frame: Frame, *, on_iteration: OnIteration = lambda done, loss: None
+    ) -> Refined:
+        """Returns one frame refined, the same whatever was refined before.
+
+        Raises:
+            PnpDepthError: The frame cannot be refined.
+        """
+        frame, opened = self._begun(frame)
+        if isinstance(opened, Fusion):
+            seconds, seed = self.asked.time_budget_s, self.asked.seed
+            until = None if seconds is None else time.monotonic() + seconds
+            refined = refine_default(opened, frame, seed=seed, until=until)
+        else:
+            refined = self._fixed(opened, frame, on_iteration)
+            if self._check:
+                refined = self._checked(opened, frame, refined, on_iteration)
+        if self._uncertainty:
+            estimate = uncertainty(refined)
+            refined = replace(
+                refined,
+                sigma=estimate.sigma,
+                valid=estimate.valid,
+                notes=(*refined.notes, estimate.note),
+            )
+        return _finished(refined, frame)
+
+    def refine_next(self, frame: Frame, carried: WarmStart) -> Refined:
+        """Returns one frame of a window, which may begin where the frame before ended.
+
+        Raises:
+            PnpDepthError: The frame cannot be refined.
+        """
+        frame, split = self._begun(frame)
+        assert isinstance(split, Split)
+        refined = refine_next(
+            self.network, split, self.settings, frame, carried, propagation=self.settings.propagate
+        )
+        return _finished(refined, frame)
+
+    def refine_together(self, group: Sequence[Frame]) -> list[Refined | PnpDepthError]:
+        """Returns frames of one size refined in one pass; an error in place of a failed frame.
+
+        Raises:
+            BatchError: The network does not take them together.
+        """
+        frames, split = [self._begun(frame)[0] for frame in group], self.split
+        assert split is not None
+        refined = refine_frames(
+            self.network, split, self.settings, frames, propagation=self.settings.propagate
+        )
+        return [
+            _finished(result, frame) if isinstance(result, Refined) else result
+            for result, frame in zip(refined, frames, strict=True)
+        ]
+
+    def decide(self, frame: Frame, more: Callable[[], Sequence[Frame]] = tuple) -> Refiner:
+        """Decides once what definitions leave open, and returns this refiner.
+
+        Args:
+            frame: The first frame.
+            more: Gives further frames, which decide as well; called only if a network needs it.
+
+        Raises:
+            UsageError: The settings contradict each other.
+            ModelError: A network cannot be used.
+        """
+        if self.members:
+            return self
+        first = frame.registered()
+        networks = [
+            resolve_definition(network, first, lambda: [each.registered() for each in more()])
+            for network in self._networks
+        ]
+        named = {network.definition.name for network in networks}
+        if self.is_default and first.rgb is not None and COMPANION not in named:
+            device, precision = str(networks[0].device), networks[0].precision
+            companion = load_network(COMPANION, None, device, precision=precision)
+            networks.append(resolve_definition(companion, first))
+        self.members = tuple(
+            self._member(network, first, self.asked if number == 0 else Settings())
+            for number, network in enumerate(networks)
+        )
+        return self
+
+    def share_registration(self, frames: Iterable[Frame]) -> None:
+        """Decides the registration that images of one size share, by all these frames together.
+
+        Images of the size of the first one decide. A frame of another size decides alone.
+        """
+        usable = list[Evidence]()
+        for read, frame in enumerate(frames, 1):
+            if frame.image is not None and frame.register == "auto":
+                known = evidence(frame.image, frame.points)
+                usable += [] if known is None else [known]
+            if read == _TRIED and not usable:  # such as scans, none of which will tell
+                break
+        if usable:
+            self.registrations = MappingProxyType({usable[0].size: estimated(usable)})
+
+    def _begun(self, frame: Frame) -> tuple[Frame, Split | Fusion]:
+        """The frame as it is refined, and the networks, open."""
+        self.decide(frame)
+        torch.manual_seed(self.asked.seed)
+        if frame.register == "auto" and frame.size in self.registrations:
+            frame = replace(frame, register=self.registrations[frame.size])
+        if self._opened is None:
+            network: Split | Fusion
+            if self.is_default:
+                network = Fusion(self.members)
+            elif self.settings.masked:
+                network = self.network.cut_at_points()
+            else:
+                network = self.network.cut_at(self.layer)
+            self._stack.enter_context(network)
+            self._opened = network
+        return frame.registered(), self._opened
+
+    def _member(self, network: Network, frame: Frame, asked: Settings) -> Member:
+        """A network, where it is cut, and its settings."""
+        definition, layer, dense = network.definition, asked.layer, is_dense(frame.points)
+        if layer is None and asked.preset is None and not asked.masked:
+            layer = default_layer(network, frame.size, len(frame.points))
+        layer = resolve_layer(definition, layer)
+        settings = resolve_settings(definition, asked, metric=frame.unit == METRES, dense=dense)
+        member = Member(network=network, layer=layer, settings=replace(settings, layer=layer))
+        return self._of_default(member, dense) if self.is_default else member
+
+    def _of_default(self, member: Member, dense: bool) -> Member:
+        """The network as the default method refines it.
+
+        A network whose output is metric is aligned too, where the points say that it should be. Of
+        networks that take the points, only those made for fusion, with a prior, are updated.
+        """
+        definition, settings = member.network.definition, member.settings
+        iterations = min(settings.iterations, UPDATES)
+        if not member.takes_points and settings.align == "none":
+            settings = replace(settings, align="auto")
+        if member.takes_points and not member.takes_prior:
+            iterations = 0
+        hidden_points = None
+        if self.asked.time_budget_s is not None and member.takes_points:
+            hidden_points = resolve_settings(definition, Settings(target="masked"), dense=dense)
+            if not dense:
+                hidden_points = replace(hidden_points, iterations=HIDDEN_POINT_STEPS)
+        settings = replace(settings, iterations=iterations)
+        return replace(member, settings=settings, hidden_points=hidden_points)
+
+    def _fixed(self, split: Split, frame: Frame, on_iteration: OnIteration) -> Refined:
+        """The frame refined by the fixed method."""
+        settings = self.settings
+        if settings.tile is not None:
+            return refine_tiled(
+                self.network, split, settings, frame, settings.tile,
+                propagation=settings.propagate, on_iteration=on_iteration,
+            )  # fmt: skip
+        (refined,) = refine_frames(
+            self.network, split, settings, (frame,),
+            propagation=settings.propagate, on_iteration=on_iteration,
+        )  # fmt: skip
+        if isinstance(refined, PnpDepthError):
+            raise refined
+        return refined
+
+    def _checked(
+        self, split: Split, frame: Frame, refined: Refined, on_iteration: OnIteration
+    ) -> Refined:
+        """The refined frame with the fixed method's check, for which it is run again.
+
+        It is returned as it is where its points are too few or the method fails.
+        """
+        parts = split_hidden(frame.points, self.asked.seed)
+        if parts is None:
+            return refined
+        kept, hidden = parts
+        try:
+            again = self._fixed(split, frame.with_points(kept), on_iteration)
+        except PnpDepthError:
+            return refined
+        return replace(refined, check=check_fixed(refined, again, hidden, kept))
+
+
+def _finished(refined: Refined, frame: Frame) -> Refined:
+    """The refined frame with what was decided before it was refined."""
+    notes = refined.notes
+    if frame.registration is not None:
+        notes = (f"image: moved into the frame of the points by {frame.registration}", *notes)
+    held_out = no_points(frame.points) if frame.held_out is None else frame.held_out
+    return replace(refined, held_out=held_out, registration=frame.registration, notes=notes)

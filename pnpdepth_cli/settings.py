@@ -1,0 +1,387 @@
+"""The settings of refinement, declared once, and how a field becomes an option.
+
+A network's definition, the command line, the Python API, `sweep` and the records have the same
+type, `Settings`. Imports neither numpy nor torch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from numbers import Integral, Real
+from typing import Any, NoReturn
+
+from pnpdepth_cli import choices
+from pnpdepth_cli.errors import UsageError
+
+LARGEST_SEED = 2**32 - 1
+_KEY = "option"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    """How a sweep shows a field that it can vary."""
+
+    title: str
+    title_percent: str = ""
+    """Title where the values are given in per cent."""
+    log: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Option:
+    """What the command line says of a field."""
+
+    help: str
+    flag: str | None = None
+    """None: the field's name with dashes."""
+    within: str | None = None
+    """Flag of the option that takes this field as NAME=VALUE. None: it has an option of its own."""
+    choices: Collection[str] | None = None
+    metavar: str | None = None
+    least: int | None = None
+    most: int | None = None
+    parse: Callable[[str], Any] | None = None
+    """Converts the text of the command line. None: by the field's type."""
+    value_if_bare: str | None = None
+    """Value of the option where none follows. None: one has to."""
+    show_default: bool = False
+    axis: Axis | None = None
+    """None: a sweep does not vary the field."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptionField:
+    """A field with its option."""
+
+    name: str
+    type: str
+    """Type of the value as it is written, without "| None"; of several, the last."""
+    default: Any
+    option: Option
+
+    @property
+    def flag(self) -> str:
+        """Spelling on the command line, such as `--lr` or `--set blur`."""
+        if self.option.within is not None:
+            return f"{self.option.within} {self.name_within}"
+        return self.option.flag or f"--{self.name_within}"
+
+    @property
+    def name_within(self) -> str:
+        """The field's name with dashes, as another option takes it."""
+        return self.name.replace("_", "-")
+
+    @property
+    def placeholder(self) -> str:
+        """What stands for the value in a help text."""
+        names = self.option.choices
+        return self.option.metavar or ("|".join(names) if names else self.type.upper())
+
+
+def option(default: Any, help: str, **details: Any) -> Any:
+    """Returns a dataclass field that the user can set.
+
+    Args:
+        default: Default of the field.
+        help: Help text of the command line.
+        **details: Other fields of `Option`.
+    """
+    return field(default=default, metadata={_KEY: Option(help=help, **details)})
+
+
+def options_of(group: type) -> Iterator[OptionField]:
+    """Yields the fields of a dataclass that were made by `option`, in their order."""
+    for declared in fields(group):
+        if _KEY in declared.metadata:
+            yield OptionField(
+                name=declared.name,
+                type=str(declared.type).removesuffix(" | None").rpartition(" | ")[2],
+                default=declared.default,
+                option=declared.metadata[_KEY],
+            )
+
+
+def parse_seconds(text: str) -> float:
+    """Returns the seconds of `5`, `5s` or `500ms`. Raises UsageError for any other text."""
+    number, unit = (text[:-2], 1e-3) if text.endswith("ms") else (text.removesuffix("s"), 1.0)
+    try:
+        seconds = float(number) * unit
+    except ValueError:
+        seconds = -1.0
+    if not 0 < seconds < math.inf:
+        raise UsageError(f"time budget {text!r} is not a duration; give seconds, such as 5s")
+    return seconds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Where a network is cut, what is updated and how, and what follows.
+
+    A field at its default is open: the user's settings come first, then those of the network's
+    definition, then the paper's (`PAPER`). The types are those of settings with nothing open.
+
+    Raises:
+        UsageError: A value is out of range.
+    """
+
+    preset: str | None = option(
+        None,
+        "paper: the paper's setting and nothing else.  [default: the networks refined, fused and"
+        " propagated]",
+        choices=choices.PRESETS,
+    )
+    layer: str | None = option(
+        None,
+        "Layer to cut at: the name of a submodule (NAME#2: its second call, NAME[KEY]: one of its"
+        " outputs), or a fraction of the network's depth, 0 the shallowest layer.",
+        metavar="NAME|0..1",
+        axis=Axis(title="layer cut at (0 first, 1 last)"),
+    )
+    iterations: int = option(
+        None,
+        "Number of updates; 0 is no refinement.",
+        metavar="K",
+        axis=Axis(title="updates"),
+    )
+    lr: float | str = option(
+        None,
+        "Step size: absolute, or % of the std of z.",
+        metavar="NUMBER|P%",
+        parse=str,
+        axis=Axis(title="step", title_percent="step (% of the deviation of z)", log=True),
+    )
+    loss: str = option(
+        None, "Loss at the sparse points.", choices=choices.LOSSES, axis=Axis(title="loss")
+    )
+    update: str = option(
+        None,
+        "Update rule; another than the network's resets lr, schedule and blur.",
+        choices=choices.UPDATES,
+        axis=Axis(title="update rule"),
+    )
+    schedule: str = option(
+        None,
+        "Step size over the updates; linear and cosine decay to 0.",
+        within="--set",
+        choices=choices.SCHEDULES,
+        axis=Axis(title="schedule of the step"),
+    )
+    blur: float = option(
+        None,
+        "Blur the gradient over S times the spacing of the points; 0 is off.",
+        within="--set",
+        metavar="S",
+        axis=Axis(title="blur of the gradient (spacings of the points)"),
+    )
+    target: str = option(
+        "given",
+        "Take the loss at the points that the network was given, or at points hidden from its"
+        " input, others at every step.",
+        choices=choices.TARGETS,
+        show_default=True,
+        axis=Axis(title="points of the loss"),
+    )
+    parameters: str = option(
+        None,
+        "What is updated: elements of z, a scale and a shift of its channels, the weights behind"
+        " the cut, or low-rank additions to them, lora:R.  [default: elements; weights with"
+        " --target masked]",
+        within="--set",
+        metavar="|".join((*choices.PARAMETERS, "weights", "lora:R")),
+        axis=Axis(title="what is updated"),
+    )
+    mask: str = option(
+        None,
+        "With --target masked: hide single points, blocks of the frame, or scan lines.",
+        within="--set",
+        choices=choices.MASKS,
+        axis=Axis(title="what is hidden"),
+    )
+    mask_fraction: float = option(
+        None,
+        "With --target masked: the fraction of the points hidden at every step.",
+        within="--set",
+        metavar="F",
+        axis=Axis(title="hidden fraction of the points"),
+    )
+    mask_scale: float = option(
+        None,
+        "With --target masked: reduce the image to this fraction of its sides during the updates;"
+        " 0.5 takes a third of the time.",
+        within="--set",
+        metavar="F",
+        axis=Axis(title="scale of the image during the updates"),
+    )
+    proximity: float = option(
+        0.0,
+        "Add W times the mean squared change of log depth to the loss.",
+        within="--set",
+        metavar="W",
+        axis=Axis(title="weight of staying near the network"),
+    )
+    line_search: bool = option(
+        False, "Undo updates that raise the loss and halve the step.", within="--set"
+    )
+    keep_best: bool = option(
+        False, "Return the depth with the lowest loss, not the last.", within="--set"
+    )
+    align: str = option(
+        None,
+        "Fit the network's output to the points by scale, or scale and shift."
+        "  [default: the network's own]",
+        choices=choices.ALIGNMENTS,
+        axis=Axis(title="alignment"),
+    )
+    align_every: bool = option(False, "Repeat the alignment at every update of z.", within="--set")
+    propagate: str = option(
+        None,
+        "Propagate the residuals at the points to all pixels: Gaussian process or edge-aware"
+        " diffusion.  [default: none, with other options of the method]",
+        choices=("none", *choices.PROPAGATIONS),
+        axis=Axis(title="propagation of the residual"),
+    )
+    tile: int | None = option(
+        None,
+        "Refine larger frames in overlapping tiles of this side length, to save memory.",
+        metavar="PIXELS",
+        least=64,
+    )
+    time_budget_s: float | None = option(
+        None,
+        "Time of a frame, such as 30s: networks that take the points make steps by points hidden"
+        " from their input while it lasts. No step begins that would not end in time.",
+        flag="--time-budget",
+        metavar="SECONDS",
+        parse=parse_seconds,
+    )
+    seed: int = option(
+        0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
+    )
+
+    def __post_init__(self) -> None:
+        for name, names in _NAMES.items():
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, str) and value in names):
+                _refuse(name, f"one of {', '.join(names)}", value)
+        for name, (valid, wanted) in _CHECKS.items():
+            value = getattr(self, name)
+            if value is not None and not valid(value):
+                _refuse(name, wanted, value)
+        if self.lr is not None and not str(self.lr).strip().endswith("%"):
+            object.__setattr__(self, "lr", float(self.lr))  # one spelling of a step
+
+    @property
+    def moves_weights(self) -> bool:
+        """Whether weights of the network are updated instead of z."""
+        return self.parameters not in (None, *choices.PARAMETERS)
+
+    @property
+    def masked(self) -> bool:
+        """Whether the loss is taken at points hidden from the network's input."""
+        return self.target == "masked"
+
+    @property
+    def gives_best(self) -> bool:
+        """Whether the result is the depth of the lowest loss; with a line search it always is."""
+        return self.keep_best or self.line_search
+
+    @property
+    def fixed_by(self) -> str:
+        """The options that fix the method, as the user gives them; empty for the default one."""
+        given = self.given()
+        flags = {each.name: each.flag for each in options_of(Settings)}
+        if self.preset is not None:
+            flags["preset"] += f" {self.preset}"
+        return " ".join(flags[name] for name in given if name not in _NOT_OF_METHOD)
+
+    def with_preset(self) -> Settings:
+        """Returns these settings, and those of the preset where these are open."""
+        return self if self.preset is None else self.over(PAPER.opened(*_OF_MASKS))
+
+    def given(self) -> dict[str, Any]:
+        """Returns the fields that are not open."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: value for name, value in values.items() if value != _OPEN[name]}
+
+    def opened(self, *names: str) -> Settings:
+        """Returns these settings with the fields of these names open."""
+        return Settings(**{k: v for k, v in self.given().items() if k not in names})
+
+    def over(self, others: Settings) -> Settings:
+        """Returns these settings, and the others' where these are open."""
+        return replace(others, **self.given())
+
+    def complete(self) -> Settings:
+        """Returns these settings, and the paper's where these are open."""
+        return self.over(PAPER)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_step(value: object) -> bool:
+    try:
+        return 0 < float(str(value).strip().removesuffix("%")) < math.inf
+    except ValueError:
+        return False
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
+
+
+def _is_weight(value: Any) -> bool:
+    return _is_number(value) and value >= 0
+
+
+def _refuse(name: str, wanted: str, value: object) -> NoReturn:
+    raise UsageError(f"{name.replace('_', '-')} must be {wanted}, got {value!r}")
+
+
+_NAMES: Mapping[str, Collection[str]] = {
+    "preset": choices.PRESETS,
+    "loss": choices.LOSSES,
+    "update": choices.UPDATES,
+    "schedule": choices.SCHEDULES,
+    "target": choices.TARGETS,
+    "mask": choices.MASKS,
+    "align": choices.ALIGNMENTS,
+    "propagate": ("none", *choices.PROPAGATIONS),
+}
+
+_CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
+    "layer": (lambda value: isinstance(value, str), "the name of a layer, or a fraction as text"),
+    "iterations": (_is_whole, "a whole number >= 0"),
+    "lr": (_is_step, "a step size above 0, or a text such as '3%'"),
+    "blur": (_is_weight, ">= 0"),
+    "parameters": (lambda value: isinstance(value, str), "the name of what is updated"),
+    "mask_fraction": (lambda value: _is_number(value) and 0 < value < 1, "between 0 and 1"),
+    "mask_scale": (lambda value: _is_number(value) and 0 < value <= 1, "above 0 and at most 1"),
+    "proximity": (_is_weight, ">= 0"),
+    "seed": (_is_whole, "a whole number >= 0"),
+}
+"""Whether a value of the field is valid, and what it must be."""
+
+_NOT_OF_METHOD = ("time_budget_s", "seed")
+_OF_MASKS = ("mask", "mask_fraction", "mask_scale")
+
+_OPEN = {each.name: each.default for each in fields(Settings)}
+
+PAPER = Settings(
+    iterations=5,
+    lr=0.01,
+    loss="l1",
+    update="sign",
+    schedule="constant",
+    blur=0.0,
+    parameters="elements",
+    mask="points",
+    mask_fraction=0.5,
+    mask_scale=1.0,
+    align="none",
+    propagate="none",
+)
+"""Wang et al., ICRA 2019, equations 2 and 3, with α, K, U and L of section IV; nothing is open."""

@@ -1,0 +1,86 @@
+"""Settings: what is open, what wins, and which values are refused."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pnpdepth_cli.core.step_sizes import step_size
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.settings import PAPER, Settings
+
+NAN, INF = math.nan, math.inf
+
+
+def test_what_is_left_open_is_the_papers() -> None:
+    assert Settings().complete() == PAPER
+    paper = (PAPER.iterations, PAPER.lr, PAPER.loss, PAPER.update, PAPER.align)
+    assert paper == (5, 0.01, "l1", "sign", "none")
+    assert Settings(iterations=3, blur=0.0).given() == {"iterations": 3, "blur": 0.0}
+
+
+def test_the_first_settings_win_and_a_field_can_be_opened_again() -> None:
+    user, network = Settings(lr="3%", blur=0.0), Settings(lr=0.5, blur=2.0, loss="log")
+    assert user.over(network) == Settings(lr="3%", blur=0.0, loss="log")
+    assert user.over(network).opened("blur") == Settings(lr="3%", loss="log")
+
+
+def test_a_preset_gives_way_to_what_is_given_beside_it() -> None:
+    preset = Settings(preset="paper", iterations=2).with_preset()
+    assert preset.complete() == Settings(preset="paper", iterations=2).over(PAPER)
+    assert Settings(iterations=2).with_preset() == Settings(iterations=2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "by"),
+    [
+        (Settings(), ""),
+        (Settings(seed=3, time_budget_s=5.0), ""),
+        (Settings(iterations=2, keep_best=True), "--iterations --set keep-best"),
+        (Settings(tile=128), "--tile"),
+        (Settings(preset="paper", iterations=2), "--preset paper --iterations"),
+    ],
+)
+def test_any_setting_of_the_method_fixes_it(settings: Settings, by: str) -> None:
+    assert settings.fixed_by == by
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *(("iterations", value) for value in ("5", -1, 2.0)),
+        *(("lr", value) for value in ("x%", "", 0, -1, NAN, INF, "inf")),
+        *((field, value) for field in ("blur", "proximity") for value in (-1, NAN, INF, "1")),
+        *((field, "foo") for field in ("preset", "loss", "update", "schedule", "align", "mask")),
+        *(("mask_fraction", value) for value in (0, 1, 1.5)),
+        *(("mask_scale", value) for value in (0, 1.5)),
+        ("align", ["auto"]),
+        ("layer", 3),
+        ("seed", -1),
+    ],
+)
+def test_a_value_that_refinement_could_not_use_is_refused_by_its_name(
+    field: str, value: Any
+) -> None:
+    with pytest.raises(UsageError, match=f"^{field.replace('_', '-')} must be .*, got "):
+        Settings(**{field: value})
+
+
+@pytest.mark.parametrize("lr", ["x%", "", "0%", "3 %", "3%", "0.5", 0.1, 1, True])
+def test_those_steps_are_taken_that_refinement_takes(lr: Any) -> None:
+    try:
+        step = step_size(lr, torch.arange(8.0))
+    except UsageError:
+        with pytest.raises(UsageError, match="lr must be"):
+            Settings(lr=lr)
+    else:
+        assert step_size(Settings(lr=lr).lr, torch.arange(8.0)) == step
+
+
+def test_numbers_of_numpy_are_as_good_and_a_step_has_one_spelling() -> None:
+    assert Settings(lr=np.float32(0.5), iterations=np.int32(3)).iterations == 3  # type: ignore[arg-type]
+    assert Settings(lr="1e-2") == Settings(lr=0.01)
