@@ -8,12 +8,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.core.metrics import Measure
 
 Style = Literal["", "bold", "dim", "good", "bad"]
 

@@ -223,7 +223,7 @@ def test_ctrl_c_at_the_very_end_keeps_the_exit_code() -> None:
 
 @POSIX
 def test_little_memory_ends_with_code_6_or_works(tmp_path: Path) -> None:
-    line = f"ulimit -v 400000; pnpdepth refine {SAMPLES}/indoor/rgb.png --sparse {GT} -o out"
+    line = f"ulimit -v 300000; pnpdepth refine {SAMPLES}/indoor/rgb.png --sparse {GT} -o out"
     done = shell(line, tmp_path)
     assert done.returncode == 6, done.stderr
     assert "Traceback" not in done.stderr

@@ -58,12 +58,10 @@ def test_the_users_options_override_the_definition() -> None:
     assert resolve_settings(STRANGER, replace(METHOD, blur=0)).blur == 0
 
 
-@pytest.mark.parametrize("command", [refine, batch, sweep])
+@pytest.mark.parametrize("command", [refine, batch])
 def test_names_and_values_reach_the_settings(command: click.Command) -> None:
     arguments = ["a", "-o", "b", "--set", "blur=2,keep-best", "--set", "mask-scale=0.5"]
-    arguments += {"refine": ["--sparse", "s"], "sweep": ["--vary", "points=1"]}.get(
-        str(command.name), []
-    )
+    arguments += ["--sparse", "s"] if command is refine else []
     values = taken(Settings, dict(command.make_context("command", arguments).params))
     assert (values["blur"], values["keep_best"], values["mask_scale"]) == (2.0, True, 0.5)
     assert "line_search" not in values

@@ -123,8 +123,8 @@ def test_depth_is_read_in_metres_where_it_is_valid(name: str, tmp_path: Path) ->
     known = inputs.gt > 0
     np.testing.assert_allclose(inputs.gt[known], 2, rtol=1e-3)
     np.testing.assert_allclose(inputs.points.depth, 2, rtol=1e-3)
-    assert inputs.rgb is not None
-    assert inputs.rgb.shape[:2] == inputs.gt.shape == inputs.points.size
+    assert inputs.image is not None
+    assert inputs.image.shape[:2] == inputs.gt.shape == inputs.points.size
     expected = HEIGHT * WIDTH // (2 if name in ("diode", "ibims") else 1)
     assert int(known.sum()) == expected
     assert not known[:, WIDTH // 2 :].any() or name not in ("diode", "ibims")

@@ -6,6 +6,7 @@ import os
 import shutil
 import threading
 import weakref
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -288,14 +289,14 @@ def test_a_folder_that_cannot_be_read_is_reported_and_left_out(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (root / "rgb/locked").mkdir()
-    scandir = os.scandir
+    entries = Path.iterdir
 
-    def scan(path: Any) -> Any:
-        if str(path).endswith("locked"):
+    def iterdir(path: Path) -> Iterator[Path]:
+        if path.name == "locked":
             raise PermissionError(13, "Permission denied", str(path))
-        return scandir(path)
+        return entries(path)
 
-    monkeypatch.setattr(os, "scandir", scan)
+    monkeypatch.setattr(Path, "iterdir", iterdir)
     listener = RecordingListener()
     assert batch(root, listener).summary["counts"]["done"] == 4
     assert any("locked cannot be read (permission denied)" in text for text in listener.messages)

@@ -66,7 +66,7 @@ def test_a_photo_with_exif_rotation_is_read_as_colmap_reads_it(
         exif = image.getexif()
         exif[0x0112] = orientation
         image.save(photo, exif=exif)
-    turned = refine(frame_on_disk(tmp_path), project)
+    turned = refine(frame_on_disk(tmp_path), project, output=tmp_path / "turned")
     assert turned["size"] == plain["size"] == [WIDTH, HEIGHT]
     assert turned["points"] == plain["points"]
     assert "image: EXIF rotation not applied, as COLMAP reads the photo" in turned["notes"]

@@ -24,9 +24,9 @@ from pnpdepth_cli.errors import (
     PnpDepthError,
     UsageError,
 )
-from pnpdepth_cli.frames import refiner as refining
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
+from pnpdepth_cli.pipeline.refinement import refine as refining
 from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.pipeline.refinement.refine import load_refiner, refine_image
 from pnpdepth_cli.pipeline.refinement.request import RefineRequest
