@@ -39,11 +39,11 @@ from benchmarks.frames import (
     without_occluded,
 )
 from pnpdepth_cli.choices import BASELINES
+from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.frames.frame import DepthMap, is_dense
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.frames.uncertainty import uncertainty
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.settings import PAPER, Settings
 
 MASKED = Settings(target="masked")

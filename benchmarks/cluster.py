@@ -21,10 +21,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from pnpdepth_cli.commands.batch.batch import run_batch
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.batch.batch import run_batch
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 LINKS = 50_000
 """Hard links of a file; ext4 allows 65,000."""
@@ -117,13 +117,13 @@ def measured(program: str, *arguments: str) -> dict[str, float]:
 PLAN = """
 import sys; from pathlib import Path
 from benchmarks.cluster import request_of
-from pnpdepth_cli.pipeline.batch.batch import plan_batch
+from pnpdepth_cli.commands.batch.batch import plan_batch
 assert not plan_batch(request_of(Path(sys.argv[1])), lambda text: None)
 """
 RESUME = """
 import sys; from pathlib import Path
 from benchmarks.cluster import Quiet, request_of
-from pnpdepth_cli.pipeline.batch.batch import run_batch
+from pnpdepth_cli.commands.batch.batch import run_batch
 counts = run_batch(request_of(Path(sys.argv[1])), Quiet()).summary["counts"]
 assert counts["done"] == counts["frames"], counts
 """

@@ -29,10 +29,10 @@ from torch import Tensor, nn
 
 from benchmarks.frames import print_row
 from benchmarks.hand_cuts import ZOO, Case
+from pnpdepth_cli.commands.bench import in_turn, peak_mb
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.precision import lower
-from pnpdepth_cli.pipeline.bench import in_turn, peak_mb
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import PAPER
 

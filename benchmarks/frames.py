@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.batch.frames import registering
+from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.completion.image_registration import estimated, evidence
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.frame import Refined, tensor_of
@@ -20,8 +22,6 @@ from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.pipeline.batch.frames import registering
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Points, occluded_in_map
 from pnpdepth_cli.settings import Settings

@@ -183,13 +183,13 @@ FORMATS = Table(
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
 EXPORTS = Table(
-    "pipeline/exports",
+    "commands/exports",
     "EXPORT",
     group="exports",
     noun="export",
     first=("colmap", "nerfstudio", "gaussian-splatting"),
 )
-"""Files for reconstruction programs: `pnpdepth_cli.pipeline.exports.Export`."""
+"""Files for reconstruction programs: `pnpdepth_cli.commands.exports.Export`."""
 
 PROPAGATIONS = Table(
     "completion/propagations",
@@ -254,13 +254,13 @@ LENSES = (
 """Lens distortions: `pnpdepth_cli.sensors.lens`."""
 
 EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
-"""Published protocols of scoring depth: `pnpdepth_cli.pipeline.evaluation.protocols.PROTOCOLS`."""
+"""Published protocols of scoring depth: `pnpdepth_cli.commands.evaluation.protocols.PROTOCOLS`."""
 
 PLOT_FORMATS = ("png", "svg", "pdf")
 """Files that `sweep` plots to."""
 
 MEASURE_GROUPS = Table(
-    "pipeline/evaluation/measures",
+    "commands/evaluation/measures",
     group="measures",
     noun="group of measures",
     names=("area", "cloud", "distance", "edges", "flicker", "normals"),
@@ -277,7 +277,7 @@ MISSING = ("skip", "min", "max", "fail")
 """Empty predictions are not scored, scored as the lower or the upper bound, or refused."""
 
 SCALINGS = ("none", "median", "affine", "affine-disparity", "log")
-"""How the prediction of an image is scaled to its ground truth: `pipeline.evaluation.scaling`."""
+"""How the prediction of an image is scaled to its ground truth: `commands.evaluation.scaling`."""
 
 PREDICTION_KINDS = ("depth", "disparity")
 """What the files of a prediction hold."""

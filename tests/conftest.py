@@ -11,7 +11,7 @@ import torch
 from hypothesis import settings
 
 if TYPE_CHECKING:
-    from tests.pipeline.frames import FrameOnDisk
+    from tests.commands.frames import FrameOnDisk
 
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.load_profile("steady")
@@ -38,7 +38,7 @@ def shared_data() -> Path:
 @pytest.fixture
 def frame(tmp_path: Path) -> FrameOnDisk:
     """A small frame and a small network on disk, in tmp_path."""
-    from tests.pipeline.frames import frame_on_disk
+    from tests.commands.frames import frame_on_disk
 
     return frame_on_disk(tmp_path)
 

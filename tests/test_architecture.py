@@ -27,8 +27,8 @@ MAY_IMPORT = {
     "completion": {*GROUND_FLOOR, "core"},
     "models": {*GROUND_FLOOR, "core", "completion"},
     "frames": {*GROUND_FLOOR, "core", "completion", "models"},
-    "pipeline": {*GROUND_FLOOR, "core", "completion", "models", "frames", "sensors", "io"},
-    "cli": {*GROUND_FLOOR, "pipeline"},
+    "commands": {*GROUND_FLOOR, "core", "completion", "models", "frames", "sensors", "io"},
+    "cli": {*GROUND_FLOOR, "commands"},
     "api": {*GROUND_FLOOR, "core", "models", "frames"},
 }
 

@@ -11,8 +11,8 @@ import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.pipeline.adapt_request import AdaptRequest
-from pnpdepth_cli.pipeline.refinement.request import parse_sample
+from pnpdepth_cli.commands.adapt_request import AdaptRequest
+from pnpdepth_cli.commands.refinement.request import parse_sample
 
 
 @click.command(short_help="Adapt a network to the sparse points of a folder.")
@@ -42,7 +42,7 @@ def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **value
     the smallest loss at its hidden points are written, with a model card beside them.
     """
     from pnpdepth_cli.cli.progress import progress_bar
-    from pnpdepth_cli.pipeline.adapt import adapt as adapt_network
+    from pnpdepth_cli.commands.adapt import adapt as adapt_network
 
     own = options.taken(AdaptRequest, values)
     refine = options.request_of(values, sample=parse_sample(sample))

@@ -17,10 +17,10 @@ import click
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.streams import INTERRUPTED
+from pnpdepth_cli.commands.batch.request import BatchRequest, ClusterOptions, SequenceOptions
+from pnpdepth_cli.commands.refinement.request import parse_sample
+from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import FramesFailedError, StorageError
-from pnpdepth_cli.pipeline.batch.request import BatchRequest, ClusterOptions, SequenceOptions
-from pnpdepth_cli.pipeline.refinement.request import parse_sample
-from pnpdepth_cli.pipeline.sparse.options import BagOptions
 
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
@@ -92,8 +92,8 @@ def batch(
     missing or whose settings or files have changed. OUTPUT/summary.json and OUTPUT/summary.csv list
     all frames; the record NAME.json beside a result says how it was made.
     """
-    from pnpdepth_cli.pipeline.batch.bags import unpacked
-    from pnpdepth_cli.pipeline.batch.batch import plan_batch
+    from pnpdepth_cli.commands.batch.bags import unpacked
+    from pnpdepth_cli.commands.batch.batch import plan_batch
 
     own = options.taken(BatchRequest, values)
     own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, values))
@@ -122,7 +122,7 @@ def _run(request: BatchRequest, as_json: bool) -> int:
     """Runs the batch and prints its summary. Returns the exit code."""
     from pnpdepth_cli.cli.progress import BatchProgress
     from pnpdepth_cli.cli.tables import print_batch, print_profile
-    from pnpdepth_cli.pipeline.batch.batch import run_batch
+    from pnpdepth_cli.commands.batch.batch import run_batch
 
     with BatchProgress() as progress, _finishing_on_interrupt() as stopped:
         try:

@@ -14,7 +14,7 @@ from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.pipeline.bench import Bench
+    from pnpdepth_cli.commands.bench import Bench
 
 
 @click.command(
@@ -75,7 +75,7 @@ def bench(size: str | None, table: bool, as_json: bool, **values: Any) -> None:
             )
         _table(as_json, **values)
         return
-    from pnpdepth_cli.pipeline.bench import BenchRequest, run_bench
+    from pnpdepth_cli.commands.bench import BenchRequest, run_bench
 
     request = BenchRequest(size=options.height_and_width(size) if size else None, **values)
     with progress_bar("bench", "round") as show:
@@ -118,7 +118,7 @@ def _print(result: Bench) -> None:
 def _table(as_json: bool, **values: Any) -> None:
     """Prints the times of the paper's networks: full size, random weights, K = 5."""
     from pnpdepth_cli.cli.tables import print_rows
-    from pnpdepth_cli.pipeline.bench import PAPER_TIMES, BenchRequest, run_bench
+    from pnpdepth_cli.commands.bench import PAPER_TIMES, BenchRequest, run_bench
 
     results = []
     with progress_bar("bench", "network") as show:

@@ -70,7 +70,7 @@ def cloud(as_json: bool, **values: Any) -> None:
     The cloud is in the camera's frame (x right, y down, z forward), with poses in the world's.
     Pixels that NAME_valid.png beside NAME_depth excludes are left out.
     """
-    from pnpdepth_cli.pipeline.cloud import CloudRequest, write_depth_cloud
+    from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
 
     record = write_depth_cloud(CloudRequest(**values))
     if as_json:

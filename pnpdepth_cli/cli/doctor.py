@@ -14,7 +14,7 @@ def doctor(as_json: bool) -> None:
 
     Paste the output into a bug report. It contains no names of files or users.
     """
-    from pnpdepth_cli.pipeline.doctor import examine
+    from pnpdepth_cli.commands.doctor import examine
 
     report = examine()
     if as_json:

@@ -205,13 +205,13 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     eigen, garg   0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
     """
     from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
-    from pnpdepth_cli.pipeline.evaluation import tables
-    from pnpdepth_cli.pipeline.evaluation.evaluate import EvalRequest
-    from pnpdepth_cli.pipeline.evaluation.evaluate import evaluate as run_evaluation
-    from pnpdepth_cli.pipeline.evaluation.frame_reading import Scales
-    from pnpdepth_cli.pipeline.evaluation.protocols import choose_protocol
-    from pnpdepth_cli.pipeline.report import evaluation as report_eval
-    from pnpdepth_cli.pipeline.tables import chosen_measures
+    from pnpdepth_cli.commands.evaluation import tables
+    from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest
+    from pnpdepth_cli.commands.evaluation.evaluate import evaluate as run_evaluation
+    from pnpdepth_cli.commands.evaluation.frame_reading import Scales
+    from pnpdepth_cli.commands.evaluation.protocols import choose_protocol
+    from pnpdepth_cli.commands.report import evaluation as report_eval
+    from pnpdepth_cli.commands.tables import chosen_measures
 
     files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
     files.check((prediction, ground_truth))

@@ -9,8 +9,7 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.pipeline.refinement.request import (
+from pnpdepth_cli.commands.refinement.request import (
     FrameFiles,
     HoldOut,
     NetworkChoice,
@@ -18,7 +17,8 @@ from pnpdepth_cli.pipeline.refinement.request import (
     RefineRequest,
     parse_file,
 )
-from pnpdepth_cli.pipeline.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import LARGEST_SEED, OptionField, Settings, options_of
 
 FILE = click.Path(path_type=Path)
@@ -114,7 +114,7 @@ def options_of_groups(
     """Returns a decorator that adds the options of these groups of a request to a command.
 
     Args:
-        *groups: Dataclasses of `pnpdepth_cli.pipeline.refinement.request`.
+        *groups: Dataclasses of `pnpdepth_cli.commands.refinement.request`.
         without: Names of fields that are left out.
     """
 

@@ -59,7 +59,7 @@ def refine(as_json: bool, **values: Any) -> None:
     (blue better, orange worse) and <name>.json.
     """
     from pnpdepth_cli.cli.tables import print_refinement
-    from pnpdepth_cli.pipeline.refinement.refine import refine_image
+    from pnpdepth_cli.commands.refinement.refine import refine_image
 
     request = options.request_of(values)
     with progress_bar("refine", "update") as show:

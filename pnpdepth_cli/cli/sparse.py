@@ -12,7 +12,7 @@ import click
 from pnpdepth_cli.choices import PATTERNS, SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.pipeline.sparse.options import BagOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
 
 _seed = click.option(
     "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Random seed."
@@ -47,7 +47,7 @@ def project(
     Points behind the camera, outside the image, behind another point in their pixel, or occluded by
     the foreground are dropped and counted. A JSON file beside the output records the settings.
     """
-    from pnpdepth_cli.pipeline.sparse.make import SparseTarget, project_scan
+    from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 
     target = SparseTarget(output=output, overlay=overlay, overwrite=overwrite)
     height_and_width = options.height_and_width(size) if size else None
@@ -113,7 +113,7 @@ def sample(
 
     The settings, with the seed, are stored in the file (PNG, CSV) and in a JSON file beside it.
     """
-    from pnpdepth_cli.pipeline.sparse import make
+    from pnpdepth_cli.commands.sparse import make
 
     values["scale"] = values.pop("depth_scale")
     target = make.SparseTarget(output=output, overwrite=overwrite)
@@ -175,7 +175,7 @@ def simulate(
                     rotation_noise_deg = 0.1   of the whole scanner
                     dropout = 0.05             fraction of lost beams
     """
-    from pnpdepth_cli.pipeline.sparse.make import SparseTarget, simulate_scan
+    from pnpdepth_cli.commands.sparse.make import SparseTarget, simulate_scan
 
     values["scale"] = values.pop("depth_scale")
     target = SparseTarget(output=output, overwrite=overwrite)
@@ -207,7 +207,7 @@ def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
     BAG is a file of ROS 1 (.bag) or ROS 2 (.mcap, .db3), or a folder that ROS 2 recorded. OUTPUT
     gets rgb/, sparse/ (PLY), calib.txt from camera_info and tf_static, and poses.txt from odometry.
     """
-    from pnpdepth_cli.pipeline.sparse.frames import FramesRequest, write_frames
+    from pnpdepth_cli.commands.sparse.frames import FramesRequest, write_frames
 
     bag_options = BagOptions(**options.taken(BagOptions, values))
     request = FramesRequest(bag=bag, output=output, options=bag_options, **values)

@@ -12,10 +12,10 @@ from pnpdepth_cli.choices import PLOT_FORMATS
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.cli.streams import INTERRUPTED
+from pnpdepth_cli.commands.batch.request import FrameSelection
+from pnpdepth_cli.commands.refinement.request import FrameFiles, NetworkChoice
+from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.errors import FramesFailedError, StorageError
-from pnpdepth_cli.pipeline.batch.request import FrameSelection
-from pnpdepth_cli.pipeline.refinement.request import FrameFiles, NetworkChoice
-from pnpdepth_cli.pipeline.sparse.options import ScanOptions
 
 _SCAN_DETAILS = ("inverse_extrinsics", "euclidean", "keep_occluded", "point_fields")
 """A scan that needs these is projected first."""
@@ -122,9 +122,9 @@ def sweep(
     per table (extra pnpdepth[plot]), and sweep.jsonl (the journal). Run again, also with other
     values, only missing values are computed.
     """
-    from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS, read_axis, studies_of, values_of
-    from pnpdepth_cli.pipeline.sweep.points import read_sampling
-    from pnpdepth_cli.pipeline.sweep.sweep import SweepRequest, run_sweep
+    from pnpdepth_cli.commands.sweep.axes import PARAMETERS, read_axis, studies_of, values_of
+    from pnpdepth_cli.commands.sweep.points import read_sampling
+    from pnpdepth_cli.commands.sweep.sweep import SweepRequest, run_sweep
 
     fixed = dict(text.partition("=")[::2] for text in settings)
     method = values_of(fixed, of_points=False)

@@ -16,8 +16,8 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.commands.tables import Cell, Table, write_text
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.pipeline.tables import Cell, Table, write_text
 
 _COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.pipeline.batches import pairs_on_disk
+from tests.commands.batches import pairs_on_disk
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from tests.cli.test_commands import code_of, refine
-from tests.pipeline.frames import FrameOnDisk
+from tests.commands.frames import FrameOnDisk
 
 
 def test_an_unaligned_network_is_aligned_and_recorded(

@@ -16,7 +16,7 @@ from pnpdepth_cli.cli import progress
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.io.layouts import PROTOCOLS
 from tests.cli.test_commands import code_of
-from tests.pipeline.batches import pairs_on_disk, results
+from tests.commands.batches import pairs_on_disk, results
 
 PROGRAM = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
 

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from pnpdepth_cli.pipeline import bench as bench_table
+from pnpdepth_cli.commands import bench as bench_table
 from tests.cli.test_commands import code_of
-from tests.pipeline.frames import FrameOnDisk
+from tests.commands.frames import FrameOnDisk
 
 
 def bench(frame: FrameOnDisk, *more: str) -> list[str]:

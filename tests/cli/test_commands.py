@@ -11,7 +11,7 @@ import pytest
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.cli.options import request_of
 from pnpdepth_cli.cli.refine import refine as refine_command
-from tests.pipeline.frames import FrameOnDisk
+from tests.commands.frames import FrameOnDisk
 
 
 def code_of(arguments: list[str]) -> int:
@@ -177,7 +177,7 @@ def test_ctrl_c_ends_with_130_and_one_line(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pnpdepth_cli.pipeline.refinement.refine.read_inputs", interrupted)
+    monkeypatch.setattr("pnpdepth_cli.commands.refinement.refine.read_inputs", interrupted)
     assert code_of(refine(frame)) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "pnpdepth: interrupted"
 

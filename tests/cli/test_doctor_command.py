@@ -11,7 +11,7 @@ import torch
 from click.testing import CliRunner
 
 from pnpdepth_cli.cli.doctor import doctor
-from pnpdepth_cli.pipeline import doctor as pipeline_doctor
+from pnpdepth_cli.commands import doctor as commands_doctor
 
 
 def test_the_report_has_versions_devices_extras_and_a_refined_plane() -> None:
@@ -36,13 +36,13 @@ def test_a_missing_extra_is_named_with_its_packages(monkeypatch: pytest.MonkeyPa
         "requires",
         lambda _: ["torch>=2.4", 'no-such-package>=1; extra == "plot"', 'pytest; extra == "test"'],
     )
-    report = pipeline_doctor.examine()
+    report = commands_doctor.examine()
     assert report["packages"] == [f"torch {metadata.version('torch')}"]
     assert report["extras"] == ["plot: not installed (no-such-package)"]
 
 
 def test_a_self_test_that_fails_ends_with_code_1(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline_doctor, "_self_test", lambda: "FAILED: the depth is wrong")
+    monkeypatch.setattr(commands_doctor, "_self_test", lambda: "FAILED: the depth is wrong")
     result = CliRunner().invoke(doctor)
     assert result.exit_code == 1
     assert "self-test   FAILED: the depth is wrong" in result.output

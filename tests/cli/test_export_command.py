@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from pnpdepth_cli.cli.export import export as command
 from pnpdepth_cli.cli.main import cli
-from tests.pipeline.test_export import project, results
+from tests.commands.test_export import project, results
 
 
 def test_frames_are_counted_and_warnings_go_to_stderr(tmp_path: Path) -> None:

@@ -12,11 +12,11 @@ from pnpdepth_cli.cli.batch import batch
 from pnpdepth_cli.cli.options import taken
 from pnpdepth_cli.cli.refine import refine
 from pnpdepth_cli.cli.sweep import sweep
+from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.sweep.axes import PARAMETERS
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
-from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS
 from pnpdepth_cli.settings import PAPER, Settings, options_of
 from tests.core.networks import UNet
 

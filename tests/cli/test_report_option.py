@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.test_score_commands import code_of
-from tests.pipeline.report_pages import frames_of
+from tests.commands.report_pages import frames_of
 
 BATCH = (
     *("batch", "drive", "-o", "out", "--model", "drive/net/my_net.py"),

@@ -16,9 +16,9 @@ import pytest
 
 from pnpdepth_cli.choices import EVAL_PROTOCOLS
 from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.pipeline.evaluation.protocols import PROTOCOLS
-from tests.pipeline.frames import frame_on_disk
+from tests.commands.frames import frame_on_disk
 
 
 def code_of(*arguments: str | Path) -> int:

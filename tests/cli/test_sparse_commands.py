@@ -8,8 +8,8 @@ import pytest
 
 from pnpdepth_cli.choices import PATTERNS, SENSORS
 from tests.cli.test_commands import code_of
-from tests.pipeline.frames import frame_on_disk
-from tests.pipeline.scan_frames import ScanOnDisk, scan_on_disk
+from tests.commands.frames import frame_on_disk
+from tests.commands.scan_frames import ScanOnDisk, scan_on_disk
 
 
 @pytest.fixture

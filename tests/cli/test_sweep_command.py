@@ -10,7 +10,7 @@ import pytest
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.sweep import sweep
-from pnpdepth_cli.pipeline.sweep.axes import PARAMETERS
+from pnpdepth_cli.commands.sweep.axes import PARAMETERS
 from tests.cli.test_commands import code_of
 
 
@@ -134,7 +134,7 @@ def test_an_empty_folder_and_frames_without_truth_are_input_errors(
 def test_ctrl_c_prints_how_to_continue_and_exits_130(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pnpdepth_cli.pipeline.sweep import running as sweep_running
+    from pnpdepth_cli.commands.sweep import running as sweep_running
 
     own, calls = sweep_running.refined, []
 

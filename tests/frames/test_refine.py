@@ -17,7 +17,7 @@ from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
-from tests.pipeline.frames import frame_on_disk
+from tests.commands.frames import frame_on_disk
 
 SETTINGS = Settings(iterations=4, lr="5%", update="adam")
 

@@ -23,7 +23,7 @@ from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
-from tests.pipeline.frames import frame_on_disk
+from tests.commands.frames import frame_on_disk
 
 CPU = torch.device("cpu")
 PLAIN = Settings(iterations=0)

@@ -26,7 +26,7 @@ from pnpdepth_cli.io.report import (
     visible,
     write_report,
 )
-from tests.pipeline.report_pages import page_data
+from tests.commands.report_pages import page_data
 
 LABELS = {"first": "Before", "second": "After", "map": "Change"}
 HEAD = Head(kind="Test", title="a report", labels=LABELS)

@@ -20,8 +20,8 @@ from pnpdepth_cli.io.report import (
     save_views,
     write_report,
 )
-from tests.pipeline.batches import add_frame, batch, pairs_on_disk
-from tests.pipeline.report_pages import frames_of, page_data
+from tests.commands.batches import add_frame, batch, pairs_on_disk
+from tests.commands.report_pages import frames_of, page_data
 
 pytest.importorskip("selenium", reason="needs selenium")
 

@@ -13,8 +13,8 @@ from PIL import Image
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.report import VIEWER
-from tests.pipeline.batches import batch, pairs_on_disk
-from tests.pipeline.report_pages import page_data
+from tests.commands.batches import batch, pairs_on_disk
+from tests.commands.report_pages import page_data
 
 pytest.importorskip("selenium", reason="needs selenium")
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from pnpdepth_cli.commands.networks.layers import list_layers
+from pnpdepth_cli.commands.refinement.request import NetworkChoice
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.models import rank_layers as rank
 from pnpdepth_cli.models.network import Network, load_network
@@ -21,8 +23,6 @@ from pnpdepth_cli.models.rank_layers import (
     rank_layers,
     wanted_field,
 )
-from pnpdepth_cli.pipeline.networks.layers import list_layers
-from pnpdepth_cli.pipeline.refinement.request import NetworkChoice
 from pnpdepth_cli.sensors import as_depth_image, occluded_in_map
 from tests.sensors.test_projected_map import boards_before_a_wall
 

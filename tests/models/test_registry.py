@@ -8,9 +8,9 @@ import pytest
 
 import model_zoo_defs
 from pnpdepth_cli import choices
+from pnpdepth_cli.commands.networks.list_models import list_models
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.registry import DEFAULT_MODEL, families, find_definition, names
-from pnpdepth_cli.pipeline.networks.list_models import list_models
 
 
 def test_every_known_name_has_a_definition_of_that_name() -> None:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.refinement.inputs import read_inputs
+from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
+from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.commands.sparse.scans import camera_of
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.request import FrameFiles, RefineRequest
-from pnpdepth_cli.pipeline.sparse.options import ScanOptions
-from pnpdepth_cli.pipeline.sparse.scans import camera_of
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     Camera,

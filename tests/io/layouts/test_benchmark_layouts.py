@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.commands.batch.frames import task_of
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.commands.refinement.request import RefineRequest, sample_pattern
 from pnpdepth_cli.errors import FileFormatError, SizeError
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.dataset.reading import masked, moved_to
 from pnpdepth_cli.io.layouts import list_frames, read_frames
-from pnpdepth_cli.pipeline.batch.frames import task_of
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest, sample_pattern
 
 HEIGHT, WIDTH = 24, 32
 

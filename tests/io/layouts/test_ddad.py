@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.commands.batch.frames import find_frames, task_of
+from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
+from pnpdepth_cli.commands.refinement.inputs import read_inputs
+from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.layouts import find_layout, list_frames
-from pnpdepth_cli.pipeline.batch.frames import find_frames, task_of
-from pnpdepth_cli.pipeline.batch.request import BatchRequest, SequenceOptions
-from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 FORWARD = {"qw": 0.5, "qx": -0.5, "qy": 0.5, "qz": -0.5}
 """Of a camera that looks along the world's x axis."""

@@ -12,9 +12,9 @@ import pytest
 from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.layouts import find_layout, list_frames, read_frames
+from tests.commands.frames import frame_on_disk
+from tests.commands.scan_frames import HEIGHT, WIDTH, scan_on_disk
 from tests.empty_files import touch, tree
-from tests.pipeline.frames import frame_on_disk
-from tests.pipeline.scan_frames import HEIGHT, WIDTH, scan_on_disk
 
 DRIVE = "2011_09_26_drive_0002_sync"
 

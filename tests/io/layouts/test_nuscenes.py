@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.commands.batch.frames import task_of
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.settings import settings_of
+from pnpdepth_cli.commands.refinement.inputs import read_inputs
+from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.layouts import find_layout, list_frames
-from pnpdepth_cli.pipeline.batch.frames import task_of
-from pnpdepth_cli.pipeline.batch.request import BatchRequest
-from pnpdepth_cli.pipeline.batch.settings import settings_of
-from pnpdepth_cli.pipeline.refinement.inputs import read_inputs
-from pnpdepth_cli.pipeline.refinement.request import RefineRequest
 
 FORWARD_TO_CAMERA = [0.5, -0.5, 0.5, -0.5]
 """w x y z of a camera that looks along the car's x axis."""

@@ -1,0 +1,343 @@
+"""`pnpdepth batch`: refines all frames of a folder or a list, except those done already."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+
+from pnpdepth_cli.commands.batch.frames import Task, find_frames, source_files, task_of
+from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions, ray_workers_of
+from pnpdepth_cli.commands.batch.sequence import in_windows, note_of_poses
+from pnpdepth_cli.commands.batch.settings import model_identity, settings_of
+from pnpdepth_cli.commands.batch.state import BatchState, Row, remove_all_leftovers
+from pnpdepth_cli.commands.batch.summary import (
+    CSV,
+    JSON,
+    Tally,
+    failed_row,
+    profile_of,
+    write_summaries,
+)
+from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.lock import in_turn, locked_folder
+from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote.store import upload
+from pnpdepth_cli.io.report import remove_report_leftovers
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.commands.report.batch import BatchReport
+
+Result = TypeVar("Result")
+_MAX_LISTED = 5
+"""Files named in messages; the rest is counted, and summary.json lists all."""
+_READERS = 8
+"""Threads that read records, whose time on network storage is waiting."""
+_PART = 256
+"""Records that a thread reads at once."""
+
+
+class Listener(Protocol):
+    """Receives the progress of a batch."""
+
+    def say(self, text: str) -> None:
+        """Receives a note or a warning, one line."""
+
+    def begin(self, to_do: int) -> None:
+        """Called once the network is loaded, with the number of frames to do."""
+
+    def frame(self, row: Row) -> None:
+        """Called with the summary's row of each frame that is done or has failed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchOutcome:
+    """How a batch ended."""
+
+    summary: dict[str, Any]
+    """The contents of summary.json without its frames."""
+    stopped: bool
+    """True if it was stopped before all frames were done."""
+
+
+class Planned(NamedTuple):
+    """A frame that is to be done, and why, such as "new" or "other settings"."""
+
+    name: str
+    why: str
+
+
+def run_batch(
+    request: BatchRequest, listener: Listener, stopped: Callable[[], bool] = lambda: False
+) -> BatchOutcome:
+    """Refines every frame that is to be done; one that fails has a row that says why.
+
+    Args:
+        request: What to refine, and how.
+        listener: Receives notes and the rows of frames.
+        stopped: Asked before each frame; True ends the batch.
+
+    Raises:
+        PnpDepthError: For what concerns all frames, such as a network that cannot be loaded, or a
+            full disk.
+    """
+    batch = _Batch(request, listener.say)
+    with ExitStack() as stack:
+        local = batch.opened_output(stack)
+        to_do = [frame for frame, _ in batch.to_do(check=not request.refine.outputs.overwrite)]
+        batch.state.mark()
+        if batch.report is not None:
+            batch.report.begin()
+        began, refined, start = 0, 0, time.perf_counter()
+        seconds = Counter[str]()
+        if to_do:
+            with closing(batch.rows(to_do, listener, stopped)) as rows:
+                for row in rows:
+                    listener.frame(row)
+                    began += 1
+                    refined += row["status"] != "failed"
+                    seconds.update(row.get("seconds") or {})
+        profile = profile_of(seconds, refined, time.perf_counter() - start)
+        with in_turn(local):  # so the summary of the shard that ends last stays
+            summary = batch.summarise(local, profile)
+    for note in summary.get("unsure", ()):
+        listener.say(f"warning: {note}")
+    return BatchOutcome(summary=summary, stopped=began < len(to_do))
+
+
+def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planned]:
+    """Returns the frames that `run_batch` would do, and why; nothing is written."""
+    batch = _Batch(request, say)
+    return [Planned(frame.name, why) for frame, why in batch.to_do(check=False)]
+
+
+class _Batch:
+    """The frames of a batch, and what its output folder holds of them.
+
+    Args:
+        request: As of `run_batch`.
+        say: Receives what was assumed, and warnings of files that are in no frame.
+    """
+
+    def __init__(self, request: BatchRequest, say: Callable[[str], None]) -> None:
+        self.workers = ray_workers_of(request.refine.network.device, request.cluster)
+        if self.workers is not None:
+            refine = request.refine.with_fields(device=self.workers.device)
+            request = replace(request, refine=refine)
+        if self.workers is not None and request.sequence.warm_start:
+            raise UsageError(
+                "--warm-start refines frames in order, in one process; give each process a --shard"
+                " of the windows instead of --ray"
+            )
+        self.request, self._say, self.found = request, say, find_frames(request)
+        self.model = model_identity(request.refine)
+        self.report = self._report()
+        for note in self._notes():
+            say(note)
+        self.state = self._new_state()
+
+    def _new_state(self) -> BatchState:
+        """The state as it is now; what changes later in a folder is not seen."""
+        return BatchState(self.request.output, self.model)
+
+    def _report(self) -> BatchReport | None:
+        """The report, if one is wanted. OutputError if it cannot or may not be written there."""
+        request = self.request
+        if request.html is None:
+            return None
+        if isinstance(request.output, RemotePath) or isinstance(request.html, RemotePath):
+            raise UsageError("--html needs local folders; give a local -o and a local folder")
+        from pnpdepth_cli.commands.report.batch import BatchReport
+
+        report = BatchReport(
+            folder=request.html,
+            output=request.output,
+            view_3d=request.html_3d,
+            colors=request.refine.outputs.colors,
+        )
+        files = (path for frame in self.found.frames for path in source_files(frame))
+        inputs = [request.source, *(files if request.html.exists() else ())]
+        report.check(inputs, overwrite=request.refine.outputs.overwrite)
+        return report
+
+    def _notes(self) -> Iterator[str]:
+        request, frames, unmatched = self.request, self.found.frames, self.found.unmatched
+        with_gt = sum(frame.gt is not None for frame in frames)
+        guessed = " (guessed; --layout names another)" if request.layout is None else ""
+        count = _count(len(frames), "frame")
+        yield f"layout: {self.found.layout}{guessed}: {count}, {with_gt:,} with ground truth"
+        cut = sorted({f.protocol.name for f in frames if f.protocol.halved or f.protocol.crop})
+        if cut and request.protocol is None:
+            yield f"protocol: {', '.join(cut)} cuts the frames; --protocol whole keeps all of them"
+        if poses := note_of_poses(frames):
+            yield poses
+        if request.limit is not None:
+            yield f"limit: the first {request.limit:,} of them"
+        if request.shard is not None:
+            number, of = request.shard
+            yield f"shard {number}/{of}: {_count(len(self.found.chosen), 'frame')} of them"
+        for frame, why in self.found.refused:
+            yield f"failed: {frame.name}: {why}"
+        for each in unmatched[:_MAX_LISTED]:
+            yield f"warning: {each}"
+        if (more := len(unmatched) - _MAX_LISTED) > 0:
+            yield f"warning: {more:,} more files are in no frame; summary.json lists them"
+
+    def opened_output(self, stack: ExitStack) -> Path:
+        """Returns the output folder, locked; of one in a store, a local one for the summaries."""
+        output, report = self.request.output, self.report
+        if isinstance(output, RemotePath):
+            return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pnpdepth-")))
+
+        def clean() -> None:
+            leftovers = remove_all_leftovers(output)
+            leftovers += 0 if report is None else remove_report_leftovers(report.folder)
+            if leftovers:
+                self._say(f"removed {leftovers:,} half-written files of a run that was killed")
+
+        make_folder(output)
+        stack.enter_context(locked_folder(output, self.request.shard, clean))
+        return output
+
+    def to_do(self, *, check: bool) -> list[tuple[Frame, str]]:
+        """Returns the frames that are to be done, and why, and says how many.
+
+        OutputError, if `check`, where a result would replace a file that no batch wrote.
+        """
+        state, chosen = self.state, self.found.chosen
+        if check:
+            state.check_replaceable(self.request.output / name for name in (CSV, JSON))
+
+        def reason(frame: Frame) -> tuple[Frame, str] | None:
+            task = task_of(self.request, frame)
+            why = state.reason_to_refine(task)
+            if why is not None and check:
+                state.check_replaceable(task.outputs.paths(), task.record)
+            return None if why is None else (frame, why)
+
+        to_do = [each for each in _read_in_parts(reason, chosen) if each is not None]
+        kinds = Counter(why.split(":")[0] for _, why in to_do)
+        reasons = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
+        frames, done = _count(len(chosen), "frame"), len(chosen) - len(to_do)
+        if to_do:
+            self._say(f"{frames}: {done:,} done already, {len(to_do):,} to do ({reasons})")
+        else:
+            self._say(f"{frames}, all of them done already")
+        return to_do
+
+    def rows(
+        self, to_do: list[Frame], listener: Listener, stopped: Callable[[], bool]
+    ) -> Generator[Row, None, None]:
+        """Refines frames in this process or on Ray workers; yields a row as each is done."""
+        # these import torch, which a run with nothing to do does not need
+        from pnpdepth_cli.commands.batch.ray_workers import rows_of_workers
+        from pnpdepth_cli.commands.batch.running import opened_network, references_of, refine_tasks
+
+        request, say = self.request, listener.say
+        references = references_of(request, self.found.frames)
+        worked = len(to_do) < len(self.found.chosen)
+        if self.workers is not None:
+            listener.begin(len(to_do))
+            yield from rows_of_workers(
+                request, self.workers, references, to_do, self.state,
+                settings_worked=worked, say=say, stopped=stopped,
+            )  # fmt: skip
+            return
+        with opened_network(request, references, say) as network:
+            listener.begin(len(to_do))
+            yield from refine_tasks(
+                self._tasks(to_do), network, self.state,
+                threads=request.workers, settings_worked=worked, stopped=stopped,
+            )  # fmt: skip
+
+    def _tasks(self, to_do: list[Frame]) -> Iterator[Task]:
+        """The frames to refine in their order, and within windows those that they begin with."""
+        if not self.request.sequence.warm_start:
+            yield from (task_of(self.request, frame) for frame in to_do)
+            return
+        by_name = {frame.name: frame for frame in self.found.frames}
+        for wanted in in_windows(to_do):
+            names = {frame.name for frame in wanted}
+            for each in wanted[-1].window:
+                task = task_of(self.request, by_name[each.name])
+                yield replace(task, written=task.name in names)
+
+    def summarise(self, local: Path, profile: dict[str, Any]) -> dict[str, Any]:
+        """Writes the summaries and the report; returns the summary without its frames."""
+        request, state, tally = self.request, self._new_state(), Tally()
+        refused = (failed_row(frame.name, {}, why) for frame, why in self.found.refused)
+        known = _read_in_parts(lambda frame: state.row(task_of(request, frame)), self.found.frames)
+        with tempfile.TemporaryFile("w+", dir=local, encoding="utf-8") as file:
+            for row in itertools.chain(refused, known):
+                if row is not None:
+                    tally.add(row)
+                    file.write(json.dumps(row) + "\n")
+            summary = self._head(tally)
+            if request.profile:
+                summary["profile"] = profile
+
+            def rows() -> Iterator[Row]:
+                file.seek(0)
+                return map(json.loads, file)
+
+            write_summaries(local, summary, rows(), tally.baseline_names)
+            if self.report is not None:
+                self.report.write(summary, rows)
+        if isinstance(request.output, RemotePath):
+            for name in (CSV, JSON):
+                upload(local / name, request.output / name)
+        return summary
+
+    def _head(self, tally: Tally) -> dict[str, Any]:
+        """The summary without its frames."""
+        request, found = self.request, self.found
+        frames, fixed_by = len(found.frames) + len(found.refused), request.refine.method.fixed_by
+        head = {
+            "command": "batch",
+            "source": str(request.source),
+            "output": str(request.output),
+            "layout": found.layout,
+            "method": {
+                "kind": "fixed" if fixed_by else "default",
+                "reason": fixed_by or "default",
+            },
+            "settings": settings_of(request.refine, self.model),
+            "counts": {
+                "frames": frames,
+                **tally.counts,
+                "pending": frames - tally.counts.total(),
+                "with_warnings": tally.warned,
+            },
+            "unit": tally.unit,
+            "mean": tally.mean(),
+            "linear": tally.mean_linear(),
+            "baselines": tally.mean_baselines(),
+            "unmatched": [str(each) for each in found.unmatched],
+        }
+        if tally.unsure:
+            head["unsure"] = tally.unsure
+        if request.sequence != SequenceOptions():
+            head["sequence"] = plain(asdict(request.sequence))
+        return head
+
+
+def _read_in_parts(work: Callable[[Frame], Result], frames: Sequence[Frame]) -> Iterator[Result]:
+    """Yields the result of each frame in order, computed by threads that take many at once."""
+    starts = range(0, len(frames), _PART)
+    parts = in_order(lambda n: [work(frame) for frame in frames[n : n + _PART]], starts, _READERS)
+    return (each for part in parts for each in part)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"

@@ -1,0 +1,343 @@
+"""Finds the frames of a batch, and the request, inputs and outputs of each. Imports no torch."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import unicodedata
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from pathlib import Path, PurePosixPath
+from typing import TypeVar
+
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.sequence import (
+    check_warm_start,
+    in_windows,
+    with_neighbours,
+    with_windows,
+)
+from pnpdepth_cli.commands.batch.summary import CSV, JSON
+from pnpdepth_cli.commands.refinement.output_files import Outputs
+from pnpdepth_cli.commands.refinement.request import FrameFiles, NeighbourFiles, RefineRequest
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.io.colmap.reading import model_files
+from pnpdepth_cli.io.dataset.frame import (
+    SCAN_ONLY_SUFFIXES,
+    Frame,
+    Source,
+    Unmatched,
+    file_of,
+    name_problem,
+)
+from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
+from pnpdepth_cli.io.lock import LOCKS
+from pnpdepth_cli.io.remote.address import RemotePath
+
+Item = TypeVar("Item")
+REGISTERING = 16
+"""Frames that decide together how images are moved into the frame of the points."""
+
+_LISTS = (".csv", ".jsonl")
+_IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchFrames:
+    """The frames of a batch."""
+
+    layout: str
+    frames: Sequence[Frame]
+    """All frames of the source whose results have files of their own."""
+    chosen: Sequence[Frame]
+    """Those within the limit and the shard."""
+    refused: Sequence[tuple[Frame, str]]
+    """Frames whose results would have no files of their own, and why."""
+    unmatched: tuple[Unmatched, ...]
+    """Files that are in no frame, and why."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One frame to refine."""
+
+    name: str
+    request: RefineRequest
+    """With the frame's files."""
+    inputs: dict[str, Path]
+    """The files that are read for it, by their part."""
+    outputs: Outputs
+    written: bool = True
+    """False for a frame that is refined only because another begins where it ends."""
+
+    @property
+    def record(self) -> Path:
+        """The record of the results, which is the last file that is written."""
+        assert self.outputs.record is not None
+        return self.outputs.record
+
+
+def find_frames(request: BatchRequest) -> BatchFrames:
+    """Returns the frames of the source.
+
+    Raises:
+        InputError: If there is none.
+        UsageError: If none has sparse depth.
+        OutputError: If the output is a file, or holds the frames.
+    """
+    source, output, sequence = request.source, request.output, request.sequence
+    if isinstance(source, RemotePath) and source.suffix not in _LISTS:
+        raise UsageError(
+            f"{source}: folders in a store are not searched for frames; give a list of them"
+            f" ({' or '.join(_LISTS)})"
+        )
+    if isinstance(source, RemotePath) and not source.exists():
+        raise InputError(f"{source}: no such object; check the address")
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output} is a file; name a folder")
+    if source.is_dir() and _is_inside(source, output):
+        raise _holds_the_frames(output)
+    layout, listing = list_frames(source, request.layout)
+    found, unmatched = _outside(output, listing.frames)
+    frames, refused = _with_own_files(found, request.refine)
+    lost = [*listing.broken, *listing.spare]
+    unmatched += [each for each in lost if not _is_inside(each.path, output)]
+    if not found:
+        first = f" ({lost[0]})" if lost else ""
+        raise InputError(
+            f"{source} looks like {layout!r} but has no frame in it{first};"
+            f" layouts are {', '.join(LAYOUTS)}"
+        )
+    if request.refine.files.sample is None and all(frame.sparse is None for frame in found):
+        raise UsageError(
+            f"{source} looks like {layout!r}, which has no sparse depth; --sample 500"
+            " draws so many points from the ground truth"
+        )
+    if sequence.accumulate:
+        frames = with_neighbours(frames, sequence.accumulate, sequence.poses)
+    if sequence.warm_start:
+        check_warm_start(request.refine)
+        frames = with_windows(frames, sequence.warm_start)
+    return BatchFrames(
+        layout=layout,
+        frames=frames,
+        chosen=_chosen(request, frames[: request.limit]),
+        refused=refused,
+        unmatched=tuple(unmatched),
+    )
+
+
+def _chosen(request: BatchRequest, frames: list[Frame]) -> list[Frame]:
+    """The frames of the shard: every N-th, or every N-th window."""
+    number, of = request.shard or (1, 1)
+    if not request.sequence.warm_start:
+        return frames[number - 1 :: of]
+    windows = in_windows(frames)[number - 1 :: of]
+    return [frame for window in windows for frame in window]
+
+
+def task_of(request: BatchRequest, frame: Frame) -> Task:
+    """Returns the frame's task; options of the user go before what the data set states."""
+    refine = request.refine
+    if request.html_3d:
+        refine = refine.with_fields(view_3d=True)
+    needs_camera = refine.outputs.needs_camera or bool(frame.neighbours)
+    files = _files_of(request, frame, needs_camera=needs_camera)
+    neighbours = (
+        NeighbourFiles(
+            files=_files_of(request, each.frame, needs_camera=True),
+            motion=each.motion,
+            poses=each.poses,
+            apart=each.apart,
+        )
+        for each in frame.neighbours
+    )
+    window = tuple(each.name for each in frame.window)
+    files = replace(files, neighbours=tuple(neighbours), window=window)
+    return Task(
+        name=frame.name,
+        request=replace(refine, files=files),
+        inputs=dict(_earlier_files(frame)) | dict(_input_files(files)),
+        outputs=Outputs.in_folder(request.output, frame.name, refine),
+    )
+
+
+def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> FrameFiles:
+    """The files of a frame, without its neighbours and window."""
+    base = request.refine.files
+    sparse = frame.sparse if base.sample is None else None
+    protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
+    gt = frame.gt
+    if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
+        gt = frame.sparse  # points are sampled from the projected scan
+    if frame.calibration is not None:
+        base = replace(base, calibration=frame.calibration)
+    is_scan = _reads_scan(base, sparse, gt)
+    scan = base.scan
+    if is_scan:
+        camera = frame.camera if scan.camera is None else scan.camera
+        scan = replace(scan, calib=scan.calib or frame.calib, camera=camera)
+    return replace(
+        base,
+        image=frame.image,
+        sparse=sparse,
+        gt=gt,
+        camera_file=frame.calib if needs_camera and not is_scan else None,
+        camera_number=frame.camera if scan.camera is None else scan.camera,
+        gt_masks=frame.masks,
+        gt_size_ok=frame.gt_other_size,
+        sparse_size_ok=base.sparse_size_ok or frame.sparse_other_size,
+        sparse_scale=frame.sparse_scale if base.depth_scale is None else None,
+        gt_scale=base.gt_scale or base.depth_scale or frame.gt_scale,
+        scan=scan,
+        protocol=protocol,
+    )
+
+
+def reference_frames(frames: Sequence[Item], first: int) -> list[Item]:
+    """Returns the frames behind the first readable one that decide input ranges with it."""
+    count = len(frames) - first - 1
+    return [frames[first + 1 + i] for i in sorted({count // 2, count - 1})] if count else []
+
+
+def registering(frames: Sequence[Item], first: int) -> list[Item]:
+    """Returns the frames, the first readable one among them, that decide the registration."""
+    count = len(frames) - first
+    chosen = {first + i * (count - 1) // (REGISTERING - 1) for i in range(REGISTERING)}
+    return [frames[i] for i in sorted(chosen)]
+
+
+def _reads_scan(files: FrameFiles, sparse: Path | None, gt: Source | None) -> bool:
+    """Whether one of them is a scan that is projected, which needs the scanner's pose."""
+    suffix, known = "" if sparse is None else sparse.suffix.lower(), files.calibration
+    return (
+        _is_scan_file(gt)
+        or _is_scan_file(sparse)
+        or (suffix == ".npy" and files.scan.calib is not None)
+        or (suffix == ".npz" and known is not None and known.has_pose)
+    )
+
+
+def _is_scan_file(source: Source | None) -> bool:
+    return isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES
+
+
+def source_files(frame: Frame) -> list[Path]:
+    """Returns the files of the frame's image, sparse depth and ground truth."""
+    parts = [frame.image, frame.sparse, frame.gt]
+    return [file_of(part) for part in parts if part is not None]
+
+
+def _input_files(files: FrameFiles) -> Iterator[tuple[str, Path]]:
+    parts = (("image", files.image), ("sparse", files.sparse), ("gt", files.gt))
+    for part, source in parts:
+        path = None if source is None else file_of(source)
+        if path is not None and part == "sparse" and path.is_dir():  # a COLMAP model
+            yield from ((f"sparse {file.name}", file) for file in model_files(path))
+        elif path is not None:
+            yield part, path
+    for each in files.neighbours:
+        points, image = each.files.sparse or each.files.gt, each.files.image
+        if points is not None:
+            path = file_of(points)
+            yield f"sparse of {path.stem}", path
+            if each.motion is None and image is not None:  # the motion is estimated
+                yield f"image of {path.stem}", file_of(image)
+    if files.gt is not None:
+        yield from ((f"mask {number}", path) for number, path in enumerate(files.gt_masks))
+    calib, extrinsics = files.scan.calib or files.camera_file, files.scan.extrinsics
+    if _reads_scan(files, files.sparse, files.gt) and extrinsics is not None:
+        yield "extrinsics", extrinsics
+    if calib is not None and calib.is_dir():
+        yield from ((f"calib {path.name}", path) for path in sorted(calib.glob("calib_*.txt")))
+    elif calib is not None:
+        yield "calib", calib
+
+
+def _earlier_files(frame: Frame) -> Iterator[tuple[str, Path]]:
+    """The files of the frames before in the window, on which this one's result depends."""
+    for each in frame.window[:-1]:
+        for other in (each, *(neighbour.frame for neighbour in each.neighbours)):
+            for number, path in enumerate(source_files(other)):
+                if path.is_file():
+                    yield f"file {number} of {other.name}", path
+
+
+def _outside(output: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list[Unmatched]]:
+    """The frames without a file in the output folder, and the files of the others there."""
+    if not output.exists():
+        return list(frames), []
+    folder, kept, ignored = output.resolve(), list[Frame](), list[Unmatched]()
+    is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
+    for frame in frames:
+        inside = (
+            path
+            for path in source_files(frame)
+            if is_inside(path.parent) or (path.is_symlink() and is_inside(path))
+        )
+        path = next(inside, None)
+        if path is None:
+            kept.append(frame)
+        else:
+            ignored.append(Unmatched(path=path, why=_IN_OUTPUT))
+    if frames and not kept:
+        raise _holds_the_frames(output)
+    return kept, ignored
+
+
+def _with_own_files(
+    frames: Sequence[Frame], refine: RefineRequest
+) -> tuple[list[Frame], list[tuple[Frame, str]]]:
+    """The frames whose results have files of their own, and the others with the reason.
+
+    Names that differ in Unicode normalisation only are one file on macOS.
+    """
+    endings = [path.name for path in Outputs.in_folder(Path(), "", refine).paths()]
+    pairs = itertools.permutations(endings, 2)
+    between = tuple({one.removesuffix(two) for one, two in pairs if one.endswith(two)})
+    of_summary = {own.removesuffix(each) for own in (CSV, JSON) for each in endings}
+    names, seen = {_normalised(frame.name) for frame in frames}, set[str]()
+
+    def problem(name: str) -> str | None:
+        if why := name_problem(name):
+            return why
+        if name in seen:
+            return "is that of another frame"
+        top, slash, _ = name.partition("/")
+        if name in of_summary or (slash and (top in (CSV, JSON) or fnmatch(top, LOCKS))):
+            return "needs a file of the batch's own"
+        if not slash and not name.endswith(between):
+            return None
+        folders = [str(parent) for parent in PurePosixPath(name).parents] if slash else []
+        clashes = itertools.product([name], between), itertools.product(folders, endings)
+        for path, ending in itertools.chain(*clashes):
+            if path.endswith(ending) and path.removesuffix(ending) in names:
+                return f"needs a file of frame {one_line(path.removesuffix(ending))!r}"
+        return None
+
+    kept, refused = list[Frame](), list[tuple[Frame, str]]()
+    for frame in frames:
+        name = _normalised(frame.name)
+        why = problem(name)
+        seen.add(name)
+        if why is None:
+            kept.append(frame)
+        else:
+            refused.append((frame, f"the name {one_line(frame.name)!r} {why}; rename it"))
+    return kept, refused
+
+
+def _normalised(name: str) -> str:
+    return unicodedata.normalize("NFC", name)
+
+
+def _is_inside(path: Path, folder: Path) -> bool:
+    return path.resolve().is_relative_to(folder.resolve())
+
+
+def _holds_the_frames(output: Path) -> OutputError:
+    return OutputError(
+        f"{output} holds the frames themselves; name a folder of its own, such as {output / 'out'}"
+    )

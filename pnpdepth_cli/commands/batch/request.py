@@ -1,0 +1,223 @@
+"""What the user asks of a batch. Imports neither numpy nor torch."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
+from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.settings import option
+
+LOCAL = "local"
+"""The address of a Ray cluster of this machine's devices, which ends with the command."""
+_ADDRESS = re.compile(r"(ray://)?[^/]+:\d+")
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """Returns (I, N) of `I/N`. Raises UsageError for any other text."""
+    number, slash, of = text.partition("/")
+    if not (slash and number.isdecimal() and of.isdecimal()):
+        raise UsageError(f"shard {text!r} is not of the form I/N, such as 1/4")
+    return int(number), int(of)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSelection:
+    """Which frames of a data set are taken, and how each is refined."""
+
+    source: Path
+    """A folder or a list of frames."""
+    output: Path
+    """The folder for the results."""
+    refine: RefineRequest
+    """How a frame is refined; its files, output and protocol are set for each frame."""
+    layout: str | None = option(
+        None, "Layout of the folder.  [default: recognised]", choices=LAYOUTS
+    )
+    protocol: str | None = option(
+        None,
+        "Crop and depth range of the frames.  [default: the layout's own]",
+        choices=FRAME_PROTOCOLS,
+    )
+    limit: int | None = option(None, "Only the first N frames.", metavar="N")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceOptions:
+    """What a frame takes over from its neighbours."""
+
+    accumulate: int = option(
+        0,
+        "Add the points of the N frames before and after, moved by the camera's poses or, without"
+        " poses, by its motion as estimated from images or scans.",
+        metavar="N",
+    )
+    poses: Path | None = option(
+        None,
+        "Camera poses of the frames in their order (KITTI or TUM rows).  [default: the layout's,"
+        " else estimated]",
+        metavar="FILE",
+    )
+    warm_start: int = option(
+        0,
+        "Refine windows of N frames in order, each frame from where the one before ended.",
+        metavar="N",
+    )
+
+    def __post_init__(self) -> None:
+        if self.accumulate < 0:
+            raise UsageError(f"--accumulate must be 0 or more, got {self.accumulate}")
+        if self.warm_start < 0 or self.warm_start == 1:
+            raise UsageError(f"--warm-start must be a window of 2 or more, got {self.warm_start}")
+        if self.poses is not None and not self.accumulate:
+            raise UsageError("--poses is for --accumulate; give --accumulate 2, say")
+
+
+def parse_address(text: str) -> str:
+    """Returns the address of a cluster. Raises UsageError for a text that is none."""
+    if text in (LOCAL, "auto") or _ADDRESS.fullmatch(text):
+        return text
+    raise UsageError(
+        f"{text!r} is no address of a Ray cluster; give --ray=auto, --ray=HOST:PORT, or --ray as"
+        " the last option for this machine"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClusterOptions:
+    """Where frames are computed, if not in this process."""
+
+    ray: str | None = option(
+        None,
+        "Run on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT. Without an address, on all"
+        " devices of this machine. Needs the extra ray.",
+        metavar="[ADDRESS]",
+        parse=parse_address,
+        value_if_bare=LOCAL,
+    )
+    ray_workers: int | None = option(
+        None,
+        "Number of Ray workers.  [default: one per GPU, or per --cpus-per-worker cores]",
+        metavar="N",
+        least=1,
+    )
+    cpus_per_worker: int = option(
+        1, "CPU cores, and threads, of a Ray worker.", metavar="N", least=1, show_default=True
+    )
+    retries: int = option(
+        2,
+        "How often a frame is tried again whose Ray worker died.",
+        metavar="N",
+        least=0,
+        show_default=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchRequest(FrameSelection):
+    """Which frames to refine, and how."""
+
+    workers: int = option(
+        2,
+        "Number of threads that read, and of threads that write.",
+        metavar="N",
+        show_default=True,
+    )
+    html: Path | None = option(
+        None,
+        "Write an HTML report: every frame before and after, the worst first.",
+        metavar="FOLDER",
+    )
+    html_3d: bool = option(
+        False,
+        "With --html: also show every frame as a point cloud, before, after and ground truth; adds"
+        " up to 2.5 MB a frame.",
+    )
+    batch_size: int = option(
+        1,
+        "Frames of one size that go through a fixed network together; more than 1 changes the last"
+        " bits of the results.",
+        metavar="N",
+        show_default=True,
+    )
+    shard: tuple[int, int] | None = option(
+        None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
+    )
+    sequence: SequenceOptions = field(default_factory=SequenceOptions)
+    """What a frame takes over from its neighbours."""
+    profile: bool = option(False, "Print the time spent in each stage.")
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
+    """The Ray workers, if any."""
+
+    def __post_init__(self) -> None:
+        from pnpdepth_cli.io.dataset.protocols import find_protocol
+
+        if self.html_3d and self.html is None:
+            raise UsageError("--html-3d adds to the report; name its folder with --html")
+        counts = {"workers": self.workers, "batch-size": self.batch_size, "limit": self.limit}
+        for name, count in counts.items():
+            if count is not None and count < 1:
+                raise UsageError(f"--{name} must be 1 or more, got {count}")
+        if self.shard is not None and not 1 <= self.shard[0] <= self.shard[1]:
+            number, of = self.shard
+            raise UsageError(
+                f"--shard must be I/N with I from 1 to N, such as 1/4, got {number}/{of}"
+            )
+        if self.protocol is not None:
+            find_protocol(self.protocol)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayWorkers:
+    """The workers that a command asks for."""
+
+    address: str
+    """Of the cluster, or LOCAL."""
+    device: str
+    """Kind of device that every worker computes on: cpu or cuda."""
+    indices: tuple[int, ...] = ()
+    """Which GPUs of this machine; empty for all."""
+    options: ClusterOptions
+    """The user's."""
+
+    @property
+    def each(self) -> str:
+        """What a worker has, in words."""
+        cpus = self.options.cpus_per_worker
+        return "one GPU" if self.device == "cuda" else f"{cpus} CPU core{'s' if cpus > 1 else ''}"
+
+
+def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
+    """Returns the workers asked for; None for this process alone.
+
+    Args:
+        device: As the user names it: one device, several with commas, or "all".
+        options: Of the cluster.
+
+    Raises:
+        UsageError: The devices cannot be spread over.
+    """
+    names = device.split(",")
+    if options.ray is None and len(names) == 1 and device != "all":
+        if options != ClusterOptions():
+            raise UsageError(
+                "--ray-workers, --cpus-per-worker and --retries are of Ray workers; add --ray"
+            )
+        return None
+    kinds = {"cuda" if name == "all" else name.partition(":")[0] for name in names}
+    kind = kinds.pop()
+    if kinds or kind not in ("cpu", "cuda"):
+        raise UsageError(f"device {device!r}: workers run on cpu, cuda, cuda:0,cuda:1 or all")
+    indices = tuple(int(name[5:]) for name in names if name[5:].isdecimal() and kind == "cuda")
+    if len(names) > 1 and len(set(indices)) < len(names):
+        raise UsageError(f"device {device!r}: name each GPU once, such as cuda:0,cuda:1")
+    address = options.ray or LOCAL
+    if indices and address != LOCAL:
+        raise UsageError(
+            f"device {device!r}: GPUs of a cluster have no numbers; take --device cuda, and"
+            f" --ray-workers {len(indices)}"
+        )
+    return RayWorkers(address=address, device=kind, indices=indices, options=options)

@@ -1,0 +1,331 @@
+"""Refines frames: threads read them in advance, the network refines, other threads write.
+
+The network runs only in the calling thread, as it is patched while it is cut. The queues between
+the threads are bounded, so memory does not grow with the number of frames.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+import traceback
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pnpdepth_cli.commands.batch.frames import Task, reference_frames, registering, task_of
+from pnpdepth_cli.commands.batch.reading import read_frame, read_task
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.state import BatchState, Row
+from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.refinement.inputs import Inputs
+from pnpdepth_cli.commands.refinement.refine import load_refiner, write_refined
+from pnpdepth_cli.commands.stopwatch import Stopwatch
+from pnpdepth_cli.errors import (
+    BatchError,
+    InputError,
+    ModelError,
+    PnpDepthError,
+    StorageError,
+    UsageError,
+)
+from pnpdepth_cli.frames.frame import Refined, WarmStart
+from pnpdepth_cli.frames.refiner import Refiner
+from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.fingerprint import Fingerprint
+
+_ROUNDING = 1e-3
+"""A larger relative difference of plain predictions is more than rounding."""
+
+
+class References(NamedTuple):
+    """The frames that decide for all frames of a batch."""
+
+    first: Frame
+    """The first one that can be read."""
+    others: Sequence[Frame]
+    """More frames, for input ranges where the network states none."""
+    registering: Sequence[Frame]
+    """Frames that decide how images are moved into the frame of the points."""
+
+
+def references_of(request: BatchRequest, frames: Sequence[Frame]) -> References | None:
+    """Returns the frames that decide, of all frames, so that every run and shard decides the same.
+
+    Returns:
+        None if no frame can be read.
+    """
+    for number, frame in enumerate(frames):
+        if _readable(task_of(request, frame)) is not None:
+            others = reference_frames(frames, number)
+            return References(frame, others, registering(frames, number))
+    return None
+
+
+@contextmanager
+def opened_network(
+    request: BatchRequest, references: References | None, say: Callable[[str], None]
+) -> Iterator[OpenNetwork | None]:
+    """Yields the network, resolved on the frames that decide, open for any number of frames.
+
+    Args:
+        request: The batch.
+        references: Of `references_of`; None yields None.
+        say: Receives what was decided.
+    """
+    if references is None:
+        yield None
+        return
+    refiner = _load(request, references, say)
+    with refiner:
+        yield OpenNetwork(refiner, request.batch_size, say)
+
+
+def _load(request: BatchRequest, references: References, say: Callable[[str], None]) -> Refiner:
+    task = task_of(request, references.first)
+    first = read_frame(task)
+    for note in first.notes:
+        say(f"{task.name}: {note}")
+
+    def readable(frames: Iterable[Frame]) -> Iterator[Inputs]:
+        read = (_readable(task_of(request, frame)) for frame in frames)
+        return (inputs for inputs in read if inputs is not None)
+
+    others = functools.cache(lambda: [*readable(references.others)])
+    refiner = load_refiner(task.request, first, others)
+    for note in refiner.network.notes:
+        say(note)
+    if first.register == "auto":
+        refiner.share_registration(readable(references.registering))
+        for (height, width), registration in refiner.registrations.items():
+            if registration is not None:
+                say(
+                    f"images of {width}×{height} are moved into the frame of the points by"
+                    f" {registration}; --registration off leaves them"
+                )
+    if refiner.is_default:
+        names = " and ".join(member.network.definition.name for member in refiner.members)
+        say(f"method: the default, with {names}")
+    else:
+        s = refiner.settings
+        say(
+            f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
+            f" updates of z ({s.update}, {s.loss}, step {s.lr})"
+        )
+    return refiner
+
+
+def _readable(task: Task) -> Inputs | None:
+    """The frame's contents; None if it cannot be read, which is reported later.
+
+    UsageError if an option is wrong, for all frames.
+    """
+    try:
+        return read_frame(task)
+    except UsageError:
+        raise
+    except Exception:
+        return None
+
+
+@dataclass(kw_only=True)
+class FrameInMemory:
+    """A frame on its way through the network."""
+
+    task: Task
+    inputs: Inputs | None = None
+    fingerprints: dict[str, Fingerprint] = field(default_factory=dict)
+    watch: Stopwatch = field(default_factory=Stopwatch)
+    result: Refined | Exception | None = None
+    """An error that occurred while it was read or refined. None before."""
+
+
+def refine_tasks(
+    tasks: Iterable[Task],
+    network: OpenNetwork | None,
+    state: BatchState,
+    *,
+    threads: int,
+    settings_worked: bool,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Generator[Row, None, None]:
+    """Refines and writes each task; yields the summary's row of each, in their order.
+
+    Args:
+        tasks: The frames to refine.
+        network: The network; None if no frame could be read.
+        state: Writes the results.
+        threads: Number of threads that read, and of threads that write.
+        settings_worked: True if a frame was refined with these settings before.
+        stopped: True if no further frame is to be begun.
+
+    Raises:
+        StorageError: When nothing more can be written.
+        ModelError: For an error of the network before any frame was refined.
+        UsageError: For an error of the settings before any frame was refined.
+    """
+
+    def refined(reading: Iterable[FrameInMemory]) -> Iterator[FrameInMemory]:
+        worked = settings_worked
+        for group in _groups(reading, network):
+            if stopped():
+                return
+            _refine(group, network)
+            for frame in group:
+                worked |= isinstance(frame.result, Refined)
+                fatal = StorageError if worked else (StorageError, ModelError, UsageError)
+                if isinstance(frame.result, fatal):
+                    raise frame.result
+                if frame.task.written:
+                    yield frame
+
+    def written(frame: FrameInMemory) -> Row:
+        return _write(frame, network, state)
+
+    with (
+        closing(in_order(_read, tasks, threads)) as reading,
+        closing(in_order(written, refined(reading), threads)) as rows,
+    ):
+        yield from rows
+
+
+def _groups(
+    frames: Iterable[FrameInMemory], network: OpenNetwork | None
+) -> Iterator[list[FrameInMemory]]:
+    """The frames in their order, in groups of those that go through the network together.
+
+    A frame that could not be read is in the group of those before it.
+    """
+    group: list[FrameInMemory] = []
+    for frame in frames:
+        sizes = {each.inputs.size for each in (*group, frame) if each.inputs is not None}
+        if len(sizes) > 1:
+            yield group
+            group = []
+        group.append(frame)
+        if network is None or len(group) >= network.batch_size:
+            yield group
+            group = []
+    if group:
+        yield group
+
+
+def _refine(group: Sequence[FrameInMemory], network: OpenNetwork | None) -> None:
+    """Sets the results of the frames that were read."""
+    frames = [frame for frame in group if frame.inputs is not None]
+    start = time.perf_counter()
+    results: Sequence[Refined | Exception]
+    if network is None:
+        error = InputError("no frame could be read when the batch began; run it again")
+        results = [error] * len(frames)
+    else:
+        results = network.refine([frame.inputs for frame in frames if frame.inputs is not None])
+    for frame, result in zip(frames, results, strict=True):
+        frame.watch.add("refine", (time.perf_counter() - start) / len(frames))
+        frame.result = result
+
+
+class OpenNetwork:
+    """Refines frames of one size, several together where the user asks for it."""
+
+    def __init__(self, refiner: Refiner, batch_size: int, say: Callable[[str], None]) -> None:
+        self.refiner, self._say = refiner, say
+        self._carried: dict[str, WarmStart] = {}  # of the last frame, by the first of its window
+        fixed = (
+            not refiner.is_default
+            and not refiner.settings.moves_weights
+            and refiner.settings.tile is None
+        )
+        if batch_size > 1 and not fixed:
+            say("batch size: 1; only frames of a fixed network without tiles go together")
+        self.batch_size = batch_size if fixed else 1
+        self._checked = False
+
+    def refine(self, group: Sequence[Inputs]) -> Sequence[Refined | Exception]:
+        """Returns the refined frames, all of one size; for one that fails, its error."""
+        if len(group) > 1 and not any(inputs.window for inputs in group):
+            try:
+                return self._together(group)
+            except PnpDepthError as error:
+                self._say(f"{len(group)} frames are refined one at a time; together: {error}")
+                if isinstance(error, BatchError):
+                    self.batch_size = 1
+        return [self._alone(inputs) for inputs in group]
+
+    def _together(self, group: Sequence[Inputs]) -> list[Refined | Exception]:
+        """The frames refined in one pass. PnpDepthError if the network does not take them so."""
+        frames = self.refiner.refine_together(group)
+        if not self._checked:
+            self._check_independent(group[0], frames[0])
+        note = f"refined together with {len(group) - 1} others, which alters the last bits"
+        return [
+            replace(frame, notes=(*frame.notes, note)) if isinstance(frame, Refined) else frame
+            for frame in frames
+        ]
+
+    def _check_independent(self, inputs: Inputs, together: Refined | PnpDepthError) -> None:
+        """Raises BatchError if the frames of a group influence each other."""
+        alone = self._alone(inputs)
+        if not isinstance(alone, Refined) or not isinstance(together, Refined):
+            return
+        self._checked = True
+        split = self.refiner.split
+        if split is None or not split.static_graph:
+            raise BatchError("the network's control flow depends on image values")
+        if not np.allclose(alone.before, together.before, rtol=_ROUNDING, atol=0):
+            raise BatchError("frames that go together influence each other")
+
+    def _alone(self, inputs: Inputs) -> Refined | Exception:
+        try:
+            if not inputs.window:
+                return self.refiner.refine_frame(inputs)
+            first, begins = inputs.window[0], len(inputs.window) == 1
+            carried = WarmStart() if begins else self._carried.pop(first, WarmStart())
+            frame = self.refiner.refine_next(inputs, carried)
+        except Exception as error:  # concerns this frame only
+            return error
+        self._carried = {first: frame.carried or WarmStart()}
+        return replace(frame, carried=None)
+
+
+def _read(task: Task) -> FrameInMemory:
+    frame = FrameInMemory(task=task)
+    try:
+        with frame.watch("read"):
+            frame.inputs, frame.fingerprints = read_task(task)
+    except Exception as error:  # concerns this frame only
+        frame.result = error
+    return frame
+
+
+def _write(frame: FrameInMemory, network: OpenNetwork | None, state: BatchState) -> Row:
+    """Writes a frame's results, or why there are none; returns the summary's row."""
+    inputs, result = frame.inputs, frame.result
+    if isinstance(result, Refined) and network is not None and inputs is not None:
+        refiner = network.refiner
+        try:
+            return state.write(
+                frame.task,
+                frame.fingerprints,
+                lambda outputs: write_refined(outputs, refiner, inputs, result, frame.watch),
+            )
+        except StorageError:
+            raise
+        except Exception as error:
+            return state.fail(frame.task, _message(error))
+    assert isinstance(result, Exception)
+    return state.fail(frame.task, _message(result))
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, PnpDepthError):
+        return str(error)
+    line = traceback.extract_tb(error.__traceback__)[-1]
+    return (
+        f"a bug of pnpdepth: {type(error).__name__}: {error} ({Path(line.filename).name}, line"
+        f" {line.lineno})"
+    )

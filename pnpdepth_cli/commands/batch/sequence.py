@@ -1,0 +1,130 @@
+"""The sequences that the frames of a data set are of: their poses, neighbours and windows."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.commands.evaluation.dependence import groups_by_name
+from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.dataset.frame import Frame, Neighbour
+from pnpdepth_cli.io.poses import read_oxts_poses, read_poses
+
+KnownPose = tuple[NDArray[np.float64], str]
+"""(3, 4) from the camera's frame to the world's in metres, and where it is from."""
+
+
+def _sequences_of(frames: Sequence[Frame]) -> list[list[int]]:
+    """The indices of the frames of each sequence, which one camera took, in order."""
+    by_name = groups_by_name([frame.name for frame in frames])
+    sequences: dict[tuple[str, int | None], list[int]] = {}
+    for index, (frame, name) in enumerate(zip(frames, by_name, strict=True)):
+        group = name if frame.group is None else frame.group
+        sequences.setdefault((group, frame.camera), []).append(index)
+    return list(sequences.values())
+
+
+def with_windows(frames: Sequence[Frame], length: int) -> list[Frame]:
+    """Returns the frames, each with its window: so many frames of its sequence in a row."""
+    result = list(frames)
+    for sequence in _sequences_of(frames):
+        for number, index in enumerate(sequence):
+            first = number - number % length
+            window = tuple(frames[other] for other in sequence[first : number + 1])
+            result[index] = replace(frames[index], window=window)
+    return result
+
+
+def in_windows(frames: Sequence[Frame]) -> list[list[Frame]]:
+    """Returns the frames by window, in the order of the first frame of each."""
+    windows: dict[str, list[Frame]] = {}
+    for frame in frames:
+        windows.setdefault((*frame.window, frame)[0].name, []).append(frame)
+    return list(windows.values())
+
+
+def check_warm_start(request: RefineRequest) -> None:
+    """Raises UsageError if the method cannot begin where the frame before ended."""
+    checked = request.hold_out.baselines or request.hold_out.uncertainty
+    if checked or not request.method.fixed_by:
+        raise UsageError(
+            "--warm-start goes with a fixed method, not with the default one; give --propagate gp,"
+            " or another option of the method"
+        )
+    if request.method.tile is not None:
+        raise UsageError("--warm-start does not go with --tile")
+
+
+def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> list[Frame]:
+    """Returns the frames, each with those at most `reach` before and after it in its sequence.
+
+    Args:
+        frames: All frames of the data set.
+        reach: Number of frames to each side.
+        poses: A file with a row for each frame. None: the frames' own poses; where a frame has
+            none, the motion is to be estimated.
+
+    Raises:
+        InputError: The file has another number of poses.
+        UsageError: A frame has no points, or its points are those of all images already.
+    """
+    known, result = _poses(frames, poses), list(frames)
+    for sequence in _sequences_of(frames):
+        for number, index in enumerate(sequence):
+            near = range(max(0, number - reach), min(len(sequence), number + reach + 1))
+            neighbours = (
+                _neighbour(frames[sequence[other]], known[sequence[other]], known[index], apart)
+                for other in near
+                if (apart := abs(other - number))
+            )
+            result[index] = replace(frames[index], neighbours=tuple(neighbours))
+    return result
+
+
+def note_of_poses(frames: Sequence[Frame]) -> str | None:
+    """Returns which poses the neighbours of the frames have, as a line; None without neighbours."""
+    counts = Counter(each.poses for frame in frames for each in frame.neighbours)
+    if len(counts) < 2:
+        return next((f"poses: {poses}" for poses in counts), None)
+    total = sum(counts.values())
+    kinds = ", ".join(f"{poses} ({count:,} of {total:,})" for poses, count in counts.items())
+    return f"poses of neighbours: {kinds}"
+
+
+def _neighbour(
+    other: Frame, other_pose: KnownPose | None, pose: KnownPose | None, apart: int
+) -> Neighbour:
+    if (other.sparse or other.gt) is None or (other.sparse is not None and other.sparse.is_dir()):
+        raise UsageError(
+            f"{other.name}: --accumulate takes depth maps or scans of single frames, not"
+            f" {'images alone' if other.sparse is None else 'a COLMAP model'}"
+        )
+    if pose is None or other_pose is None:
+        kind = "scans" if other.image is None else "images"
+        return Neighbour(frame=other, motion=None, poses=f"estimated from the {kind}", apart=apart)
+    (matrix, source), (other_matrix, _) = pose, other_pose
+    turn = matrix[:, :3].T @ other_matrix[:, :3]
+    shift = matrix[:, :3].T @ (other_matrix[:, 3] - matrix[:, 3])
+    motion = tuple(map(tuple, np.column_stack([turn, shift]).tolist()))
+    return Neighbour(frame=other, motion=motion, poses=source, apart=apart)
+
+
+def _poses(frames: Sequence[Frame], path: Path | None) -> list[KnownPose | None]:
+    """The pose of each frame; None where it is unknown."""
+    if path is not None:
+        return [(row, str(path)) for row in read_poses(path, len(frames), "frames")]
+    poses = [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
+    for sequence in _sequences_of(frames):
+        packets = [frames[index].oxts for index in sequence]
+        first = frames[sequence[0]]
+        if first.calib is not None and None not in packets:
+            read = read_oxts_poses([p for p in packets if p], first.calib, first.camera)
+            for index, pose in zip(sequence, read, strict=True):
+                poses[index] = pose, "KITTI's inertial system"
+    return poses

@@ -1,0 +1,260 @@
+"""`pnpdepth cloud`: depth maps as one coloured point cloud."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli import __version__
+from pnpdepth_cli.commands.refinement.frame_camera import (
+    FrameCamera,
+    camera_of_exif,
+    camera_of_file,
+    camera_of_fov,
+)
+from pnpdepth_cli.commands.results import ResultFrame, result_frames
+from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
+from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.cloud_files import CLOUD_SUFFIXES, write_cloud
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.poses import read_poses
+from pnpdepth_cli.io.record import plain, write_json
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.sensors.cloud import EDGE, PointCloud, VoxelGrid, cloud_from_depth
+from pnpdepth_cli.sensors.consistency import View, consistent_depth, neighbouring_views
+
+_IN_MEMORY = 12
+"""Depth maps of neighbouring views that are kept, with their points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudRequest:
+    """What the user asks of a cloud."""
+
+    depth: Path
+    """A depth file, or a folder with files NAME_depth.SUFFIX, as `refine` and `batch` write."""
+    output: Path
+    """The file to write; its suffix is one of `CLOUD_SUFFIXES`."""
+    image: Path | None = None
+    """The colours. None: the image that the record NAME.json beside the depth names, if any."""
+    calib: Path | None = None
+    """Calibration of the camera. None: `fov_deg`, else the record's camera, else EXIF."""
+    camera: int | None = None
+    """KITTI's camera number."""
+    fov_deg: float | None = None
+    """Horizontal field of view of a camera without distortion, instead of `calib`."""
+    poses: Path | None = None
+    """Poses of the depth files, in their order. None: those of the records, if they have any. With
+    poses, the cloud is in the world's frame."""
+    depth_scale: float | None = None
+    """Integer depth files hold metres × this."""
+    max_depth: float = math.inf
+    max_sigma: float | None = None
+    """Largest standard deviation of a pixel, as a fraction of its depth."""
+    edge: float = EDGE
+    """Jump of depth at which the cloud is cut, see `cloud_from_depth`."""
+    min_views: int = 1
+    """Views that have to agree on a pixel, its own included; see `consistent_depth`."""
+    voxel: float | None = None
+    """Side of the cubes in which points are merged. None: all points are kept."""
+    overwrite: bool = False
+
+
+def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
+    """Writes the cloud and its record beside it, and returns the record.
+
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
+    """
+    _check(request)
+    frames = result_frames(request.depth)
+    poses = _poses(request, frames)
+    if request.min_views > 1 and (poses[0] is None or len(frames) < request.min_views):
+        raise UsageError(
+            f"--min-views {request.min_views} needs as many frames with poses; give a folder of"
+            " results, and --poses"
+        )
+    coloured = all(request.image or frame.image for frame in frames)
+    notes: list[str] = []
+    parts = _parts(request, frames, poses, coloured, notes)
+    make_folder(request.output.parent)
+    points = write_cloud(request.output, _merged(request, parts, coloured))
+    inputs = ("depth", "output", "image", "overwrite", "camera", "calib", "poses")
+    settings = {name: value for name, value in asdict(request).items() if name not in inputs}
+    record = {
+        "command": "cloud",
+        "version": __version__,
+        "output": str(request.output),
+        "points": points,
+        "coloured": coloured,
+        "unit": frames[0].unit,
+        "inputs": {
+            "depth": [str(frame.depth) for frame in frames],
+            "calib": None if request.calib is None else str(request.calib),
+            "poses": None if request.poses is None else str(request.poses),
+        },
+        "settings": plain(settings),
+        "notes": notes,
+        "frame": "camera" if poses[0] is None else "world",
+    }
+    write_json(record_path(request.output), record)
+    return record
+
+
+def record_path(output: Path) -> Path:
+    """Returns the path of the record of a cloud; NAME.json may be that of a refinement."""
+    return output.with_name(f"{output.name}.json")
+
+
+def _check(request: CloudRequest) -> None:
+    if request.output.suffix.lower() not in CLOUD_SUFFIXES:
+        raise OutputError(
+            f"{request.output}: a cloud is written as one of {', '.join(CLOUD_SUFFIXES)}"
+        )
+    for path in (request.output, record_path(request.output)):
+        if path.exists() and not request.overwrite:
+            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
+    if request.calib is not None and request.fov_deg is not None:
+        raise UsageError("--calib and --fov both give the camera; leave one out")
+    if request.image is not None and request.depth.is_dir():
+        raise UsageError("--image is for one depth file; records name the images of a folder")
+    if request.voxel is not None and not 0 < request.voxel < math.inf:
+        raise UsageError(f"--voxel must be a length above 0, got {request.voxel:g}")
+    if not 0 <= request.edge < math.inf:
+        raise UsageError(f"--edge must be a fraction such as {EDGE}, got {request.edge:g}")
+
+
+def _poses(request: CloudRequest, frames: list[ResultFrame]) -> list[NDArray[np.float64] | None]:
+    """The pose of each frame: of the file that is given, else of the records."""
+    if request.poses is not None:
+        return list(read_poses(request.poses, len(frames), "depth files"))
+    cameras = [frame.camera for frame in frames]
+    poses = [None if camera is None else camera.pose for camera in cameras]
+    without = [f.depth for f, pose in zip(frames, poses, strict=True) if pose is None]
+    if without and len(without) < len(frames):
+        raise InputError(
+            f"{without[0]} has no pose in its record, but others have; give --poses for all, or"
+            " refine it again as the others"
+        )
+    return poses
+
+
+def _parts(
+    request: CloudRequest,
+    frames: list[ResultFrame],
+    poses: list[NDArray[np.float64] | None],
+    coloured: bool,
+    notes: list[str],
+) -> Iterator[PointCloud]:
+    """Yields the clouds of all depth maps, in the world's frame if there are poses."""
+
+    @functools.lru_cache(maxsize=_IN_MEMORY)
+    def view(index: int) -> View:
+        depth, found = _depth_and_camera(request, frames[index])
+        pose = poses[index]
+        notes.extend(note for note in found.notes if note not in notes)
+        return View(depth=depth, camera=found.camera, pose=np.eye(4)[:3] if pose is None else pose)
+
+    for index, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
+        here = view(index)
+        depth = here.depth
+        if request.min_views > 1:
+            known = np.stack([each for each in poses if each is not None])
+            others = (view(other) for other in neighbouring_views(known, index))
+            depth = consistent_depth(here, others, request.min_views)
+        rgb = _colours(request, frame, here.depth) if coloured else None
+        for part in cloud_from_depth(depth, here.camera, rgb=rgb, edge=request.edge):
+            yield part if pose is None else part.transformed(pose)
+
+
+def _merged(
+    request: CloudRequest, parts: Iterator[PointCloud], coloured: bool
+) -> Iterator[PointCloud]:
+    """The parts, or their points merged. Raises InputError if there is none."""
+    grid = None if request.voxel is None else VoxelGrid(request.voxel)
+    empty = True
+    for part in parts:
+        empty &= not len(part.xyz)
+        if grid is None:
+            yield part
+        else:
+            grid.add(part)
+    if empty:
+        raise InputError(f"{request.depth}: no pixel is left; relax --max-depth, --max-sigma, …")
+    if grid is not None:
+        yield grid.cloud(coloured=coloured)
+
+
+def _depth_and_camera(
+    request: CloudRequest, frame: ResultFrame
+) -> tuple[NDArray[np.float32], FrameCamera]:
+    """The depth of a frame, 0 where it is excluded, and its camera."""
+    depth = read_depth(frame.depth, scale=request.depth_scale).values
+    keep = depth <= request.max_depth
+    if frame.valid is not None:
+        keep &= _of_size(frame, frame.valid, read_rgb(frame.valid).values[..., 0], depth) > 0
+    if request.max_sigma is not None:
+        if frame.sigma is None:
+            raise InputError(
+                f"{frame.depth} has no standard deviation beside it; --max-sigma needs the file"
+                " that `pnpdepth refine --uncertainty` writes"
+            )
+        sigma = _of_size(frame, frame.sigma, read_depth(frame.sigma).values, depth)
+        keep &= sigma <= request.max_sigma * depth
+    size = (depth.shape[0], depth.shape[1])
+    return np.where(keep, depth, np.float32(0)), _camera(request, frame, size)
+
+
+def _of_size(
+    frame: ResultFrame, path: Path, values: NDArray[np.float32], depth: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    if values.shape != depth.shape:
+        raise SizeError(f"{path} is not of the size of {frame.depth}")
+    return values
+
+
+def _colours(
+    request: CloudRequest, frame: ResultFrame, depth: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    image = request.image or frame.image
+    assert image is not None
+    rgb = read_rgb(image).values
+    if rgb.shape[:2] != depth.shape:  # of a photo that COLMAP read as it is stored
+        rgb = read_rgb(image, upright=False).values
+    if rgb.shape[:2] != depth.shape:
+        raise SizeError(
+            f"{image} is {rgb.shape[1]}×{rgb.shape[0]} but {frame.depth} is"
+            f" {depth.shape[1]}×{depth.shape[0]}; give the image of this depth with --image"
+        )
+    return rgb
+
+
+def _camera(request: CloudRequest, frame: ResultFrame, size: tuple[int, int]) -> FrameCamera:
+    """The camera of a depth map (H, W): as it is given, else of its record, else of EXIF."""
+    if request.calib is not None:
+        return camera_of_file(request.calib, request.camera, size, frame.depth)
+    if request.fov_deg is not None:
+        return camera_of_fov(request.fov_deg, size)
+    if frame.camera is not None:
+        if frame.record.get("size") != [size[1], size[0]]:
+            raise SizeError(
+                f"{frame.depth} is {size[1]}×{size[0]}, unlike its record; refine it again, or give"
+                " --calib"
+            )
+        note = f"camera: {frame.camera.source} (from the record)"
+        return replace(frame.camera, notes=(note,))
+    image = request.image or frame.image
+    camera = None if image is None else camera_of_exif(image, size)
+    if camera is None:
+        raise UsageError(
+            f"a cloud needs the camera, and neither a record nor EXIF gives that of {frame.depth};"
+            " give --calib or --fov"
+        )
+    return camera

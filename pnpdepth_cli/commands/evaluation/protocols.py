@@ -1,0 +1,269 @@
+"""Published evaluation protocols: which pixels are scored, how, and how frames are averaged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.choices import MEASURE_GROUPS
+from pnpdepth_cli.commands.evaluation.kitti_devkit import DEVKIT_MEASURES
+from pnpdepth_cli.commands.evaluation.measures import MeasureGroup
+from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, MEASURES, Measure
+from pnpdepth_cli.errors import SizeError, UsageError
+
+KITTI_DEVKIT = "kitti-devkit"
+
+# (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
+# Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by
+# trial to reproduce Eigen et al. 2014. Nearly all later evaluations use these two.
+_CROP_FRACTIONS = {
+    "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),
+    "eigen": (0.3324324, 0.91351351, 0.0359477, 0.96405229),
+}
+# Eigen et al. 2014 for NYU Depth v2: rows 45 to 470, columns 41 to 600 of 480x640 pixels.
+_NYU_SIZE = (480, 640)
+_NYU_WINDOW = (45, 471, 41, 601)
+# What networks for KITTI's benchmark see of a frame: 352x1216 pixels at the bottom, centred (BTS,
+# Lee et al. 2019, `do_kb_crop`).
+_KB_SIZE = (352, 1216)
+_CROPS = ("none", "nyu", *_CROP_FRACTIONS)
+
+Window = tuple[int, int, int, int]
+"""(top, bottom, left, right) in pixels; bottom and right are just outside."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalProtocol:
+    """How predictions are scored."""
+
+    name: str
+    scale: float = 256.0
+    """Codes per metre of integer files that neither the file nor the user states."""
+    min_depth: float = 0.0
+    """Ground truth is scored above it, metres."""
+    max_depth: float | None = None
+    """Ground truth is scored below it, metres; None for no bound."""
+    clip: bool = False
+    """Whether predictions are clipped to these bounds."""
+    crop: str = "none"
+    """One of _CROPS, or X,Y,WIDTH,HEIGHT in pixels."""
+    mask: Path | None = None
+    """An image, or a folder of one per frame, whose pixels above 0 are scored."""
+    average: str = "per-image"
+    """One of choices.AVERAGES."""
+    thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
+    """Of δ1, δ2 and δ3."""
+    exclude_sparse: bool = False
+    """Whether pixels with a sparse point are left out."""
+    missing: str = "skip"
+    """What becomes of empty predictions, one of choices.MISSING."""
+    prediction_kind: str = "depth"
+    """One of choices.PREDICTION_KINDS."""
+    scale_by: str = "none"
+    """How the prediction of each image is scaled to its ground truth, one of choices.SCALINGS."""
+    prediction_crop: str | None = None
+    """Part of the ground truth's frame that predictions show: "kb", or X,Y,WIDTH,HEIGHT; None for
+    all of it. The rest counts as empty."""
+    groups: tuple[str, ...] = ()
+    """Additional measures, names of MEASURE_GROUPS."""
+    resize: str | None = None
+    """How a prediction of another size is resized to the ground truth's; None refuses it."""
+
+    @property
+    def is_devkit(self) -> bool:
+        """True if the development kit's definitions replace those of core.metrics."""
+        return self.name == KITTI_DEVKIT
+
+    @property
+    def measures(self) -> tuple[Measure, ...]:
+        """The measures in order, and how tables show them."""
+        if self.is_devkit:
+            return DEVKIT_MEASURES
+        base = _IN_MILLIMETRES if self.name == "kitti" else MEASURES
+        return (*base, *(m for group in self.measure_groups for m in group.measures))
+
+    @property
+    def measure_groups(self) -> tuple[MeasureGroup, ...]:
+        """The groups of additional measures."""
+        return tuple(MEASURE_GROUPS[name] for name in self.groups)
+
+    def window(self, size: tuple[int, int]) -> Window:
+        """Returns the rows and columns that are scored of a frame of `size` (H, W) pixels.
+
+        Raises:
+            SizeError: If the crop does not fit the frame.
+        """
+        return _window(self.crop, size, "crop")
+
+    def prediction_window(self, size: tuple[int, int]) -> Window:
+        """Returns the rows and columns of a frame of `size` (H, W) pixels that predictions show.
+
+        Raises:
+            SizeError: If the crop does not fit the frame.
+        """
+        return _window(self.prediction_crop or "none", size, "--pred-crop")
+
+    def scoring(self) -> dict[str, Any]:
+        """Returns what decides the figures; equal for two evaluations that can be compared."""
+        rules = {name: value for name, value in asdict(self).items() if name not in _OF_READING}
+        return rules | {
+            "thresholds": list(self.thresholds),
+            "definitions": KITTI_DEVKIT if self.is_devkit else "usual",
+            "mask": None if self.mask is None else str(self.mask),
+        }
+
+    def describe(self) -> str:
+        """Returns one line, such as `eigen: ground truth in 0.001–80 m, crop eigen, …`."""
+        kept = (*_OF_READING, "exclude_sparse")
+        own = replace(PROTOCOLS[self.name], **{name: getattr(self, name) for name in kept})
+        if self.max_depth is None:
+            bounds = f" above {self.min_depth:g} m" if self.min_depth else ""
+        else:
+            bounds = f" in {self.min_depth:g}–{self.max_depth:g} m"
+        disparity, scaled = self.prediction_kind == "disparity", self.scale_by != "none"
+        limits = ", ".join(f"{limit:.6g}" for limit in self.thresholds)
+        averaged = "the images" if self.average == "per-image" else "all pixels together"
+        parts = {
+            f"{self.name}{'' if self == own else ' (changed)'}: all known ground truth{bounds}": 1,
+            f"crop {self.crop}" if self.crop != "none" else "no crop": True,
+            "predictions clipped to the same range": self.clip,
+            f"mask {self.mask}": self.mask,
+            "without the pixels of sparse points": self.exclude_sparse,
+            f"predictions resized ({self.resize})": self.resize,
+            f"predictions of crop {self.prediction_crop}": self.prediction_crop,
+            "predictions are disparity": disparity,
+            f"each image scaled by {self.scale_by}": scaled,
+            _MISSING_TEXTS[self.missing]: self.missing != "skip",
+            "missing predictions filled in, errors as its program prints them": self.is_devkit,
+            f"δ below {limits}": not self.is_devkit,
+            f"mean over {averaged}": True,
+        }
+        return ", ".join(text for text, applies in parts.items() if applies)
+
+
+_IN_MILLIMETRES = tuple(
+    replace(m, shown_unit="mm", shown_factor=1000.0, decimals=1) if m.key in ("rmse", "mae") else m
+    for m in MEASURES
+)
+
+_OF_READING = ("name", "scale", "resize", "mask", "prediction_kind", "prediction_crop", "groups")
+"""Fields that say how files are read, not how they are scored."""
+
+_MISSING_TEXTS = {
+    "skip": "",
+    "min": "empty predictions scored as the lower bound",
+    "max": "empty predictions scored as the upper bound",
+    "fail": "no empty predictions",
+}
+# The reference codes (monodepth2's evaluate_depth.py, BTS's eval) clamp predictions with
+# `pred[pred < min_depth] = min_depth`, which scores empty ones (0, NaN) as the lower bound.
+_EIGEN = EvalProtocol(
+    name="eigen", crop="eigen", min_depth=1e-3, max_depth=80.0, clip=True, missing="min"
+)
+
+PROTOCOLS = {
+    protocol.name: protocol
+    for protocol in (
+        # Ma and Karaman's evaluation, which the paper's follows: no bounds, no crop.
+        EvalProtocol(name="paper"),
+        # Eigen et al. 2014 with the bounds of later tables (BTS, AdaBins): 0.001 to 10 m.
+        replace(_EIGEN, name="nyu-eigen", scale=1000.0, max_depth=10.0, crop="nyu"),
+        # The completion benchmark's measures in its units, with nothing filled in.
+        EvalProtocol(name="kitti"),
+        EvalProtocol(name=KITTI_DEVKIT),
+        _EIGEN,
+        replace(_EIGEN, name="garg", crop="garg"),
+    )
+}
+
+_NOT_OF_DEVKIT = {
+    "average": "--average",
+    "thresholds": "--delta",
+    "missing": "--missing",
+    "groups": "--measures",
+}
+
+
+def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
+    """Returns the protocol of this name with the fields that the user changes.
+
+    Args:
+        name: One of PROTOCOLS.
+        **changes: Fields of EvalProtocol; None leaves a field as it is.
+
+    Raises:
+        UsageError: For an unknown name or a setting out of its range.
+    """
+    if name not in PROTOCOLS:
+        raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
+    changed = {field: value for field, value in changes.items() if value is not None}
+    published = PROTOCOLS[name]
+    for field, option in _NOT_OF_DEVKIT.items() if published.is_devkit else ():
+        if changed.get(field, getattr(published, field)) != getattr(published, field):
+            raise UsageError(
+                f"{option} does not apply to {name}: it has its own measures, no δ, averages"
+                " over the images, and fills in missing predictions"
+            )
+    if changed.get("min_depth") == 0 and published.missing == "min":
+        changed.setdefault("missing", "skip")  # there is no bound to score empty predictions as
+    protocol = replace(published, **changed)
+    _check(protocol)
+    return protocol
+
+
+def _check(protocol: EvalProtocol) -> None:
+    low, high = protocol.min_depth, protocol.max_depth
+    if not (math.isfinite(low) and low >= 0):
+        raise UsageError(f"--min-depth must be metres >= 0, got {low:g}")
+    if high is not None and not (math.isfinite(high) and high > low):
+        raise UsageError(f"--max-depth must be metres above --min-depth {low:g}, got {high:g}")
+    if not all(math.isfinite(limit) and limit > 1 for limit in protocol.thresholds):
+        raise UsageError("--delta must be above 1: δ counts ratios below it")
+    for name in protocol.groups:
+        _ = MEASURE_GROUPS[name]
+    if protocol.groups and protocol.average == "pooled":
+        raise UsageError("--measures are of each image; --average pooled does not apply to them")
+    if protocol.missing == "min" and low == 0:
+        raise UsageError("--missing min scores empty predictions as --min-depth; set it above 0")
+    if protocol.missing == "max" and high is None:
+        raise UsageError("--missing max scores empty predictions as --max-depth; set it")
+    if protocol.crop not in _CROPS:
+        _rectangle(protocol.crop, names=_CROPS)
+    if protocol.prediction_crop not in (None, "kb"):
+        _rectangle(protocol.prediction_crop or "", names=("kb",))
+
+
+def _window(crop: str, size: tuple[int, int], called: str) -> Window:
+    height, width = size
+    if crop == "none":
+        return 0, height, 0, width
+    if crop in _CROP_FRACTIONS:
+        top, bottom, left, right = _CROP_FRACTIONS[crop]
+        return int(top * height), int(bottom * height), int(left * width), int(right * width)
+    if crop == "nyu":
+        if size != _NYU_SIZE:
+            raise SizeError(
+                f"crop nyu is for frames of 640×480 but this one is {width}×{height};"
+                " --crop none, or give X,Y,WIDTH,HEIGHT"
+            )
+        return _NYU_WINDOW
+    if crop == "kb":
+        h, w = _KB_SIZE
+        x, y = (width - w) // 2, height - h
+    else:
+        x, y, w, h = _rectangle(crop)
+    if min(x, y) < 0 or x + w > width or y + h > height:
+        raise SizeError(f"{called} {crop} does not lie in a frame of {width}×{height}")
+    return y, y + h, x, x + w
+
+
+def _rectangle(text: str, names: tuple[str, ...] = ()) -> tuple[int, int, int, int]:
+    try:
+        x, y, width, height = (int(word) for word in text.split(","))
+    except ValueError:
+        x, y, width, height = -1, -1, 0, 0
+    if min(x, y) < 0 or min(width, height) < 1:
+        raise UsageError(f"crop {text!r} is neither X,Y,WIDTH,HEIGHT nor one of {', '.join(names)}")
+    return x, y, width, height

@@ -1,0 +1,208 @@
+"""The tables of an evaluation and of a comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pnpdepth_cli.commands.evaluation.compare import ALPHA, Comparison
+from pnpdepth_cli.commands.evaluation.diagnostics import kinds_of
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, frame_record
+from pnpdepth_cli.commands.evaluation.frame_scoring import FrameScores
+from pnpdepth_cli.commands.tables import (
+    Cell,
+    Table,
+    chosen_measures,
+    column_title,
+    format_value,
+)
+from pnpdepth_cli.core.metrics import Measure
+
+_FRAMES_SHOWN = 12
+_FRAME_COLUMNS = 6
+_STARS = (0.05, 0.01, 0.001)
+
+
+def text_tables(evaluation: Evaluation, columns: Sequence[str] | None) -> list[Table]:
+    """Returns what the terminal shows: the means, the frames or the worst of them, calibration."""
+    frames = [frames_table(evaluation, columns)] if len(evaluation.frames) > 1 else []
+    return [means_by_measure(evaluation, columns), *frames, *calibration_tables(evaluation)]
+
+
+def means_by_measure(evaluation: Evaluation, columns: Sequence[str] | None = None) -> Table:
+    """Returns a row for each measure: its mean and the interval of it."""
+    count = len(evaluation.scored)
+    pixels = sum(frame.pixels for frame in evaluation.frames)
+    of = f"{count:,} frame{'' if count == 1 else 's'}, {pixels:,} pixels"
+    pooled = evaluation.protocol.average == "pooled"
+    caption = f"Over the pixels of {of}, together" if pooled else f"Means over {of}"
+    header, has_interval = ["", "mean"], evaluation.interval is not None
+    if has_interval:
+        header.append("95 %")
+        caption += f"; 95 % interval: studentised bootstrap over {evaluation.clusters.describe()}"
+    rows = []
+    for measure in chosen_measures(evaluation.protocol.measures, columns):
+        interval = [_interval(evaluation, measure)] if has_interval else []
+        mean = format_value(measure, evaluation.mean[measure.key])
+        rows.append([column_title(measure), mean, *interval])
+    coverage = ["coverage ↑", f"{evaluation.coverage:.2%}", *[""] * has_interval]
+    return Table(header=header, rows=[*rows, coverage], caption=caption)
+
+
+def means_row(evaluation: Evaluation, name: str, columns: Sequence[str] | None) -> Table:
+    """Returns one row: the chosen means with their intervals, the frames and the coverage."""
+    measures = chosen_measures(evaluation.protocol.measures, columns)
+    cells = [format_value(measure, evaluation.mean[measure.key]) for measure in measures]
+    if evaluation.interval is not None:
+        ends = [_interval(evaluation, measure) for measure in measures]
+        cells = [f"{cell} ({end})" for cell, end in zip(cells, ends, strict=True)]
+    scored = f"{len(evaluation.scored):,} of {len(evaluation.frames):,}"
+    assumed = {
+        f"{side}: {kind.source}, assumed"
+        for side, kinds in kinds_of(evaluation.frames).items()
+        for kind, _ in kinds
+        if kind.assumed
+    }
+    return Table(
+        header=["", *map(column_title, measures), "frames", "coverage"],
+        rows=[[name, *cells, scored, f"{evaluation.coverage:.2%}"]],
+        caption="; ".join([evaluation.protocol.describe(), *sorted(assumed)]),
+    )
+
+
+def _interval(evaluation: Evaluation, measure: Measure) -> str:
+    ends = (evaluation.interval or {}).get(measure.key, ())
+    return " … ".join(format_value(measure, end) for end in ends)
+
+
+def frames_csv(evaluation: Evaluation) -> Table:
+    """Returns a row for each frame: its files, its counts, and its measures as stored."""
+    keys = [measure.key for measure in evaluation.protocol.measures]
+    records = [frame_record(frame) for frame in evaluation.frames]
+    columns = [name for name in records[0] if name not in ("values", "error")]
+    rows = [
+        [*(r[name] for name in columns), *(r["values"].get(key) for key in keys), r["error"]]
+        for r in records
+    ]
+    return Table(
+        header=[*columns, *keys, "error"],
+        rows=[["" if _is_nothing(each) else str(each) for each in row] for row in rows],
+    )
+
+
+def _is_nothing(value: object) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def frames_table(evaluation: Evaluation, columns: Sequence[str] | None) -> Table:
+    """Returns the chosen or first measures of each frame, or of the worst of many."""
+    measures = chosen_measures(evaluation.protocol.measures, columns)
+    measures = measures if columns else measures[:_FRAME_COLUMNS]
+    everything = len(evaluation.frames) <= _FRAMES_SHOWN
+    frames = evaluation.frames if everything else worst(evaluation, "rmse")[:_FRAMES_SHOWN]
+    return Table(
+        caption="Frames" if everything else f"The {len(frames)} worst by RMSE; --csv has all",
+        header=["frame", *map(column_title, measures), "coverage"],
+        rows=[
+            [frame.name, *(format_value(m, frame.values.get(m.key)) for m in measures),
+             _coverage(frame)]
+            for frame in frames
+        ],
+    )  # fmt: skip
+
+
+def worst(evaluation: Evaluation, key: str) -> list[FrameScores]:
+    """Returns the scored frames by one measure, worst first, those with NaN at the very end."""
+    (measure,) = (m for m in evaluation.protocol.measures if m.key == key)
+    sign = 1 if measure.higher_is_better else -1
+    values = ((frame, frame.values[key]) for frame in evaluation.scored)
+    ordered = sorted(values, key=lambda of: (math.isnan(of[1]), sign * of[1]))
+    return [frame for frame, _ in ordered]
+
+
+def _coverage(frame: FrameScores) -> str:
+    if frame.missing:
+        return Cell("missing", "bad")
+    return f"{frame.coverage:.2%}" if frame.scored else Cell("not scored", "bad")
+
+
+def calibration_tables(evaluation: Evaluation) -> list[Table]:
+    """Returns how right the predicted standard deviation is, if there is one."""
+    found = evaluation.uncertainty
+    if found is None:
+        return []
+    rows = [
+        ["errors within 1σ", f"{found.within_1_sigma:.1%}", "68.3%"],
+        ["errors within 2σ", f"{found.within_2_sigma:.1%}", "95.4%"],
+        ["AUSE (MAE, normalised)", f"{found.ause:.4f}", "0"],
+    ]
+    caption = f"Standard deviation of {found.frames:,} frame{'' if found.frames == 1 else 's'}"
+    return [Table(caption=caption, header=["", "observed", "calibrated"], rows=rows)]
+
+
+def comparison_table(comparison: Comparison) -> Table:
+    """Returns a row for each measure and run; all runs but the first have gain and p."""
+    base, *others = comparison.runs
+    rows = []
+    for measure in comparison.measures:
+        title, mean = column_title(measure), format_value(measure, base.mean[measure.key])
+        rows.append([title, base.label, mean, *["–"] * 4])
+        for run, gains in zip(others, comparison.gains, strict=True):
+            gain = gains[measure.key]
+            significant = gain.p_adjusted < ALPHA
+            percent = Cell(
+                _signed(gain.percent),
+                ("good" if gain.percent > 0 else "bad") if significant else "dim",
+            )
+            rows.append([
+                title,
+                run.label,
+                format_value(measure, run.mean[measure.key]),
+                percent,
+                *(_signed(end) for end in (gain.low_percent, gain.high_percent)),
+                "–" if math.isnan(gain.p_adjusted) else f"{gain.p_adjusted:.4f}",
+            ])  # fmt: skip
+    swaps = "all" if comparison.exact_p_values else f"{comparison.resamples:,} random"
+    return Table(
+        header=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
+        rows=rows,
+        caption=(
+            f"{len(comparison.frames):,} shared frames; gains in per cent of the error of"
+            f" {base.label}, positive is better; intervals (95 %) and p-values, from {swaps} swaps,"
+            f" {_tested(comparison)}"
+        ),
+    )
+
+
+def _tested(comparison: Comparison) -> str:
+    clusters, count = comparison.clusters.describe(), len(comparison.measures)
+    return f"over {clusters}, p adjusted for {count} measures (Holm)"
+
+
+def _signed(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:+.2f}"
+
+
+def methods_table(comparison: Comparison) -> Table:
+    """Returns a row for each run and a column for each measure, the best of a column in bold.
+
+    Stars mark where a run differs from the first significantly.
+    """
+    rows: list[list[str]] = [[run.label] for run in comparison.runs]
+    for measure in comparison.measures:
+        means = [run.mean[measure.key] for run in comparison.runs]
+        pick = max if measure.higher_is_better else min
+        best = pick((mean for mean in means if not math.isnan(mean)), default=None)
+        p_values = [1.0, *(gains[measure.key].p_adjusted for gains in comparison.gains)]
+        for row, mean, p in zip(rows, means, p_values, strict=True):
+            text, stars = format_value(measure, mean), "*" * sum(p < limit for limit in _STARS)
+            is_best = best is not None and text == format_value(measure, best)
+            row.append(Cell(text + stars, "bold" if is_best else ""))
+    return Table(
+        header=["", *map(column_title, comparison.measures)],
+        rows=rows,
+        caption=(
+            f"means over {len(comparison.frames):,} frames, the best in bold; *, **, ***: differs"
+            f" from {comparison.runs[0].label} with p < 0.05, 0.01, 0.001 {_tested(comparison)}"
+        ),
+    )

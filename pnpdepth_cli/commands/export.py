@@ -1,0 +1,138 @@
+"""`pnpdepth export`: results of `refine` or `batch` in the files of a reconstruction program."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli import __version__
+from pnpdepth_cli.choices import EXPORTS
+from pnpdepth_cli.commands.exports import Depth, Export, ExportFrame
+from pnpdepth_cli.commands.results import ResultFrame, result_frames
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
+from pnpdepth_cli.io.atomic import all_or_none, make_folder
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.io.rgb import read_rgb, sizes_of
+
+_LONGEST_NAME = 200
+"""Bytes of a name of a record that becomes a path."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportRequest:
+    """What the user asks of an export."""
+
+    results: Path
+    """A folder that `refine` or `batch` wrote, or a depth file in it."""
+    to: str
+    """One of `choices.EXPORTS`."""
+    output: Path
+    """The folder to write to; it may hold the images and the model already."""
+    overwrite: bool = False
+    """Whether existing files are replaced."""
+
+
+def export_results(request: ExportRequest) -> dict[str, Any]:
+    """Writes the files and `export_NAME.json`, and returns what that holds.
+
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
+    """
+    export: Export = EXPORTS[request.to]
+    if request.output.exists() and not request.output.is_dir():
+        raise OutputError(f"{request.output} is a file; name a folder")
+    frames = [_frame(result, export) for result in result_frames(request.results)]
+    _check_one_unit(frames)
+    written = [*export.files(request.output, frames), request.output / f"export_{request.to}.json"]
+    if len(set(written)) < len(written):
+        raise InputError(f"{request.results}: two frames have one image name; refine them again")
+    for path in written:
+        if path.exists() and not request.overwrite:
+            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another folder")
+    make_folder(request.output)
+    record: dict[str, Any] = {
+        "command": "export",
+        "version": __version__,
+        "to": request.to,
+        "results": str(request.results),
+        "frames": len(frames),
+        "unit": frames[0].unit,
+    }
+    with all_or_none(written):
+        record["notes"] = export.write(request.output, frames)
+        record["files"] = [path.as_posix() for path in written[:-1]]
+        write_json(written[-1], record)
+    return record
+
+
+def _frame(result: ResultFrame, export: Export) -> ExportFrame:
+    record, camera, image = result.record, result.camera, result.image
+    if camera is None or image is None:
+        lacks = "a record with its camera" if camera is None else "its image, which was moved"
+        raise InputError(
+            f"{result.depth} lacks {lacks}; refine it again with a COLMAP model, --calib or --fov"
+        )
+    if export.needs_pose and camera.pose is None:
+        raise InputError(
+            f"{result.depth} has no pose in its record; refine it with a COLMAP model, as"
+            " `batch --layout colmap` does"
+        )
+    try:
+        width, height = map(operator.index, record["size"])
+        sparse = record["inputs"]["sparse"]
+        numbers = float(record["points"]["farthest"]), float(sparse.get("unit_scale") or 1)
+        name = sparse.get("image") or (PurePosixPath(result.name).parent / image.name).as_posix()
+        if not all(1e-9 < number < 1e9 for number in numbers) or not _is_fit(name):
+            raise ValueError
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise FileFormatError(
+            f"{result.depth}: the record beside it is damaged; refine it again"
+        ) from error
+    if (height, width) not in sizes_of(image):
+        raise SizeError(
+            f"{result.depth} is not of the size of {image}; refine the whole image"
+            " (--protocol whole)"
+        )
+    return ExportFrame(
+        image=image,
+        image_name=name,
+        size=(height, width),
+        camera=camera,
+        unit=result.unit,
+        unit_scale=numbers[1],
+        farthest=numbers[0],
+        read=functools.partial(_read, result),
+    )
+
+
+def _is_fit(name: Any) -> bool:
+    """Whether a name of a record is fit for a file: relative, inside, printable, not long."""
+    path = PurePosixPath(name)  # TypeError if it is no text
+    inside = path.parts and not path.is_absolute() and ".." not in path.parts
+    long = len(name.encode("utf-8", "surrogateescape")) > _LONGEST_NAME
+    return bool(inside) and name.isprintable() and "\\" not in name and not long
+
+
+def _check_one_unit(frames: Sequence[ExportFrame]) -> None:
+    units = sorted({f"{frame.unit} (unit-scale {frame.unit_scale:g})" for frame in frames})
+    if len(units) > 1:
+        raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
+
+
+def _read(result: ResultFrame) -> tuple[Depth, NDArray[np.bool_]]:
+    depth = read_depth(result.depth).values
+    known = depth > 0
+    if result.valid is None:
+        return depth, known
+    valid = read_rgb(result.valid).values[..., 0] > 0
+    if valid.shape != depth.shape:
+        raise SizeError(f"{result.valid} is not of the size of {result.depth}")
+    return depth, known & valid

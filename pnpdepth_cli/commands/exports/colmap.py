@@ -1,0 +1,57 @@
+"""`colmap`: depth and normal maps of COLMAP's dense workspace, for its stereo fusion.
+
+A map is the text "width&height&channels&" and float32 little-endian values, x fastest, then y, then
+channel (COLMAP's documentation of dense maps, and its read_write_dense.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note
+from pnpdepth_cli.io.atomic import atomic_path, make_folder
+from pnpdepth_cli.sensors.cloud import depth_normals
+
+
+def _map(folder: Path, frame: ExportFrame, kind: str) -> Path:
+    return folder / "stereo" / f"{kind}_maps" / f"{frame.image_name}.geometric.bin"
+
+
+def _images_to_fuse(folder: Path) -> Path:
+    return folder / "stereo" / "fusion.cfg"
+
+
+def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
+    maps = [_map(folder, frame, kind) for frame in frames for kind in ("depth", "normal")]
+    return maps if _images_to_fuse(folder).exists() else [*maps, _images_to_fuse(folder)]
+
+
+def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
+    for frame in frames:
+        depth = frame.valid_depth()
+        _write_map(_map(folder, frame, "normal"), depth_normals(depth, frame.camera.camera))
+        _write_map(_map(folder, frame, "depth"), depth[..., None] / frame.unit_scale)
+    listed = _images_to_fuse(folder)
+    if not listed.exists():  # image_undistorter has written it already
+        with atomic_path(listed) as temporary:
+            text = "".join(f"{frame.image_name}\n" for frame in frames)
+            temporary.write_text(text, encoding="utf-8", newline="\n")
+    return distortion_note(frames, "COLMAP's fusion")
+
+
+def _write_map(path: Path, values: NDArray[np.floating]) -> None:
+    """Writes an (H, W, C) map."""
+    height, width, channels = values.shape
+    make_folder(path.parent)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(f"{width}&{height}&{channels}&".encode())
+        file.write(np.ascontiguousarray(values.transpose(2, 0, 1)).astype("<f4").tobytes())
+
+
+EXPORT = Export(
+    title="COLMAP depth and normal maps (stereo/)", needs_pose=False, files=_files, write=_write
+)

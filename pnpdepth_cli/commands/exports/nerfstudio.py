@@ -1,0 +1,139 @@
+"""`nerfstudio`: transforms.json with poses, intrinsics and depth as 16-bit PNG in millimetres.
+
+Nerfstudio's data conventions: camera axes are x right, y up, z backwards; principal points count
+from the image's corner, so pixel centres are at .5; a depth is PNG code × 0.001 in the unit of the
+poses. Instant-NGP reads the same file; it takes that factor from `integer_depth_scale`.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pnpdepth_cli.commands.exports import Export, ExportFrame
+from pnpdepth_cli.commands.sparse.options import METRES
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.atomic import atomic_path, make_folder
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.formats.png import LARGEST_CODE
+from pnpdepth_cli.io.record import write_json
+
+_CODES_PER_UNIT = 1000.0
+_BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
+_COEFFICIENTS = {
+    "radial-tangential": ("k1", "k2", "p1", "p2", "k3", "k4"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+_MODELS = {"radial-tangential": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+
+
+def _depth_image(folder: Path, frame: ExportFrame) -> Path:
+    return folder / "depths" / f"{frame.stem}.png"
+
+
+def _image(folder: Path, frame: ExportFrame) -> Path:
+    """The image, or where it is copied to: Nerfstudio reads images in its folder."""
+    inside = frame.image.resolve().is_relative_to(folder.resolve())
+    return frame.image if inside else folder / "images" / frame.image_name
+
+
+def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
+    copies = [path for f in frames if (path := _image(folder, f)) != f.image]
+    return [*copies, *(_depth_image(folder, f) for f in frames), folder / "transforms.json"]
+
+
+def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
+    lenses = sorted({frame.camera.camera.lens for frame in frames})
+    if len(lenses) > 1:
+        raise InputError(
+            f"the cameras have lenses of different kinds ({', '.join(lenses)}), but Nerfstudio"
+            " takes one; undistort the images first"
+        )
+    factor = _factor(frames)
+    clipped, entries = 0, []
+    for frame in frames:
+        entries.append(_entry(folder, frame, factor))
+        depth = frame.valid_depth() * np.float32(factor)
+        fits = np.rint(depth * _CODES_PER_UNIT) <= LARGEST_CODE
+        clipped += int((~fits).sum())
+        path = _depth_image(folder, frame)
+        make_folder(path.parent)
+        write_depth(path, np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
+        copy = _image(folder, frame)
+        if copy != frame.image:
+            make_folder(copy.parent)
+            with atomic_path(copy) as temporary:
+                shutil.copyfile(frame.image, temporary)
+    content = {
+        "camera_model": _MODELS[lenses[0]],
+        "enable_depth_loading": True,
+        "integer_depth_scale": 1 / _CODES_PER_UNIT,
+        "frames": entries,
+    }
+    write_json(folder / "transforms.json", content)
+    notes = []
+    if clipped:
+        limit = LARGEST_CODE / _CODES_PER_UNIT / factor
+        notes.append(f"depth: {clipped:,} pixels beyond {limit:.4g} {frames[0].unit} are unknown")
+    if factor != 1:
+        notes.append(f"unit: poses and depth are × {factor:g}, so that depth fits 16 bits")
+    return notes
+
+
+def _factor(frames: Sequence[ExportFrame]) -> float:
+    """What poses and depths in model units are multiplied by, a power of two; 1 for metres."""
+    if all(frame.unit == METRES for frame in frames):
+        return 1.0
+    farthest = _BEYOND_POINTS * max(frame.farthest for frame in frames)
+    return float(2.0 ** math.floor(math.log2(LARGEST_CODE / _CODES_PER_UNIT / farthest)))
+
+
+def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
+    """The frame's entry in transforms.json."""
+    camera, pose = frame.camera.camera, frame.camera.pose
+    assert pose is not None
+    names = _COEFFICIENTS.get(camera.lens, ())
+    values = dict(zip(names, camera.distortion, strict=False))
+    if camera.lens not in _MODELS or any(camera.distortion[len(names) :]):
+        raise InputError(
+            f"{frame.image} has a lens that Nerfstudio does not know ({camera.lens},"
+            f" {len(camera.distortion)} coefficients); undistort the images first"
+        )
+    depth = _relative(_depth_image(folder, frame), folder)
+    matrix = np.eye(4)
+    matrix[:3] = pose
+    matrix[:3, 3] *= factor
+    matrix[:3, 1:3] *= -1
+    intrinsics = camera.intrinsics
+    return {
+        "file_path": _relative(_image(folder, frame), folder),
+        "depth_file_path": depth,
+        "depth_path": depth,
+        "transform_matrix": matrix.tolist(),
+        "w": frame.size[1],
+        "h": frame.size[0],
+        "fl_x": intrinsics[0, 0],
+        "fl_y": intrinsics[1, 1],
+        "cx": intrinsics[0, 2] + 0.5,
+        "cy": intrinsics[1, 2] + 0.5,
+        **{name: values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")},
+    }
+
+
+def _relative(path: Path, folder: Path) -> str:
+    if not path.is_relative_to(folder):
+        path, folder = path.resolve(), folder.resolve()
+    return path.relative_to(folder).as_posix()
+
+
+EXPORT = Export(
+    title="transforms.json of Nerfstudio and Instant-NGP with depth",
+    needs_pose=True,
+    files=_files,
+    write=_write,
+)

@@ -1,0 +1,163 @@
+"""The camera of a frame: from the sparse depth, a calibration, a field of view, or EXIF."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.choices import LENSES
+from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
+from pnpdepth_cli.commands.sparse.scans import camera_of, check_size
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.dataset.protocols import Protocol
+from pnpdepth_cli.io.rgb import read_focal_length
+from pnpdepth_cli.sensors.camera import Camera
+
+_MAX_FOV_DEG = 170.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameCamera:
+    """The camera that took a frame."""
+
+    camera: Camera
+    source: str
+    """Where it is from, for a person."""
+    pose: NDArray[np.float64] | None = None
+    """(3, 4) x_world = pose · (x, 1), in the unit of the depth. None: unknown."""
+    notes: tuple[str, ...] = ()
+
+    def in_part(self, protocol: Protocol, size: tuple[int, int]) -> FrameCamera:
+        """Returns the camera of the part that a protocol keeps of an image of (H, W)."""
+        intrinsics = protocol.intrinsics_in_crop(self.camera.intrinsics, size)
+        return replace(self, camera=replace(self.camera, intrinsics=intrinsics))
+
+    def record(self) -> dict[str, Any]:
+        """Returns what a record keeps of it; `of_record` reads it."""
+        return {
+            "intrinsics": self.camera.intrinsics.tolist(),
+            "lens": self.camera.lens,
+            "distortion": list(self.camera.distortion),
+            "pose": None if self.pose is None else self.pose.tolist(),
+            "source": self.source,
+        }
+
+    @classmethod
+    def of_record(cls, entry: Mapping[str, Any]) -> FrameCamera:
+        """Returns the camera of an entry of `record`.
+
+        Raises:
+            KeyError: A part is missing.
+            TypeError: A part is not of numbers.
+            ValueError: No camera has these numbers.
+        """
+        intrinsics = np.array(entry["intrinsics"], np.float64).reshape(3, 3)
+        distortion = tuple(float(each) for each in entry["distortion"])
+        pose = None if entry["pose"] is None else np.array(entry["pose"], float).reshape(3, 4)
+        numbers = np.concatenate(
+            [intrinsics.ravel(), distortion, [] if pose is None else pose.ravel()]
+        )
+        if not np.isfinite(numbers).all() or entry["lens"] not in LENSES:
+            raise ValueError("no camera has these numbers")
+        if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or intrinsics[2].tolist() != [0, 0, 1]:
+            raise ValueError("no camera has these intrinsics")
+        return cls(
+            camera=Camera(intrinsics=intrinsics, distortion=distortion, lens=entry["lens"]),
+            source=str(entry["source"]),
+            pose=pose,
+        )
+
+
+def camera_of_frame(
+    request: RefineRequest, of_points: FrameCamera | None, size: tuple[int, int]
+) -> FrameCamera | None:
+    """Returns the camera of the frame in the part that its protocol keeps; None if unknown.
+
+    Args:
+        request: What is asked for. EXIF is read only where an output needs the camera.
+        of_points: The camera that came with the sparse depth, of the whole image.
+        size: (H, W) of the whole image.
+
+    Raises:
+        UsageError: An output needs the camera, and nothing gives it; or --fov repeats it.
+        SizeError: The calibration is of another image.
+    """
+    files, outputs = request.files, request.outputs
+    known = of_points or _of_files(files, size)
+    if outputs.fov_deg is not None:
+        if known is not None:
+            raise UsageError(f"the camera is known ({known.source}); leave out --fov")
+        known = camera_of_fov(outputs.fov_deg, size)
+    if known is None and outputs.needs_camera:
+        image = files.image if isinstance(files.image, Path) else None
+        known = None if image is None else camera_of_exif(image, size)
+        if known is None:
+            flag, named = "--ply" if outputs.ply else "--html-3d", image or files.sparse
+            raise UsageError(
+                f"{flag} needs the camera, and {named} has neither a calibration nor a focal length"
+                " in EXIF; give --calib or --fov"
+            )
+    return None if known is None else known.in_part(files.protocol, size)
+
+
+def camera_of_file(
+    path: Path, number: int | None, size: tuple[int, int], image: Path | None = None
+) -> FrameCamera:
+    """Returns the camera of a calibration file for an image (H, W) of this file.
+
+    Raises:
+        InputError: The file is no calibration.
+        SizeError: It is of another image.
+    """
+    calibration = read_calibration(path, number)
+    notes = check_size(path, calibration, size, image)
+    return FrameCamera(
+        camera=camera_of(calibration), source=f"{path}: {calibration.source}", notes=tuple(notes)
+    )
+
+
+def camera_of_fov(fov_deg: float, size: tuple[int, int]) -> FrameCamera:
+    """Returns a camera without distortion of this horizontal field of view, for (H, W) pixels.
+
+    Raises:
+        UsageError: No such camera exists.
+    """
+    if not 0 < fov_deg <= _MAX_FOV_DEG:
+        raise UsageError(f"--fov is {fov_deg:g} degrees; give 0 to {_MAX_FOV_DEG:g}")
+    focal_px = size[1] / 2 / math.tan(math.radians(fov_deg) / 2)
+    return _pinhole(focal_px, size, f"--fov {fov_deg:g}")
+
+
+def camera_of_exif(image: Path, size: tuple[int, int]) -> FrameCamera | None:
+    """Returns the camera of an image's EXIF, without distortion; None if EXIF does not give it."""
+    focal = read_focal_length(image, size)
+    return None if focal is None else _pinhole(focal.pixels, size, focal.source)
+
+
+def _of_files(files: FrameFiles, size: tuple[int, int]) -> FrameCamera | None:
+    """The camera of the calibration, if there is one."""
+    image = files.image if isinstance(files.image, Path) else None
+    if files.scan.calib is not None:
+        return camera_of_file(files.scan.calib, files.scan.camera, size, image)
+    if files.camera_file is not None:
+        return camera_of_file(files.camera_file, files.camera_number, size, image)
+    calibration = files.calibration
+    if calibration is None:
+        return None
+    return FrameCamera(camera=camera_of(calibration), source=calibration.source)
+
+
+def _pinhole(focal_px: float, size: tuple[int, int], source: str) -> FrameCamera:
+    height, width = size
+    intrinsics = np.array(
+        [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
+    )
+    note = f"camera: {focal_px:.1f} pixels of focal length, no distortion ({source})"
+    return FrameCamera(camera=Camera(intrinsics=intrinsics), source=source, notes=(note,))

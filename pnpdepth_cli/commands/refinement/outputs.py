@@ -1,0 +1,149 @@
+"""Writes the files of a refined frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pnpdepth_cli.commands.refinement.inputs import Inputs
+from pnpdepth_cli.commands.refinement.output_files import Outputs
+from pnpdepth_cli.commands.refinement.view_3d import write_view
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.frames.frame import Refined, is_dense
+from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.cloud_files import write_cloud
+from pnpdepth_cli.io.depth import metres, write_depth
+from pnpdepth_cli.io.formats import format_of_suffix
+from pnpdepth_cli.io.formats.png import LARGEST_CODE
+from pnpdepth_cli.io.visualisation import (
+    improvement,
+    improvement_at_points,
+    preview,
+    sigma_preview,
+    write_mask,
+)
+from pnpdepth_cli.sensors.cloud import cloud_from_depth
+
+Image = NDArray[np.float32]
+
+INTEGER_SCALE = 256.0
+"""KITTI's codes per metre, for points that have none of their own and fit."""
+
+_COARSER = (100.0, 10.0, 1.0, 0.1)  # codes per metre where 256 cannot hold the points
+_FINER = (1000.0, 10_000.0, 100_000.0)  # where 256 would round them
+_BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
+_LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
+
+
+def output_scale(outputs: Outputs, inputs: Inputs) -> float:
+    """Returns the codes per metre of an integer depth file for this frame.
+
+    What the user asks for, else the sparse depth file's own, else 256 unless the points do not fit;
+    known before refinement.
+    """
+    if outputs.scale is not None:
+        return outputs.scale
+    if inputs.sparse_scale is not None:
+        return inputs.sparse_scale
+    nearest, farthest = float(inputs.own.depth.min()), float(inputs.own.depth.max())
+    scale = INTEGER_SCALE
+    for coarser in _COARSER:
+        if _BEYOND_POINTS * farthest * scale > LARGEST_CODE:
+            scale = coarser
+    for finer in _FINER:
+        if nearest * scale < _LEAST_CODES and _BEYOND_POINTS * farthest * finer <= LARGEST_CODE:
+            scale = finer
+    return scale
+
+
+def within_range(outputs: Outputs, inputs: Inputs, frame: Refined) -> Refined:
+    """Returns the frame with depths that the format can hold, with a note if any is clipped."""
+    depth_format = format_of_suffix(outputs.depth.suffix)
+    if depth_format is None or not depth_format.integer:
+        return frame
+    scale = output_scale(outputs, inputs)
+    nearest, farthest = np.float32(1 / scale), np.float32(LARGEST_CODE / scale)
+    known = np.isfinite(frame.after) & (frame.after > 0)
+    beyond, below = known & (frame.after > farthest), known & (frame.after < 0.5 / scale)
+    notes = [
+        f"output: {int(mask.sum()):,} of {mask.size:,} pixels clipped to {metres(float(limit))} m,"
+        f" the {extreme} depth of a 16-bit PNG with {scale:g} codes per metre; --format exr holds"
+        " every depth"
+        for mask, limit, extreme in ((beyond, farthest, "largest"), (below, nearest, "smallest"))
+        if mask.any()
+    ]
+    if not notes:
+        return frame
+    after = np.where(beyond, farthest, np.where(below, nearest, frame.after))
+    return replace(frame, after=after, notes=(*frame.notes, *notes))
+
+
+def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str, Any]:
+    """Writes the depth and its images. Returns their entries of the record."""
+    image = replace(inputs, register=frame.registration).registered().image
+    make_folder(outputs.depth.parent)
+    write_depth(outputs.depth, frame.after, scale=output_scale(outputs, inputs))
+    if outputs.sigma is not None and frame.sigma is not None:
+        write_depth(outputs.sigma, frame.sigma)
+    if outputs.sigma_preview is not None and frame.sigma is not None:
+        sigma_preview(frame.sigma, frame.valid, outputs.sigma_preview, inputs.unit)
+    if outputs.valid is not None and frame.valid is not None:
+        write_mask(outputs.valid, frame.valid)
+    record: dict[str, Any] = {"improved_fraction": None}
+    if outputs.preview is not None:
+        preview(
+            image,
+            inputs.own.xy.numpy(),
+            inputs.own.depth.numpy(),
+            frame.before,
+            frame.after,
+            outputs.preview,
+            inputs.unit,
+            valid=frame.valid,
+            linear=None if is_dense(frame.used) else linear(frame.used).numpy(),
+        )
+    if outputs.improvement is not None:
+        record["improved_fraction"] = _write_improvement(
+            outputs.improvement, image, inputs, frame, outputs.colors
+        )
+    if outputs.cloud is not None:
+        record["cloud"] = _write_cloud(outputs.cloud, image, inputs, frame)
+    if outputs.view is not None:
+        write_view(outputs.view, image, inputs, frame)
+    kinds = ("depth", "sigma", "valid", "preview", "improvement", "cloud", "view")
+    written = outputs.by_kind()
+    record["outputs"] = {kind: str(written[kind]) if kind in written else None for kind in kinds}
+    return record
+
+
+def _write_cloud(path: Path, image: Image | None, inputs: Inputs, frame: Refined) -> dict[str, Any]:
+    """Writes the cloud of the refined depth, in the world's frame if the pose is known."""
+    assert inputs.camera is not None
+    parts = cloud_from_depth(frame.after, inputs.camera.camera, rgb=image, keep=frame.valid)
+    pose = inputs.camera.pose
+    points = write_cloud(path, (part if pose is None else part.transformed(pose) for part in parts))
+    return {"points": points, "frame": "camera" if pose is None else "world"}
+
+
+def _write_improvement(
+    path: Path, image: Image | None, inputs: Inputs, frame: Refined, colors: str
+) -> float:
+    if inputs.gt is not None:
+        return improvement(frame.before, frame.after, inputs.gt, path, rgb=image, colors=colors)
+    points = frame.held_out if len(frame.held_out) else frame.used
+    return improvement_at_points(
+        image if image is not None else frame.before,
+        points.xy.numpy(),
+        points.depth.numpy(),
+        points.sample(torch.from_numpy(frame.before)).numpy(),
+        points.sample(torch.from_numpy(frame.after)).numpy(),
+        held_out=bool(len(frame.held_out)),
+        path=path,
+        unit=inputs.unit,
+        colors=colors,
+    )

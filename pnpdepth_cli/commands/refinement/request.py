@@ -1,0 +1,314 @@
+"""What the user asks of a refinement, in groups. None means the network's own default.
+
+Command line options, sweep axes and batch cache keys are derived from these declarations
+(`pnpdepth_cli.settings`). Imports neither numpy nor torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pnpdepth_cli import choices
+from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.remote.address import path_of
+from pnpdepth_cli.settings import Settings, option
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.io.calibration import Calibration
+    from pnpdepth_cli.io.dataset.frame import Pose, Source
+    from pnpdepth_cli.io.dataset.protocols import Protocol
+    from pnpdepth_cli.sensors import SamplePattern
+
+
+def _whole_frame() -> Protocol:
+    from pnpdepth_cli.io.dataset.protocols import WHOLE
+
+    return WHOLE
+
+
+def parse_file(text: str) -> Path:
+    """Returns the path of a local file, or of one in a store. Raises UsageError as `path_of`."""
+    return path_of(text)
+
+
+def parse_codes_per_metre(text: str) -> float:
+    """Returns the codes per metre of `256` or `mm`. Raises UsageError for any other text."""
+    try:
+        scale = 1000.0 if text == "mm" else float(text)
+    except ValueError:
+        scale = -1.0
+    if not 0 < scale < float("inf"):
+        raise UsageError(f"--output-scale {text!r} is neither mm nor codes per metre such as 256")
+    return scale
+
+
+def parse_registration(text: str) -> str | tuple[float, float, float]:
+    """Returns `auto` or `off`, or the three numbers of `0.9,-5,0`. Raises UsageError otherwise."""
+    if text in ("auto", "off"):
+        return text
+    try:
+        zoom, right, down = (float(part) for part in text.split(","))
+        if 0.1 <= zoom <= 10 and abs(right) < float("inf") and abs(down) < float("inf"):
+            return zoom, right, down
+    except ValueError:
+        pass
+    raise UsageError(
+        f"--registration {text!r} is neither auto, off, nor ZOOM,RIGHT,DOWN such as 0.9,-5,0"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameFiles:
+    """The files of a frame and how they are read."""
+
+    image: Source | None = None
+    """None for a network that takes sparse depth alone."""
+    sparse: Path | None = None
+    """Sparse depth, a LiDAR scan, or a COLMAP model. None: `sample` takes points of the ground
+    truth."""
+    gt: Source | None = None
+    depth_scale: float | None = option(
+        None,
+        "Integer depth files hold metres × S.  [default: from the file, else 256]",
+        metavar="S",
+    )
+    sparse_scale: float | None = None
+    """Of the sparse depth, over `depth_scale`."""
+    gt_scale: float | None = option(None, "--depth-scale of the ground truth.", metavar="S")
+    channel: str | None = option(
+        None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
+    )
+    sparse_size_ok: bool = option(
+        False, "Accept a sparse depth map of another size; its points are moved to the image."
+    )
+    registration: str | tuple[float, float, float] = option(
+        "auto",
+        "Whether the image is moved into the frame of the points: auto, if their depth edges show"
+        " that it is not registered; off; or by ZOOM,RIGHT,DOWN in pixels.",
+        metavar="auto|off|Z,R,D",
+        parse=parse_registration,
+        show_default=True,
+    )
+    colmap: ColmapOptions = field(default_factory=ColmapOptions)
+    scan: ScanOptions = field(default_factory=ScanOptions)
+    calibration: Calibration | None = None
+    """Of a LiDAR scan, where the data set gives it instead of a file."""
+    camera_file: Path | None = None
+    """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
+    camera_number: int | None = None
+    neighbours: tuple[NeighbourFiles, ...] = ()
+    """Other frames of the sequence, whose points are moved into this one."""
+    window: tuple[str, ...] = ()
+    """Names of the frames of its window up to this one. Empty for a frame outside of windows."""
+    gt_masks: tuple[Path, ...] = ()
+    """Where one of these is 0, the ground truth is unknown."""
+    gt_size_ok: bool = False
+    """Accept ground truth of another size; its known pixels are moved to the image."""
+    sample: SamplePattern | None = None
+    """Which pixels of the ground truth serve as sparse depth."""
+    protocol: Protocol = field(default_factory=_whole_frame)
+
+    def is_scan(self, sparse: Path) -> bool:
+        """Returns whether sparse depth is a scan that is projected.
+
+        An .npz is one where the data set gives the pose of the scanner; else as `scan.describes`.
+
+        Raises:
+            UsageError: It is not, and an option is given that only a scan has.
+        """
+        if sparse.suffix.lower() == ".npz" and self.calibration is not None:
+            return self.calibration.has_pose
+        return self.scan.describes(sparse)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeighbourFiles:
+    """Another frame of the sequence, whose points are moved into this one."""
+
+    files: FrameFiles
+    motion: Pose | None
+    """(3, 4) from the other camera's frame to this one's, metres. None: it is estimated."""
+    poses: str
+    """Where the motion is from, for a person."""
+    apart: int
+    """Distance in frames, at least 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkChoice:
+    """Which network, with which weights, and where it runs."""
+
+    model: str = option(
+        "compact",
+        "A name of `pnpdepth models`, FILE.onnx[:OUTPUT], FILE.pt2, a Hugging Face folder, or"
+        " FILE.py[:ATTR], which is Python code and is run.",
+        metavar="NETWORK",
+        show_default=True,
+    )
+    more_models: tuple[str, ...] = ()
+    """Further networks, with their own weights, which are fused with the first."""
+    checkpoint: Path | None = option(
+        None,
+        "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder. No code in"
+        " it is run.",
+    )
+    output_kind: str | None = option(
+        None,
+        "Meaning of the network's output, replacing what its definition says.",
+        choices=choices.SPACES,
+    )
+    normalise: str | None = option(
+        None,
+        "RGB range of the network's input: 0…1, ImageNet's mean and std, −1…1, 0…255.",
+        choices=choices.NORMALISATIONS,
+    )
+    precision: str = option(
+        "fp32",
+        "Precision of convolutions and matrix products; z, loss and updates stay in fp32.",
+        choices=choices.PRECISIONS,
+        show_default=True,
+    )
+    device: str = option(
+        "cpu",
+        "cpu, cuda, cuda:1, mps, …; batch and sweep also take several, cuda:0,cuda:1, or all.",
+        metavar="NAME",
+        show_default=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class HoldOut:
+    """Which points are held out, and what is measured by them."""
+
+    baselines: bool = option(False, "Also print every baseline, such as linear interpolation.")
+    uncertainty: bool = option(
+        False, "Write the depth's standard deviation and a mask of valid depth."
+    )
+    holdout: float = option(0.0, "Hold out this fraction of the points to score at.", metavar="F")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputOptions:
+    """Where results go, and in which form."""
+
+    output: Path | None = None
+    """A folder, or one depth file. None: a folder named after the image."""
+    format: str = option(
+        "png",
+        "Format of the depth file in an output folder.",
+        choices=choices.FORMATS,
+        show_default=True,
+    )
+    output_scale: float | None = option(
+        None,
+        "Codes per metre of a 16-bit PNG; mm is 1000.  [default: as the sparse depth file, else 256"
+        " or what fits]",
+        metavar="mm|S",
+        parse=parse_codes_per_metre,
+    )
+    ply: bool = option(False, "Also write a coloured point cloud, NAME.ply.")
+    fov_deg: float | None = option(
+        None,
+        "Horizontal field of view, for --ply without --calib, COLMAP model or EXIF.",
+        flag="--fov",
+        metavar="DEG",
+    )
+    view_3d: bool = False
+    """Whether the 3D view of the frame is written, which the report of a batch shows."""
+    colors: str = option(
+        "blue-orange",
+        "Colours of better and worse: blue and orange, or the paper's red and green.",
+        choices=choices.COLORS,
+        show_default=True,
+    )
+    previews: str = option(
+        "all",
+        "Which frames get preview and improvement images: all, worst (those worse than linear"
+        " interpolation), or none.",
+        choices=choices.PREVIEWS,
+        show_default=True,
+    )
+    overwrite: bool = option(False, "Replace existing results.")
+
+    @property
+    def needs_camera(self) -> bool:
+        """Whether an output cannot be written without the camera."""
+        return self.ply or self.view_3d
+
+
+_NOT_IN_DIGEST = frozenset(
+    {
+        *("image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"),
+        *("camera_file", "camera_number", "ply", "view_3d"),
+    }
+)
+"""Fields that say where something lies, whose content is compared instead, or that add a file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineRequest:
+    """Everything the user asks of the refinement of one frame."""
+
+    files: FrameFiles = field(default_factory=FrameFiles)
+    network: NetworkChoice = field(default_factory=NetworkChoice)
+    method: Settings = field(default_factory=Settings)
+    hold_out: HoldOut = field(default_factory=HoldOut)
+    outputs: OutputOptions = field(default_factory=OutputOptions)
+
+    @classmethod
+    def from_fields(cls, **values: Any) -> RefineRequest:
+        """Returns the request with these fields of its groups, whichever group each is in."""
+        return cls().with_fields(**values)
+
+    def with_fields(self, **values: Any) -> RefineRequest:
+        """Returns a copy with other values of these fields, whichever group each is in."""
+        groups = {}
+        for group in fields(self):
+            own = getattr(self, group.name)
+            names = values.keys() & {each.name for each in fields(own)}
+            groups[group.name] = replace(own, **{name: values.pop(name) for name in names})
+        if values:
+            raise TypeError(f"a RefineRequest has no fields {', '.join(sorted(values))}")
+        return RefineRequest(**groups)
+
+    def settings(self, *groups: str) -> dict[str, Any]:
+        """Returns all fields that decide the result except the frame's files, by name.
+
+        Args:
+            *groups: Names of groups. None: all of them.
+        """
+        chosen = [getattr(self, e.name) for e in fields(self) if not groups or e.name in groups]
+        return {
+            each.name: getattr(group, each.name)
+            for group in chosen
+            for each in fields(group)
+            if each.name not in _NOT_IN_DIGEST
+        }
+
+
+def count_or_fraction(text: str) -> tuple[int | None, float | None]:
+    """Returns (points, fraction) of `500` or `5%`; the other is None. Raises UsageError."""
+    try:
+        if text.strip().endswith("%"):
+            return None, float(text.strip()[:-1]) / 100
+        return int(text), None
+    except ValueError:
+        raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
+
+
+def sample_pattern(kind: str, count: int | None, fraction: float | None) -> SamplePattern:
+    """Returns the pattern of so many points, or this fraction of the known pixels."""
+    from pnpdepth_cli.sensors import SamplePattern
+
+    return SamplePattern(kind=kind, count=count, fraction=fraction)
+
+
+def parse_sample(text: str | None) -> SamplePattern | None:
+    """Returns the pattern of `500`, `5%` or `lines:16`; None for None. Raises UsageError."""
+    if text is None:
+        return None
+    kind, colon, count = text.rpartition(":")
+    return sample_pattern(kind if colon else "uniform", *count_or_fraction(count))

@@ -1,0 +1,334 @@
+"""`pnpdepth batch --html`: each frame before and after refinement, with a map of the change.
+
+Everything is read from the results on disk: scores from the rows of the summary, images from the
+previews and the improvement maps, which the report links as they were written. So a report also has
+the frames of earlier runs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pnpdepth_cli.commands.report.evaluation import column_of, frames_text
+from pnpdepth_cli.commands.tables import column_title, format_value
+from pnpdepth_cli.core.metrics import MEASURES, Measure
+from pnpdepth_cli.errors import InputError, OutputError
+from pnpdepth_cli.io.colours import paint_gain, swatches
+from pnpdepth_cli.io.figure import figure_content
+from pnpdepth_cli.io.report import (
+    IMAGES,
+    Column,
+    Head,
+    Table,
+    begin_report,
+    check_report_folder,
+    image_key,
+    link_image,
+    save_view_3d,
+    write_report,
+)
+
+Row = dict[str, Any]
+
+_PANELS = {
+    "Depth before": "first",
+    "Depth after": "second",
+    "Change of error": "map",
+    "Image": "image",
+    "Sparse depth": "sparse",
+}
+_LABELS = {
+    "first": "Before",
+    "second": "After",
+    "map": "Change of error",
+    "image": "Image",
+    "sparse": "Sparse depth",
+    "gt": "Ground truth",
+}
+_GT, _HELD_OUT, _USED = "scores", "held_out_error", "sparse_error"
+_BASES = {
+    _GT: "against ground truth",
+    _HELD_OUT: "at held-out points",
+    _USED: "at the points used",
+}
+"""What errors are measured on, the best first. A gain at the points used means nothing."""
+_ERRORS = {measure.key: measure for measure in MEASURES if measure.key in ("rmse", "mae")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchReport:
+    """Writes the report of a batch."""
+
+    folder: Path
+    output: Path
+    """The folder of the results."""
+    view_3d: bool = False
+    colors: str = "blue-orange"
+    """Colours of the improvement maps."""
+
+    def check(self, inputs: Sequence[Path], *, overwrite: bool) -> None:
+        """Raises OutputError for a folder that the report cannot or may not be written to."""
+        folder, output = self.folder.resolve(), self.output.resolve()
+        if output.is_relative_to(folder):
+            raise OutputError(
+                f"{self.folder} holds the results; name a folder of its own for the report, such as"
+                f" {self.output / 'report'}"
+            )
+        others = [path for path in inputs if not _holds_results(path, output, folder)]
+        check_report_folder(self.folder, others, made_of=self._source(), overwrite=overwrite)
+
+    def begin(self) -> None:
+        """Creates the folder, marked so that the next run may replace it."""
+        begin_report(self.folder, self._source())
+
+    def write(self, summary: Mapping[str, Any], rows: Callable[[], Iterable[Row]]) -> None:
+        """Writes the page, and links the images of all frames.
+
+        Args:
+            summary: The batch's summary without its frames.
+            rows: Gives the summary's rows, each time anew.
+        """
+        bases, failed, first = set[str | None](), [], None
+        for row in rows():
+            if row["outputs"]:
+                first = first or row
+                bases.add(_basis(row))
+            else:
+                failed.append((row["name"], row["message"]))
+        head, mixed = _head(summary, first, failed, self.colors), len(bases - {None}) > 1
+        entries = (self._entry(row, head.columns, mixed) for row in rows() if row["outputs"])
+        write_report(self.folder, head, entries, viewer=self.view_3d)
+
+    def _source(self) -> dict[str, Any]:
+        folder, output = self.folder.resolve(), self.output.resolve()
+        return {"command": "batch", "output": os.path.relpath(output, folder)}
+
+    def _entry(self, row: Row, columns: Sequence[Column], mixed: bool) -> dict[str, Any]:
+        basis = _basis(row)
+        values = _values(row, basis)
+        if basis == _USED and columns[0].signed:
+            values = {}  # others have a gain that means something
+        tag = _BASES[basis] if mixed and basis else ""
+        try:
+            views = self._views(row)
+        except InputError:  # a result has gone or changed; the next run refines it again
+            views = {"key": None}
+        return {
+            "name": row["name"],
+            "values": [values.get(column.key) for column in columns],
+            "notes": list(_notes(row, basis)),
+            "tag": "diverged" if row["status"] == "diverged" else tag,
+            **views,
+        }
+
+    def _views(self, row: Row) -> dict[str, Any]:
+        """Links the images of the row's frame; returns the page's entry of them."""
+        files = {kind: self.output / path for kind, path in row["outputs"].items()}
+        if not ("preview" in files and "improvement" in files):
+            return {"key": None}
+        key, views, figures = image_key(row["name"]), {}, {}
+        for kind in ("preview", "improvement"):
+            figure = figures[kind] = figure_content(files[kind])
+            name = f"{IMAGES}/{key}_{kind}.png"
+            link_image(files[kind], self.folder / name)
+            for panel in figure["panels"]:
+                if panel["title"] in _PANELS:
+                    place = {"src": name, "box": panel["box"], "size": figure["size"]}
+                    views[_PANELS[panel["title"]]] = place
+        view_mb = None
+        if self.view_3d and "view" in files:
+            view_mb = save_view_3d(files["view"], self.folder / IMAGES / f"{key}_view.js")
+        return {
+            "key": key,
+            "views": views,
+            "view_mb": view_mb,
+            "scale_m": [figures["preview"][end] for end in ("low_m", "high_m")],
+            "map": {name: figures["improvement"][name] for name in ("ends", "unknown", "footer")},
+        }
+
+
+def _holds_results(path: Path, output: Path, folder: Path) -> bool:
+    """True for a folder that holds the results, if the report is among them too."""
+    return folder.is_relative_to(output) and output.is_relative_to(path.resolve())
+
+
+def _basis(row: Row) -> str | None:
+    return next((basis for basis in _BASES if row[basis]), None)
+
+
+def _columns(measured: bool, unit: str) -> list[Column]:
+    """Errors before and after; with gains if any frame has ground truth or held-out points."""
+    columns = []
+    percent: dict[str, Any] = {"decimals": 1, "percent": True, "higher_is_better": True}
+    for key, measure in _ERRORS.items():
+        if measured:
+            title = f"{measure.title} gain"
+            columns.append(Column(key=f"{key}_gain", title=title, signed=True, **percent))
+        for stage in ("before", "after"):
+            title, name = f"{measure.title} {stage}", f"{key}_{stage}"
+            columns.append(column_of(in_unit(measure, unit), title=title, key=name, listed=True))
+    return [*columns, Column(key="improved", title="Improved", **percent)]
+
+
+def _values(row: Row, basis: str | None) -> dict[str, float | None]:
+    if basis is None:
+        return {}
+    values: dict[str, float | None] = {"improved": row.get("improved_fraction")}
+    for key in _ERRORS:
+        before, after = (row[basis][stage].get(key) for stage in ("before", "after"))
+        values |= {f"{key}_before": before, f"{key}_after": after}
+        values[f"{key}_gain"] = _gain(before, after)
+    return values
+
+
+def _gain(before: float | None, after: float | None) -> float | None:
+    return 1 - after / before if before and after is not None else None
+
+
+def _notes(row: Row, basis: str | None) -> Iterator[str]:
+    if row["message"]:
+        yield row["message"]
+    if basis is not None:
+        after = row[basis]["after"]
+        count = f"{after['pixels']:,} pixels" if basis == _GT else f"{after['points']:,} points"
+        yield f"Errors are {_BASES[basis]}, {count}."
+    if basis == _USED:
+        yield "Refinement fits these points, so its gain there proves nothing."
+    yield from row["warnings"]
+
+
+def _head(
+    summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str, str]], colors: str
+) -> Head:
+    unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), []
+    means = {basis: summary["mean"][basis] for basis in _BASES if summary["mean"][basis]}
+    measured = bool(means.keys() - {_USED})
+    if unmatched:
+        notes = [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
+    if means and not measured:
+        notes.append("Without ground truth or --holdout, no error is measured.")
+    return Head(
+        kind="Batch refinement",
+        title=summary["output"],
+        tiles=_tiles(summary),
+        facts=_facts(summary, first),
+        notes=notes,
+        tables=[
+            *(_means(basis, mean, unit) for basis, mean in means.items()),
+            *_baselines(summary.get("baselines"), unit),
+        ],
+        without_title=f"Not refined: {len(failed):,}",
+        without=failed,
+        columns=_columns(measured, unit),
+        sort_by="rmse_gain" if measured else "rmse_after",
+        labels=_LABELS,
+        thumb="second",
+        map_colours=swatches(paint_gain(np.linspace(-1, 1, 9), np.full(9, 0.88), colors)),
+        unit=unit,
+    )
+
+
+def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """The number of frames, and errors that were not measured at the points used."""
+    counts = summary["counts"]
+    refined = counts["done"] + counts["diverged"]
+    others = [
+        f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
+    ]
+    tiles = [("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
+    for basis in (_GT, _HELD_OUT):
+        mean = summary["mean"][basis]
+        for key, measure in _ERRORS.items() if mean else ():
+            before, after = (mean[stage].get(key) for stage in ("before", "after"))
+            change = f"{format_value(measure, before)} → {format_value(measure, after)}"
+            gain = _gain(before, after)
+            gain_text = "" if gain is None else f"gain {_signed(100 * gain, 1, '%')} "
+            label = f"{measure.title} [{summary['unit']}]"
+            tiles.append((label, change, f"{gain_text}{_BASES[basis]}"))
+    return tiles
+
+
+def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str]]:
+    settings = summary["settings"]
+    facts = [
+        ("Frames of", f"{summary['source']} (layout {summary['layout']})"),
+        ("Results in", summary["output"]),
+        ("Network", str(settings["model"])),
+    ]
+    if summary["method"]["kind"] == "default":
+        facts.append(("Refinement", "networks refined, fused and propagated (the default method)"))
+    elif first is not None:
+        used = first["settings"]
+        refined = f"{used['iterations']} updates of z at {used['layer']}"
+        facts.append(
+            ("Refinement", f"{refined} ({used['update']}, {used['loss']}, step {used['lr']})")
+        )
+        facts.append(("Alignment", str(used["align"])))
+    if settings["propagate"]:
+        facts.append(("Propagation", settings["propagate"]))
+    if settings["holdout"]:
+        held_out = f"{settings['holdout']:.0%} of the points, seed {settings['seed']}"
+        facts.append(("Held out", held_out))
+    if summary["counts"]["with_warnings"]:
+        facts.append(("Warnings", f"in {frames_text(summary['counts']['with_warnings'])}"))
+    return facts
+
+
+def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
+    measures: Iterable[Measure] = MEASURES if basis == _GT else _ERRORS.values()
+    rows = []
+    for measure in measures:
+        before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
+        values = [format_value(measure, before), format_value(measure, after)]
+        change = _gain_text(measure, before, after)
+        rows.append([column_title(in_unit(measure, unit)), *values, change])
+    if basis == _GT:
+        coverage = [mean[stage].get("coverage") for stage in ("before", "after")]
+        shares = ["–" if value is None else f"{value:.2%}" for value in coverage]
+        rows.append(["coverage", *shares, ""])
+    shown = 3 if basis == _USED else 4  # a gain at the points used means nothing
+    return Table(
+        caption=f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}",
+        header=["", "before", "after", "gain"][:shown],
+        rows=[row[:shown] for row in rows],
+    )
+
+
+def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[Table]:
+    """A table of the simple baselines, the network and the result; empty without --baselines."""
+    if not mean:
+        return []
+    places = {"held_out_mae": "MAE at held-out points", "mae": "MAE", "rmse": "RMSE"}
+    rows = [
+        [name, *(format_value(_ERRORS["mae"], row[key]) for key in places), f"{row['frames']:,}"]
+        for name, row in mean.items()
+    ]
+    header = ["", *(f"{title} [{unit}]" for title in places.values()), "frames"]
+    return [Table(caption="Simple baselines: means over frames", header=header, rows=rows)]
+
+
+def in_unit(measure: Measure, unit: str) -> Measure:
+    """Returns the measure of depths whose unit is not the metre, such as a model's."""
+    return replace(measure, unit=unit) if measure.unit == "m" else measure
+
+
+def _gain_text(measure: Measure, before: float | None, after: float | None) -> str:
+    if before is None or after is None:
+        return "–"
+    if measure.percent:
+        return _signed(100 * (after - before), 2, " pt")
+    gain = _gain(before, after)
+    return "–" if gain is None else _signed(100 * gain, 1, "%")
+
+
+def _signed(value: float, decimals: int, unit: str) -> str:
+    """The value with its sign; without one if it is rounded to zero."""
+    text = f"{abs(value):.{decimals}f}"
+    sign = "" if float(text) == 0 else "+" if value > 0 else "−"
+    return f"{sign}{text}{unit}"

@@ -1,0 +1,240 @@
+"""`pnpdepth eval --html`: each frame's prediction, its ground truth, and a map of its errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
+from pnpdepth_cli.commands.evaluation.frame_reading import image_of, load_frame
+from pnpdepth_cli.commands.evaluation.frame_scoring import FrameScores, filled
+from pnpdepth_cli.commands.evaluation.tables import calibration_tables, means_by_measure
+from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.tables import format_value, unit_of
+from pnpdepth_cli.core.metrics import Measure
+from pnpdepth_cli.errors import InputError, PnpDepthError
+from pnpdepth_cli.io.colours import depth_scale, grey_of, paint_error, swatches
+from pnpdepth_cli.io.report import (
+    Chart,
+    Column,
+    Head,
+    Table,
+    begin_report,
+    check_report_folder,
+    image_key,
+    save_views,
+    whole_report,
+    write_report,
+)
+from pnpdepth_cli.io.visualisation import error_map
+
+_SOURCE = {"command": "eval"}
+_LISTED = ("rmse", "mae", "mre", "irmse", "delta1")
+
+
+def check_eval_report(folder: Path, inputs: list[Path], *, overwrite: bool) -> None:
+    """Raises OutputError for a folder that the report cannot or may not be written to."""
+    check_report_folder(folder, inputs, made_of=None, overwrite=overwrite)
+
+
+def write_eval_report(
+    folder: Path,
+    evaluation: Evaluation,
+    *,
+    on_frame: Callable[[int, int], None] = lambda done, of: None,
+) -> None:
+    """Writes the report; the files are read once more for its images.
+
+    Args:
+        folder: Where the page and its images are written.
+        evaluation: The scores.
+        on_frame: Called with (done, of) after each frame.
+
+    Raises:
+        OutputError: If the report cannot be written; then the folder is as it was before.
+    """
+    columns = _columns(evaluation)
+    scored = evaluation.scored
+
+    def entries(images: Path) -> Iterator[dict[str, Any]]:
+        drawn = in_order(
+            lambda frame: _entry(frame, evaluation, columns, images),
+            scored,
+            evaluation.request.workers,
+        )
+        for done, entry in enumerate(drawn, start=1):
+            yield entry
+            on_frame(done, len(scored))
+
+    with whole_report(folder) as temporary:
+        images = begin_report(temporary, _SOURCE)
+        write_report(temporary, _head(evaluation, columns), entries(images))
+
+
+def column_of(measure: Measure, *, title: str = "", key: str = "", listed: bool) -> Column:
+    """Returns the column of a measure, with its own title and key or other ones."""
+    return Column(
+        key=key or measure.key,
+        title=title or measure.title,
+        unit=unit_of(measure),
+        decimals=measure.decimals,
+        factor=measure.shown_factor,
+        percent=measure.percent,
+        higher_is_better=measure.higher_is_better,
+        listed=listed,
+    )
+
+
+def frames_text(count: int) -> str:
+    """Returns text such as `12 frames`."""
+    return f"{count:,} frame{'' if count == 1 else 's'}"
+
+
+def _columns(evaluation: Evaluation) -> list[Column]:
+    measures = evaluation.protocol.measures
+    keys = {measure.key for measure in measures}
+    listed = _LISTED if keys.issuperset(_LISTED) else tuple(keys)
+    return [
+        *(column_of(measure, listed=measure.key in listed) for measure in measures),
+        Column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
+    ]
+
+
+def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
+    request = evaluation.request
+    without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
+    fill = " (filled in)" if evaluation.protocol.is_devkit else ""
+    return Head(
+        kind="Depth evaluation",
+        title=str(request.prediction),
+        tiles=_tiles(evaluation),
+        facts=[
+            ("Prediction", str(request.prediction)),
+            ("Ground truth", str(request.ground_truth)),
+            *([("Sparse depth", str(request.sparse))] if request.sparse else []),
+            ("Protocol", evaluation.protocol.describe()),
+            ("Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"),
+        ],
+        notes=evaluation.notes,
+        tables=[
+            Table(caption=table.caption, header=table.header, rows=table.rows)
+            for table in (means_by_measure(evaluation), *calibration_tables(evaluation))
+        ],
+        charts=_charts(evaluation),
+        without_title=f"Not scored: {len(without):,}",
+        without=without,
+        columns=columns,
+        sort_by="rmse",
+        labels={
+            "first": f"Prediction{fill}", "second": "Ground truth", "map": "Error",
+            "image": "Image",
+        },
+        map_colours=swatches(paint_error(np.linspace(-1, 1, 9), np.full(9, 0.88))),
+    )  # fmt: skip
+
+
+def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
+    frames, scored = len(evaluation.frames), len(evaluation.scored)
+    missing, failed = len(evaluation.missing), len(evaluation.failed)
+    unscored = [f"{missing:,} without prediction"] if missing else []
+    unscored += [f"{failed:,} with a faulty file"] if failed else []
+    of = f"{scored:,} of {frames:,}" if scored != frames else f"{frames:,}"
+    coverage = f"{evaluation.coverage:.2%}"
+    return [
+        ("Frames scored", of, ", ".join(unscored)),
+        *(
+            (measure.title, format_value(measure, evaluation.mean[measure.key], unit=True), "")
+            for measure in evaluation.protocol.measures
+            if measure.key in ("rmse", "mae", "delta1")
+        ),
+        ("Coverage", coverage, "of the ground truth has a prediction"),
+    ]
+
+
+def _charts(evaluation: Evaluation) -> list[Chart]:
+    """The calibration plot and the sparsification curve of the predicted standard deviation."""
+    found = evaluation.uncertainty
+    if found is None:
+        return []
+    frames = frames_text(found.frames)
+    charts = [
+        Chart(
+            caption=f"Calibration, {frames}",
+            x_title="errors within the interval if normal",
+            y_title="observed",
+            lines={
+                "observed": list(zip(found.expected, found.observed, strict=True)),
+                "normal": [(0, 0), (1, 1)],
+            },
+        )
+    ]
+    if whole := found.sparsification[0]:
+        by_sigma, by_error = (
+            [(part, mae / whole) for part, mae in zip(found.removed, curve, strict=True)]
+            for curve in (found.sparsification, found.oracle)
+        )
+        charts.append(
+            Chart(
+                caption=f"Sparsification, {frames}: AUSE {found.ause:.4f}",
+                x_title="pixels removed",
+                y_title="MAE of the others",
+                lines={"by σ": by_sigma, "by error (oracle)": by_error},
+            )
+        )
+    return charts
+
+
+def _entry(
+    frame: FrameScores, evaluation: Evaluation, columns: list[Column], images: Path
+) -> dict[str, Any]:
+    values = frame.values | {"coverage": frame.coverage}
+    notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
+    if frame.leaked:
+        notes.append(f"{frame.leaked:,} of them were given to the network as sparse depth.")
+    notes.append(f"Prediction: {frame.pair.prediction}")
+    notes.append(f"Ground truth: {frame.pair.frame.gt}")
+    try:
+        drawn = _drawn(frame, evaluation, images)
+    except InputError as error:  # the file has changed since it was scored
+        notes.append(str(error))
+        drawn = {"key": None}
+    return {
+        "name": frame.name,
+        "values": [values.get(column.key) for column in columns],
+        "notes": notes,
+        "tag": "",
+        **drawn,
+    }
+
+
+def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str, Any]:
+    """Writes the images of a frame and returns the page's entry of them."""
+    protocol, pair = evaluation.protocol, frame.pair
+    loaded = load_frame(pair, protocol, evaluation.request.scales)
+    gt, depth = loaded.gt, loaded.depth
+    if protocol.is_devkit:
+        depth = filled(depth)
+    try:
+        image = image_of(pair, gt.shape)
+    except PnpDepthError:
+        image = None
+    errors, strongest_m = error_map(depth, gt, None if image is None else grey_of(image))
+    scale = depth_scale(depth, gt)
+    views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors}
+    if image is not None:
+        views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
+    key = image_key(frame.name)
+    amount = f"by {strongest_m:.3g} m or more"
+    return {
+        "key": key,
+        "views": save_views(images, key, views),
+        "scale_m": [scale.low_m, scale.high_m],
+        "map": {
+            "ends": [f"too near {amount}", f"too far {amount}"],
+            "unknown": None if ((gt > 0) & (depth > 0)).all() else "not scored",
+            "footer": "prediction against ground truth",
+        },
+    }

@@ -1,0 +1,96 @@
+"""The frames that `refine` or `batch` wrote: depth files with their records and masks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
+from pnpdepth_cli.commands.sparse.options import METRES
+from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.dataset.find_files import find_files
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.record import read_json
+
+DEPTH_ENDING = "_depth"
+"""End of the stem of a depth file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultFrame:
+    """The files of one depth map."""
+
+    name: str
+    """Path below the folder of the results, without the ending."""
+    depth: Path
+    sigma: Path | None = None
+    """Standard deviation of the depth."""
+    valid: Path | None = None
+    """Mask of the pixels whose depth is valid."""
+    record: Mapping[str, Any] = field(default_factory=dict)
+    """The record beside the depth; empty if there is none."""
+
+    @property
+    def image(self) -> Path | None:
+        """The image that the record names, if it exists."""
+        entry = _entry(_entry(self.record, "inputs"), "image")
+        path = entry.get("path")
+        return Path(path) if isinstance(path, str) and Path(path).is_file() else None
+
+    @property
+    def unit(self) -> str:
+        """The unit of the depth."""
+        return str(self.record.get("unit", METRES))
+
+    @property
+    def camera(self) -> FrameCamera | None:
+        """The camera that the record holds. Raises FileFormatError if it is damaged."""
+        entry = _entry(self.record, "camera")
+        try:
+            return FrameCamera.of_record(entry) if entry else None
+        except (KeyError, ValueError, TypeError, OverflowError) as error:
+            raise FileFormatError(
+                f"{self.depth}: the camera in the record beside it is damaged; refine it again"
+            ) from error
+
+
+def result_frames(root: Path) -> list[ResultFrame]:
+    """Returns the frame of a depth file, or those of a folder with files NAME_depth.SUFFIX.
+
+    Raises:
+        InputError: There is none, or a record cannot be read.
+    """
+    if not root.is_dir():
+        return [_frame(root.stem.removesuffix(DEPTH_ENDING), root)]
+    files, _ = find_files(root, DEPTH_SUFFIXES)
+    frames = [
+        _frame(name.removesuffix(DEPTH_ENDING), path)
+        for name, path in files.items()
+        if name.endswith(DEPTH_ENDING)
+    ]
+    if not frames:
+        raise InputError(f"{root} has no files NAME{DEPTH_ENDING}.png or of another format")
+    return frames
+
+
+def _frame(name: str, depth: Path) -> ResultFrame:
+    record = _beside(depth, ".json")
+    return ResultFrame(
+        name=name,
+        depth=depth,
+        sigma=_beside(depth, "_sigma.exr"),
+        valid=_beside(depth, "_valid.png"),
+        record={} if record is None else read_json(record),
+    )
+
+
+def _beside(depth: Path, ending: str) -> Path | None:
+    path = depth.with_name(depth.stem.removesuffix(DEPTH_ENDING) + ending)
+    return path if path != depth and path.is_file() else None
+
+
+def _entry(record: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    value = record.get(name)
+    return value if isinstance(value, dict) else {}

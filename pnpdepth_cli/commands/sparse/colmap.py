@@ -1,0 +1,169 @@
+"""The points of a COLMAP model that one image observes, as its sparse depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.commands.sparse.options import METRES, MODEL_UNITS, ColmapOptions
+from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
+from pnpdepth_cli.io.colmap.model import ColmapCamera, ColmapModel
+from pnpdepth_cli.io.colmap.reading import find_model, model_files, name_in_model, read_model
+from pnpdepth_cli.io.dataset.reading import check_same_view
+from pnpdepth_cli.io.depth import describe_range
+from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.sensors import Camera, Points
+from pnpdepth_cli.sensors.sparse import DropCounter, describe_dropped
+
+_SIZES_IN_RANGE = 8.0
+"""A 16-bit file in model units holds depths up to at least so many times the model's extent."""
+
+_LARGEST_CODE = 65535
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapPointsOfImage:
+    """Sparse depth of one image."""
+
+    points: Points
+    """In the frame of the image, depth in `unit`."""
+    camera: Camera
+    """In pixels of the image."""
+    pose: NDArray[np.float64]
+    """(3, 4) from the camera's frame to the model's, in `unit`."""
+    unit: str
+    """METRES or MODEL_UNITS."""
+    scale: float | None
+    """Codes per unit of a 16-bit output in model units; None for metres."""
+    record: dict[str, Any]
+    """What a record keeps of it."""
+    notes: tuple[str, ...]
+    """Lines for a person."""
+
+
+def read_colmap_points(
+    path: Path, options: ColmapOptions, image: Path, size: tuple[int, int], *, any_size: bool
+) -> ColmapPointsOfImage:
+    """Returns the points that COLMAP matched in an image, projected into it.
+
+    The camera's own lens distortion is applied to the points, so the photo stays as it was taken.
+
+    Args:
+        path: Folder of the model.
+        options: Limits and unit.
+        image: The photo.
+        size: (H, W) of the photo.
+        any_size: Whether a photo of another size than the model's camera is accepted.
+
+    Raises:
+        InputError: The model cannot be read, or lacks the image.
+        SizeError: The photo is not of the camera's size.
+        NoPointsError: No point is left.
+    """
+    model = read_model(path)
+    name = name_in_model(model, image)
+    camera = model.cameras[model.images[name].camera]
+    if camera.size != size and not any_size:
+        raise SizeError(
+            f"{image} is {size[1]}×{size[0]} but its camera in {model.folder} is"
+            f" {camera.size[1]}×{camera.size[0]}; give the photo that COLMAP was given, unrotated,"
+            " or --sparse-size-ok if it was only resized"
+        )
+    check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
+    points = _observed(model, name, options)
+    turn, shift = model.images[name].rotation.T, model.images[name].translation
+    unit = MODEL_UNITS if options.unit_scale is None else METRES
+    source = f"COLMAP model, image {name}, {camera.model} camera"
+    notes = [f"sparse: {describe_range(points.depth, source, unit=unit)}"]
+    if _eye(camera).has_lens:
+        notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
+    lost = describe_dropped(points.dropped)
+    notes += [f"sparse: dropped {lost}"] if lost else []
+    if unit == MODEL_UNITS:
+        notes.append("unit: depth is in model units; --colmap unit-scale=M gives metres per unit")
+    return ColmapPointsOfImage(
+        points=points.resized(*size),
+        camera=_resized(_eye(camera), camera.size, size),
+        pose=np.column_stack([turn, -turn @ shift * (options.unit_scale or 1.0)]),
+        unit=unit,
+        scale=_output_scale(model) if unit == MODEL_UNITS else None,
+        record={
+            "path": str(model.folder),
+            "sha256": {p.name: fingerprint(p).sha256 for p in model_files(find_model(path))},
+            "read_as": source,
+            "image": name,
+            "lens": camera.lens,
+            "distortion": list(camera.distortion),
+            "unit_scale": options.unit_scale,
+            "min_track": options.min_track,
+            "max_reprojection": options.max_reprojection,
+            "dropped": dict(points.dropped),
+        },
+        notes=tuple(notes),
+    )
+
+
+def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
+    """The points in the image's tracks that pass the filters, in the frame of its camera's size."""
+    image, points = model.images[name], model.points
+    camera = model.cameras[image.camera]
+    row = np.searchsorted(points.number, image.points)
+    known = row < len(points.number)
+    known[known] = points.number[row[known]] == image.points[known]
+    row = row[known]
+    if not len(row):
+        raise NoPointsError(f"{model.folder} has no points in {name!r}; register it with matches")
+    drops = DropCounter(len(row))
+    least = min(options.min_track, len(model.images))
+    row = row[drops.keep(points.track[row] >= least, f"seen in fewer than {least} images")]
+    why = f"with a reprojection error above {options.max_reprojection:g} px"
+    row = row[drops.keep(points.error[row] <= options.max_reprojection, why)]
+    seen = points.xyz[row] @ image.rotation.T + image.translation
+    front = drops.keep(seen[:, 2] > 0, "behind the camera")
+    if len(row) and not front.any():
+        raise InputError(
+            f"all {len(row):,} points of {name!r} in {model.folder} are behind its camera; the"
+            " model is damaged, or its poses are inverted"
+        )
+    seen = seen[front]
+    seen, xy = drops.keep_seen(seen, _eye(camera).pixels_of(seen), camera.size)
+    depth = seen[:, 2] * (options.unit_scale or 1.0)
+    if not len(depth):
+        raise NoPointsError(
+            f"none of the {len(known):,} points of {name!r} in {model.folder} is left ({drops});"
+            " relax --colmap min-track or max-reprojection"
+        )
+    return Points(
+        xy=xy.astype(np.float32),
+        depth=depth.astype(np.float32),
+        size=camera.size,
+        dropped=drops.dropped,
+    )
+
+
+def _eye(camera: ColmapCamera) -> Camera:
+    return Camera(intrinsics=camera.intrinsics, distortion=camera.distortion, lens=camera.lens)
+
+
+def _resized(camera: Camera, old: tuple[int, int], new: tuple[int, int]) -> Camera:
+    """The camera for another size of the image, (H, W); pixel centres are at whole numbers."""
+    scale = np.array([[new[1] / old[1]], [new[0] / old[0]]])
+    intrinsics = camera.intrinsics.copy()
+    intrinsics[:2, 2] += 0.5
+    intrinsics[:2] *= scale
+    intrinsics[:2, 2] -= 0.5
+    return replace(camera, intrinsics=intrinsics)
+
+
+def _output_scale(model: ColmapModel) -> float:
+    """A power of two, one for the whole model, so that its depths use the codes of 16 bits."""
+    centre = np.median(model.points.xyz, axis=0)
+    extent = float(np.median(np.linalg.norm(model.points.xyz - centre, axis=1)))
+    poses = model.images.values()
+    path = [np.linalg.norm(image.rotation.T @ image.translation + centre) for image in poses]
+    farthest = _SIZES_IN_RANGE * max(extent, float(np.median(path)), 1e-9)
+    return float(2.0 ** np.floor(np.log2(_LARGEST_CODE / farthest)))

@@ -1,0 +1,281 @@
+"""`pnpdepth frames`: a bag as a folder of images, scans and their calibration."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from pnpdepth_cli.commands.sparse.options import BagOptions
+from pnpdepth_cli.commands.sparse.scans import chosen_camera
+from pnpdepth_cli.errors import InputError, OutputError
+from pnpdepth_cli.io.atomic import atomic_path, make_folder
+from pnpdepth_cli.io.bags.bag import (
+    CLOUDS,
+    IMAGES,
+    ODOMETRY,
+    POSES,
+    TRANSFORMS,
+    Bag,
+    check_topics,
+    open_bag,
+    topic_of,
+)
+from pnpdepth_cli.io.bags.messages import (
+    Stamped,
+    cloud_points,
+    image_file,
+    nearest_pairs,
+    seconds_of,
+)
+from pnpdepth_cli.io.bags.transforms import (
+    camera_info_topic,
+    camera_of_bag,
+    camera_trajectory,
+    frame_of,
+    poses_topics,
+    static_pose,
+)
+from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.cloud_files import write_points
+from pnpdepth_cli.io.poses import Trajectory
+from pnpdepth_cli.io.record import plain, read_json, write_json
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.scans import read_scan
+
+POSES_FILE = "poses.txt"
+"""Rows as of the TUM RGB-D benchmark, one for each frame in the order of their names."""
+
+RECORD = "frames.json"
+_FOLDERS = ("rgb", "sparse")
+_COMPARED_FRAMES = 5
+_LONGEST_GAP_S = 0.5
+"""Between two poses that one is interpolated from."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesRequest:
+    """Which bag to write as files, and where."""
+
+    bag: Path
+    """A file or a folder."""
+    output: Path
+    """The folder for rgb/, sparse/, calib.txt, poses.txt and frames.json."""
+    options: BagOptions = field(default_factory=BagOptions)
+    limit: int | None = None
+    """Only the first frames; None for all."""
+    overwrite: bool = False
+    calib: Path | None = None
+    """The camera's calibration instead of that of the bag."""
+    camera: int | None = None
+    """Which camera of `calib`."""
+
+
+def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
+    """Writes the frames of a bag in the layout `pairs`, one at a time, and returns the record.
+
+    `say` receives what was guessed, and warnings.
+
+    Raises:
+        InputError: The bag cannot be read, or has no frame.
+        UsageError: Topics are ambiguous.
+        OutputError: The folder holds files that may not be replaced.
+    """
+    _check_output(request)
+    wanted, tolerance = request.options.wanted, request.options.tolerance
+    with open_bag(request.bag) as bag:
+        check_topics(bag, wanted, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES, *TRANSFORMS))
+        topics = topic_of(bag, wanted, IMAGES), topic_of(bag, wanted, CLOUDS)
+        say(f"topics: images of {topics[0]}, points of {topics[1]}")
+        _clear(request)
+        lost, times, poses = 0, list[float](), None
+        frames = "", ""
+        for image, scan in nearest_pairs(_stream(bag, *topics), tolerance):
+            if scan is None:
+                lost += 1
+                continue
+            frames = frames if times else (frame_of(image.message), frame_of(scan.message))
+            _write_frame(request.output, topics, image, scan)
+            times.append(image.time_s)
+            if len(times) == request.limit:
+                break
+        if times:
+            camera = _write_calibration(request, bag, topics[0], frames, say)
+            poses = _write_poses(request, bag, camera, times, say)
+    if lost:
+        say(f"warning: {lost:,} images have no scan within {tolerance:g} s")
+    if not times:
+        raise InputError(
+            f"{request.bag}: no image of {topics[0]} has a scan of {topics[1]} within"
+            f" {tolerance:g} s; check the clocks, or give a larger --tolerance"
+        )
+    record = _identity(request) | {
+        "image_topic": topics[0],
+        "points_topic": topics[1],
+        "complete": True,
+        "frames": len(times),
+        "poses": poses,
+        "images_without_scan": lost,
+    }
+    write_json(request.output / RECORD, record)
+    return record
+
+
+def written_before(request: FramesRequest) -> bool:
+    """Returns whether the folder holds the frames of this bag with these options."""
+    path = request.output / RECORD
+    if not path.is_file():
+        return False
+    identity, record = plain(_identity(request) | {"complete": True}), read_json(path)
+    return all(record.get(name) == value for name, value in identity.items())
+
+
+def _check_output(request: FramesRequest) -> None:
+    folder = request.output
+    ours = (folder / RECORD).is_file()
+    if ours and not request.overwrite:
+        raise OutputError(f"{folder} holds the frames of a bag; --overwrite replaces them")
+    if folder.is_file() or (not ours and folder.is_dir() and any(folder.iterdir())):
+        raise OutputError(f"{folder} exists, and holds no frames of a bag; name another with -o")
+
+
+def _clear(request: FramesRequest) -> None:
+    """Removes the frames that were written before, and records that these are incomplete."""
+    for name in _FOLDERS:
+        make_folder(request.output / name)
+        for path in (request.output / name).iterdir():
+            path.unlink()
+    for name in ("calib.txt", POSES_FILE):
+        (request.output / name).unlink(missing_ok=True)
+    write_json(request.output / RECORD, _identity(request) | {"complete": False})
+
+
+def _identity(request: FramesRequest) -> dict[str, Any]:
+    paths = sorted(request.bag.iterdir()) if request.bag.is_dir() else [request.bag]
+    return {
+        "command": "frames",
+        "bag": str(request.bag),
+        "bag_files": {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths},
+        "options": asdict(request.options),
+        "limit": request.limit,
+        "calib": None if request.calib is None else str(request.calib),
+        "camera": request.camera,
+    }
+
+
+def _stream(bag: Bag, images: str, points: str) -> Iterator[tuple[bool, Stamped]]:
+    for topic, logged_ns, message in bag.messages([images, points]):
+        yield topic == images, Stamped(seconds_of(message, logged_ns), message)
+
+
+def _write_frame(folder: Path, topics: tuple[str, str], image: Stamped, scan: Stamped) -> None:
+    """Writes rgb/NAME.png and sparse/NAME.ply; the name is the image's time."""
+    name = f"{image.time_s:.6f}".replace(".", "_")
+    suffix, data = image_file(image.message, topics[0])
+    with atomic_path(folder / "rgb" / f"{name}{suffix}") as temporary:
+        temporary.write_bytes(data)
+    write_points(folder / "sparse" / f"{name}.ply", cloud_points(scan.message, topics[1]))
+
+
+def _write_calibration(
+    request: FramesRequest, bag: Bag, image_topic: str, frames: tuple[str, str], say: Say
+) -> str:
+    """Writes calib.txt as far as there is a calibration; returns the name of the camera's frame.
+
+    `frames` are the names in the headers of an image and a scan.
+    """
+    topic = camera_info_topic(bag, image_topic)
+    of_bag = None if topic is None else camera_of_bag(bag, topic)
+    names = (of_bag[1] if of_bag else "") or frames[0], frames[1]
+    if request.calib is not None:
+        calibration, source = read_calibration(request.calib, request.camera), str(request.calib)
+    elif of_bag is None:
+        say(f"warning: {bag.path} has no camera_info of {image_topic}; refine with --calib")
+        return frames[0]
+    else:
+        calibration, source = of_bag[0], str(topic)
+    pose = None if calibration.has_pose else static_pose(bag, *names)
+    if pose is not None:
+        source += f", and /tf_static from {names[0]} to {names[1]}"
+        calibration = replace(calibration, rotation=pose[0], translation=pose[1], has_pose=True)
+    if not calibration.has_pose:
+        say(
+            f"warning: {bag.path} has no static transform from {names[0]} to {names[1]}; refine"
+            " with --extrinsics"
+        )
+    else:
+        say(f"calibration: {source}")
+    if request.calib is None and calibration.rectified:
+        pairs = _some_frames(request.output)
+        calibration, note = chosen_camera(calibration, pairs, image_topic)
+        say(note)
+    with atomic_path(request.output / "calib.txt") as temporary:
+        temporary.write_text(_calibration_text(calibration))
+    return names[0]
+
+
+def _some_frames(
+    folder: Path,
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Yields the image and the points of a few frames."""
+    scans = sorted((folder / "sparse").iterdir())
+    positions = np.linspace(0, len(scans) - 1, min(_COMPARED_FRAMES, len(scans)))
+    for scan in (scans[round(position)] for position in positions):
+        (image,) = (folder / "rgb").glob(f"{scan.stem}.*")
+        yield read_rgb(image).values, read_scan(scan).points
+
+
+def _calibration_text(calibration: Calibration) -> str:
+    fields: dict[str, Any] = {"K": calibration.intrinsics.ravel().tolist()}
+    if calibration.has_pose:
+        fields["R"] = calibration.rotation.ravel().tolist()
+        fields["t"] = calibration.translation.tolist()
+    if calibration.distortion:
+        fields["distortion"] = list(calibration.distortion)
+    if calibration.size is not None:
+        fields["size"] = [calibration.size[1], calibration.size[0]]
+    lines = [f"{name}: {json.dumps(value)}\n" for name, value in fields.items()]
+    return "".join([*lines, f"lens: {calibration.lens}\n"])
+
+
+def _write_poses(
+    request: FramesRequest, bag: Bag, camera: str, times: Sequence[float], say: Say
+) -> str | None:
+    """Writes poses.txt if the bag has a pose for every frame; returns the topic, else None."""
+    topics = poses_topics(bag, request.options.wanted)
+    if len(topics) != 1:
+        if topics:
+            say(f"poses: none, as several topics give some; --topics {' | '.join(topics)}")
+        return None
+    (topic,) = topics
+    trajectory = camera_trajectory(bag, topic, camera)
+    if trajectory is None:
+        say(f"warning: no transforms tie the camera's frame {camera} to the poses of {topic}")
+        return None
+    rows = [row for time_s in times if (row := _row(trajectory, time_s)) is not None]
+    if len(rows) < len(times):
+        say(
+            f"warning: {len(times) - len(rows):,} of {len(times):,} images have no pose in {topic}"
+            f" within {_LONGEST_GAP_S:g} s, so poses.txt is not written"
+        )
+        return None
+    with atomic_path(request.output / POSES_FILE) as temporary:
+        temporary.write_text("".join(rows))
+    say(f"poses: of {topic}")
+    return topic
+
+
+def _row(trajectory: Trajectory, time_s: float) -> str | None:
+    pose = trajectory.at(time_s, _LONGEST_GAP_S)
+    if pose is None:
+        return None
+    quaternion = Rotation.from_matrix(pose[:, :3]).as_quat()
+    return " ".join(map(str, [f"{time_s:.6f}", *pose[:, 3], *quaternion])) + "\n"

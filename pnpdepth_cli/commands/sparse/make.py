@@ -1,0 +1,326 @@
+"""The commands that make sparse depth: `pnpdepth project`, `sample` and `simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli import __version__
+from pnpdepth_cli.commands.refinement.request import count_or_fraction
+from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.commands.sparse.scans import camera_of, check_size, read_scan_points
+from pnpdepth_cli.errors import OutputError, SizeError, UsageError
+from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
+from pnpdepth_cli.io.record import plain, sha256_of, write_json
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.sensor_file import OPTIONAL, read_sensor
+from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
+from pnpdepth_cli.io.visualisation import overlay
+from pnpdepth_cli.sensors import (
+    FORWARD_LEFT_UP,
+    LIDARS,
+    Camera,
+    Lidar,
+    Points,
+    SampleNoise,
+    SamplePattern,
+    as_depth_image,
+    sample_points,
+    simulate_lidar,
+)
+
+AT_CALIBRATION = "calib"
+"""Position of a simulated scanner: the pose that the calibration gives."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SparseTarget:
+    """Where sparse depth is written."""
+
+    output: Path
+    """The sparse depth; its suffix is one of `SPARSE_SUFFIXES`."""
+    overlay: Path | None = None
+    """A PNG of the points on the image; None for none."""
+    overwrite: bool = False
+
+    @property
+    def record(self) -> Path:
+        """The JSON beside the output, with everything it was made from."""
+        return self.output.with_suffix(".json")
+
+    def check(self, inputs: Iterable[Path | None]) -> None:
+        """Raises OutputError for files that cannot be written, or that replace an input."""
+        if self.output.suffix.lower() not in SPARSE_SUFFIXES:
+            raise OutputError(
+                f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
+            )
+        if self.overlay is not None and self.overlay.suffix.lower() != ".png":
+            raise OutputError(f"{self.overlay}: the overlay is a PNG; name it so")
+        taken = {p.resolve() for p in inputs if p is not None}
+        for path in filter(None, (self.output, self.record, self.overlay)):
+            if path.resolve() in taken:
+                raise OutputError(f"{path} is an input or named twice; give another output")
+            if path.exists() and not self.overwrite:
+                raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
+            taken.add(path.resolve())
+
+    def write(
+        self,
+        points: Points,
+        settings: dict[str, Any],
+        *,
+        inputs: dict[str, Any],
+        notes: Sequence[str],
+        rgb: NDArray[np.float32] | None = None,
+    ) -> dict[str, Any]:
+        """Writes the sparse depth, its record and the overlay, and returns the record.
+
+        A PNG or CSV keeps the settings too. `rgb`, (H, W, 3) in 0..1, is the image of the overlay.
+        """
+        provenance = {"command": settings["command"], "version": __version__, **settings}
+        for path in filter(None, (self.output, self.overlay)):
+            make_folder(path.parent)
+        image = as_depth_image(points)
+        write_sparse(self.output, points.xy, points.depth, image, provenance=provenance)
+        if self.overlay is not None and rgb is not None:
+            overlay(rgb, points.xy, points.depth, self.overlay)
+        record = {
+            **provenance,
+            "inputs": inputs,
+            "points": {
+                "count": len(points),
+                "fraction_of_pixels": len(points) / image.size,
+                "nearest": float(points.depth.min()),
+                "farthest": float(points.depth.max()),
+                "dropped": dict(points.dropped),
+            },
+            "size": [points.size[1], points.size[0]],
+            "notes": list(notes),
+            "outputs": {
+                "sparse": str(self.output),
+                "overlay": str(self.overlay) if self.overlay else None,
+                "record": str(self.record),
+            },
+        }
+        write_json(self.record, record)
+        return record
+
+
+def project_scan(
+    scan: Path,
+    options: ScanOptions,
+    target: SparseTarget,
+    *,
+    image: Path | None = None,
+    size: tuple[int, int] | None = None,
+) -> dict[str, Any]:
+    """Writes the scan's points that the camera sees, and returns the record.
+
+    Args:
+        scan: Its file.
+        options: Calibration and limits.
+        target: Files to write.
+        image: The camera's image, which gives the size and the ground of an overlay.
+        size: (H, W) of the image, where there is no file of it.
+    """
+    target.check((scan, image, options.calib, options.extrinsics))
+    if target.overlay is not None and image is None:
+        raise UsageError("an overlay needs the image; give --image")
+    rgb = None if image is None else read_rgb(image).values
+    if rgb is not None:
+        if size not in (None, rgb.shape[:2]):
+            raise SizeError(f"{image} is {rgb.shape[1]}×{rgb.shape[0]}, not of the size given")
+        size = (rgb.shape[0], rgb.shape[1])
+    projected = read_scan_points(scan, options, size, image)
+    settings = {"command": "project", **plain(asdict(options))}
+    if options.point_fields is None:
+        del settings["point_fields"]
+    return target.write(
+        projected.points,
+        settings,
+        inputs=_files(image=image) | {"scan": projected.record},
+        notes=projected.notes,
+        rgb=rgb,
+    )
+
+
+def sample_depth(
+    depth: Path,
+    target: SparseTarget,
+    pattern: SamplePattern,
+    *,
+    noise: SampleNoise | None = None,
+    image: Path | None = None,
+    seed: int = 0,
+    **reading: Any,
+) -> dict[str, Any]:
+    """Writes points of a dense depth map, and returns the record.
+
+    Args:
+        depth: The file of the map.
+        target: Files to write.
+        pattern: Which pixels are sampled.
+        noise: Added to the points; None for none.
+        image: For the patterns that need one.
+        seed: Of all random choices.
+        **reading: `scale` and `channel` of `read_depth`.
+    """
+    target.check((depth, image))
+    noise = noise or SampleNoise()
+    dense, notes = _dense(depth, **reading)
+    rgb = None if image is None else read_rgb(image).values
+    points = sample_points(dense, pattern, seed, image=rgb, noise=noise)
+    wanted = pattern.wanted(int(np.count_nonzero(dense)))
+    sampled = len(points) + sum(points.dropped.values())
+    if pattern.kind in ("features", "edges") and sampled < wanted:
+        notes.append(f"warning: the image has {sampled:,} of the {wanted:,} points asked for")
+    notes.append(f"sparse: {describe_range(points.depth, f'{pattern.kind}, seed {seed}')}")
+    settings = {"pattern": asdict(pattern), "noise": asdict(noise), "seed": seed}
+    inputs = _files(depth=depth, image=image)
+    return target.write(points, {"command": "sample", **settings}, inputs=inputs, notes=notes)
+
+
+def simulate_scan(
+    depth: Path,
+    target: SparseTarget,
+    spec: str,
+    calib: Path,
+    *,
+    camera: int | None = None,
+    position: str | None = None,
+    seed: int = 0,
+    **reading: Any,
+) -> dict[str, Any]:
+    """Writes the points of a simulated sensor in a dense depth map, and returns the record.
+
+    Args:
+        depth: The file of the map.
+        target: Files to write.
+        spec: The sensor, as `find_sensor` takes it.
+        calib: Calibration of the camera.
+        camera: Which camera of it.
+        position: Of the scanner: metres right of, below and in front of the camera as X,Y,Z, or
+            `AT_CALIBRATION`. None: at the camera.
+        seed: Of all noise.
+        **reading: `scale` and `channel` of `read_depth`.
+    """
+    sensor = find_sensor(spec)
+    target.check((depth, calib, Path(spec.partition(",")[0])))
+    dense, notes = _dense(depth, **reading)
+    calibration = read_calibration(calib, camera)
+    notes += check_size(calib, calibration, (dense.shape[0], dense.shape[1]), depth)
+    eye = _placed(calib, calibration, position)
+    points = simulate_lidar(dense, eye, sensor, seed)
+    notes.append(f"sparse: {describe_range(points.depth, f'{sensor.name}, seed {seed}')}")
+    settings = {
+        "command": "simulate",
+        "sensor": plain(asdict(sensor)),
+        "rotation": eye.rotation.tolist(),
+        "translation": eye.translation.tolist(),
+        "seed": seed,
+    }
+    named = {"calibration": {"path": str(calib), "read_as": calibration.source}}
+    return target.write(points, settings, inputs=_files(depth=depth) | named, notes=notes)
+
+
+def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
+    """The dense depth (H, W), and lines for a person."""
+    dense = read_depth(path, **reading)
+    text = describe_range(
+        dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
+    )
+    unlikely = implausible(dense.values, dense.scale)
+    return dense.values, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
+
+
+def read_pattern(text: str, count: str | None) -> SamplePattern:
+    """Returns the pattern of `uniform` and `500` or `5%`, or of `region:X,Y,W,H`."""
+    kind, colon, rectangle = text.partition(":")
+    number, fraction = (None, None) if count is None else count_or_fraction(count)
+    region = None
+    if colon:
+        try:
+            left, top, width, height = (int(word) for word in rectangle.split(","))
+        except ValueError:
+            raise UsageError(f"pattern {text!r} is not of the form region:X,Y,W,H") from None
+        region = left, top, width, height
+    return SamplePattern(kind=kind, count=number, fraction=fraction, region=region)
+
+
+def read_noise(text: str | None) -> SampleNoise:
+    """Returns the noise of `0.05` metres, `2%` of the depth, `outliers=10%` and `jitter=1` pixel.
+
+    Several are separated by commas. Raises UsageError for any other text.
+    """
+    names = {"outliers": "outliers", "jitter": "jitter_px"}
+    values: dict[str, float] = {}
+    for word in filter(None, (text or "").split(",")):
+        name, equals, number = word.rpartition("=")
+        try:
+            value = float(number.removesuffix("%")) / (100 if number.endswith("%") else 1)
+            key = names[name] if equals else ("relative" if number.endswith("%") else "metres")
+        except (ValueError, KeyError):
+            raise UsageError(
+                f"--noise must be metres, P%, outliers=P% or jitter=PIXELS, got {word!r}"
+            ) from None
+        values[key] = value
+    return SampleNoise(**values)
+
+
+def find_sensor(spec: str) -> Lidar:
+    """Returns the sensor of `NAME` or `FILE.toml`, with `,key=value` of `OPTIONAL` after it.
+
+    Raises:
+        UsageError: There is no sensor of this name, or it is described wrongly.
+        InputError: The file cannot be read.
+    """
+    name, *changes = spec.split(",")
+    if name in LIDARS:
+        sensor = LIDARS[name]
+    elif Path(name).suffix.lower() == ".toml":
+        sensor = Lidar(**read_sensor(Path(name)))
+    else:
+        known = ", ".join(LIDARS)
+        raise UsageError(f"no sensor {name!r}; --sensor is a TOML file or one of: {known}")
+    values: dict[str, Any] = {}
+    for change in changes:
+        key, _, value = change.partition("=")
+        try:
+            values[OPTIONAL[OPTIONAL.index(key)]] = float(value)
+        except ValueError:
+            raise UsageError(
+                f"--sensor {spec}: {change!r} is not NAME=NUMBER with one of {', '.join(OPTIONAL)}"
+            ) from None
+    return replace(sensor, **values)
+
+
+def _placed(path: Path, calibration: Calibration, position: str | None) -> Camera:
+    """The camera, with the scanner at the position that is asked for."""
+    camera = camera_of(calibration)
+    if position == AT_CALIBRATION:
+        if not calibration.has_pose:
+            raise UsageError(f"{path} has no pose of the scanner; add R and t")
+        return camera
+    try:
+        metres = np.array((position or "0,0,0").split(","), np.float64)
+    except ValueError:
+        metres = np.empty(0)
+    if metres.shape != (3,) or not np.isfinite(metres).all():
+        raise UsageError(f"--position must be X,Y,Z in metres or calib, got {position!r}")
+    return replace(camera, rotation=FORWARD_LEFT_UP, translation=metres)
+
+
+def _files(**paths: Path | None) -> dict[str, Any]:
+    """Path and digest of the files that are given."""
+    return {
+        name: {"path": str(path), "sha256": sha256_of(path)}
+        for name, path in paths.items()
+        if path is not None
+    }

@@ -1,0 +1,216 @@
+"""`batch --accumulate`: points of neighbouring frames, whatever the shards."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.cli.main import run
+from pnpdepth_cli.commands.batch.request import SequenceOptions
+from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.sensors import SamplePattern
+from tests.commands.batches import RecordingListener, batch
+from tests.commands.drives import drive_on_disk, without_results
+from tests.commands.frames import frame_on_disk
+
+DRIVE = Path(__file__).parents[3] / "samples/drive"
+
+
+def accumulating(root: Path, **changes: Any) -> Any:
+    sequence = SequenceOptions(accumulate=1, poses=root / "poses.txt")
+    return batch(root, **{"sequence": sequence, "refine": {"iterations": 2}} | changes)
+
+
+def record_of(root: Path, name: str) -> Any:
+    return json.loads((root / "out" / f"{name}.json").read_text())
+
+
+def depths(root: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((root / "out").glob("*_depth.png"))}
+
+
+def test_a_frame_takes_the_points_of_its_neighbours(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path, points=150)
+    accumulating(root)
+    first, second = record_of(root, "drive_000"), record_of(root, "drive_001")
+    assert first["points"]["moved"] > 60
+    assert second["points"]["moved"] > first["points"]["moved"]
+    assert [Path(each["path"]).name for each in second["inputs"]["neighbours"]] == [
+        "drive_000.png",
+        "drive_002.png",
+    ]
+
+
+def test_held_out_points_are_the_frames_own_and_score_better(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path, points=150)
+    refine = {"iterations": 0, "propagate": "gp", "holdout": 0.2}
+    accumulating(root, refine=refine)
+    more = record_of(root, "drive_001")
+    without_results(root)
+    batch(root, refine=refine)
+    alone = record_of(root, "drive_001")
+    assert more["points"]["held_out"] == alone["points"]["held_out"] == 30
+    errors = [each["held_out_error"]["after"]["mae"] for each in (more, alone)]
+    assert errors[0] < 0.85 * errors[1]
+
+
+def test_the_bytes_do_not_depend_on_the_shards(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path)
+    accumulating(root)
+    whole = depths(root)
+    without_results(root)
+    for number in (1, 2, 3):
+        accumulating(root, shard=(number, 3))
+    assert len(whole) == 4
+    assert depths(root) == whole
+
+
+def test_a_frame_is_done_again_when_a_neighbours_points_change(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path)
+    accumulating(root)
+    (root / "sparse/drive_000.png").write_bytes((root / "sparse/drive_003.png").read_bytes())
+    listener = RecordingListener()
+    accumulating(root, listener=listener)
+    assert listener.names == ["drive_000", "drive_001"]
+
+
+def test_other_poses_make_frames_be_done_again(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path)
+    accumulating(root)
+    rows = (root / "poses.txt").read_text().splitlines()
+    (root / "poses.txt").write_text("\n".join([*rows[:3], "1 0 0 0 0 1 0 0 0 0 1 0.35"]))
+    listener = RecordingListener()
+    accumulating(root, listener=listener)
+    assert listener.names == ["drive_002", "drive_003"]
+
+
+def test_frames_of_another_sequence_or_camera_are_no_neighbours(tmp_path: Path) -> None:
+    pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+    kinds = [("a_1", 2), ("a_2", 2), ("b_1", 2), ("a_1", 3), ("a_2", 3)]
+    frames = [
+        Frame(name=name, sparse=tmp_path / f"{name}_{camera}.png", camera=camera, pose=pose)
+        for name, camera in kinds
+    ]
+    linked = with_neighbours(frames, 2, None)
+    assert [[each.frame.sparse.stem for each in frame.neighbours] for frame in linked] == [
+        ["a_2_2"], ["a_1_2"], [], ["a_2_3"], ["a_1_3"],
+    ]  # fmt: skip
+
+
+def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
+    turned = ((0.0, -1.0, 0.0, 4.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0))
+    still = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+    frames = [
+        Frame(name=f"a_{number}", sparse=Path("s.png"), pose=pose)
+        for number, pose in enumerate((still, turned))
+    ]
+    (of_turned,) = with_neighbours(frames, 1, None)[0].neighbours
+    (of_still,) = with_neighbours(frames, 1, None)[1].neighbours
+    assert of_turned.motion == turned
+    np.testing.assert_allclose(
+        of_still.motion, [[0, 1, 0, 0], [-1, 0, 0, 4], [0, 0, 1, -1]], atol=1e-12
+    )
+
+
+def test_a_frame_without_points_cannot_be_accumulated() -> None:
+    frame = Frame(name="a", pose=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)))
+    with pytest.raises(UsageError, match="not images alone"):
+        with_neighbours([frame, frame], 1, None)
+
+
+def test_the_note_names_the_poses_that_are_used() -> None:
+    pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+    own = Frame(name="a_1", image=Path("i.png"), sparse=Path("s.png"), pose=pose)
+    without = replace(own, name="a_2", pose=None)
+    assert note_of_poses([own]) is None
+    assert note_of_poses(with_neighbours([own, own], 1, None)) == "poses: the layout's"
+    estimated = "poses: estimated from the images"
+    assert note_of_poses(with_neighbours([own, without], 1, None)) == estimated
+    assert note_of_poses(with_neighbours([own, own, without], 1, None)) == (
+        "poses of neighbours: the layout's (2 of 4), estimated from the images (2 of 4)"
+    )
+
+
+def rendered_drive(root: Path) -> Path:
+    """The drive of `samples/` without its poses, and net/ with a network."""
+    for part in ("rgb", "sparse", "calib"):
+        shutil.copytree(DRIVE / part, root / part)
+    (root / "net").mkdir()
+    frame_on_disk(root / "net")
+    return root
+
+
+def without_poses(root: Path, **changes: Any) -> Any:
+    return accumulating(root, limit=1, sequence=SequenceOptions(accumulate=1), **changes)
+
+
+def test_without_poses_the_motion_is_estimated_and_recorded(tmp_path: Path) -> None:
+    root, listener = rendered_drive(tmp_path), RecordingListener()
+    without_poses(root, listener=listener)
+    assert "poses: estimated from the images" in listener.messages
+    record = record_of(root, "drive_000")
+    (neighbour,) = record["inputs"]["neighbours"]
+    assert neighbour["poses"] == "estimated from the images"
+    assert neighbour["basis"].endswith("matches of the images")
+    assert abs(neighbour["motion"][2][3] - 0.6) < 0.03
+    assert record["points"]["moved"] > 500
+
+
+@pytest.mark.slow
+def test_a_frame_is_done_again_when_the_image_of_its_motion_changes(tmp_path: Path) -> None:
+    root, listener = rendered_drive(tmp_path), RecordingListener()
+    without_poses(root)
+    shutil.copy(root / "rgb/drive_002.jpg", root / "rgb/drive_001.jpg")
+    without_poses(root, listener=listener)
+    assert listener.names == ["drive_000"]
+
+
+def test_a_frame_whose_motion_cannot_be_estimated_fails_with_the_reason(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path, frames=2)
+    listener = RecordingListener()
+    accumulating(root, listener=listener, sequence=SequenceOptions(accumulate=1))
+    assert len(listener.rows) == 2
+    for row in listener.rows:
+        assert "no motion to a neighbour can be estimated" in row["message"]
+        assert row["message"].endswith("give --poses, or leave out --accumulate")
+
+
+def test_neighbours_of_sampled_frames_are_sampled(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path, frames=2)
+    shutil.copytree(root / "sparse", root / "gt")
+    accumulating(root, refine={"iterations": 1, "sample": SamplePattern(count=200)})
+    record = record_of(root, "drive_000")
+    assert record["points"]["moved"] > 20
+    assert record["inputs"]["neighbours"][0]["path"].endswith("gt/drive_001.png")
+
+
+def test_the_command_names_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = drive_on_disk(tmp_path, frames=2)
+    command = ["batch", str(root), "-o", str(root / "out"), "--iterations", "1"]
+    command += ["--model", str(root / "net/my_net.py")]
+    (root / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    assert run([*command, "--accumulate", "2", "--poses", str(root / "poses.txt")]) == 3
+    assert "has 1 poses for 2 frames" in capsys.readouterr().err
+    assert run([*command, "--poses", str(root / "poses.txt")]) == 2
+    assert run([*command, "--accumulate", "-1"]) == 2
+    assert not (root / "out").exists()
+
+
+def test_a_frame_without_calibration_fails_with_the_reason(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path, frames=2)
+    (root / "calib/drive_001.txt").unlink()
+    (root / "calib/drive_000.txt").unlink()
+    (root / "calib").rmdir()
+    listener = RecordingListener()
+    accumulating(root, listener=listener)
+    assert ["needs the camera" in row["message"] for row in listener.rows] == [True, True]

@@ -1,0 +1,175 @@
+"""Batches on a real Ray cluster of three nodes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.commands.batch import ray_workers
+from pnpdepth_cli.commands.batch.request import ClusterOptions
+from pnpdepth_cli.commands.batch.state import remove_all_leftovers
+from pnpdepth_cli.errors import ClusterError
+from tests.commands.batch.ray_nodes import three_nodes
+from tests.commands.batches import (
+    RecordingListener,
+    add_frame,
+    batch,
+    pairs_on_disk,
+    results,
+)
+
+pytest.importorskip("ray")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="nodes are addresses of loopback"),
+]
+NAMES = tuple(f"f{number:02}" for number in range(12))
+DEADLY = "        if float(rgb.mean()) > 0.99:\n            import os\n            os._exit(1)\n"
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    with three_nodes() as nodes:
+        yield nodes
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames of which one kills its worker, where the network is `deadly`."""
+    root = pairs_on_disk(tmp_path_factory.mktemp("frames") / "drive", NAMES)
+    batch(root)
+    (root / "out").rename(root / "plain")
+    return root
+
+
+@pytest.fixture
+def root(frames: Path) -> Iterator[Path]:
+    yield frames
+    shutil.rmtree(frames / "out", ignore_errors=True)
+
+
+class Doing(RecordingListener):
+    """Does something at a row."""
+
+    def __init__(self, number: int, what: Callable[[], Any]) -> None:
+        super().__init__()
+        self._number, self._what = number, what
+
+    def frame(self, row: dict[str, Any]) -> None:
+        super().frame(row)
+        if len(self.rows) == self._number:
+            self._what()
+
+
+def different(root: Path) -> list[str]:
+    """The names of the results that differ from those of one process.
+
+    A worker dies some time after its node or driver; what it leaves half-written is removed, as
+    the next run does.
+    """
+    remove_all_leftovers(root / "out")
+    there, plain = results(root / "out"), results(root / "plain")
+    names = there.keys() | plain.keys()
+    return sorted(name for name in names if there.get(name) != plain.get(name))
+
+
+def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, root: Path) -> None:
+    lost = cluster.worker_nodes.copy().pop()
+    half_written = root / "out" / ".0123456789ab.png"
+
+    def lose_a_node() -> None:
+        half_written.write_bytes(b"of a worker that died")
+        cluster.remove_node(lost, allow_graceful=False)
+
+    listener = Doing(2, lose_a_node)
+    outcome = batch(root, listener, cluster=ClusterOptions(ray=cluster.address), profile=True)
+    cluster.add_node(num_cpus=1, node_ip_address="127.0.0.5")
+    assert not half_written.exists()
+    cluster.wait_for_nodes(timeout=120)  # until the lost one counts as dead
+    assert sorted(listener.names) == list(NAMES)
+    assert different(root) == []
+    assert outcome.summary["counts"]["done"] == outcome.summary["profile"]["frames"] == len(NAMES)
+
+
+def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
+    cluster: Any, tmp_path: Path
+) -> None:
+    root = pairs_on_disk(tmp_path / "drive", NAMES[:5])
+    add_frame(root, "bad", np.full((46, 62, 3), 255, np.uint8))
+    model = root / "net" / "my_net.py"
+    start = "    def forward(self, rgb):\n"
+    model.write_text(model.read_text().replace(start, start + DEADLY))
+    listener = RecordingListener()
+    batch(root, listener, cluster=ClusterOptions(ray=cluster.address, ray_workers=2, retries=1))
+    rows = {row["name"]: row for row in listener.rows}
+    assert len(rows) == len(listener.rows) == 6
+    assert rows["bad"]["status"] == "failed"
+    assert rows["bad"]["message"].startswith("its worker died 2 times")
+    assert {row["status"] for name, row in rows.items() if name != "bad"} == {"done"}
+
+
+def test_a_killed_driver_is_resumed(cluster: Any, root: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from tests.commands.batches import RecordingListener, batch\n"
+        "from pnpdepth_cli.commands.batch.request import ClusterOptions\n"
+        "class Telling(RecordingListener):\n"
+        "    def frame(self, row): print(row['name'], flush=True)\n"
+        "options = ClusterOptions(ray=sys.argv[2], ray_workers=1)\n"
+        "batch(Path(sys.argv[1]), Telling(), cluster=options)\n"
+    )
+    driver = subprocess.Popen(
+        [sys.executable, "-c", program, str(root), cluster.address],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    assert driver.stdout is not None
+    first = driver.stdout.readline().strip()
+    os.kill(driver.pid, signal.SIGKILL)
+    driver.wait()
+    driver.stdout.close()
+    assert (root / "out" / f"{first}.json").exists()
+    listener = RecordingListener()
+    batch(root, listener)
+    assert first not in listener.names
+    assert different(root) == []
+
+
+def test_what_is_wrong_with_a_cluster_is_an_error(
+    cluster: Any, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = ClusterOptions(ray=cluster.address)
+    one = replace(options, ray_workers=1)
+    with pytest.raises(ClusterError, match="for 3 Ray workers with 1 CPU core each, and 9 asked"):
+        batch(root, cluster=replace(options, ray_workers=9))
+    with pytest.raises(ClusterError, match="for 0 Ray workers with one GPU each, and 1 asked"):
+        batch(root, cluster=options, refine={"device": "cuda"})
+    with monkeypatch.context() as changed:
+        changed.setattr(ray_workers, "software", lambda: {"torch": "1.0"})
+        with pytest.raises(
+            ClusterError, match=r"has torch .* and the driver has 1\.0; install the"
+        ):
+            batch(root, cluster=one)
+    assert not results(root / "out")
+
+
+def test_a_stopped_batch_ends_with_the_frames_that_are_begun(cluster: Any, root: Path) -> None:
+    listener = RecordingListener()
+    outcome = batch(
+        root,
+        listener,
+        stopped=lambda: bool(listener.rows),
+        cluster=ClusterOptions(ray=cluster.address, ray_workers=1),
+    )
+    assert outcome.stopped
+    assert 1 <= len(listener.rows) < len(NAMES)
+    assert {path.stem for path in (root / "out").glob("f*.json")} == set(listener.names)

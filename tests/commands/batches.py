@@ -1,0 +1,121 @@
+"""Folders of small frames, and batches of them, for tests."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pnpdepth_cli.commands.batch.batch import BatchOutcome, run_batch
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.refinement.refine import refine_image
+from pnpdepth_cli.commands.refinement.request import RefineRequest
+from tests.commands.frames import frame_on_disk
+
+NAMES = ("a", "b", "c", "d")
+
+
+class RecordingListener:
+    """Records the messages and rows of a batch."""
+
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+        self.rows: list[dict[str, Any]] = []
+        self.to_do = 0
+
+    def say(self, text: str) -> None:
+        self.messages.append(text)
+
+    def begin(self, to_do: int) -> None:
+        self.to_do = to_do
+
+    def frame(self, row: dict[str, Any]) -> None:
+        self.rows.append(row)
+
+    @property
+    def names(self) -> list[str]:
+        return [row["name"] for row in self.rows]
+
+
+def pairs_on_disk(root: Path, names: tuple[str, ...] = NAMES, gt: bool = True) -> Path:
+    """rgb/ sparse/ gt/ with these frames, all a little different, and net/ with a network."""
+    net = root / "net"
+    net.mkdir(parents=True)
+    frame = frame_on_disk(net)
+    image = cv2.imread(str(frame.image))
+    for number, name in enumerate(names):
+        add_frame(root, name, np.roll(image, number, axis=1), gt=gt)
+    return root
+
+
+def add_frame(root: Path, name: str, image: Any = None, gt: bool = True) -> None:
+    """One more frame, with the image of the network by default."""
+    net = root / "net"
+    for part, file in (("rgb", "img"), ("sparse", "s"), *([("gt", "gt")] if gt else [])):
+        target = root / part / f"{name}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(net / f"{file}.png", target)
+    if image is not None:
+        data = cv2.imencode(".png", image)[1]
+        (root / "rgb" / f"{name}.png").write_bytes(data.tobytes())
+
+
+def refinement(root: Path, **changes: Any) -> RefineRequest:
+    """A request to refine with the network in net/, without the choice unless it is asked for."""
+    fields: dict[str, Any] = {
+        "propagate": None if {"preset", "auto"} & changes.keys() else "none",
+        "model": str(root / "net" / "my_net.py"),
+        "checkpoint": root / "net" / "my_net.safetensors",
+    }
+    return RefineRequest.from_fields(**fields | changes)
+
+
+def batch(
+    root: Path,
+    listener: RecordingListener | None = None,
+    *,
+    stopped: Any = lambda: False,
+    refine: dict[str, Any] | None = None,
+    **changes: Any,
+) -> BatchOutcome:
+    """A batch of the folder into its out/."""
+    fields: dict[str, Any] = {
+        "source": root,
+        "output": root / "out",
+        "refine": refinement(root, **(refine or {})),
+    }
+    return run_batch(BatchRequest(**fields | changes), listener or RecordingListener(), stopped)
+
+
+def refine_one_by_one(root: Path, names: tuple[str, ...], **changes: Any) -> None:
+    """Each of these frames refined by itself, into out/."""
+    for name in names:
+        parts = (("image", "rgb"), ("sparse", "sparse"), ("gt", "gt"))
+        files = {part: root / folder / f"{name}.png" for part, folder in parts}
+        refine_image(refinement(root, output=root / "out", **files, **changes))
+
+
+def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
+    """Every result below a folder: bytes, and records without times and what a batch adds."""
+    contents: dict[str, bytes | dict[str, Any]] = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_dir() or name.startswith(("summary.", "batch.", ".batch.")):
+            continue
+        if path.suffix == ".json" and not path.name.startswith("."):  # those need not be whole
+            record = json.loads(path.read_text())
+            for key in ("seconds", "peak_memory_mb", "batch"):
+                record.pop(key, None)
+            contents[name] = record
+        else:
+            contents[name] = path.read_bytes()
+    return contents
+
+
+def times(folder: Path) -> dict[str, int]:
+    """When each result was written."""
+    return {name: (folder / name).stat().st_mtime_ns for name in results(folder)}

@@ -1,0 +1,302 @@
+"""Runs compared: gains and p-values by hand, and what cannot be compared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.commands.evaluation.compare import CompareRequest, Comparison
+from pnpdepth_cli.commands.evaluation.compare import compare as compare_runs
+from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, evaluate
+from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.record import write_json
+
+
+def compare(paths: list[str], **settings: Any) -> Comparison:
+    return compare_runs(CompareRequest(paths=paths, **settings))
+
+
+def run(root: Path, name: str, errors: dict[str, list[float]], **frames: Any) -> str:
+    """A saved evaluation of frames of 4 pixels at 10 m with these errors."""
+    for frame, error in errors.items():
+        for folder, depth in ((name, 10 + np.array([error])), ("gt", np.full((1, len(error)), 10))):
+            (root / folder).mkdir(exist_ok=True)
+            write_depth(root / folder / f"{frame}.npy", depth.astype(np.float32))
+    request = EvalRequest(prediction=root / name, ground_truth=root / "gt", resamples=0, **frames)
+    path = root / f"{name}.json"
+    write_json(path, evaluate(request).as_record())
+    return str(path)
+
+
+FIRST = {"a": [2.0, 2.0], "b": [4.0, 4.0], "c": [1.0, 1.0]}
+BETTER = {"a": [1.0, 1.0], "b": [3.0, 3.0], "c": [0.5, 0.5]}
+
+
+def test_a_lower_error_is_a_positive_gain(tmp_path: Path) -> None:
+    comparison = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
+    gain = comparison.gains[0]["mae"]
+    assert gain.percent == pytest.approx(100 * 2.5 / 7)
+    assert gain.difference == pytest.approx(-2.5 / 3)
+    assert gain.p_value == 2 / 8  # all three got better: two of the eight swaps differ as much
+    assert np.isnan([gain.low_percent, gain.high_percent]).all()  # three frames are too few
+    assert comparison.exact_p_values
+    assert [r.label for r in comparison.runs] == ["one", "two"]
+    assert comparison.runs[0].mean["mae"] == pytest.approx(7 / 3)
+    (note,) = comparison.notes
+    assert note == (
+        "warning: 3 frames are too few independent ones to conclude anything from 4 measures: the"
+        " smallest possible p is 0.25, adjusted 1; there is no interval below 5"
+    )
+
+
+def test_a_higher_fraction_below_the_threshold_is_a_positive_gain(tmp_path: Path) -> None:
+    comparison = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
+    assert comparison.runs[0].mean["delta1"] == pytest.approx(2 / 3)
+    assert comparison.gains[0]["delta1"].percent == 0  # 1.3 and 1.4 are above 1.25
+    half = {"a": [3.0, 1.0]}
+    comparison = compare([run(tmp_path, "half", half), run(tmp_path, "whole", {"a": [1.0, 1.0]})])
+    assert comparison.gains[0]["delta1"].percent == pytest.approx(100)
+
+
+def test_a_run_is_no_better_than_itself(tmp_path: Path) -> None:
+    path = run(tmp_path, "one", FIRST)
+    comparison = compare([path, path])
+    for gain in comparison.gains[0].values():
+        assert (gain.percent, gain.p_value, gain.p_adjusted) == (0, 1, 1)
+    assert [r.label for r in comparison.runs] == [path, path]
+
+
+def test_frames_are_paired_by_name_and_the_others_reported(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", {"a": [2.0], "b": [4.0], "only one": [9.0]})
+    (tmp_path / "gt" / "only one.npy").unlink()
+    two = run(tmp_path, "two", {"b": [2.0], "a": [1.0]})
+    comparison = compare([one, two])
+    assert comparison.frames == ("a", "b")
+    assert comparison.runs[0].mean["mae"] == pytest.approx(3)
+    note = comparison.notes[0]
+    assert "1 frames of" in note
+    assert note.endswith("left out: only one")
+
+
+def test_one_frame_has_a_gain_but_nothing_to_resample(tmp_path: Path) -> None:
+    comparison = compare([run(tmp_path, "one", {"a": [2.0]}), run(tmp_path, "two", {"a": [1.0]})])
+    gain = comparison.gains[0]["mae"]
+    assert gain.percent == pytest.approx(50)
+    assert np.isnan([gain.low_percent, gain.high_percent, gain.p_value]).all()
+    assert comparison.as_record()["gains"][0]["mae"]["p_value"] is None
+
+
+def test_pooled_runs_are_compared_over_their_pixels(tmp_path: Path) -> None:
+    pooled: dict[str, Any] = {"changes": {"average": "pooled"}}
+    one = run(tmp_path, "one", {"a": [2.0], "b": [4.0, 4.0, 4.0]}, **pooled)
+    two = run(tmp_path, "two", {"a": [1.0], "b": [4.0, 4.0, 4.0]}, **pooled)
+    comparison = compare([one, two])
+    assert comparison.runs[0].mean["mae"] == pytest.approx(14 / 4)
+    assert comparison.gains[0]["mae"].percent == pytest.approx(100 / 14)
+    assert comparison.gains[0]["mae"].p_value == 1  # only a differs: any swap is as large
+
+
+def test_many_frames_are_tested_with_random_swaps_of_the_seed(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    first = {f"{n:02}": [float(rng.uniform(1, 2))] for n in range(20)}
+    second = {name: [error[0] * float(rng.uniform(0.7, 1.2))] for name, error in first.items()}
+    paths = [run(tmp_path, "one", first), run(tmp_path, "two", second)]
+    comparison = compare(paths, resamples=500, seed=1, grouped=False)
+    assert not comparison.exact_p_values
+    assert (
+        comparison.as_record() == compare(paths, resamples=500, seed=1, grouped=False).as_record()
+    )
+    assert comparison.gains != compare(paths, resamples=500, seed=2, grouped=False).gains
+
+
+SIX = {f"{n:04}": [error] for n, error in enumerate((2.0, 5.0, 1.0, 4.0, 1.5, 3.0))}
+
+
+def scaled(errors: dict[str, list[float]], factors: list[float]) -> dict[str, list[float]]:
+    rows = zip(errors.items(), factors, strict=True)
+    return {name: [error * factor for error in row] for (name, row), factor in rows}
+
+
+def test_six_frames_have_an_interval_around_the_gain(tmp_path: Path) -> None:
+    better = scaled(SIX, [0.5, 0.8, 0.6, 0.7, 0.9, 0.55])
+    comparison = compare([run(tmp_path, "one", SIX), run(tmp_path, "two", better)])
+    gain = comparison.gains[0]["mae"]
+    assert gain.low_percent < gain.percent < gain.high_percent
+    assert gain.p_value == 2 / 64
+    (note,) = comparison.notes
+    assert note.endswith("4 measures: the smallest possible p is 0.031, adjusted 0.12")
+    same = compare([run(tmp_path, "one", SIX), run(tmp_path, "half", scaled(SIX, [0.5] * 6))])
+    equal = same.gains[0]["mae"]
+    assert (equal.low_percent, equal.high_percent) == pytest.approx((50, 50))
+
+
+FLICKER = {"changes": {"groups": ("flicker",)}}
+
+
+def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    first = {f"{n:04}": rng.uniform(1, 2, 4).tolist() for n in range(9)}
+    second = {name: (np.array(row) * rng.uniform(0.4, 0.6)).tolist() for name, row in first.items()}
+    plain = [run(tmp_path, name, errors) for name, errors in (("a", first), ("b", second))]
+    paths = [run(tmp_path, f"{n}", e, **FLICKER) for n, e in (("c", first), ("d", second))]
+    comparison = compare(paths, all_measures=True, grouped=False)
+    (gains,) = comparison.gains
+    (mae,) = (g["mae"] for g in compare(plain, all_measures=True, grouped=False).gains)
+    for name in ("percent", "low_percent", "high_percent", "difference", "p_value"):
+        assert getattr(gains["mae"], name) == pytest.approx(getattr(mae, name), rel=1e-9)
+    assert mae.high_percent - mae.low_percent > 1
+    # the first frame of a sequence has no flicker
+    saved = [json.loads(Path(path).read_text())["frames"][1:] for path in paths]
+    one, two = (np.array([frame["values"]["flicker"] for frame in of]) for of in saved)
+    flicker = gains["flicker"]
+    assert comparison.runs[0].mean["flicker"] == pytest.approx(one.mean())
+    assert flicker.percent == pytest.approx(100 * (1 - two.mean() / one.mean()))
+    assert flicker.low_percent < flicker.percent - 1 < flicker.percent + 1 < flicker.high_percent
+    assert flicker.p_value == 2 / 2**8
+    assert any("flicker" in note and "1 lack it" in note for note in comparison.notes)
+
+
+def test_p_values_are_adjusted_for_the_number_of_measures(tmp_path: Path) -> None:
+    better = scaled(SIX, [0.5, 0.8, 0.6, 0.7, 0.9, 0.55])
+    comparison = compare(
+        [run(tmp_path, "one", SIX), run(tmp_path, "two", better)], all_measures=True
+    )
+    p_values = [gain.p_value for gain in comparison.gains[0].values()]
+    smallest = min(comparison.gains[0].values(), key=lambda gain: gain.p_value)
+    assert len(p_values) == len(comparison.measures) == 12
+    main = compare([run(tmp_path, "one", SIX), run(tmp_path, "two", better)])
+    assert [measure.key for measure in main.measures] == ["rmse", "mae", "mre", "delta1"]
+    assert main.gains[0]["rmse"].p_value == comparison.gains[0]["rmse"].p_value
+    assert smallest.p_adjusted == pytest.approx(min(1, 12 * min(p_values)))
+
+
+def test_frames_of_one_group_are_swapped_together(tmp_path: Path) -> None:
+    first = {f"{drive}_{n:04}": [2.0 + n] for drive in "abc" for n in range(4)}
+    paths = [run(tmp_path, "one", first), run(tmp_path, "two", scaled(first, [0.5] * 12))]
+    grouped = compare(paths)
+    assert grouped.clusters.describe() == "3 groups of frames"
+    assert grouped.gains[0]["mae"].p_value == 2 / 8
+    assert grouped.notes[-1].startswith("warning: 3 groups of frames are too few")
+    assert grouped.as_record()["clusters"] == {"count": 3, "unit": "groups of frames"}
+    alone = compare(paths, grouped=False)
+    assert alone.clusters.describe() == "12 frames"
+    assert alone.gains[0]["mae"].p_value == 2 / 4096
+
+
+def test_a_correlated_sequence_is_swapped_in_blocks(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    drift = np.cumsum(rng.normal(0, 0.05, 120))
+    first = {f"{n:04}": [3.0] for n in range(120)}
+    second = {f"{n:04}": [3.0 + float(drift[n])] for n in range(120)}
+    comparison = compare([run(tmp_path, "one", first), run(tmp_path, "two", second)])
+    assert comparison.clusters.count <= 10
+    assert "consecutive frames" in comparison.clusters.describe()
+
+
+def test_different_rules_are_refused_and_named(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", FIRST)
+    two = run(tmp_path, "two", FIRST, changes={"max_depth": 50.0})
+    with pytest.raises(InputError) as error:
+        compare([one, two])
+    assert str(error.value) == (
+        f"{one} and {two} were scored by different rules (max_depth None and 50.0); score both by"
+        " one protocol"
+    )
+    devkit = run(tmp_path, "three", FIRST, protocol="kitti-devkit")
+    with pytest.raises(InputError, match="definitions usual and kitti-devkit"):
+        compare([one, devkit])
+
+
+def test_runs_without_a_common_frame_are_refused(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", {"a": [1.0]})
+    (tmp_path / "gt" / "a.npy").unlink()
+    two = run(tmp_path, "two", {"b": [1.0]})
+    with pytest.raises(InputError, match="no scored frame in common: a; and b"):
+        compare([one, two])
+
+
+def test_other_pixels_and_other_ground_truth_cause_a_warning(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", {"a": [1.0, 1.0]})
+    less = run(tmp_path, "less", {"a": [1.0, -10.0]})
+    (note,) = compare([one, less]).notes
+    assert "coverage differs (100.00% in" in note
+    assert "this is no ranking" in note
+    other = run(tmp_path, "other", {"a": [1.0, 1.0, 1.0]})
+    (note,) = compare([one, other]).notes
+    assert "another number of pixels with ground truth" in note
+
+
+SCORES = {
+    "before": {"rmse": 2.0, "mae": 1.5, "delta1": 0.5, "pixels": 90, "coverage": 0.9},
+    "after": {"rmse": 1.0, "mae": 1.2, "delta1": 0.6, "pixels": 90, "coverage": 0.9},
+}
+
+
+def test_a_batch_is_compared_with_what_it_started_from(tmp_path: Path) -> None:
+    frames = [
+        {"name": "drive/1", "status": "done", "scores": SCORES},
+        {"name": "drive/2", "status": "done", "scores": SCORES},
+        {"name": "drive/3", "status": "failed", "scores": None},
+    ]
+    (tmp_path / "summary.json").write_text(json.dumps({"counts": {}, "frames": frames}))
+    for result in (tmp_path, tmp_path / "summary.json"):
+        comparison = compare([f"{tmp_path}/summary.json:before", str(result)])
+        assert comparison.frames == ("drive/1", "drive/2")
+        assert [m.key for m in comparison.measures] == ["rmse", "mae", "delta1"]
+        assert comparison.gains[0]["rmse"].percent == 50
+        assert comparison.gains[0]["delta1"].percent == pytest.approx(20)
+        assert [r.label for r in comparison.runs] == ["summary:before", "summary"]
+
+
+def test_a_refinement_can_be_compared_with_an_evaluation(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(json.dumps({"settings": {}, "scores": SCORES}))
+    one = run(tmp_path, "one", {"a": [1.0] * 90})
+    comparison = compare([one, str(tmp_path / "a.json")])
+    assert comparison.frames == ("a",)
+    assert [m.key for m in comparison.measures] == ["rmse", "mae", "delta1"]
+
+
+BROKEN = [
+    ("{}", "holds no scores"),
+    ('{"frames": []}', "holds no scores"),
+    ('{"scores": null}', "holds no scores"),
+    ('{"command": "eval"}', "does not hold scores as pnpdepth writes them"),
+    ('{"frames": [{"scores": {}}]}', "does not hold scores as pnpdepth writes them"),
+    ('{"scores": {"after": {"rmse": 1}}}', "does not hold scores as pnpdepth writes them"),
+    ("[1]", "no JSON object"),
+    ("nonsense", "not valid JSON"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BROKEN)
+def test_a_file_without_scores_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    one = run(tmp_path, "one", FIRST)
+    (tmp_path / "broken.json").write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        compare([one, str(tmp_path / "broken.json")])
+
+
+def test_before_is_only_for_what_has_one_and_one_run_is_none_to_compare(tmp_path: Path) -> None:
+    one = run(tmp_path, "one", FIRST)
+    with pytest.raises(UsageError, match="leave out :before"):
+        compare([one, f"{one}:before"])
+    with pytest.raises(UsageError, match="two runs"):
+        compare([one])
+    with pytest.raises(UsageError, match="--bootstrap must be >= 1, got 0"):
+        compare([one, one], resamples=0)
+
+
+def test_runs_are_named_by_the_shortest_ends_of_their_paths(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    one, two = (run(tmp_path / folder, "run", FIRST) for folder in "ab")
+    assert [r.label for r in compare([one, two]).runs] == ["a/run", "b/run"]
+    frames = [{"name": "drive/1", "status": "done", "scores": SCORES}]
+    (tmp_path / "a" / "summary.json").write_text(json.dumps({"counts": {}, "frames": frames}))
+    both = [f"{tmp_path}/a/summary.json:before", f"{tmp_path}/a"]
+    assert [r.label for r in compare(both).runs] == ["summary:before", "summary"]

@@ -1,0 +1,556 @@
+"""Evaluations of files and folders: values by hand and by plain numpy, and every warning."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.frame_reading import Scales
+from pnpdepth_cli.commands.evaluation.tables import worst
+from pnpdepth_cli.errors import InputError, SizeError, UsageError
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.sensors import SamplePattern, sample_points
+
+
+def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_depth(path, np.array(rows, np.float32), scale=scale)
+    return path
+
+
+def scored(root: Path, **options: Any) -> Evaluation:
+    changes = {
+        name: options.pop(name)
+        for name in list(options)
+        if name not in {each.name for each in fields(EvalRequest)}
+    }
+    return evaluate(
+        EvalRequest(prediction=root / "out", ground_truth=root / "gt", changes=changes, **options)
+    )
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Path:
+    """Two frames: errors of 1 and 1 m over two pixels, and of 3 m over one, half predicted."""
+    depth_file(tmp_path / "out" / "a_depth.npy", [[2, 3]])
+    depth_file(tmp_path / "gt" / "a.npy", [[1, 4]])
+    depth_file(tmp_path / "out" / "ü b_depth.npy", [[8, 0]])
+    depth_file(tmp_path / "gt" / "ü b.npy", [[5, 5]])
+    return tmp_path
+
+
+def test_each_image_counts_alike_or_each_pixel(two: Path) -> None:
+    per_image, pooled = scored(two), scored(two, average="pooled")
+    assert per_image.mean["rmse"] == (1 + 3) / 2
+    assert per_image.mean["mre"] == (0.625 + 0.6) / 2
+    assert pooled.mean["rmse"] == pytest.approx(math.sqrt((1 + 1 + 9) / 3))
+    assert pooled.mean["mae"] == pytest.approx(5 / 3)
+    assert per_image.frames[0].values == pooled.frames[0].values
+
+
+def test_coverage_is_of_each_frame_and_of_all(two: Path) -> None:
+    result = scored(two)
+    assert [(f.name, f.pixels, f.known, f.coverage) for f in result.frames] == [
+        ("a", 2, 2, 1.0), ("ü b", 1, 2, 0.5),
+    ]  # fmt: skip
+    assert result.coverage == 0.75
+    assert any(
+        "1 pixels (25.00%) of the ground truth have no prediction" in n for n in result.notes
+    )
+    assert result.unscored() is None
+
+
+def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path) -> None:
+    depth_file(two / "gt" / "c.npy", [[1, 1]])
+    result = scored(two)
+    assert [frame.name for frame in result.missing] == ["c"]
+    assert result.mean["rmse"] == 2
+    assert result.coverage == 3 / 6
+    assert result.unscored() == (
+        "1 of 3 frames were not scored (1 without prediction, 0 with a faulty file); the means are"
+        " over the other 2"
+    )
+    assert "warning: 1 of 3 frames have no prediction: c" in result.notes
+
+
+FAULTS = [
+    (lambda p: p.write_bytes(b"no depth"), "is not a depth file"),
+    (lambda p: depth_file(p, [[0, 0]]), "holds no valid depth"),
+    (lambda p: depth_file(p, [[1, 1, 1]]), "is 3×1 but the ground truth"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "message"), FAULTS)
+def test_a_failed_frame_is_reported_and_the_others_are_scored(
+    two: Path, spoil: Any, message: str
+) -> None:
+    spoil(two / "out" / "a_depth.npy")
+    result = scored(two)
+    assert [frame.name for frame in result.failed] == ["a"]
+    assert result.mean["rmse"] == 3
+    assert message in (result.frames[0].error or "")
+    assert any(note.startswith("warning: frame a was not scored") for note in result.notes)
+    assert "1 with a faulty file" in (result.unscored() or "")
+
+
+def test_where_nothing_can_be_scored_the_first_reason_is_the_error(two: Path) -> None:
+    for name in ("a_depth.npy", "ü b_depth.npy"):
+        depth_file(two / "out" / name, [[0, 0]])
+    with pytest.raises(InputError, match=r"no frame could be scored; the first: .*a_depth\.npy"):
+        scored(two)
+
+
+def test_two_single_files_raise_their_error(two: Path) -> None:
+    prediction, gt = two / "out" / "a_depth.npy", two / "gt" / "a.npy"
+    result = evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
+    assert (result.mean["rmse"], result.interval) == (1, None)
+    depth_file(prediction, [[1, 1, 1]])
+    with pytest.raises(
+        SizeError, match=r"a_depth\.npy is 3×1 but the ground truth .*a\.npy is 2×1; --res"
+    ):
+        evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
+    depth_file(prediction, [[0, 0]])
+    with pytest.raises(InputError, match="holds no valid depth"):
+        evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
+    depth_file(gt, [[0, 0]])
+    with pytest.raises(InputError, match=r"a\.npy has no known depth where protocol paper scores"):
+        evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
+
+
+def brute(p: np.ndarray, g: np.ndarray, counts: np.ndarray) -> dict[str, float]:
+    """Per image, plain numpy in double precision."""
+    both = counts & (g > 0) & (p > 0)
+    p, g = p[both].astype(float), g[both].astype(float)
+    return {
+        "rmse": float(np.sqrt(np.mean((p - g) ** 2))),
+        "mae": float(np.mean(abs(p - g))),
+        "mre": float(np.mean(abs(p - g) / g)),
+        "sq_rel": float(np.mean((p - g) ** 2 / g)),
+        "log10": float(np.mean(abs(np.log10(p / g)))),
+        "rmse_log": float(np.sqrt(np.mean(np.log(p / g) ** 2))),
+        "irmse": float(1000 * np.sqrt(np.mean((1 / p - 1 / g) ** 2))),
+        "imae": float(1000 * np.mean(abs(1 / p - 1 / g))),
+        "silog": float(100 * np.std(np.log(p / g))),
+        **{f"delta{k}": float(np.mean(np.maximum(p / g, g / p) < 1.25**k)) for k in (1, 2, 3)},
+    }
+
+
+@pytest.fixture(scope="module")
+def random_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, np.ndarray]:
+    """Six frames of 640×480 with ground truth from 0.2 to 12 m, and predictions with holes."""
+    root, rng = tmp_path_factory.mktemp("random"), np.random.default_rng(0)
+    gt = rng.uniform(0.2, 12, (6, 480, 640)).astype(np.float32)
+    prediction = (gt * np.exp(rng.normal(0, 0.2, gt.shape))).astype(np.float32)
+    gt[rng.random(gt.shape) < 0.3] = 0
+    prediction[rng.random(gt.shape) < 0.1] = 0
+    for number in range(6):
+        depth_file(root / "out" / f"{number}_depth.npy", prediction[number])
+        depth_file(root / "gt" / f"{number}.npy", gt[number])
+    return root, prediction, gt
+
+
+def means(rows: list[dict[str, float]]) -> dict[str, Any]:
+    return {key: pytest.approx(np.mean([row[key] for row in rows]), rel=1e-9) for key in rows[0]}
+
+
+def test_a_published_protocol_is_what_plain_numpy_makes_of_its_definition(
+    random_frames: tuple[Path, np.ndarray, np.ndarray],
+) -> None:
+    root, prediction, gt = random_frames
+    inside = np.zeros(gt.shape[1:], bool)
+    inside[45:471, 41:601] = True
+    clipped = np.clip(prediction, np.float32(1e-3), 10)  # empty predictions too, as BTS does
+
+    def expected(depth: np.ndarray) -> dict[str, Any]:
+        pairs = zip(depth, gt, strict=True)
+        return means([brute(p, g, inside & (g > 1e-3) & (g < 10)) for p, g in pairs])
+
+    assert scored(root, protocol="nyu-eigen").mean == expected(clipped)
+    skipped = scored(root, protocol="nyu-eigen", missing="skip")
+    assert skipped.mean == expected(np.where(prediction > 0, clipped, 0))
+    assert skipped.coverage == scored(root, protocol="nyu-eigen").coverage < 1
+
+
+def test_crop_bounds_and_mask_can_each_be_set_alone(
+    random_frames: tuple[Path, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    root, prediction, gt = random_frames
+    everything = np.ones(gt.shape[1:], bool)
+    crop = np.zeros_like(everything)
+    crop[20:60, 10:110] = True
+    frames = list(zip(prediction, gt, strict=True))
+    assert scored(root, crop="10,20,100,40").mean == means([brute(p, g, crop) for p, g in frames])
+    far = scored(root, min_depth=2.0, max_depth=5.0)
+    assert far.mean == means([brute(p, g, (g > 2) & (g < 5)) for p, g in frames])
+    mask = np.random.default_rng(1).random(everything.shape) < 0.5
+    cv2.imwrite(str(tmp_path / "mask.png"), mask.astype(np.uint8) * 255)
+    np.save(tmp_path / "mask.npy", mask.astype(np.uint8))
+    expected = means([brute(p, g, mask) for p, g in frames])
+    assert scored(root, mask=tmp_path / "mask.png").mean == expected
+    assert scored(root, mask=tmp_path / "mask.npy").mean == expected
+
+
+def test_the_interval_holds_the_mean_and_is_of_the_seed(
+    random_frames: tuple[Path, np.ndarray, np.ndarray],
+) -> None:
+    root = random_frames[0]
+    result = scored(root, resamples=500, seed=1)
+    assert result.interval is not None
+    for key, mean in result.mean.items():
+        low, high = result.interval[key]
+        assert low < mean < high, key
+    assert result.interval == scored(root, resamples=500, seed=1).interval
+    assert result.interval != scored(root, resamples=500, seed=2).interval
+    assert scored(root, resamples=0).interval is None
+    assert result.clusters.describe() == "6 frames"
+
+
+def test_missing_pixels_are_skipped_clamped_or_refused(two: Path) -> None:
+    bounds = {"min_depth": 0.5, "max_depth": 10.0}
+    skipped = scored(two, **bounds)
+    lowest, highest = (scored(two, missing=name, **bounds) for name in ("min", "max"))
+    assert skipped.frames[1].values["mae"] == 3
+    assert lowest.frames[1].values["mae"] == (3 + 4.5) / 2
+    assert highest.frames[1].values["mae"] == (3 + 5) / 2
+    assert [e.coverage for e in (skipped, lowest, highest)] == [0.75, 0.75, 0.75]
+    assert (lowest.frames[1].pixels, lowest.frames[1].predicted) == (2, 1)
+    assert any("what is missing is scored as 0.5 m" in note for note in lowest.notes)
+    refused = scored(two, missing="fail", **bounds)
+    assert [frame.name for frame in refused.failed] == ["ü b"]
+    assert "--missing fail refuses" in (refused.frames[1].error or "")
+
+
+def test_protocols_of_papers_score_empty_predictions_as_the_lower_bound(tmp_path: Path) -> None:
+    gt = np.full((20, 20), 4, np.float32)
+    prediction = gt.copy()
+    prediction[:, ::2] = 0
+    depth_file(tmp_path / "out" / "a.npy", prediction)
+    depth_file(tmp_path / "gt" / "a.npy", gt)
+    # BTS: pred[pred < min_depth] = min_depth, and all masked ground truth is scored
+    garg = scored(tmp_path, protocol="garg")
+    assert garg.mean["mre"] == pytest.approx(0.5 * (4 - 1e-3) / 4, rel=0.12)
+    assert garg.frames[0].pixels == garg.frames[0].known
+    assert scored(tmp_path, protocol="garg", missing="skip").mean["mre"] == 0
+    assert scored(tmp_path, protocol="garg", min_depth=0.0).mean["mre"] == 0
+
+
+def test_few_groups_of_frames_have_no_interval_but_a_note(tmp_path: Path) -> None:
+    for drive in ("a", "b"):
+        for number in range(4):
+            depth_file(tmp_path / "out" / drive / f"{number:04}_depth.npy", [[2 + number]])
+            depth_file(tmp_path / "gt" / drive / f"{number:04}.npy", [[2]])
+    result = scored(tmp_path)
+    assert result.interval is None
+    assert "no interval: 2 groups of frames are too few" in result.notes[-1]
+    assert [frame["group"] for frame in result.as_record()["frames"]] == ["a"] * 4 + ["b"] * 4
+    assert scored(tmp_path, grouped=False).interval is not None
+
+
+def test_the_group_of_a_manifest_goes_before_the_name(tmp_path: Path) -> None:
+    lines = ["image,gt,group"]
+    for number in range(3):
+        depth_file(tmp_path / "out" / f"{number}_depth.npy", [[2]])
+        depth_file(tmp_path / "gt" / f"{number}.npy", [[2]])
+        lines.append(f"{number}.png,gt/{number}.npy,{'ab'[number % 2]}")
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((1, 1, 3), np.uint8))
+    (tmp_path / "list.csv").write_text("\n".join(lines))
+    result = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "list.csv"))
+    assert [frame.pair.group for frame in result.frames] == ["a", "b", "a"]
+
+
+def test_a_mask_of_another_size_or_missing_for_a_frame_is_a_fault(two: Path) -> None:
+    depth_file(two / "masks" / "a.npy", [[1, 0, 1]])
+    with pytest.raises(InputError, match=r"mask .*a\.npy is 3×1 but the ground truth"):
+        scored(two, mask=two / "masks")
+    depth_file(two / "masks" / "a.npy", [[1, 0]])
+    result = scored(two, mask=two / "masks")
+    assert result.frames[0].pixels == 1
+    assert "has no mask in" in (result.frames[1].error or "")
+
+
+def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
+    tmp_path: Path,
+) -> None:
+    codes = np.array([[1000, 2000]], np.uint16)
+    for folder in ("out", "gt"):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "a.png"), codes)
+    assert scored(tmp_path).mean["rmse"] == 0
+    by_option = scored(tmp_path, scales=Scales(prediction=1000.0, truth=1000.0))
+    assert by_option.mean["mae"] == 0
+    assert by_option.frames[0].kinds["gt"].scale == 1000
+    nyu = scored(tmp_path, protocol="nyu-eigen", crop="none")
+    assert any("÷ 1000; --gt-scale to change" in note for note in nyu.notes)
+    depth_file(tmp_path / "out" / "a.png", [[1, 2]], scale=100)
+    own = scored(tmp_path, protocol="nyu-eigen", crop="none")
+    assert own.mean["rmse"] == 0
+    assert any("÷ 100 (from the file)" in note for note in own.notes)
+
+
+FACTORS = [(1000.0, "1000"), (256.0, "256"), (0.1, "1/10"), (1000 / 256, "3.906"), (5.0, "5"),
+           (256 / 1000, "1/3.906")]  # fmt: skip
+
+
+@pytest.mark.parametrize(("factor", "message"), FACTORS)
+def test_a_round_factor_between_two_float_files_is_warned_of(
+    tmp_path: Path, factor: float, message: str
+) -> None:
+    gt = np.random.default_rng(0).uniform(1, 4, (6, 8)).astype(np.float32)
+    depth_file(tmp_path / "gt" / "a.npy", gt)
+    depth_file(tmp_path / "out" / "a.npy", gt * np.float32(factor * 1.03))
+    (warning,) = (n for n in scored(tmp_path).notes if n.startswith("warning"))
+    assert f"about {message}: a scale is probably wrong; float files hold metres" in warning
+
+
+@pytest.mark.parametrize("codes", [1000, 5000, 1])
+@pytest.mark.parametrize("side", ["gt", "out", "sparse"])
+def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(
+    tmp_path: Path, side: str, codes: int
+) -> None:
+    depth = np.random.default_rng(0).integers(1, 9, (6, 8)).astype(np.float32)
+    for folder in ("gt", "out", "sparse"):
+        (tmp_path / folder).mkdir()
+        if folder == side:
+            image = np.rint(depth * codes).astype(np.uint16)
+            cv2.imwrite(str(tmp_path / folder / "a.png"), image)
+        else:
+            depth_file(tmp_path / folder / "a.npy", depth)
+    option, field = {
+        "gt": ("--gt-scale", "truth"),
+        "out": ("--pred-scale", "prediction"),
+        "sparse": ("--sparse-scale", "sparse"),
+    }[side]
+    inputs = {"sparse": tmp_path / "sparse"} if side == "sparse" else {}
+    with pytest.raises(InputError) as error:
+        scored(tmp_path, **inputs)
+    assert f"{option} {codes} (now 256) would remove it, {option} 256 keeps it" in str(error.value)
+    right = scored(tmp_path, scales=Scales(**{field: float(codes)}), **inputs)
+    assert right.mean["rmse"] == 0
+    wrong = scored(tmp_path, scales=Scales(**{field: 256.0}), **inputs)
+    assert any("a scale is probably wrong" in note for note in wrong.notes)
+
+
+def test_sparse_input_in_the_ground_truth_causes_a_warning_and_can_be_excluded(
+    tmp_path: Path,
+) -> None:
+    gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
+    points = np.zeros_like(gt)
+    points[0, :4] = gt[0, :4]  # the ground truth itself
+    points[1, :3] = gt[1, :3] + 0.2  # measured anew
+    prediction = np.where(points > 0, points, gt + 1)
+    depth_file(tmp_path / "gt" / "a.npy", gt)
+    depth_file(tmp_path / "out" / "a.npy", prediction)
+    depth_file(tmp_path / "sparse.npy", points)
+    result = scored(tmp_path, sparse=tmp_path / "sparse.npy")
+    (warning,) = (n for n in result.notes if n.startswith("warning"))
+    assert "4 of the scored pixels (4.00%) have a point of the sparse input" in warning
+    assert "--exclude-sparse" in warning
+    without = scored(tmp_path, sparse=tmp_path / "sparse.npy", exclude_sparse=True)
+    assert without.frames[0].known == 93
+    assert without.mean["mae"] == pytest.approx(1)
+    assert not [n for n in without.notes if n.startswith("warning")]
+
+
+def test_the_same_depth_in_other_codes_is_still_the_sparse_input(tmp_path: Path) -> None:
+    gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
+    depth_file(tmp_path / "gt" / "a.png", gt, scale=256)
+    depth_file(tmp_path / "out" / "a.png", gt, scale=1000)
+    depth_file(tmp_path / "s.png", np.where(np.eye(10) > 0, gt, 0), scale=1000)
+    assert scored(tmp_path, sparse=tmp_path / "s.png").frames[0].leaked == 10
+
+
+def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) -> None:
+    sparse = depth_file(two / "s.npy", [[1, 0]])
+    record = {"inputs": {"sparse": {"path": str(sparse)}}}
+    (two / "out" / "a.json").write_text(json.dumps(record))
+    result = scored(two)
+    assert [f.leaked for f in result.frames] == [1, None]
+    sampled = {"inputs": {"sparse": {"sampled_from": "gt"}}, "points": {"used": 2}}
+    (two / "out" / "a.json").write_text(json.dumps(sampled))
+    assert scored(two).frames[0].leaked == 2
+    sparse.write_bytes(b"spoilt")
+    (two / "out" / "a.json").write_text(json.dumps(record))
+    assert scored(two).frames[0].leaked is None
+    (two / "out" / "a.json").write_text(json.dumps(sampled))
+    with pytest.raises(
+        InputError, match=r"cannot be sampled again as its record says .*; give them with --sparse"
+    ):
+        scored(two, exclude_sparse=True)
+
+
+def test_a_smaller_prediction_is_resized_only_on_request(tmp_path: Path) -> None:
+    depth_file(tmp_path / "gt" / "a.npy", [[1, 1, 3, 3], [1, 1, 3, 3]])
+    depth_file(tmp_path / "out" / "a.npy", [[1, 3]])
+    with pytest.raises(InputError, match="--resize nearest or bilinear"):
+        scored(tmp_path)
+    assert scored(tmp_path, resize="nearest").mean["mae"] == 0
+    assert scored(tmp_path, resize="bilinear").mean["mae"] == 0.25
+    depth_file(tmp_path / "out" / "a.npy", [[0, 3]])
+    result = scored(tmp_path, resize="bilinear")
+    assert (result.frames[0].pixels, result.mean["mae"]) == (4, 0)
+
+
+def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) -> None:
+    for folder, codes in (("out", [[65535, 512]]), ("gt", [[256, 512]])):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "a.png"), np.array(codes, np.uint16))
+    devkit = scored(tmp_path, protocol="kitti-devkit")
+    assert devkit.mean["mae"] == pytest.approx((65535 / 256 - 1) / 2)
+    assert scored(tmp_path).frames[0].pixels == 1
+
+
+def test_empty_rows_that_the_kit_does_not_fill_are_reported(tmp_path: Path) -> None:
+    depth_file(tmp_path / "out" / "a.npy", [[1], [0], [1]])
+    depth_file(tmp_path / "gt" / "a.npy", [[1], [1], [1]])
+    result = scored(tmp_path, protocol="kitti-devkit")
+    assert result.mean["mae"] == pytest.approx(2 / 3)
+    assert math.isnan(result.mean["log_mae"])
+    depth_file(tmp_path / "out" / "a.npy", [[0], [0], [0]])
+    assert scored(tmp_path, protocol="kitti-devkit").mean["mae"] == 2  # against −1 m
+    assert any("empty rows between filled ones" in note for note in result.notes)
+    assert result.as_record()["mean"]["log_mae"] is None
+
+
+def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    rng = np.random.default_rng(0)
+    depths = rng.uniform(1, 4, (2, 480, 640)).astype(np.float32)
+    mat = tmp_path / "gt" / "nyu_depth_v2_labeled.mat"
+    mat.parent.mkdir()
+    with h5py.File(mat, "w") as file:
+        file["depths"] = depths.transpose(0, 2, 1)
+        file["images"] = np.zeros((2, 3, 640, 480), np.uint8)
+    predictions = depths * rng.uniform(0.9, 1.1, depths.shape).astype(np.float32)
+    for number, prediction in enumerate(predictions, start=1):
+        depth_file(tmp_path / "out" / f"{number:04}_depth.npy", prediction)
+    result = scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole")
+    error = (predictions - depths)[:, 45:471, 41:601].astype(np.float64)
+    expected = np.sqrt((error**2).mean(axis=(1, 2))).mean()
+    assert result.mean["rmse"] == pytest.approx(expected, rel=1e-6)
+    assert scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole").mean == result.mean
+    with pytest.raises(InputError, match=r"no frame could be scored; the first: .*304×228"):
+        scored(tmp_path, protocol="nyu-eigen")
+
+
+def test_predictions_of_kittis_benchmark_crop_are_aligned_with_the_frame(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    gt = rng.uniform(2, 60, (375, 1242)).astype(np.float32)
+    prediction = rng.uniform(2, 60, (352, 1216)).astype(np.float32)
+    depth_file(tmp_path / "gt" / "a.npy", gt)
+    depth_file(tmp_path / "out" / "a.npy", prediction)
+    with pytest.raises(InputError, match="--pred-crop kb puts"):
+        scored(tmp_path)
+    skipped = scored(tmp_path, prediction_crop="kb")
+    error = prediction.astype(np.float64) - gt[375 - 352 :, 13 : 13 + 1216]
+    assert skipped.mean["rmse"] == pytest.approx(np.sqrt((error**2).mean()), rel=1e-6)
+    assert skipped.coverage == pytest.approx(352 * 1216 / (375 * 1242))
+    # BTS and AdaBins paste the crop into zeros, clip, and score inside Garg's crop
+    whole = np.zeros((375, 1242), np.float32)
+    whole[23:, 13:1229] = prediction
+    inside = (slice(153, 371), slice(44, 1197))
+    clipped = np.clip(whole, 1e-3, 80)[inside].astype(np.float64)
+    expected = np.sqrt(((clipped - gt[inside]) ** 2).mean())
+    garg = scored(tmp_path, protocol="garg", prediction_crop="kb")
+    assert garg.mean["rmse"] == pytest.approx(expected, rel=1e-6)
+    same = scored(tmp_path, prediction_crop="13,23,1216,352")
+    assert same.mean == skipped.mean
+    with pytest.raises(UsageError, match="neither X,Y,WIDTH,HEIGHT nor one of kb"):
+        scored(tmp_path, prediction_crop="kitti")
+
+
+REFUSED = [
+    ({"layout_protocol": "whole"}, "--layout-protocol whole is for data sets"),
+    ({"scales": Scales(truth=0.0)}, "--gt-scale"),
+    ({"scales": Scales(prediction=math.nan)}, "--pred-scale"),
+    ({"workers": 0}, "--workers"),
+    ({"resamples": -1}, "--bootstrap"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), REFUSED)
+def test_an_option_without_sense_is_refused(
+    two: Path, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        scored(two, **options)
+
+
+def test_the_worst_frames_come_first_in_either_direction(two: Path) -> None:
+    result = scored(two)
+    assert [f.name for f in worst(result, "rmse")] == ["ü b", "a"]
+    assert [f.name for f in worst(result, "delta3")] == ["a", "ü b"]
+    assert not [note for note in result.notes if "scale is probably wrong" in note]
+
+
+@pytest.fixture
+def sequences(tmp_path: Path) -> Path:
+    """Two sequences of two frames, and the intrinsics."""
+    rng = np.random.default_rng(0)
+    for name in ("a/0", "a/1", "b/0", "b/1"):
+        gt = rng.uniform(2, 9, (20, 30))
+        depth_file(tmp_path / "gt" / f"{name}.npy", gt)
+        depth_file(tmp_path / "out" / f"{name}.npy", gt * rng.uniform(0.9, 1.1, gt.shape))
+    (tmp_path / "K.txt").write_text("K: 50 0 15 0 50 10 0 0 1\n")
+    return tmp_path
+
+
+def test_additional_measures_follow_the_default_ones(sequences: Path) -> None:
+    default, more = scored(sequences), scored(sequences, groups=("area", "flicker"))
+    assert list(more.mean)[: len(default.mean)] == list(default.mean)
+    assert default.mean.items() <= more.mean.items()
+    assert more.protocol.scoring() == default.protocol.scoring()
+    first, second, third, fourth = (frame.values["flicker"] for frame in more.frames)
+    assert math.isnan(first)
+    assert math.isnan(third)
+    assert more.mean["flicker"] == pytest.approx((second + fourth) / 2)  # over those that have it
+    assert math.isnan(more.mean["mae_40_80"])
+
+
+def test_measures_of_the_scene_need_intrinsics(sequences: Path) -> None:
+    with pytest.raises(InputError, match="--measures cloud needs the intrinsics of frame a/0"):
+        scored(sequences, groups=("cloud",))
+    result = scored(sequences, groups=("cloud", "normals"), calib=sequences / "K.txt")
+    assert 0 < result.mean["f_score"] < 1
+    assert 0 < result.mean["normal_angle"] < 90
+    with pytest.raises(InputError, match="--measures distance needs the sparse depth of frame"):
+        scored(sequences, groups=("distance",))
+
+
+def test_unknown_and_unfitting_measures_are_refused(two: Path) -> None:
+    with pytest.raises(UsageError, match="unknown group of measures 'edge'; did you mean 'edges'"):
+        scored(two, groups=("edge",))
+    with pytest.raises(UsageError, match="--average pooled does not apply"):
+        scored(two, groups=("area",), average="pooled")
+    with pytest.raises(UsageError, match="--measures does not apply to kitti-devkit"):
+        scored(two, groups=("area",), protocol="kitti-devkit")
+
+
+def test_points_sampled_from_the_ground_truth_are_excluded_as_they_were_drawn(
+    tmp_path: Path,
+) -> None:
+    gt = np.random.default_rng(0).uniform(2, 9, (20, 30)).astype(np.float32)
+    points = sample_points(gt, SamplePattern(count=50), seed=7)
+    x, y = np.rint(points.xy).astype(int).T
+    depth = gt + 1
+    depth[y, x] = gt[y, x]  # copies the points
+    depth_file(tmp_path / "gt" / "a.npy", gt)
+    depth_file(tmp_path / "out" / "a_depth.npy", depth)
+    sampling = {"sampled_from": "gt/a.npy", **asdict(SamplePattern(count=50)), "seed": 7}
+    record = {"inputs": {"sparse": sampling}, "points": {"used": 50}}
+    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
+    assert scored(tmp_path).mean["mae"] == pytest.approx(1 - 50 / 600, rel=1e-5)
+    result = scored(tmp_path, exclude_sparse=True)
+    assert result.frames[0].pixels == 550
+    assert result.mean["mae"] == pytest.approx(1, rel=1e-5)
+    record["points"]["used"] = 51
+    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match="it is of another ground truth; give them with --sparse"):
+        scored(tmp_path, exclude_sparse=True)

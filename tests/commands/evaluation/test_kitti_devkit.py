@@ -1,0 +1,130 @@
+"""The development kit's figures: by hand, by plain loops, and as its own program printed them."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from pnpdepth_cli.commands.evaluation.kitti_devkit import (
+    DEVKIT_MEASURES,
+    devkit_errors,
+    devkit_mean,
+    fill_background,
+)
+from pnpdepth_cli.io.depth import read_depth
+
+SAMPLES = Path(__file__).parents[3] / "samples"
+F = np.float32
+
+
+def filled_by_loops(depth: np.ndarray) -> np.ndarray:
+    """What the readme of the kit says of missing predictions, one pixel after the other."""
+    height, width = depth.shape
+    out = np.where(depth > 0, depth, F(-1))
+    for row in out:
+        known = [u for u in range(width) if row[u] >= 0]
+        for a, b in pairwise(known):
+            for u in range(a + 1, b):
+                row[u] = min(row[a], row[b])
+        if known:
+            row[: known[0]] = row[known[0]]
+            row[known[-1] + 1 :] = row[known[-1]]
+    for column in out.T:
+        known = [v for v in range(height) if column[v] >= 0]
+        if known:
+            column[: known[0]] = column[known[0]]
+            column[known[-1] + 1 :] = column[known[-1]]
+    return out
+
+
+def errors_by_loops(predicted: np.ndarray, gt: np.ndarray) -> dict[str, float]:
+    """The nine errors in single precision, added up down each column, column after column."""
+    predicted = filled_by_loops(predicted)
+    sums = {measure.key: F(0) for measure in DEVKIT_MEASURES}
+    log_sum, count = F(0), 0
+    height, width = gt.shape
+    for u in range(width):
+        for v in range(height):
+            g, p = gt[v, u], predicted[v, u]
+            if g <= 0:
+                continue
+            error = abs(g - p)
+            inverse = F(abs(1.0 / float(g) - 1.0 / float(p)))
+            log_p = F(math.log(p)) if p > 0 else F(math.nan)
+            log_error = F(math.log(g)) - log_p
+            sums["mae"] += error
+            sums["rmse"] += error * error
+            sums["inverse_mae"] += inverse
+            sums["inverse_rmse"] += inverse * inverse
+            sums["log_mae"] += abs(log_error)
+            sums["log_rmse"] += log_error * log_error
+            sums["abs_relative"] += error / g
+            sums["squared_relative"] += error * error / (g * g)
+            log_sum += log_error
+            count += 1
+    n = F(count)
+    errors = {key: value / n for key, value in sums.items()}
+    with np.errstate(invalid="ignore"):
+        errors["scale_invariant_log"] = np.sqrt(errors["log_rmse"] - log_sum * log_sum / (n * n))
+    for key in ("rmse", "inverse_rmse", "log_rmse"):
+        errors[key] = np.sqrt(errors[key])
+    return {key: float(value) for key, value in errors.items()}
+
+
+def codes(least: int) -> st.SearchStrategy[np.ndarray]:
+    """Small images of KITTI's depth codes, many of them unknown."""
+    some = st.one_of(st.just(0), st.integers(0, 3), st.integers(least, 20_000))
+    return arrays(np.uint16, (4, 5), elements=some)
+
+
+def metres(stored: np.ndarray) -> np.ndarray:
+    return stored.astype(F) / F(256)
+
+
+@given(codes(1))
+def test_what_is_missing_is_filled_as_by_the_loops_of_the_definition(stored: np.ndarray) -> None:
+    depth = metres(stored)
+    np.testing.assert_array_equal(fill_background(depth), filled_by_loops(depth))
+
+
+@given(codes(1), codes(1))
+def test_the_errors_are_those_of_the_loops_digit_for_digit(
+    predicted: np.ndarray, gt: np.ndarray
+) -> None:
+    gt[0, 0] = 256
+    errors = devkit_errors(metres(predicted), metres(gt))
+    assert errors == pytest.approx(
+        errors_by_loops(metres(predicted), metres(gt)), rel=0, abs=0, nan_ok=True
+    )
+
+
+def test_an_empty_row_between_others_is_left_out_of_the_fill() -> None:
+    depth = np.array([[2, 2], [0, 0], [4, 4]], F)
+    assert fill_background(depth)[1].tolist() == [-1, -1]
+    errors = devkit_errors(depth, np.full((3, 2), 2, F))
+    assert errors["mae"] == pytest.approx((0 + 3 + 2) / 3)
+    assert math.isnan(errors["log_mae"])
+
+
+def test_the_figures_are_those_of_the_official_program() -> None:
+    """Printed by evaluate_depth of the kit (g++ -O3) for the sample's scan and its ground truth."""
+    predicted = read_depth(SAMPLES / "street" / "sparse.png").values
+    gt = read_depth(SAMPLES / "street" / "gt.png").values
+    printed = "5.375677 11.679524 0.025707 0.039534 0.325306 0.521867 0.501333 0.289888 0.218769"
+    errors = devkit_errors(predicted, gt)
+    assert " ".join(f"{errors[measure.key]:f}" for measure in DEVKIT_MEASURES) == printed
+
+
+def test_the_mean_over_frames_is_added_up_in_single_precision_too() -> None:
+    values = np.random.default_rng(0).random((1000, 2))
+    total = np.zeros(2, F)
+    for row in values:
+        total = total + row.astype(F)
+    assert devkit_mean(values).tolist() == (total / F(1000)).astype(float).tolist()

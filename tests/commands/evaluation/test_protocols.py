@@ -1,0 +1,104 @@
+"""What the published protocols cut out, and which changes of them make sense."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS, choose_protocol
+from pnpdepth_cli.errors import SizeError, UsageError
+
+# (protocol, frame, (top, bottom, left, right)) as the published evaluations cut them
+WINDOWS = [
+    ("paper", (228, 304), (0, 228, 0, 304)),
+    ("nyu-eigen", (480, 640), (45, 471, 41, 601)),
+    ("garg", (375, 1242), (153, 371, 44, 1197)),
+    ("garg", (370, 1224), (151, 366, 43, 1180)),
+    ("eigen", (375, 1242), (124, 342, 44, 1197)),
+    ("eigen", (352, 1216), (117, 321, 43, 1172)),
+    ("kitti-devkit", (375, 1242), (0, 375, 0, 1242)),
+]
+
+
+@pytest.mark.parametrize(("name", "size", "window"), WINDOWS)
+def test_a_protocol_scores_the_window_that_was_published(
+    name: str, size: tuple[int, int], window: tuple[int, int, int, int]
+) -> None:
+    assert PROTOCOLS[name].window(size) == window
+
+
+def test_the_bounds_are_the_published_ones() -> None:
+    bounds = {p.name: (p.min_depth, p.max_depth, p.clip) for p in PROTOCOLS.values()}
+    assert bounds == {
+        "paper": (0.0, None, False),
+        "nyu-eigen": (1e-3, 10.0, True),
+        "kitti": (0.0, None, False),
+        "kitti-devkit": (0.0, None, False),
+        "eigen": (1e-3, 80.0, True),
+        "garg": (1e-3, 80.0, True),
+    }
+    assert {p.average for p in PROTOCOLS.values()} == {"per-image"}
+
+
+def test_a_rectangle_is_cut_where_it_is_and_refused_where_it_is_not_inside() -> None:
+    protocol = choose_protocol("paper", crop="10,20,30,40")
+    assert protocol.window((60, 40)) == (20, 60, 10, 40)
+    with pytest.raises(SizeError, match="39×60"):
+        protocol.window((60, 39))
+
+
+def test_the_nyu_crop_is_of_640_by_480_only() -> None:
+    with pytest.raises(SizeError, match=r"640×480 but this one is 304×228; --crop none"):
+        PROTOCOLS["nyu-eigen"].window((228, 304))
+
+
+REFUSED: list[tuple[str, dict[str, Any], str]] = [
+    ("papre", {}, "paper, nyu"),
+    ("paper", {"min_depth": -1.0}, "--min-depth must be metres >= 0, got -1"),
+    ("paper", {"min_depth": 5.0, "max_depth": 5.0}, "above --min-depth 5, got 5"),
+    ("paper", {"max_depth": float("nan")}, "--max-depth"),
+    ("paper", {"crop": "center"}, "X,Y,WIDTH,HEIGHT"),
+    ("paper", {"crop": "0,0,0,5"}, "X,Y,WIDTH,HEIGHT"),
+    ("paper", {"thresholds": (1.0, 1.0, 1.0)}, "above 1"),
+    ("kitti-devkit", {"average": "pooled"}, "--average"),
+    ("kitti-devkit", {"thresholds": (1.01, 1.02, 1.03)}, "--delta"),
+]
+
+
+@pytest.mark.parametrize(("name", "changes", "message"), REFUSED)
+def test_a_setting_without_sense_is_refused(
+    name: str, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UsageError) as error:
+        choose_protocol(name, **changes)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_unset_fields_stay_as_published() -> None:
+    changed = choose_protocol("eigen", max_depth=50.0, crop=None, clip=None)
+    assert changed == replace(PROTOCOLS["eigen"], max_depth=50.0)
+
+
+def test_the_description_states_what_is_scored_and_whether_it_was_changed() -> None:
+    assert PROTOCOLS["eigen"].describe() == (
+        "eigen: all known ground truth in 0.001–80 m, crop eigen, predictions clipped to the same"
+        " range, empty predictions scored as the lower bound, δ below 1.25, 1.5625, 1.95312,"
+        " mean over the images"
+    )
+    changed = choose_protocol("kitti", average="pooled", mask=Path("m.png"), exclude_sparse=True)
+    assert changed.describe() == (
+        "kitti (changed): all known ground truth, no crop, mask m.png, without the pixels of sparse"
+        " points, δ below 1.25, 1.5625, 1.95312, mean over all pixels together"
+    )
+
+
+def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:
+    assert PROTOCOLS["paper"].scoring() == PROTOCOLS["kitti"].scoring()
+    assert PROTOCOLS["paper"].scoring() == choose_protocol("paper", resize="nearest").scoring()
+    kinds = ("paper", "nyu-eigen", "kitti-devkit", "eigen", "garg")
+    rules = [PROTOCOLS[name].scoring() for name in kinds]
+    assert all(a != b for i, a in enumerate(rules) for b in rules[:i])

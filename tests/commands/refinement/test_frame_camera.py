@@ -1,0 +1,171 @@
+"""The camera of a frame is found, recorded, and used for its point cloud."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera, camera_of_fov
+from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.io.dataset.protocols import Protocol
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.cloud import depth_edges
+from tests.colmap_models import HEIGHT, WIDTH, write_text_model
+from tests.commands.batches import RecordingListener, batch, pairs_on_disk
+from tests.commands.frames import FrameOnDisk, frame_on_disk, run
+from tests.commands.scan_frames import FOCAL_PX, scan_on_disk
+
+
+def points_of(path: Path) -> np.ndarray:
+    return read_scan(path).points[:, :3]
+
+
+def pixels_kept(depth: Path) -> int:
+    values = read_depth(depth).values
+    return int(((values > 0) & ~depth_edges(values, 0.05)).sum())
+
+
+def test_the_cloud_of_a_field_of_view_has_the_points_of_the_depth(frame: FrameOnDisk) -> None:
+    record = run(frame, ply=True, fov_deg=60.0, format="npy").record
+    path = frame.folder / "out" / "img.ply"
+    assert record["outputs"]["cloud"] == str(path)
+    kept = pixels_kept(frame.folder / "out" / "img_depth.npy")
+    assert record["cloud"] == {"points": kept, "frame": "camera"}
+    assert len(points_of(path)) == kept > 100
+    assert any("(--fov 60)" in note for note in record["notes"])
+
+
+def test_a_calibration_beside_a_depth_map_is_that_of_the_camera(frame: FrameOnDisk) -> None:
+    calib = frame.folder / "k.txt"
+    calib.write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\ndistortion: [-0.1, 0, 0, 0]\n")
+    record = run(frame, ply=True, scan=ScanOptions(calib=calib)).record
+    assert record["camera"]["intrinsics"] == [[50, 0, 30], [0, 50, 20], [0, 0, 1]]
+    assert record["camera"]["distortion"] == [-0.1, 0, 0, 0]
+
+
+def test_a_calibration_of_another_size_is_refused(frame: FrameOnDisk) -> None:
+    calib = frame.folder / "k.txt"
+    calib.write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\nsize: [64, 48]\n")
+    with pytest.raises(SizeError, match="64×48"):
+        run(frame, ply=True, scan=ScanOptions(calib=calib))
+
+
+def test_exif_is_used_where_nothing_else_gives_the_camera(frame: FrameOnDisk) -> None:
+    image = Image.open(frame.image)
+    exif = image.getexif()
+    exif.get_ifd(0x8769)[0xA405] = 26
+    photo = frame.folder / "img.jpg"
+    image.save(photo, exif=exif)
+    record = run(replace(frame, image=photo), ply=True).record
+    assert "26 mm" in record["camera"]["source"]
+    assert any("no distortion (EXIF" in note for note in record["notes"])
+
+
+def test_without_a_camera_the_cloud_is_refused_before_anything_is_written(
+    frame: FrameOnDisk,
+) -> None:
+    with pytest.raises(UsageError, match=r"--ply needs the camera, .* give --calib or --fov"):
+        run(frame, ply=True)
+    assert not (frame.folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fov_deg": 180.0}, "--fov is 180 degrees"),
+        ({"fov_deg": 60.0, "output": Path("a.exr")}, "--ply writes a second file"),
+    ],
+)
+def test_requests_that_cannot_be_met_are_one_line(
+    frame: FrameOnDisk, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        run(frame, ply=True, **changes)
+
+
+def test_a_colmap_model_gives_camera_and_pose(tmp_path: Path) -> None:
+    frame = frame_on_disk(tmp_path, HEIGHT, WIDTH)
+    write_text_model(tmp_path / "sparse", names=("x.png", "img.png"), camera="SIMPLE_RADIAL")
+    record = run(frame, ply=True, sparse=tmp_path / "sparse").record
+    assert record["cloud"]["frame"] == "world"
+    assert record["camera"]["distortion"] == [-0.1, 0, 0, 0]
+    assert record["camera"]["pose"] == [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0]]
+    x, z = points_of(tmp_path / "out" / "img.ply").T[[0, 2]]
+    assert 3 < np.median(z) < 5
+    camera = FrameCamera.of_record(record["camera"]).camera
+    corners = np.array([[0, 0], [WIDTH - 1, HEIGHT - 1]])
+    left, right = camera.unproject(corners, np.ones(2))[:, 0]
+    assert x.min() == pytest.approx(left * z[x.argmin()] - 0.1, abs=0.3)
+    assert x.max() == pytest.approx(right * z[x.argmax()] - 0.1, abs=0.3)
+
+
+def test_a_scan_gives_the_camera_of_its_calibration(tmp_path: Path) -> None:
+    frame, scan = frame_on_disk(tmp_path), scan_on_disk(tmp_path)
+    changes = {"image": scan.image, "sparse": scan.scan, "scan": ScanOptions(calib=scan.calib)}
+    record = run(frame, ply=True, **changes).record
+    assert record["camera"]["intrinsics"] == [[FOCAL_PX, 0, 31.5], [0, FOCAL_PX, 23.5], [0, 0, 1]]
+    assert record["cloud"]["frame"] == "camera"
+    assert record["cloud"]["points"] == len(points_of(tmp_path / "out" / "img.ply")) > 100
+
+
+def test_a_field_of_view_beside_a_known_camera_is_refused(tmp_path: Path) -> None:
+    frame = frame_on_disk(tmp_path, HEIGHT, WIDTH)
+    write_text_model(tmp_path / "sparse", names=("x.png", "img.png"))
+    with pytest.raises(UsageError, match=r"the camera is known .* leave out --fov"):
+        run(frame, fov_deg=60.0, sparse=tmp_path / "sparse")
+
+
+def test_the_camera_of_a_part_sees_the_same_directions() -> None:
+    protocol = Protocol(name="test", halved=True, crop=(20, 30), anchor="bottom")
+    whole = camera_of_fov(70, (60, 80))
+    part = whole.in_part(protocol, (60, 80))
+    xy = np.array([[33.0, 41.0], [50.0, 47.0]])
+    rays = whole.camera.unproject(xy, np.ones(2))
+    assert part.camera.pixels_of(rays) == pytest.approx(protocol.in_crop(xy, (60, 80)), abs=1e-4)
+
+
+def test_a_record_holds_the_camera_exactly() -> None:
+    pose = np.column_stack([np.eye(3), [0.1, 0.2, 0.3]])
+    camera = Camera(
+        intrinsics=np.array([[50.1, 0, 31.3], [0, 51, 22], [0, 0, 1]]),
+        distortion=(0.1, 0.2, 0.0, 0.0),
+        lens="fisheye",
+    )
+    entry = json.loads(json.dumps(FrameCamera(camera=camera, source="s", pose=pose).record()))
+    again = FrameCamera.of_record(entry)
+    assert again.record() == entry
+    assert (again.camera.intrinsics == camera.intrinsics).all()
+
+
+def test_a_batch_writes_a_cloud_of_each_frame_and_a_lost_one_again(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path, ("a", "b"))
+    (root / "calib.txt").write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\n")
+    batch(root)
+    listener = RecordingListener()
+    batch(root, listener, refine={"ply": True})
+    assert listener.names == ["a", "b"]
+    (root / "out/b.ply").unlink()
+    listener = RecordingListener()
+    batch(root, listener, refine={"ply": True})
+    assert listener.names == ["b"]
+    assert listener.rows[0]["outputs"]["cloud"] == "b.ply"
+    assert len(points_of(root / "out/b.ply")) > 100
+    (root / "calib.txt").write_text("K: [60, 0, 30, 0, 60, 20, 0, 0, 1]\n")
+    listener = RecordingListener()
+    batch(root, listener, refine={"ply": True})
+    assert listener.names == ["a", "b"]
+
+
+def test_a_batch_without_a_camera_ends_before_the_first_frame(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path, ("a",))
+    with pytest.raises(UsageError, match="--ply needs the camera"):
+        batch(root, refine={"ply": True})

@@ -1,0 +1,101 @@
+"""The input range of a network that states none."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.errors import NoPointsError
+from pnpdepth_cli.frames import resolve
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.resolve import NORMALISATIONS, chosen_input_range
+from pnpdepth_cli.models.network import Network
+from tests.commands.batches import batch, pairs_on_disk
+
+
+@pytest.mark.parametrize(
+    ("errors", "expected"),
+    [
+        ({"unit": 0.064, "imagenet": 0.062, "symmetric": 0.07, "bytes": 0.3}, ("unit", "imagenet")),
+        ({"unit": 0.06, "imagenet": 0.15, "symmetric": 0.2, "bytes": 0.3}, ("unit", None)),
+        ({"unit": 0.2, "imagenet": 0.05, "symmetric": 0.15, "bytes": 0.3}, ("imagenet", None)),
+        ({"unit": 0.2, "imagenet": 0.05, "symmetric": 0.06, "bytes": 1}, ("imagenet", "symmetric")),
+    ],
+)
+def test_0_to_1_is_kept_unless_clearly_beaten(
+    errors: dict[str, float], expected: tuple[str, str | None]
+) -> None:
+    assert chosen_input_range(errors) == expected
+
+
+MISLEADING, OTHER = 3.0, 2.0
+"""Error of 0…1 over that of ImageNet's range, on the first frame and on the others."""
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Frames that ranges are compared on, by the range; the first one misleads."""
+    counted: Counter[str] = Counter()
+
+    def error(network: Network, frame: Frame) -> float:
+        (name,) = [
+            n for n, how in NORMALISATIONS.items() if how == network.definition.normalisation
+        ]
+        counted[name] += 1
+        first = counted[name] == 1
+        if name == "imagenet":
+            return 0.1 if first else 0.3
+        return 0.3 if first else 0.1 if name == "unit" else 1.0
+
+    monkeypatch.setattr(resolve, "_alignment_error", error)
+    return counted
+
+
+def open_range(root: Path) -> Path:
+    """The frames' network without an input range."""
+    model = root / "net" / "my_net.py"
+    model.write_text(model.read_text().replace("build=Net", "build=Net, normalisation=None"))
+    return root
+
+
+def test_a_batch_compares_input_ranges_on_three_frames(tmp_path: Path, seen: Counter[str]) -> None:
+    root = open_range(pairs_on_disk(tmp_path / "drive"))
+    batch(root)
+    assert set(seen.values()) == {3}
+    record = json.loads((root / "out" / "a.json").read_text())
+    assert record["settings"]["normalise"] == "unit"
+    assert any("mean of 3 frames" in note for note in record["notes"])
+
+
+def test_a_single_frame_decides_alone(tmp_path: Path, seen: Counter[str]) -> None:
+    root = open_range(pairs_on_disk(tmp_path / "drive", ("a",)))
+    batch(root)
+    record = json.loads((root / "out" / "a.json").read_text())
+    assert record["settings"]["normalise"] == "imagenet"
+
+
+def test_a_stated_range_needs_no_further_frame(tmp_path: Path, seen: Counter[str]) -> None:
+    batch(pairs_on_disk(tmp_path / "drive"))
+    assert not seen
+
+
+def test_a_frame_without_points_in_view_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: Counter[str] = Counter()
+
+    def error(network: Network, frame: Frame) -> float:
+        name = str(network.definition.normalisation)
+        calls[name] += 1
+        if calls[name] == 2:
+            raise NoPointsError("none in view")
+        return 0.1 if network.definition.normalisation == NORMALISATIONS["unit"] else 0.3
+
+    monkeypatch.setattr(resolve, "_alignment_error", error)
+    root = open_range(pairs_on_disk(tmp_path / "drive"))
+    batch(root)
+    notes = json.loads((root / "out" / "a.json").read_text())["notes"]
+    assert any("unit 10.0%" in note for note in notes)

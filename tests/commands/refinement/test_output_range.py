@@ -1,0 +1,107 @@
+"""Depths of an integer file: its codes per metre, and what is clipped."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pnpdepth_cli.commands.refinement.inputs import Inputs
+from pnpdepth_cli.commands.refinement.output_files import Outputs
+from pnpdepth_cli.commands.refinement.outputs import output_scale, within_range
+from pnpdepth_cli.commands.refinement.request import parse_codes_per_metre
+from pnpdepth_cli.core.refine import Refinement
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.frame import Refined, no_points
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.points import SparsePoints
+from tests.commands.frames import frame_on_disk, run
+
+PNG = Outputs(depth=Path("depth.png"))
+
+
+def inputs_at(*depths: float, scale: float | None = None) -> Inputs:
+    xy = torch.tensor([[float(column), 0.0] for column in range(len(depths))])
+    points = SparsePoints(xy=xy, depth=torch.tensor(depths), size=(1, 4))
+    return Inputs(rgb=None, points=points, own=points, sparse_scale=scale)
+
+
+def refined_to(*depths: float, inputs: Inputs) -> Refined:
+    depth = np.array([depths], np.float32)
+    return Refined(
+        before=depth,
+        after=depth,
+        used=inputs.points,
+        held_out=no_points(inputs.points),
+        refinement=Refinement(
+            before=torch.from_numpy(depth),
+            after=torch.from_numpy(depth),
+            losses=(0.0,),
+            step=0.0,
+            kept=0,
+        ),
+        diverged=None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("depths", "scale", "expected"),
+    [
+        ((0.4, 80.0), None, 256),
+        ((0.4, 80.0), 1000.0, 1000),
+        ((5.0, 400.0), None, 100),
+        ((900.0, 3000.0), None, 10),
+        ((0.005, 0.02), None, 10_000),
+        ((0.005, 80.0), None, 256),
+    ],
+)
+def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points(
+    depths: tuple[float, ...], scale: float | None, expected: float
+) -> None:
+    assert output_scale(PNG, inputs_at(*depths, scale=scale)) == expected
+
+
+def test_depths_beyond_16_bits_are_clipped_and_counted() -> None:
+    inputs = inputs_at(10.0, 80.0)
+    frame = refined_to(0.0, 1e-9, 50.0, 800.0, inputs=inputs)
+    clipped = within_range(PNG, inputs, frame)
+    assert clipped.after.tolist() == [[0.0, 1 / 256, 50.0, 65534 / 256]]
+    assert len(clipped.notes) == 2
+    assert "1 of 4 pixels clipped to 256.0 m, the largest" in clipped.notes[0]
+    assert within_range(Outputs(depth=Path("depth.exr")), inputs, frame) is frame
+    plain = replace(frame, after=np.full((1, 4), 50, np.float32))
+    assert within_range(PNG, inputs, plain) is plain
+
+
+def test_a_refinement_beyond_the_format_is_written_with_a_note(tmp_path: Path) -> None:
+    frame = frame_on_disk(tmp_path)
+    text = frame.model.read_text()
+    frame.model.write_text(text.replace("2 + 3 *", "400 + 3 *"))
+    record = run(frame, iterations=0).record
+    assert any("pixels clipped to 65.5 m" in note for note in record["notes"])
+    assert read_depth(tmp_path / "out" / "img_depth.png").values.max() == np.float32(65.534)
+    assert json.loads((tmp_path / "out" / "img.json").read_text())["notes"] == record["notes"]
+
+
+@pytest.mark.parametrize(("text", "expected"), [("mm", 1000.0), ("5", 5.0), ("0.5", 0.5)])
+def test_an_output_scale_is_mm_or_a_number(text: str, expected: float) -> None:
+    assert parse_codes_per_metre(text) == expected
+
+
+@pytest.mark.parametrize("text", ["cm", "0", "-1", "inf", "nan", ""])
+def test_any_other_output_scale_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="neither mm nor codes per metre"):
+        parse_codes_per_metre(text)
+
+
+def test_a_file_in_millimetres_holds_depth_times_a_thousand(tmp_path: Path) -> None:
+    record = run(frame_on_disk(tmp_path), output_scale=1000.0).record
+    written = read_depth(tmp_path / "out" / "img_depth.png")
+    assert written.scale == 1000
+    codes = np.asarray(Image.open(record["outputs"]["depth"]))
+    assert (np.rint(written.values * 1000) == codes).all()

@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from pnpdepth_cli import Refiner, load_network
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.commands.refinement.refine import load_refiner, refine_image
+from pnpdepth_cli.commands.refinement.request import RefineRequest, parse_registration
+from pnpdepth_cli.completion.image_registration import estimated, evidence
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.settings import Settings
+from tests.commands.batches import RecordingListener
+from tests.commands.frames import FrameOnDisk, run
+from tests.completion.unregistered import SIZE, UNREGISTERED, frame
+
+
+def write_frame(folder: Path, seed: int, count: int) -> dict[str, Path]:
+    """Writes a frame that is not registered; returns its image and sparse depth."""
+    rgb, points = frame(seed, UNREGISTERED, count)
+    folder.mkdir(parents=True, exist_ok=True)
+    image, sparse = folder / f"{seed:03}_rgb.png", folder / f"{seed:03}_sparse.png"
+    cv2.imwrite(str(image), np.rint(rgb[..., ::-1] * 255).astype(np.uint8))
+    depth = np.zeros(SIZE, np.float32)
+    column, row = points.xy.numpy().astype(int).T
+    depth[row, column] = points.depth.numpy()
+    write_depth(sparse, depth, scale=1000)
+    return {"image": image, "sparse": sparse}
+
+
+def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) -> dict[str, Any]:
+    """The record of the frame, refined with these options."""
+    request = {
+        **write_frame(folder, 0, count),
+        "output": folder / "out",
+        "model": str(own.model),
+        "checkpoint": own.checkpoint,
+        "propagate": "none",
+        "overwrite": True,
+    }
+    return refine_image(RefineRequest.from_fields(**(request | options))).record
+
+
+def test_an_unregistered_image_is_moved_and_the_record_says_so(
+    tmp_path: Path, frame: FrameOnDisk
+) -> None:
+    record = refined(tmp_path / "a", frame)
+    assert record["registration"]["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.012)
+    assert any(note.startswith("image: moved into the frame of the") for note in record["notes"])
+
+
+def test_off_leaves_the_image_and_numbers_move_it_so(tmp_path: Path, frame: FrameOnDisk) -> None:
+    assert refined(tmp_path / "a", frame, registration="off")["registration"] is None
+    off = read_depth(tmp_path / "a" / "out" / "000_rgb_depth.png").values
+    record = refined(tmp_path / "a", frame, registration=(0.9, -5.0, 3.0))
+    assert record["registration"] == {"zoom": 0.9, "right": -5.0, "down": 3.0}
+    moved = read_depth(tmp_path / "a" / "out" / "000_rgb_depth.png").values
+    assert (off != moved).mean() > 0.1
+
+
+def test_a_moved_image_gives_what_the_same_image_moved_on_disk_gives(
+    tmp_path: Path, frame: FrameOnDisk
+) -> None:
+    refined(tmp_path / "a", frame, registration=(1.0, -4.0, 3.0))
+    direct = read_depth(tmp_path / "a" / "out" / "000_rgb_depth.png").values
+    files = write_frame(tmp_path / "b", 0, 500)
+    rgb = read_rgb(files["image"]).values
+    rows = (np.arange(SIZE[0]) + 3).clip(0, SIZE[0] - 1)
+    columns = (np.arange(SIZE[1]) - 4).clip(0, SIZE[1] - 1)
+    moved = np.rint(rgb[rows][:, columns] * 255).astype(np.uint8)
+    other = tmp_path / "b" / "moved.png"
+    cv2.imwrite(str(other), moved[..., ::-1])
+    refined(tmp_path / "b", frame, image=other, registration="off")
+    on_disk = read_depth(tmp_path / "b" / "out" / "moved_depth.png").values
+    assert (direct == on_disk).all()
+
+
+def test_the_papers_setting_moves_no_image(tmp_path: Path, frame: FrameOnDisk) -> None:
+    record = refined(tmp_path / "a", frame, preset="paper", propagate=None)
+    assert record["registration"] is None
+
+
+def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> None:
+    files = write_frame(tmp_path, 0, 800)
+    inputs = read_inputs(RefineRequest.from_fields(**files))
+    record = refined(tmp_path, frame, count=800, holdout=0.5, seed=3)
+    assert inputs.image is not None
+    all_points = evidence(inputs.image, inputs.points)
+    assert all_points is not None
+    whole = estimated([all_points])
+    assert whole is not None
+    assert record["points"]["used"] == 400
+    assert record["registration"] is not None
+    assert record["registration"]["right"] != whole.right
+
+
+def test_a_registered_frame_has_no_registration_in_its_record(frame: FrameOnDisk) -> None:
+    assert run(frame).record["registration"] is None
+
+
+def batch_records(folder: Path, own: FrameOnDisk, count: int, **options: Any) -> list[Any]:
+    """Writes eight frames, refines them as a batch, and returns the registration of each."""
+    import json
+
+    from pnpdepth_cli.commands.batch.batch import run_batch
+
+    for seed in range(8):
+        files = write_frame(folder / "in", seed, count)
+        for kind, name in (("image", "rgb"), ("sparse", "sparse")):
+            target = folder / "in" / name / f"{seed:03}.png"
+            target.parent.mkdir(exist_ok=True)
+            files[kind].rename(target)
+    refine = RefineRequest.from_fields(
+        model=str(own.model), checkpoint=own.checkpoint, propagate="none", **options
+    )
+    request = BatchRequest(source=folder / "in", output=folder / "out", refine=refine)
+    run_batch(request, RecordingListener())
+    records = sorted((folder / "out").glob("0*.json"))
+    return [json.loads(path.read_text())["registration"] for path in records]
+
+
+def test_the_frames_of_a_batch_share_a_registration_that_none_shows_alone(
+    tmp_path: Path, frame: FrameOnDisk
+) -> None:
+    assert refined(tmp_path / "alone", frame, count=80)["registration"] is None
+    registrations = batch_records(tmp_path, frame, count=80)
+    assert len(registrations) == 8
+    assert registrations[0] is not None
+    assert registrations[0]["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.02)
+    assert all(each == registrations[0] for each in registrations)
+
+
+def test_of_frames_that_say_nothing_three_are_read(frame: FrameOnDisk) -> None:
+    request = RefineRequest.from_fields(
+        image=frame.image, sparse=frame.sparse, model=str(frame.model), checkpoint=frame.checkpoint
+    )
+    inputs = read_inputs(request)
+    few = replace(inputs, points=inputs.points.select(torch.arange(60) < 5))
+    read = []
+
+    def group() -> Iterator[Inputs]:
+        for number in range(10):
+            read.append(number)
+            yield few
+
+    refiner = load_refiner(request, inputs)
+    refiner.share_registration(group())
+    assert read == [0, 1, 2]
+    assert refiner.registrations == {}
+
+
+def test_a_batch_leaves_images_where_it_is_told_to(tmp_path: Path, frame: FrameOnDisk) -> None:
+    assert batch_records(tmp_path, frame, count=500, registration="off") == [None] * 8
+
+
+def test_arrays_in_memory_are_registered_too() -> None:
+    rgb, points = frame(0, UNREGISTERED)
+    network = load_network("compact")
+    fixed = Settings(propagate="none")
+    with Refiner(network, fixed) as auto, Refiner(network, fixed, registration="off") as off:
+        assert any("moved into the frame" in note for note in auto.refine(rgb, points).notes)
+        assert not any("moved into" in note for note in off.refine(rgb, points).notes)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "on", "1,2", "0,0,0", "nan,0,0", "1,inf,0", "1,2,3,4", "a,b,c"]
+)
+def test_another_text_than_auto_off_or_three_numbers_is_an_error(text: str) -> None:
+    with pytest.raises(UsageError, match="neither auto, off, nor ZOOM,RIGHT,DOWN"):
+        parse_registration(text)
+
+
+def test_three_numbers_are_zoom_and_shift() -> None:
+    assert parse_registration("0.9,-5,0") == (0.9, -5.0, 0.0)
+    assert parse_registration("auto") == "auto"

@@ -1,0 +1,76 @@
+"""The 3D view of a frame is packed so that depths and directions are those of its cloud."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from pnpdepth_cli.commands.refinement.view_3d import LARGEST_VIEW, _rays, _stride
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.cloud import kept_pixels
+from tests.commands.frames import frame_on_disk, run
+
+
+def unpacked(text: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), kind).reshape(shape)
+
+
+@pytest.fixture
+def view(tmp_path: Path) -> dict[str, Any]:
+    frame = frame_on_disk(tmp_path)
+    run(frame, view_3d=True, fov_deg=60.0, format="npy", gt=frame.gt)
+    content: dict[str, Any] = json.loads((tmp_path / "out" / "img_view.json").read_text())
+    return content
+
+
+def test_depths_are_those_of_the_cloud_to_a_ten_thousandth(
+    view: dict[str, Any], tmp_path: Path
+) -> None:
+    width, height = view["size"]
+    near, far = view["range"]
+    for name, path in (("after", "out/img_depth.npy"), ("gt", "gt.png")):
+        codes = unpacked(view["depths"][name], "<u2", (height, width)).astype(float)
+        depth = np.where(codes > 0, near * (far / near) ** ((codes - 1) / 65534), 0)
+        expected = read_depth(tmp_path / path).values
+        kept = kept_pixels(expected)
+        assert ((depth > 0) == kept).all()
+        assert depth[kept] == pytest.approx(expected[kept], rel=1e-4)
+    assert view["depths"]["before"] != view["depths"]["after"]
+
+
+def test_colours_are_those_of_the_image(view: dict[str, Any], tmp_path: Path) -> None:
+    width, height = view["size"]
+    colours = unpacked(view["colours"], "|u1", (height, width, 3))
+    assert (colours == np.rint(read_rgb(tmp_path / "img.png").values * 255)).all()
+
+
+@pytest.mark.slow
+def test_interpolated_directions_are_exact_to_a_twentieth_of_a_pixel() -> None:
+    focal_px, size = 400.0, (360, 480)
+    camera = Camera(
+        intrinsics=np.array([[focal_px, 0, 240], [0, focal_px, 180], [0, 0, 1]]),
+        distortion=(-0.2, 0.03, 0.001, 0.0),
+    )
+    nodes = _rays(camera, size)
+    y, x = np.mgrid[: size[0], : size[1]].reshape(2, -1)
+    at = [y / (size[0] - 1) * (nodes.shape[0] - 1), x / (size[1] - 1) * (nodes.shape[1] - 1)]
+    rays = np.stack([map_coordinates(nodes[:, :, axis], at, order=1) for axis in (0, 1)], axis=1)
+    exact = camera.unproject(np.column_stack([x, y]), np.ones(len(x)))[:, :2]
+    assert np.abs(rays - exact).max() * focal_px < 0.05
+
+
+@pytest.mark.parametrize("size", [(375, 1242), (480, 640), (3000, 4000), (448, 447), (8, 9)])
+def test_a_cloud_has_at_most_the_largest_number_of_points(size: tuple[int, int]) -> None:
+    stride = _stride(size)
+    count = math.prod(len(range(stride // 2, side, stride)) for side in size)
+    assert count <= LARGEST_VIEW
+    assert stride == 1 or math.prod(size) / (stride - 1) ** 2 > 0.98 * LARGEST_VIEW

@@ -1,0 +1,307 @@
+"""Reports of batches: what is on the page, where it comes from, and where it may not go."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pnpdepth_cli.choices import COLORS
+from pnpdepth_cli.commands.batch.batch import plan_batch
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.report import batch as report_batch
+from pnpdepth_cli.errors import OutputError, StorageError
+from pnpdepth_cli.io.colours import paint_gain
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.figure import figure_content
+from pnpdepth_cli.io.report import link_image
+from tests.commands.batches import (
+    NAMES,
+    RecordingListener,
+    batch,
+    pairs_on_disk,
+    refinement,
+)
+from tests.commands.report_pages import everything, frames_of, images_of, page_data
+
+_VIEWS = {"first", "second", "map", "image", "sparse"}
+_FILES = {"preview.png", "improvement.png"}
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return pairs_on_disk(tmp_path / "drive")
+
+
+@pytest.fixture
+def report(tmp_path: Path) -> Path:
+    return tmp_path / "report"
+
+
+def test_every_frame_is_on_the_page_which_links_the_panels_of_its_files_on_disk(
+    root: Path, report: Path
+) -> None:
+    batch(root, html=report)
+    frames, images = frames_of(report), images_of(report)
+    assert tuple(frames) == NAMES
+    assert len(images) == len(NAMES) * len(_FILES)
+    for frame in frames.values():
+        assert {n.partition("_")[2] for n in images if n.startswith(frame["key"])} == _FILES
+        assert set(frame["views"]) == _VIEWS
+    frame = frames["c"]
+    for view, kind, title in (
+        ("first", "preview", "Depth before"),
+        ("second", "preview", "Depth after"),
+        ("image", "preview", "Image"),
+        ("map", "improvement", "Change of error"),
+    ):
+        result = root / f"out/c_{kind}.png"
+        figure, shown = figure_content(result), frame["views"][view]
+        assert (report / shown["src"]).samefile(result)
+        assert shown["box"] in [p["box"] for p in figure["panels"] if p["title"] == title]
+        assert shown["size"] == list(figure["size"])
+    preview = figure_content(root / "out/c_preview.png")
+    assert frame["scale_m"] == [preview["low_m"], preview["high_m"]]
+    assert frame["map"]["footer"] == figure["footer"]
+
+
+def test_gains_are_those_of_depth_against_ground_truth(root: Path, report: Path) -> None:
+    batch(root, html=report)
+    batch(root, output=root / "plain", refine={"iterations": 0})
+    gt = read_depth(root / "gt/b.png").values
+    before, after = (
+        np.abs(read_depth(root / out / "b_depth.png").values - gt).mean()
+        for out in ("plain", "out")
+    )
+    values = frames_of(report)["b"]["values"]
+    assert values["mae_before"] == pytest.approx(before, abs=3e-3)  # the files are 16-bit
+    assert values["mae_after"] == pytest.approx(after, abs=3e-3)
+    assert values["mae_gain"] == 1 - values["mae_after"] / values["mae_before"]
+    assert values["mae_gain"] != 0
+    assert 0 < values["improved"] < 1
+
+
+def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report: Path) -> None:
+    batch(root, limit=2)
+    listener = RecordingListener()
+    batch(root, listener, html=report)
+    assert listener.names == ["c", "d"]
+    resumed = everything(report)
+    shutil.rmtree(report)
+    shutil.rmtree(root / "out")
+    batch(root, html=report)
+    assert resumed == everything(report)
+
+
+def test_a_second_run_writes_the_same_page_and_only_an_image_that_is_missing(
+    root: Path, report: Path
+) -> None:
+    batch(root, html=report)
+    before = everything(report)
+    missing = report / "images" / f"{frames_of(report)['b']['key']}_preview.png"
+    drawn = {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
+    missing.unlink()
+    batch(root, html=report)
+    assert before == everything(report)
+    assert drawn == {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
+
+
+def test_a_frame_that_is_redone_has_new_images_and_one_that_is_gone_has_none(
+    root: Path, report: Path
+) -> None:
+    batch(root, html=report)
+    before, key = images_of(report), {n: f["key"] for n, f in frames_of(report).items()}
+    cv2.imwrite(str(root / "rgb/a.png"), cv2.imread(str(root / "rgb/a.png"))[:, ::-1])
+    (root / "rgb/d.png").unlink()
+    batch(root, html=report)
+    after = images_of(report)
+    changed = {name.partition("_")[0] for name in after if before[name] != after[name]}
+    assert changed == {key["a"]}
+    assert {name.partition("_")[0] for name in before.keys() - after.keys()} == {key["d"]}
+
+
+def test_a_failed_frame_is_listed_with_its_reason(root: Path, report: Path) -> None:
+    (root / "rgb/b.png").write_bytes(b"no image")
+    batch(root, html=report)
+    data = page_data(report)
+    assert [frame["name"] for frame in data["frames"]] == ["a", "c", "d"]
+    (failed,) = data["without"]
+    assert failed[0] == "b"
+    assert "b.png" in failed[1]
+    assert data["tiles"][0] == ("Frames refined", "3 of 4", "1 failed")
+    for name in NAMES:
+        (root / f"rgb/{name}.png").write_bytes(b"no image")
+    batch(root, html=report)
+    assert frames_of(report) == {}
+    assert len(page_data(report)["without"]) == 4
+
+
+def test_a_batch_that_is_stopped_has_a_report_of_what_is_done(root: Path, report: Path) -> None:
+    answers = iter([False, True, True, True])
+    batch(root, html=report, stopped=lambda: next(answers))
+    assert list(frames_of(report)) == ["a"]
+    assert page_data(report)["tiles"][0][2] == "3 pending"
+
+
+def test_the_page_states_the_refinement_and_that_it_may_differ_per_frame(
+    root: Path, report: Path, tmp_path: Path
+) -> None:
+    batch(root, html=report, refine={"propagate": "gp"})
+    facts = dict(page_data(report)["facts"])
+    assert facts["Refinement"] == "5 updates of z at middle (sign, l1, step 0.01)"
+    assert (facts["Alignment"], facts["Propagation"]) == ("none", "gp")
+    batch(root, output=root / "auto", html=tmp_path / "auto", refine={"propagate": None})
+    facts = dict(page_data(tmp_path / "auto")["facts"])
+    assert facts["Refinement"].endswith("(the default method)")
+    assert "Alignment" not in facts
+
+
+def test_without_ground_truth_gains_are_those_at_held_out_points(root: Path, report: Path) -> None:
+    shutil.rmtree(root / "gt")
+    batch(root, html=report, refine={"holdout": 0.3})
+    frame = frames_of(report)["a"]
+    assert frame["values"]["rmse_gain"] is not None
+    assert any("at held-out points" in note for note in frame["notes"])
+    tables = [table["caption"] for table in page_data(report)["tables"]]
+    assert tables == [
+        "Means over 4 frames, at held-out points", "Means over 4 frames, at the points used",
+    ]  # fmt: skip
+
+
+def test_with_neither_ground_truth_nor_held_out_points_there_is_no_gain(
+    root: Path, report: Path
+) -> None:
+    shutil.rmtree(root / "gt")
+    batch(root, html=report)
+    data = page_data(report)
+    assert not [column for column in data["columns"] if "gain" in column["title"]]
+    assert data["columns"][data["sort_by"]]["key"] == "rmse_after"
+    assert data["tables"][0]["header"] == ["", "before", "after"]
+    assert [label for label, *_ in data["tiles"]] == ["Frames refined"]
+    assert "no error is measured" in data["notes"][0]
+    assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
+
+
+def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
+    root: Path, report: Path
+) -> None:
+    for name in "bcd":
+        (root / f"gt/{name}.png").unlink()
+    batch(root, html=report)
+    frames = frames_of(report)
+    assert frames["a"]["values"]["rmse_gain"] is not None
+    assert set(frames["b"]["values"].values()) == {None}
+    assert (frames["a"]["tag"], frames["b"]["tag"]) == (
+        "against ground truth",
+        "at the points used",
+    )
+
+
+def test_the_shard_that_ends_last_reports_all_frames(root: Path, report: Path) -> None:
+    batch(root, html=report, shard=(1, 2))
+    assert list(frames_of(report)) == ["a", "c"]
+    batch(root, html=report, shard=(2, 2))
+    assert tuple(frames_of(report)) == NAMES
+    assert len(images_of(report)) == len(NAMES) * len(_FILES)
+
+
+def test_the_report_may_lie_in_the_results_and_the_results_among_the_frames(root: Path) -> None:
+    report = root / "out" / "report"
+    for _ in range(2):
+        batch(root, html=report)
+        assert tuple(frames_of(report)) == NAMES
+
+
+def refused(root: Path, output: Path, **changes: Any) -> str:
+    request = BatchRequest(
+        source=root, output=root / "out", html=output, refine=refinement(root, **changes)
+    )
+    with pytest.raises(OutputError) as first:
+        batch(root, html=output, refine=changes)
+    with pytest.raises(OutputError) as planned:
+        plan_batch(request, lambda text: None)
+    assert str(first.value) == str(planned.value)
+    return str(first.value)
+
+
+def test_outputs_inside_the_inputs_or_around_them_are_refused(root: Path, tmp_path: Path) -> None:
+    assert "which is read" in refused(root, root / "rgb" / "report", overwrite=True)
+    for output in (root, root / "out", tmp_path):
+        assert "holds the results" in refused(root, output, overwrite=True)
+    assert not (root / "out").exists()
+
+
+def test_a_list_has_its_files_elsewhere_which_are_safe_as_well(root: Path, tmp_path: Path) -> None:
+    listed = tmp_path / "frames.csv"
+    listed.write_text("image,sparse\ndrive/rgb/a.png,drive/sparse/a.png\n")
+    with pytest.raises(OutputError, match=r"holds .*rgb/a\.png, which is read"):
+        batch(root, source=listed, output=tmp_path / "out", html=root, refine={"overwrite": True})
+
+
+def test_another_batchs_report_is_replaced_only_on_request(root: Path, report: Path) -> None:
+    batch(root, html=report)
+    before = everything(report)
+    with pytest.raises(OutputError, match="--overwrite replaces the report"):
+        batch(root, output=root / "other", html=report)
+    assert everything(report) == before
+    batch(root, output=root / "other", html=report, refine={"overwrite": True})
+    assert page_data(report)["title"].endswith("other")
+
+
+def test_a_preview_that_went_missing_costs_one_frame_its_images(root: Path, report: Path) -> None:
+    batch(root)
+    (root / "out/b_preview.png").unlink()
+    batch(root, limit=1, html=report)
+    frames = frames_of(report)
+    assert frames["b"]["key"] is None
+    assert all(frames[name]["key"] for name in "acd")
+    assert frames["b"]["values"]["rmse_gain"] is not None
+
+
+def test_a_disk_that_is_full_while_linking_ends_the_run_and_the_next_one_goes_on(
+    root: Path, report: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    linked: list[Path] = []
+
+    def full_at_the_second(source: Path, target: Path) -> None:
+        linked.append(target)
+        if len(linked) == 2:
+            raise StorageError("the disk is full")
+        link_image(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(report_batch, "link_image", full_at_the_second)
+        with pytest.raises(StorageError):
+            batch(root, html=report)
+    assert not (report / "index.html").exists()
+    (report / "images" / ".0123456789ab.png").write_bytes(b"half")
+    listener = RecordingListener()
+    batch(root, listener, html=report)
+    assert listener.messages[1].startswith("removed 1 half-written files")
+    resumed = everything(report)
+    shutil.rmtree(report)
+    batch(root, html=report)
+    assert resumed == everything(report)
+
+
+@pytest.mark.parametrize(("unit", "shown"), [("m", "RMSE [m]"), ("units", "RMSE [units]")])
+def test_errors_have_the_unit_of_the_depths(unit: str, shown: str) -> None:
+    mean = {stage: {"rmse": 0.5, "irmse": 2.0} for stage in ("before", "after")} | {"frames": 1}
+    rows = report_batch._means("scores", mean, unit).rows
+    titles = [row[0] for row in rows]
+    assert f"{shown} ↓" in titles
+    assert "iRMSE [1/km] ↓" in titles
+
+
+@pytest.mark.parametrize("colors", COLORS)
+def test_the_legend_has_the_colours_of_the_improvement_maps(
+    root: Path, report: Path, colors: str
+) -> None:
+    batch(root, html=report, refine={"colors": colors})
+    worse, better = (paint_gain(np.array(s), np.array(0.88), colors) for s in (-1.0, 1.0))
+    shown = page_data(report)["map_colours"]
+    assert [shown[0], shown[-1]] == ["#" + bytes(each).hex() for each in (worse, better)]

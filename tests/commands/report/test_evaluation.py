@@ -1,0 +1,197 @@
+"""Reports of evaluations: the content of the page and its images."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, Evaluation, evaluate
+from pnpdepth_cli.commands.report.evaluation import _charts, write_eval_report
+from pnpdepth_cli.errors import StorageError
+from pnpdepth_cli.io.depth import write_depth
+from tests.commands.report_pages import everything, frames_of, images_of, page_data
+from tests.io.test_atomic import no_room_on_disk
+
+NAMES = ("a", "b <i>", "c\nd")
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    for number, name in enumerate(NAMES):
+        gt = rng.uniform(1, 9, (60, 80)).astype(np.float32)
+        for folder, depth in (("out", gt + 0.1 * (number + 1)), ("gt", gt)):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            write_depth(tmp_path / folder / f"{name}.npy", depth.astype(np.float32))
+    return tmp_path
+
+
+def reported(root: Path, **options: Any) -> Evaluation:
+    result = evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **options))
+    write_eval_report(root / "report", result)
+    return result
+
+
+def panel(root: Path, name: str, view: str) -> np.ndarray:
+    key = frames_of(root / "report")[name]["key"]
+    data = images_of(root / "report")[f"{key}_{view}.jpg"]
+    return np.asarray(Image.open(io.BytesIO(data))).astype(int)
+
+
+def test_the_page_has_the_means_the_protocol_and_every_frame(root: Path) -> None:
+    result = reported(root, protocol="kitti")
+    data = page_data(root / "report")
+    assert data["charts"] == []
+    assert dict(data["facts"])["Protocol"] == result.protocol.describe()
+    assert data["tables"][0]["rows"][0][:2] == ["RMSE [mm] ↓", "200.0"]
+    assert data["columns"][data["sort_by"]]["key"] == "rmse"
+    frames = frames_of(root / "report")
+    assert tuple(frames) == NAMES
+    for row in result.frames:
+        assert frames[row.name]["values"] == row.values | {"coverage": 1.0}
+    (rmse,) = (column for column in data["columns"] if column["key"] == "rmse")
+    assert (rmse["unit"], rmse["factor"]) == ("mm", 1000)
+
+
+def test_unscored_frames_are_listed_with_their_reason(root: Path) -> None:
+    (root / "out/a.npy").unlink()
+    (root / "out/b <i>.npy").write_bytes(b"broken")
+    reported(root)
+    data = page_data(root / "report")
+    assert [name for name, _ in data["without"]] == ["a", "b <i>"]
+    assert data["without"][0][1] == "there is no prediction"
+    remark = "1 without prediction, 1 with a faulty file"
+    assert data["tiles"][0] == ("Frames scored", "1 of 3", remark)
+    assert list(frames_of(root / "report")) == ["c\nd"]
+
+
+def test_the_slider_has_prediction_and_ground_truth_in_the_same_colours(root: Path) -> None:
+    gt = np.full((60, 80), 2, np.float32)
+    gt[:, 40:] = 6
+    write_depth(root / "gt/a.npy", gt)
+    write_depth(root / "out/a.npy", gt[:, ::-1].copy())
+    reported(root)
+    first, second = panel(root, "a", "first"), panel(root, "a", "second")
+    assert np.abs(first - second[:, ::-1]).mean() < 3
+    low, high = frames_of(root / "report")["a"]["scale_m"]
+    assert (low, high) == (2, 6)
+
+
+def test_the_map_is_orange_where_the_prediction_is_too_far_and_dark_where_none_counts(
+    root: Path,
+) -> None:
+    gt = np.full((60, 80), 4, np.float32)
+    gt[:20] = 0
+    prediction = np.full((60, 80), 4, np.float32)
+    prediction[:, 40:] = 5
+    write_depth(root / "gt/a.npy", gt)
+    write_depth(root / "out/a.npy", prediction)
+    reported(root)
+    shown = panel(root, "a", "map")
+    height, width = shown.shape[:2]
+    unknown = shown[: height // 4].mean((0, 1))
+    right = shown[height // 2 :, : width // 3].mean((0, 1))
+    far = shown[height // 2 :, 2 * width // 3 :].mean((0, 1))
+    assert unknown.max() < 80
+    assert right.min() > 180
+    assert far == pytest.approx([220, 105, 0], abs=6)
+    values = frames_of(root / "report")["a"]["map"]
+    assert values["ends"] == ["too near by 1 m or more", "too far by 1 m or more"]
+    assert values["unknown"] == "not scored"
+
+
+def test_the_image_is_shown_where_the_predictions_record_names_one(root: Path) -> None:
+    image = np.full((60, 80, 3), (0, 0, 255), np.uint8)
+    cv2.imwrite(str(root / "img.png"), image)
+    cv2.imwrite(str(root / "other.png"), image[:30])
+    for name, file in (("a", "img.png"), ("b <i>", "other.png"), ("c\nd", "none.png")):
+        record = {"inputs": {"image": {"path": str(root / file)}}}
+        (root / f"out/{name}.json").write_text(json.dumps(record))
+    reported(root)
+    views = [frame["views"] for frame in frames_of(root / "report").values()]
+    assert ["image" in each for each in views] == [True, False, False]
+    assert panel(root, "a", "image").mean((0, 1)) == pytest.approx([255, 0, 0], abs=3)
+
+
+def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
+    root: Path,
+) -> None:
+    rng = np.random.default_rng(1)
+    for name in NAMES:
+        gt = np.load(root / "gt" / f"{name}.npy")
+        sigma = rng.uniform(0.05, 0.5, gt.shape).astype(np.float32)
+        (root / "out" / f"{name}.npy").unlink()
+        depth = gt + sigma * rng.normal(size=gt.shape)
+        write_depth(root / "out" / f"{name}_depth.npy", np.maximum(depth, 0.1).astype(np.float32))
+        np.save(root / "out" / f"{name}_sigma.npy", sigma)
+    result = reported(root)
+    assert result.uncertainty is not None
+    assert len(page_data(root / "report")["charts"]) == 2
+    calibration, sparsification = _charts(result)
+    observed = calibration.lines["observed"]
+    assert observed == [(x, pytest.approx(x, abs=0.02)) for x, _ in observed]
+    by_sigma, by_error = map(dict, sparsification.lines.values())
+    assert by_sigma[0] == by_error[0] == 1
+    assert 1 > by_sigma[0.5] > by_error[0.5] > 0
+    area = np.trapezoid([by_sigma[x] - by_error[x] for x in by_sigma], list(by_sigma))
+    assert area == pytest.approx(result.uncertainty.ause)
+
+
+def test_what_the_development_kit_fills_in_is_shown_filled(root: Path) -> None:
+    depth = np.full((60, 80), 4, np.float32)
+    write_depth(root / "gt/a.npy", depth)
+    depth[:, 20:40] = 0
+    write_depth(root / "out/a.npy", depth)
+    reported(root, protocol="kitti-devkit")
+    assert page_data(root / "report")["labels"]["first"] == "Prediction (filled in)"
+    assert frames_of(root / "report")["a"]["map"]["unknown"] is None
+    shown = panel(root, "a", "first")
+    assert np.abs(shown - shown[0, 0]).max() < 6
+
+
+def test_a_file_that_goes_after_scoring_costs_one_frame_its_images(root: Path) -> None:
+    result = evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt"))
+    (root / "out/a.npy").unlink()
+    write_eval_report(root / "report", result)
+    frames = frames_of(root / "report")
+    assert frames["a"]["key"] is None
+    assert "a.npy" in frames["a"]["notes"][-1]
+    assert frames["c\nd"]["key"]
+
+
+def test_the_same_evaluation_gives_the_same_bytes(root: Path) -> None:
+    reported(root, workers=1)
+    first = images_of(root / "report"), (root / "report/index.html").read_bytes()
+    reported(root, workers=3)
+    assert first == (images_of(root / "report"), (root / "report/index.html").read_bytes())
+
+
+def test_a_full_disk_leaves_the_report_of_before(root: Path) -> None:
+    reported(root)
+    before = everything(root / "report")
+    (root / "report" / "notes.txt").write_text("mine")
+    write_depth(root / "out" / "a.npy", np.full((60, 80), 9, np.float32))
+    with no_room_on_disk(), pytest.raises(StorageError):
+        reported(root)
+    assert everything(root / "report") == before | {"notes.txt": b"mine"}
+    reported(root)
+    after = everything(root / "report")
+    assert after["notes.txt"] == b"mine"
+    assert after["index.html"] != before["index.html"]
+
+
+def test_a_new_report_removes_the_images_of_frames_that_are_gone(root: Path) -> None:
+    reported(root)
+    before = everything(root / "report")
+    (root / "gt" / "a.npy").unlink()
+    reported(root)
+    after = everything(root / "report")
+    assert len(after) == len(before) * 2 // 3 + 1
+    assert set(after) < set(before)

@@ -1,0 +1,155 @@
+"""Bags of ROS 1, ROS 2 and MCAP, as files and as the source of a batch."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+
+from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.commands.sparse.frames import FramesRequest, write_frames
+from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.scans import read_scan_points
+from pnpdepth_cli.errors import FileFormatError, OutputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.layouts import read_frames
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.scans import read_scan
+from tests.bags import HEIGHT, IMAGES, POINTS, WIDTH, write_bag
+from tests.commands.frames import frame_on_disk
+
+KINDS = ("ros1.bag", "ros2", "drive.mcap")
+
+
+def written(bag: Path, folder: Path, **options: object) -> list[str]:
+    """What was said while the frames of a bag were written."""
+    messages: list[str] = []
+    write_frames(FramesRequest(bag=bag, output=folder, **options), messages.append)  # type: ignore[arg-type]
+    return messages
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_bag_becomes_frames_with_a_calibration(
+    kind: str, compressed: bool, tmp_path: Path
+) -> None:
+    bag = write_bag(tmp_path / kind, compressed=compressed)
+    messages = written(bag, tmp_path / "frames")
+    topic = f"{IMAGES}/compressed" if compressed else IMAGES
+    assert messages[0] == f"topics: images of {topic}, points of {POINTS}"
+    frames = read_frames(tmp_path / "frames")
+    assert [frame.name for frame in frames] == [f"1700000000_0{n}0000" for n in (0, 3, 6)]
+    pixels = read_rgb(frames[1].image).values  # type: ignore[arg-type]
+    assert pixels.shape == (HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(pixels[5, 5] * 255, [200, 41, 41], atol=4 if compressed else 0)
+    assert frames[1].sparse is not None
+    assert len(read_scan(frames[1].sparse).points) == 150
+    calibration = read_calibration(tmp_path / "frames" / "calib.txt")
+    assert (calibration.size, calibration.has_pose) == ((HEIGHT, WIDTH), True)
+    np.testing.assert_allclose(calibration.rotation, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(calibration.translation, [0, -0.2, 0], atol=1e-9)
+
+
+def test_scans_of_a_bag_project_to_where_they_belong(tmp_path: Path) -> None:
+    written(write_bag(tmp_path / "drive.mcap"), tmp_path / "frames")
+    frame = read_frames(tmp_path / "frames")[0]
+    assert frame.sparse is not None
+    options = ScanOptions(calib=frame.calib)
+    points = read_scan_points(frame.sparse, options, (HEIGHT, WIDTH)).points
+    # y = 0, z = -0.1667 in the LiDAR is 0.0333 m above the camera's axis, 5 m ahead
+    np.testing.assert_allclose(points.depth, 5)
+    assert np.abs(points.xy - [31.5, 23.5 - 60 * 0.03333 / 5]).sum(axis=1).min() < 0.01
+
+
+def test_a_batch_takes_a_bag_and_writes_its_frames_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, frame = write_bag(tmp_path / "drive.mcap"), frame_on_disk(tmp_path)
+    network = ["--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
+    command = ["batch", str(bag), "-o", str(tmp_path / "out"), *network, "--iterations", "1"]
+    for text, again in (("wrote 3 frames to", "3 to do"), ("", "all of them done already")):
+        with pytest.raises(SystemExit) as ended:
+            main(command)
+        assert ended.value.code == 0
+        printed = capsys.readouterr().err
+        assert text in printed
+        assert again in printed
+    assert len(list((tmp_path / "out_frames" / "rgb").iterdir())) == 3
+
+
+def test_several_topics_are_listed_and_one_can_be_named(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "drive.mcap")
+    missing = BagOptions(topics="/rear")
+    with pytest.raises(UsageError, match=r"no topic /rear .* there are /front/image_raw, /lidar"):
+        written(bag, tmp_path / "frames", options=missing)
+    named = BagOptions(topics=f"{POINTS},{IMAGES}")
+    assert len(written(bag, tmp_path / "frames", options=named)) == 2
+
+
+def test_a_bag_without_calibration_gets_a_note_that_names_it(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "a.mcap", static=False)
+    messages = written(bag, tmp_path / "a")
+    assert "no static transform from camera to lidar; refine with --extrinsics" in messages[-1]
+    assert not read_calibration(tmp_path / "a" / "calib.txt").has_pose
+    messages = written(write_bag(tmp_path / "b.mcap", info=False), tmp_path / "b")
+    assert "has no camera_info of /front/image_raw; refine with --calib" in messages[-1]
+
+
+def test_images_without_a_scan_in_time_are_counted(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "drive.mcap")
+    with pytest.raises(PnpDepthError, match=r"within 0\.001 s; check the clocks"):
+        written(bag, tmp_path / "frames", options=BagOptions(tolerance=0.001))
+
+
+def test_frames_of_a_bag_are_replaced_and_other_folders_left_alone(tmp_path: Path) -> None:
+    bag, folder = write_bag(tmp_path / "drive.mcap"), tmp_path / "frames"
+    written(bag, folder)
+    with pytest.raises(OutputError, match="holds the frames of a bag; --overwrite"):
+        written(bag, folder)
+    written(bag, folder, limit=1, overwrite=True)
+    assert len(list((folder / "sparse").iterdir())) == 1
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "thesis.tex").touch()
+    with pytest.raises(OutputError, match="holds no frames of a bag; name another"):
+        written(bag, tmp_path / "own", overwrite=True)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.7, 0.98])
+def test_a_bag_that_is_cut_short_is_one_line(kind: str, part: float, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / kind)
+    file = next(bag.glob("*.db3")) if bag.is_dir() else bag
+    data = file.read_bytes()
+    file.write_bytes(data[: int(part * len(data))])
+    try:
+        written(bag, tmp_path / "frames")
+    except FileFormatError as error:
+        assert "\n" not in str(error)  # noqa: PT017
+        assert "cannot be read as a bag" in str(error)  # noqa: PT017
+    else:
+        assert part > 0.9  # the index at the end is not needed by every reader
+
+
+def test_each_image_gets_the_nearest_scan_within_the_tolerance() -> None:
+    def stream() -> list[tuple[bool, Stamped]]:
+        times = [(False, 0.0), (True, 0.04), (True, 0.06), (False, 0.1), (True, 0.2), (False, 0.29)]
+        return [(is_image, Stamped(time_s=t, message=t)) for is_image, t in times]
+
+    pairs = [(i.message, s and s.message) for i, s in nearest_pairs(stream(), 0.095)]
+    assert pairs == [(0.04, 0.0), (0.06, 0.1), (0.2, 0.29)]
+    assert [s for _, s in nearest_pairs(stream(), 0.01)] == [None] * 3
+
+
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
+    peaks = []
+    for frames in (50, 2000):
+        bag = write_bag(tmp_path / f"{frames}.mcap", frames=frames)
+        written(bag, tmp_path / f"frames_{frames}")
+        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    assert len(list((tmp_path / "frames_2000" / "rgb").iterdir())) == 2000
+    assert peaks[1] - peaks[0] < 60

@@ -1,0 +1,237 @@
+"""COLMAP models as sparse depth: of the samples' photos, and of small models with known points."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
+from pnpdepth_cli.commands.sparse.options import ColmapOptions
+from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.layouts import list_frames
+from tests.colmap_models import HEIGHT, WIDTH, write_text_model
+from tests.commands.frames import FrameOnDisk, frame_on_disk, run
+
+PHOTOS = Path(__file__).parents[3] / "samples" / "photos"
+METRES_PER_UNIT = 0.0876
+"""Of the samples' model, found by comparison with their ground truth."""
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A project of three photos and a text model."""
+    write_text_model(tmp_path / "sparse" / "0", names=("a.png", "b.png", "c.png"))
+    (tmp_path / "images").mkdir()
+    pixels = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    for name in "abc":
+        cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), pixels)
+    return tmp_path
+
+
+def read(project: Path, name: str = "a.png", **options: Any) -> Any:
+    return read_colmap_points(
+        project,
+        ColmapOptions(**options),
+        project / "images" / name,
+        (HEIGHT, WIDTH),
+        any_size=False,
+    )
+
+
+def change(project: Path, file: str, old: str, new: str) -> None:
+    path = project / "sparse" / "0" / file
+    path.write_text(path.read_text().replace(old, new))
+
+
+def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> dict[str, Any]:
+    files = {"image": project / "images" / "a.png", "sparse": project / "sparse" / "0"}
+    return run(frame, **(files | changes)).record
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_a_photo_with_exif_rotation_is_read_as_colmap_reads_it(
+    orientation: int, tmp_path: Path, project: Path
+) -> None:
+    plain = refine(frame_on_disk(tmp_path), project)
+    photo = project / "images" / "a.png"
+    with Image.open(photo) as image:
+        exif = image.getexif()
+        exif[0x0112] = orientation
+        image.save(photo, exif=exif)
+    turned = refine(frame_on_disk(tmp_path), project, output=tmp_path / "turned")
+    assert turned["size"] == plain["size"] == [WIDTH, HEIGHT]
+    assert turned["points"] == plain["points"]
+    assert "image: EXIF rotation not applied, as COLMAP reads the photo" in turned["notes"]
+
+
+def test_a_photo_of_another_view_is_refused_whatever_size_is_allowed(project: Path) -> None:
+    for size, why in (((WIDTH, HEIGHT), "turned by 90°"), ((WIDTH, 3 * WIDTH), "same view")):
+        with pytest.raises(SizeError, match=why):
+            read_colmap_points(
+                project, ColmapOptions(), project / "images/a.png", size, any_size=True
+            )
+
+
+@pytest.mark.parametrize("name", ["03", "04"])
+def test_a_real_model_agrees_with_the_ground_truth_up_to_one_scale(name: str) -> None:
+    truth = read_depth(PHOTOS / "gt" / f"{name}.png").values
+    image = PHOTOS / "images" / f"{name}.jpg"
+    options = ColmapOptions(unit_scale=METRES_PER_UNIT)
+    points = read_colmap_points(PHOTOS, options, image, truth.shape, any_size=False).points
+    assert len(points) > 100
+    column, row = np.rint(points.xy).astype(int).T
+    known = truth[row, column] > 0
+    ratio = points.depth[known] / truth[row, column][known]
+    assert np.median(ratio) == pytest.approx(1, abs=0.02)
+    assert np.mean(np.abs(ratio - 1) < 0.05) > 0.7
+
+
+def test_points_of_a_real_model_project_onto_their_keypoints() -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = pycolmap.Reconstruction(str(PHOTOS / "sparse" / "0"))
+    options = ColmapOptions(min_track=1, max_reprojection=1e9)
+    for image in theirs.images.values():
+        path = PHOTOS / "images" / image.name
+        points = read_colmap_points(PHOTOS, options, path, (360, 480), any_size=False).points
+        keypoints = [p for p in image.points2D if p.has_point3D()]
+        world = np.array([theirs.points3D[p.point3D_id].xyz for p in keypoints])
+        expected = image.camera.img_from_cam(image.cam_from_world() * world) - 0.5
+        off = np.linalg.norm(points.xy[:, None] - expected[None], axis=2).min(axis=1)
+        assert off.max() < 0.01
+
+
+def test_depth_is_in_model_units_in_every_output(tmp_path: Path, project: Path) -> None:
+    record = refine(frame_on_disk(tmp_path), project)
+    assert record["unit"] == "model units"
+    assert 3.4 < record["points"]["nearest"] < record["points"]["farthest"] < 4.6
+    assert any("model units (COLMAP model, image a.png" in note for note in record["notes"])
+    written = read_depth(tmp_path / "out" / "a_depth.png")
+    assert written.scale not in (None, 256)
+    assert np.log2(written.scale) % 1 == 0
+
+
+def test_a_unit_scale_makes_it_metres(tmp_path: Path, project: Path) -> None:
+    record = refine(frame_on_disk(tmp_path), project, colmap=ColmapOptions(unit_scale=0.5))
+    assert record["unit"] == "m"
+    assert 1.7 < record["points"]["nearest"] < record["points"]["farthest"] < 2.3
+    assert read_depth(tmp_path / "out" / "a_depth.png").scale == 256
+
+
+def test_ground_truth_in_metres_is_not_compared_with_model_units(
+    tmp_path: Path, project: Path
+) -> None:
+    frame = frame_on_disk(tmp_path, HEIGHT, WIDTH)
+    with pytest.raises(UsageError, match="in metres but the sparse depth in model units; give"):
+        refine(frame, project, gt=frame.gt)
+
+
+def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) -> None:
+    change(project, "points3D.txt", "9 9 9 0.5 1 0 2 0 3 0", "9 9 9 2.5 1 0 2 0 3 0")
+    change(project, "points3D.txt", "9 9 9 0.5 1 1 2 1 3 1", "9 9 9 0.5 1 1 2 1")
+    points = read(project).points
+    assert points.dropped["seen in fewer than 3 images"] == 1
+    assert points.dropped["with a reprojection error above 2 px"] == 1
+    kept = read(project, min_track=2, max_reprojection=3).points
+    assert kept.dropped["seen in fewer than 2 images"] == 0
+    assert len(kept) >= len(points)
+
+
+def test_a_model_of_two_images_is_not_asked_for_tracks_of_three(tmp_path: Path) -> None:
+    write_text_model(tmp_path, names=("a.png", "b.png"))
+    options = ColmapOptions()
+    points = read_colmap_points(
+        tmp_path, options, Path("a.png"), (HEIGHT, WIDTH), any_size=False
+    ).points
+    assert points.dropped["seen in fewer than 2 images"] == 0
+
+
+def test_points_behind_the_camera_are_counted_and_a_model_of_nothing_else_refused(
+    project: Path,
+) -> None:
+    points = project / "sparse" / "0" / "points3D.txt"
+    first, *others = points.read_text().splitlines(keepends=True)
+    points.write_text("".join([first.replace(first.split()[3], "-4"), *others]))
+    assert read(project).points.dropped["behind the camera"] == 1
+    change(project, "images.txt", "1 1 0 0 0 0.0 0 0 1", "1 1 0 0 0 0.0 0 -9 1")
+    with pytest.raises(InputError, match=r"all 40 points of 'a\.png' .* are behind its camera"):
+        read(project)
+
+
+@pytest.mark.parametrize("position", range(7))
+def test_a_pose_with_one_number_that_is_none_is_refused(project: Path, position: int) -> None:
+    pose = ["1", "0", "0", "0", "0.0", "0", "0"]
+    damaged = " ".join([*pose[:position], "nan", *pose[position + 1 :]])
+    change(project, "images.txt", f"1 {' '.join(pose)} 1 a.png", f"1 {damaged} 1 a.png")
+    with pytest.raises(FileFormatError, match=r"the pose of 'a\.png' is not made of finite"):
+        read(project)
+
+
+def test_an_image_without_points_left_is_one_line(project: Path) -> None:
+    with pytest.raises(NoPointsError, match="relax --colmap min-track or max-reprojection"):
+        read(project, max_reprojection=0.1)
+
+
+def test_images_of_mixed_cameras_have_each_their_own(project: Path) -> None:
+    cameras = project / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(f"{cameras.read_text()}2 SIMPLE_PINHOLE 32 24 25 16.25 11.5\n")
+    change(project, "images.txt", "2 1 0 0 0 0.1 0 0 1 b.png", "2 1 0 0 0 0.1 0 0 2 b.png")
+    whole = read(project).points
+    with pytest.raises(SizeError, match=r"b\.png is 64×48 but its camera .* is 32×24"):
+        read(project, "b.png")
+    small = read_colmap_points(
+        project, ColmapOptions(), project / "images" / "b.png", (HEIGHT, WIDTH), any_size=True
+    ).points
+    assert small.size == whole.size
+
+
+def test_a_batch_takes_each_registered_photo(
+    tmp_path: Path, project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = frame_on_disk(tmp_path)
+    cv2.imwrite(str(project / "images" / "new.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    (project / "images" / "c.png").unlink()
+    layout, listing = list_frames(project)
+    assert layout == "colmap"
+    assert [each.name for each in listing.frames] == ["a", "b"]
+    assert listing.frames[1].pose == ((1, 0, 0, -0.1), (0, 1, 0, 0), (0, 0, 1, 0))
+    assert ["is missing, but registered" in str(each) for each in listing.broken] == [True]
+    assert ["is not registered" in str(each) for each in listing.spare] == [True]
+    network = ["--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
+    for text in ("2 to do (2 new)", "all of them done already"):
+        with pytest.raises(SystemExit) as ended:
+            main(["batch", str(project), "-o", str(tmp_path / "batch"), *network])
+        assert ended.value.code == 0
+        printed = capsys.readouterr().err
+        assert text in printed
+        assert "all of them" in text or "model units (COLMAP model" in printed
+    summary = json.loads((tmp_path / "batch" / "summary.json").read_text())
+    assert (summary["layout"], summary["unit"]) == ("colmap", "model units")
+
+
+def test_the_largest_of_several_models_is_used(project: Path) -> None:
+    write_text_model(project / "sparse" / "1", names=("d.png",))
+    listing = list_frames(project)[1]
+    assert [each.name for each in listing.frames] == ["a", "b", "c"]
+    assert any("another model, of 1 images" in str(each) for each in listing.spare)
+
+
+def test_a_network_of_metres_is_scaled_to_model_units(tmp_path: Path, project: Path) -> None:
+    frame = frame_on_disk(tmp_path)
+    assert refine(frame, project)["settings"]["align"] == "scale"
+    record = refine(
+        frame, project, colmap=ColmapOptions(unit_scale=1.0), output=tmp_path / "metres"
+    )
+    assert record["settings"]["align"] == "none"
+
+
+def test_options_of_a_model_are_refused_for_other_sparse_depth(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"s\.png is no COLMAP model, so --colmap"):
+        run(frame_on_disk(tmp_path), colmap=ColmapOptions(unit_scale=1.0))

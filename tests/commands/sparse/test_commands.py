@@ -1,0 +1,299 @@
+"""project, sample and simulate, through files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from pnpdepth_cli.commands.sparse.make import (
+    SparseTarget,
+    find_sensor,
+    project_scan,
+    read_noise,
+    sample_depth,
+    simulate_scan,
+)
+from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.commands.sparse.scans import camera_of, read_scan_points
+from pnpdepth_cli.errors import (
+    FileFormatError,
+    NoPointsError,
+    OutputError,
+    PnpDepthError,
+    SizeError,
+    UsageError,
+)
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.sparse_files import read_sparse
+from pnpdepth_cli.sensors import LIDARS, SampleNoise, SamplePattern
+from tests.commands.scan_frames import ScanOnDisk, scan_on_disk
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> ScanOnDisk:
+    return scan_on_disk(tmp_path)
+
+
+def projected(frame: ScanOnDisk, output: str = "sparse.csv", **more: Any) -> dict[str, Any]:
+    target = SparseTarget(output=frame.folder / output)
+    standard = {"options": ScanOptions(calib=frame.calib), "target": target, "image": frame.image}
+    return project_scan(**({"scan": frame.scan} | standard | more))
+
+
+def test_a_projected_scan_lands_where_it_was_made_to(frame: ScanOnDisk) -> None:
+    record = projected(frame)
+    got = read_sparse(frame.folder / "sparse.csv", size=(60, 100)).points
+    np.testing.assert_allclose(got.xy, frame.xy, atol=1e-3)
+    np.testing.assert_allclose(got.depth, frame.depth, atol=1e-4)
+    assert record["points"]["count"] == 150
+    assert json.loads((frame.folder / "sparse.json").read_text()) == json.loads(json.dumps(record))
+
+
+@pytest.mark.parametrize("suffix", DEPTH_SUFFIXES)
+def test_every_depth_format_holds_the_same_points(frame: ScanOnDisk, suffix: str) -> None:
+    projected(frame, f"sparse{suffix}")
+    got = read_depth(frame.folder / f"sparse{suffix}").values
+    column, row = np.floor(frame.xy + 0.5).astype(int).T
+    want = np.zeros((48, 64))
+    want[row, column] = frame.depth
+    np.testing.assert_allclose(got, want, atol=0.002 if suffix == ".png" else 1e-4)
+
+
+def test_the_overlay_is_written_beside(frame: ScanOnDisk) -> None:
+    target = SparseTarget(output=frame.folder / "s.png", overlay=frame.folder / "o" / "over.png")
+    projected(frame, target=target)
+    assert cv2.imread(str(frame.folder / "o" / "over.png")).shape[1] > 300
+    again = replace(target, overwrite=True)
+    with pytest.raises(UsageError, match="needs the image"):
+        projected(frame, target=again, image=None, size=(48, 64))
+
+
+def test_the_size_comes_from_image_option_or_calibration(frame: ScanOnDisk) -> None:
+    with pytest.raises(SizeError, match="does not give the image's size"):
+        projected(frame, image=None)
+    by_option = projected(frame, image=None, size=(48, 64))
+    frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
+    by_file = projected(frame, "other.csv", image=None)
+    assert by_option["points"] == by_file["points"]
+
+
+def refused(frame: ScanOnDisk, error: type[PnpDepthError], message: str, **more: object) -> None:
+    before = sorted(frame.folder.rglob("*"))
+    with pytest.raises(error) as caught:
+        projected(frame, **more)  # type: ignore[arg-type]
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert sorted(frame.folder.rglob("*")) == before
+
+
+def test_bad_input_is_refused_in_one_line_and_nothing_is_written(frame: ScanOnDisk) -> None:
+    cut = frame.folder / "cut.bin"
+    cut.write_bytes(frame.scan.read_bytes()[:-3])
+    refused(frame, FileFormatError, "multiple of 16", scan=cut)
+    values = np.fromfile(frame.scan, "<f4")
+    values[9] = np.nan
+    values.tofile(cut)
+    refused(frame, FileFormatError, "1 of 150 points", scan=cut)
+    refused(frame, FileFormatError, "not a scan", scan=frame.image)
+    refused(frame, FileFormatError, "is not an image", image=frame.scan)
+    refused(frame, UsageError, "needs --calib", options=ScanOptions())
+    behind = np.fromfile(frame.scan, "<f4").reshape(-1, 4) * [-1, 1, 1, 1]
+    behind.astype("<f4").tofile(cut)
+    refused(frame, NoPointsError, "150 behind the camera", scan=cut)
+
+
+def test_an_image_of_another_camera_is_an_error_or_gets_a_warning(frame: ScanOnDisk) -> None:
+    small = frame.folder / "small.png"
+    Image.new("RGB", (20, 15)).save(small)
+    refused(frame, SizeError, "small.png is 20×15, which does not contain", image=small)
+    wide = frame.folder / "wide.png"
+    Image.new("RGB", (128, 48)).save(wide)
+    record = projected(frame, image=wide)
+    assert any(note.startswith("warning: the principal point") for note in record["notes"])
+    frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
+    target = SparseTarget(output=frame.folder / "b.csv")
+    refused(frame, SizeError, "is for images of 64×48", image=wide, target=target)
+
+
+def test_a_calibration_without_a_scanner_is_refused(frame: ScanOnDisk) -> None:
+    frame.calib.write_text("60 0 31.5 0 60 23.5 0 0 1")
+    refused(frame, UsageError, "has no pose of the scanner")
+
+
+def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
+    projected(frame)
+    refused(frame, OutputError, "exists; --overwrite")
+    target = SparseTarget(output=frame.folder / "sparse.csv", overwrite=True)
+    projected(frame, target=target)
+    into = SparseTarget(output=frame.folder / "calib.csv", overwrite=True)
+    calib = frame.folder / "calib.json"
+    calib.write_text('{"K": [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}')
+    refused(frame, OutputError, "is an input", target=into, options=ScanOptions(calib=calib))
+    below = SparseTarget(output=frame.gt / "s.png")
+    refused(frame, OutputError, "cannot be written (file exists)", target=below)
+    refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))
+
+
+def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> None:
+    assert ScanOptions(calib=frame.calib).describes(frame.scan)
+    assert ScanOptions().describes(frame.scan)
+    assert ScanOptions(calib=frame.calib).describes(Path("scan.npy"))
+    assert not ScanOptions().describes(Path("sparse.npy"))
+    with pytest.raises(UsageError, match="is no scan"):
+        ScanOptions(max_range=9.0).describes(frame.gt)
+    assert not ScanOptions(keep_occluded=True).describes(frame.gt)
+
+
+def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
+    pattern = {name: more.pop(name) for name in ("kind", "count", "fraction") if name in more}
+    target = SparseTarget(output=frame.folder / output)
+    return sample_depth(frame.gt, target, SamplePattern(**pattern), **more)
+
+
+def test_the_seed_is_in_the_png_and_in_the_record(frame: ScanOnDisk) -> None:
+    sampled(frame, "u.png", count=100, seed=11)
+    assert np.count_nonzero(read_depth(frame.folder / "u.png").values) == 100
+    settings = json.loads(Image.open(frame.folder / "u.png").text["pnpdepth:made"])
+    assert settings["seed"] == 11
+    assert settings["pattern"]["kind"] == "uniform"
+    assert json.loads((frame.folder / "u.json").read_text())["seed"] == 11
+    assert read_depth(frame.folder / "u.png").scale == 256
+
+
+def test_the_same_seed_gives_the_same_bytes(frame: ScanOnDisk) -> None:
+    for name in ("a", "b"):
+        sampled(frame, f"{name}.png", fraction=0.1, noise=SampleNoise(metres=0.1), seed=2)
+    assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
+
+
+def test_fewer_edges_than_requested_are_reported(frame: ScanOnDisk) -> None:
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:, 30:] = 255
+    cv2.imwrite(str(frame.image), image)
+    record = sampled(frame, "e.png", kind="edges", count=3000, image=frame.image)
+    assert record["points"]["count"] < 3000
+    assert any("of the 3,000 points asked for" in note for note in record["notes"])
+
+
+def simulated(frame: ScanOnDisk, output: str, sensor: str, **more: Any) -> dict[str, Any]:
+    target = SparseTarget(output=frame.folder / output)
+    return simulate_scan(frame.gt, target, sensor, frame.calib, **more)
+
+
+def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
+    sensor = frame.folder / "mine.toml"
+    sensor.write_text("top_deg = 20\nstep_deg = 2\nbeams = 21\nazimuth_step_deg = 0.5\n")
+    for output, position in (("camera.csv", {}), ("scanner.csv", {"position": "calib"})):
+        record = simulated(frame, output, str(sensor), **position)
+        got = read_sparse(frame.folder / output, size=(60, 100)).points
+        np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
+        assert record["sensor"]["name"] == "mine"
+        assert record["sensor"]["max_range"] is None
+        assert len(got.depth) > 500
+
+
+def test_the_scanner_can_stand_beside_the_camera(frame: ScanOnDisk) -> None:
+    record = simulated(frame, "s.csv", "vlp-16", position="0.5,0,-0.1")
+    assert record["translation"] == [0.5, 0, -0.1]
+    with pytest.raises(UsageError, match="--position must be X,Y,Z"):
+        simulated(frame, "t.csv", "vlp-16", position="0,0")
+
+
+@pytest.mark.parametrize(
+    ("text", "noise"),
+    [
+        (None, SampleNoise()),
+        ("0.05", SampleNoise(metres=0.05)),
+        ("2%,outliers=10%,jitter=1", SampleNoise(relative=0.02, outliers=0.1, jitter_px=1)),
+    ],
+)
+def test_noise_is_read_as_it_is_written(text: str | None, noise: SampleNoise) -> None:
+    assert read_noise(text) == noise
+
+
+@pytest.mark.parametrize("text", ["much", "blur=1", "jitter="])
+def test_noise_of_another_kind_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="--noise must be metres"):
+        read_noise(text)
+
+
+def test_a_named_sensor_can_be_changed() -> None:
+    sensor = find_sensor("vlp-16,dropout=0.1,max_range=30")
+    assert sensor == replace(LIDARS["vlp-16"], dropout=0.1, max_range=30)
+    for spec in ("vlp-16,beams=3", "vlp-16,dropout", "vlp-16,dropout=x"):
+        with pytest.raises(UsageError, match="is not NAME=NUMBER"):
+            find_sensor(spec)
+
+
+def test_an_unknown_sensor_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(UsageError, match="vlp-16, vlp-32c"):
+        find_sensor("vlp-17")
+
+
+def test_kittis_frames_project_to_the_density_of_the_data_sets_own(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    folder = shared_data / "kitti_object"
+    for image in sorted((folder / "image_2").glob("*.png")):
+        record = project_scan(
+            scan=folder / "velodyne" / f"{image.stem}.bin",
+            options=ScanOptions(calib=folder / "calib" / f"{image.stem}.txt"),
+            target=SparseTarget(output=tmp_path / f"{image.stem}.png"),
+            image=image,
+        )
+        assert 0.033 < record["points"]["fraction_of_pixels"] < 0.045
+
+
+def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    folder = shared_data / "kitti_dc"
+    name = "0000000005.png"
+    theirs = cv2.imread(str(folder / "velodyne_raw" / name), cv2.IMREAD_UNCHANGED)
+    camera = camera_of(read_calibration(folder, 2))
+    row, column = np.nonzero(theirs)
+    xy = np.column_stack([column, row]).astype(np.float64)
+    points = camera.to_scanner(camera.unproject(xy, theirs[row, column] / 256))
+    scan = tmp_path / "scan.bin"
+    np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(scan)
+    project_scan(
+        scan=scan,
+        options=ScanOptions(calib=folder, camera=2, keep_occluded=True),
+        target=SparseTarget(output=tmp_path / "sparse.png"),
+        image=folder / "image" / "0000000005.jpg",
+    )
+    ours = cv2.imread(str(tmp_path / "sparse.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("camera", range(4))
+def test_kittis_scans_land_where_the_development_kits_formula_puts_them(
+    shared_data: Path, camera: int
+) -> None:
+    folder = shared_data / "kitti_object"
+    scan = np.fromfile(folder / "velodyne" / "000002.bin", "<f4").reshape(-1, 4)
+    calib = folder / "calib" / "000002.txt"
+    lines = (line.partition(":") for line in calib.read_text().splitlines() if line)
+    rows = {name: np.array(values.split(), float) for name, _, values in lines}
+    rectify, velo_to_cam = np.eye(4), np.eye(4)
+    rectify[:3, :3] = rows["R0_rect"].reshape(3, 3)
+    velo_to_cam[:3] = rows["Tr_velo_to_cam"].reshape(3, 4)
+    projection = rows[f"P{camera}"].reshape(3, 4) @ rectify @ velo_to_cam
+    u, v, depth = projection @ np.column_stack([scan[:, :3], np.ones(len(scan))]).T
+    options = ScanOptions(calib=calib, camera=camera, keep_occluded=True)
+    got = read_scan_points(folder / "velodyne" / "000002.bin", options, (375, 1242)).points
+    want = np.column_stack([u / depth, v / depth])[got.index]
+    np.testing.assert_allclose(got.xy, want, atol=1e-3)
+    np.testing.assert_allclose(got.depth, depth[got.index], rtol=1e-5)
+    x, y = u / depth, v / depth
+    inside = (depth > 0) & (x >= -0.5) & (x < 1241.5) & (y >= -0.5) & (y < 374.5)
+    assert len(got.depth) == inside.sum() - got.dropped["behind another in their pixel"]

@@ -1,0 +1,100 @@
+"""A scan with extrinsics from a file, and extrinsics of the wrong direction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
+from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.commands.sparse.scans import camera_of, check_direction, read_scan_points
+from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.extrinsics import inverse
+from pnpdepth_cli.io.record import read_json
+from pnpdepth_cli.io.scans import read_scan
+from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
+
+TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+SHIFT = np.array([0.1, -0.05, -0.2])
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> ScanOnDisk:
+    """A scan whose calibration lacks the pose, and the pose in a file of its own."""
+    scene = scan_on_disk(tmp_path)
+    scene.calib.write_text(CALIBRATION.splitlines()[0])
+    np.savetxt(tmp_path / "pose.txt", np.column_stack([TURN, SHIFT]))
+    np.savetxt(tmp_path / "inverse.txt", np.column_stack([TURN.T, -TURN.T @ SHIFT]))
+    return scene
+
+
+def test_extrinsics_of_a_file_complete_a_calibration(scene: ScanOnDisk) -> None:
+    options = ScanOptions(calib=scene.calib)
+    with pytest.raises(UsageError, match=r"has no pose of the scanner; .* or give --extrinsics"):
+        read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
+    options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
+    read = read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
+    np.testing.assert_allclose(read.points.xy, scene.xy[read.points.index], atol=1e-3)
+
+
+def test_projecting_with_extrinsics_records_their_path(scene: ScanOnDisk) -> None:
+    options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
+    for name in ("out.png", "out.csv"):
+        record = project_scan(
+            scene.scan,
+            options,
+            SparseTarget(output=scene.folder / name, overwrite=True),
+            size=(HEIGHT, WIDTH),
+        )
+        assert record["extrinsics"] == str(options.extrinsics)
+        assert read_json(scene.folder / "out.json") == record
+
+
+def test_the_extrinsics_are_not_replaced_by_the_output(scene: ScanOnDisk) -> None:
+    pose = scene.folder / "pose.json"
+    pose.write_text((scene.folder / "pose.txt").read_text())
+    options = ScanOptions(calib=scene.calib, extrinsics=pose)
+    target = SparseTarget(output=scene.folder / "pose.png", overwrite=True)
+    with pytest.raises(OutputError, match=r"pose\.json is an input"):
+        project_scan(scene.scan, options, target, size=(HEIGHT, WIDTH))
+
+
+def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> None:
+    wrong = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "inverse.txt")
+    with pytest.raises(UsageError, match=r"put 0 of 150 scan .* add --scan inverse-extrinsics"):
+        read_scan_points(scene.scan, wrong, (HEIGHT, WIDTH))
+    right = ScanOptions(
+        calib=scene.calib, extrinsics=scene.folder / "inverse.txt", inverse_extrinsics=True
+    )
+    read = read_scan_points(scene.scan, right, (HEIGHT, WIDTH))
+    np.testing.assert_allclose(read.points.xy, scene.xy[read.points.index], atol=1e-3)
+    assert not [note for note in read.notes if "extrinsics" in note]
+
+
+def test_a_fisheye_lens_of_a_plain_calibration_is_applied(scene: ScanOnDisk) -> None:
+    plain = scene.calib.read_text()
+    moved = []
+    for lens in ("", "\ndistortion: [0.1, 0, 0, 0]\nlens: fisheye\n"):
+        scene.calib.write_text(plain + lens)
+        options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
+        points = read_scan_points(scene.scan, options, (HEIGHT, WIDTH)).points
+        moved.append(points.xy[:5])
+    assert np.abs(moved[0] - moved[1]).max() > 0.01
+
+
+def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> None:
+    folder = shared_data / "kitti_object"
+    for path in sorted((folder / "calib").glob("*.txt")):
+        scan = read_scan(folder / "velodyne" / f"{path.stem}.bin").points
+        right = camera_of(read_calibration(path))
+        turn, shift = inverse((right.rotation, right.translation))
+        wrong = replace(right, rotation=turn, translation=shift)
+        portrait = replace(right, intrinsics=np.array([[700.0, 0, 180], [0, 700, 600], [0, 0, 1]]))
+        assert check_direction(scan, right, (375, 1242)) == []
+        assert check_direction(scan, portrait, (1242, 375)) == []
+        (warning,) = check_direction(scan, wrong, (375, 1242))
+        assert "if they map the camera to the scanner, add --scan inverse-extrinsics" in warning

@@ -1,0 +1,703 @@
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from pnpdepth_cli.commands.refinement import refine as refining
+from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.commands.refinement.refine import load_refiner, refine_image
+from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.commands.sweep.axes import PARAMETERS, read_axis, studies_of
+from pnpdepth_cli.commands.sweep.plan import Method
+from pnpdepth_cli.commands.sweep.plots import across_and_apart
+from pnpdepth_cli.commands.sweep.points import Sampling, frame_points, read_sampling
+from pnpdepth_cli.commands.sweep.running import refined
+from pnpdepth_cli.commands.sweep.sweep import SweepRequest, run_sweep
+from pnpdepth_cli.commands.sweep.tables import METHODS, SWEPT, summarise
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import (
+    InputError,
+    LayerError,
+    OutputError,
+    PnpDepthError,
+    UsageError,
+)
+from pnpdepth_cli.frames import refiner as frame_refiner
+from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.lock import locked_folder
+from pnpdepth_cli.sensors import (
+    FORWARD_LEFT_UP,
+    LIDARS,
+    Camera,
+    SampleNoise,
+    SamplePattern,
+    sample_points,
+    simulate_lidar,
+)
+from tests.commands.batches import RecordingListener, pairs_on_disk, refinement
+
+CALIB = "60 0 31\n0 60 23\n0 0 1\n"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return pairs_on_disk(tmp_path / "drive", ("a", "b"))
+
+
+def sweep(
+    root: Path,
+    *vary: str,
+    listener: RecordingListener | None = None,
+    one_by_one: bool = False,
+    refine: dict[str, Any] | None = None,
+    **changes: Any,
+) -> dict[str, Any]:
+    fields: dict[str, Any] = {
+        "source": root,
+        "output": root / "out",
+        "refine": refinement(root, **(refine or {})),
+        "studies": studies_of([read_axis(text) for text in vary], one_by_one=one_by_one),
+        "plots": "none",
+        "resamples": 50,
+    }
+    return run_sweep(SweepRequest(**fields | changes), listener or RecordingListener())
+
+
+def one_frame(root: Path, **changes: Any) -> tuple[RefineRequest, Inputs]:
+    files = {part: root / part / "a.png" for part in ("sparse", "gt")}
+    request = refinement(root, image=root / "rgb/a.png", **files, **changes)
+    return request, read_inputs(request)
+
+
+def alone(root: Path, **changes: Any) -> dict[str, Any]:
+    """The scores before and after of frame a by `pnpdepth refine`."""
+    request, _ = one_frame(root, output=root / "alone.npy", overwrite=True, **changes)
+    scores: dict[str, Any] = refine_image(request).record["scores"]
+    return scores
+
+
+def journal(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "sweep.jsonl").read_text().splitlines()]
+
+
+def lines(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+class Killed(RecordingListener):
+    """Somebody who kills the sweep after so many runs."""
+
+    def __init__(self, after: int) -> None:
+        super().__init__()
+        self._after = after
+
+    def frame(self, row: dict[str, Any]) -> None:
+        super().frame(row)
+        if len(self.rows) == self._after:
+            raise KeyboardInterrupt
+
+
+# what is computed
+
+
+@pytest.mark.parametrize("keep_best", [False, True])
+@pytest.mark.parametrize("lr", ["0.01", "60%"])
+def test_one_run_scores_every_number_of_updates_as_a_refinement_of_that_number_alone(
+    root: Path, keep_best: bool, lr: str
+) -> None:
+    request, inputs = one_frame(root, lr=lr, keep_best=keep_best)
+    refiner = load_refiner(request, inputs)
+    with Split(refiner.network.module, refiner.layer) as split:
+        method = Method(layer=refiner.layer, settings=refiner.settings)
+        result = refined(refiner.network, split, method, inputs, (0, 1, 3, 8))
+    for k in (0, 1, 3, 8):
+        wanted = alone(root, lr=lr, keep_best=keep_best, iterations=k)["after"]
+        assert result["scores"][str(k)].items() >= wanted.items()
+    assert result["scores"]["0"].items() >= result["plain"].items()
+
+
+def test_what_is_propagated_afterwards_is_scored_so_and_the_plain_network_is_not(
+    root: Path,
+) -> None:
+    sweep(root, "propagate=none,gp", "iterations=0,2")
+    wanted = alone(root, iterations=0, propagate="gp")
+    rows = lines(root / "out/sweep_frames.csv")
+    (line,) = [
+        each
+        for each in rows
+        if (each["propagate"], each["iterations"], each["frame"]) == ("gp", "0", "a")
+    ]
+    assert float(line["mae_refined"]) == wanted["after"]["mae"]
+    assert float(line["mae_plain"]) == wanted["before"]["mae"]
+    assert wanted["after"]["mae"] < wanted["before"]["mae"]
+
+
+def test_a_grid_holds_the_scores_of_batch_and_of_linear_interpolation(root: Path) -> None:
+    record = sweep(root, "iterations=0,2", "lr=1%,10%")
+    wanted = alone(root, iterations=2, lr="10%")
+    _, inputs = one_frame(root)
+    assert inputs.gt is not None
+    interpolated = score(linear(inputs.points), torch.from_numpy(inputs.gt))
+    (line,) = [
+        each
+        for each in lines(root / "out/sweep_frames.csv")
+        if (each["iterations"], each["lr"], each["frame"]) == ("2", "10%", "a")
+    ]
+    assert float(line["mae_refined"]) == wanted["after"]["mae"]
+    assert float(line["rmse_plain"]) == wanted["before"]["rmse"]
+    assert float(line["delta1_linear"]) == interpolated.delta1
+    assert line["status"] == "done"
+    assert int(line["points_used"]) == 60
+    cells = record["studies"][0]["cells"]
+    assert [cell["parameters"] for cell in cells] == [
+        {"iterations": k, "lr": lr} for k in ("0", "2") for lr in ("1%", "10%")
+    ]
+    assert cells[0]["measures"]["mae"]["gain"] == 0
+    assert cells[3]["measures"]["mae"]["gain"] > cells[2]["measures"]["mae"]["gain"] > 0
+
+
+def test_all_numbers_of_updates_come_from_one_run_and_the_network_is_loaded_once(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded: list[object] = []
+    own = refining.load_network
+    monkeypatch.setattr(refining, "load_network", lambda *a, **k: loaded.append(a) or own(*a, **k))
+    sweep(root, "points=20,60", "iterations=0,1,2,5")
+    assert len(loaded) == 1
+    entries = journal(root / "out")
+    assert len(entries) == 2 * 2 * 2  # frames × points × (linear and one refinement)
+    assert [list(each["scores"]) for each in entries[:2]] == [["linear"], ["0", "1", "2", "5"]]
+
+
+def test_where_the_step_falls_with_the_updates_each_number_is_a_run_of_its_own(root: Path) -> None:
+    sweep(root, "iterations=1,4", refine={"schedule": "linear"})
+    rows = lines(root / "out/sweep_frames.csv")
+    (line,) = [each for each in rows if (each["iterations"], each["frame"]) == ("4", "a")]
+    wanted = alone(root, iterations=4, schedule="linear")["after"]["mae"]
+    assert float(line["mae_refined"]) == wanted
+    assert len(journal(root / "out")) == 2 * 3
+
+
+def test_one_by_one_shares_what_the_tables_have_in_common(root: Path) -> None:
+    record = sweep(root, "iterations=1,5", "lr=0.01,0.1", "loss=l1,l2", one_by_one=True)
+    assert [study["name"] for study in record["studies"]] == ["iterations", "lr", "loss"]
+    # linear, then lr 0.01 with l1 (of all three tables), lr 0.1, and l2
+    assert len(journal(root / "out")) == 2 * 4
+    same = [record["studies"][n]["cells"][k]["measures"] for n, k in ((0, 1), (1, 0), (2, 0))]
+    assert same[0] == same[1] == same[2]
+
+
+def test_the_record_has_the_settings_that_are_not_varied(root: Path) -> None:
+    record = sweep(root, "layer=encode,1", sampling=read_sampling("grid:20"), refine={"lr": "2%"})
+    base = record["base"]
+    assert (base["layer"], base["lr"], base["iterations"]) == ("middle", "2%", 5)
+    assert (base["sensor"], base["points"]) == ("grid", "20")
+
+
+def test_where_no_layer_is_named_the_cut_is_that_of_refine(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frame_refiner, "default_layer", lambda network, size, count: "encode")
+    record = sweep(root, "iterations=0,2")
+    assert record["base"]["layer"] == "encode"
+    named = sweep(root, "iterations=0,2", refine={"layer": "encode"}, output=root / "named")
+    assert record["studies"] == named["studies"]
+
+
+def test_a_refinement_that_diverges_counts_with_its_last_good_depth(root: Path) -> None:
+    model = root / "net/my_net.py"
+    formula = "2 + 3 * self.decode(torch.tanh(self.middle(self.encode(rgb))))"
+    exponential = "torch.exp(self.decode(self.middle(self.encode(rgb))))"
+    model.write_text(model.read_text().replace(formula, exponential))
+    listener = RecordingListener()
+    record = sweep(root, "lr=0.01,1e4", "iterations=0,5", listener=listener)
+    cells = record["studies"][0]["cells"]
+    assert [cell["diverged"] for cell in cells] == [0, 0, 0, 2]
+    values = cells[3]["measures"]["mae"]
+    last_good = alone(root, lr="1e4", iterations=5)["after"]["mae"]
+    rows = lines(root / "out/sweep_frames.csv")
+    (line,) = [e for e in rows if e["status"] == "diverged" and e["frame"] == "a"]
+    assert float(line["mae_refined"]) == last_good
+    assert values["refined"] == pytest.approx(
+        np.mean(
+            [float(e["mae_refined"]) for e in rows if e["lr"] == "1e4" and e["iterations"] == "5"]
+        )
+    )
+    (message, _) = [row["message"] for row in listener.rows if row["status"] == "diverged"]
+    assert "try a smaller --lr" in message
+
+
+# going on
+
+
+def test_the_same_command_again_computes_nothing_and_writes_the_same(root: Path) -> None:
+    names = ("sweep.csv", "sweep.json", "sweep_frames.csv", "sweep_points_iterations.png")
+    vary = ("points=20,60", "iterations=0,2")
+    sweep(root, *vary, seeds=2, plots="png")
+    before = [(root / "out" / name).read_bytes() for name in names]
+    listener = RecordingListener()
+    sweep(root, *vary, seeds=2, plots="png", listener=listener)
+    assert listener.to_do == 0
+    assert listener.rows == []
+    assert [(root / "out" / name).read_bytes() for name in names] == before
+
+
+def test_other_values_only_compute_what_is_missing(root: Path) -> None:
+    sweep(root, "points=20,60", "iterations=1,5")
+    for vary, runs in (
+        (("points=20,60", "iterations=1"), 0),
+        (("points=20", "iterations=1,2"), 2),  # a refinement of each frame
+        (("points=20,40", "iterations=1,2,5"), 4),  # and linear of each
+        (("lr=0.01,0.1", "points=20"), 2),  # lr 0.01 is the network's default
+    ):
+        listener = RecordingListener()
+        sweep(root, *vary, listener=listener)
+        assert listener.to_do == runs, vary
+    for vary, runs in (("sensor=uniform:30", 4), ("sensor=uniform:30,own", 4)):
+        listener = RecordingListener()
+        sweep(root, vary, listener=listener)
+        assert listener.to_do == runs, vary
+    fresh = sweep(root, "points=20,60", "iterations=1,2,5", output=root / "fresh")
+    grown = sweep(root, "points=20,60", "iterations=1,2,5")
+    assert grown["studies"] == fresh["studies"]
+
+
+@pytest.mark.parametrize("after", [1, 4, 7])
+def test_a_sweep_that_was_killed_goes_on_and_ends_the_same(root: Path, after: int) -> None:
+    vary = ("points=20,60", "iterations=0,3")
+    with pytest.raises(KeyboardInterrupt):
+        sweep(root, *vary, listener=Killed(after))
+    with (root / "out/sweep.jsonl").open("a") as file:
+        file.write('{"run": "torn')
+    listener = RecordingListener()
+    resumed = sweep(root, *vary, listener=listener)
+    assert listener.to_do == 8 - after
+    assert resumed["studies"] == sweep(root, *vary, output=root / "other")["studies"]
+
+
+def test_a_formula_as_a_name_is_text_in_the_tables(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive", ("=1+1", "b"))
+    sweep(root, "iterations=0")
+    assert [row["frame"] for row in lines(root / "out/sweep_frames.csv")] == ["'=1+1", "b"]
+
+
+def test_an_edited_line_of_the_journal_is_computed_again(root: Path) -> None:
+    undisturbed = sweep(root, "iterations=0,2")
+    path = root / "out/sweep.jsonl"
+    path.write_text(path.read_text().replace('"rmse"', '"other"', 1))
+    listener = RecordingListener()
+    resumed = sweep(root, "iterations=0,2", listener=listener)
+    assert listener.to_do == 1
+    assert any("1 lines of" in text and "are damaged" in text for text in listener.messages)
+    assert resumed["studies"] == undisturbed["studies"]
+
+
+def test_what_was_made_of_a_file_that_changed_is_computed_again(root: Path) -> None:
+    sweep(root, "iterations=0,2")
+    cv2.imwrite(str(root / "rgb/b.png"), np.zeros((46, 62, 3), np.uint8))
+    listener = RecordingListener()
+    sweep(root, "iterations=0,2", listener=listener)
+    assert listener.names == ["b", "b"]
+
+
+def test_other_weights_are_another_network(root: Path) -> None:
+    sweep(root, "iterations=0,2")
+    network = root / "net/my_net.py"
+    network.write_text(network.read_text().replace("2 + 3 *", "2 + 4 *"))
+    listener = RecordingListener()
+    sweep(root, "iterations=0,2", listener=listener)
+    assert listener.to_do == 4
+
+
+# points
+
+
+def test_points_of_a_pattern_are_those_of_sample_with_the_same_seed(root: Path) -> None:
+    request, inputs = one_frame(root)
+    sampling = replace(read_sampling("uniform:30"), noise=0.1, outliers=0.2, jitter=0.3)
+    points = frame_points(sampling, 7, inputs, request, Frame(name="a"))
+    assert inputs.gt is not None
+    noise = SampleNoise(metres=0.1, outliers=0.2, jitter_px=0.3)
+    wanted = sample_points(inputs.gt, SamplePattern(count=30), 7, noise=noise)
+    assert np.array_equal(points.xy.numpy(), wanted.xy)
+    assert np.array_equal(points.depth.numpy(), wanted.depth)
+
+
+def test_a_lidar_stands_where_the_camera_is(root: Path, tmp_path: Path) -> None:
+    calib = tmp_path / "calib.txt"
+    calib.write_text(CALIB)
+    request, inputs = one_frame(root)
+    sampling = Sampling(sensor="vlp-16", rotation_noise=2)
+    points = frame_points(sampling, 3, inputs, request, Frame(name="a", calib=calib))
+    k = np.array([[60, 0, 31], [0, 60, 23], [0, 0, 1.0]])
+    camera = Camera(intrinsics=k, rotation=FORWARD_LEFT_UP, translation=np.zeros(3))
+    assert inputs.gt is not None
+    scanner = replace(LIDARS["vlp-16"], rotation_noise_deg=2)
+    wanted = simulate_lidar(inputs.gt, camera, scanner, 3)
+    assert np.array_equal(points.xy.numpy(), wanted.xy)
+    assert np.array_equal(points.depth.numpy(), wanted.depth)
+
+
+def test_so_many_of_the_frames_own_points_are_among_them(root: Path) -> None:
+    request, inputs = one_frame(root)
+    own = {tuple(xy) for xy in inputs.points.xy.tolist()}
+    for points, count in (("20", 20), ("50%", 30), ("100%", 60), (None, 60)):
+        sampled = frame_points(Sampling(points=points), 0, inputs, request, Frame(name="a"))
+        kept = {tuple(xy) for xy in sampled.xy.tolist()}
+        assert len(kept) == count
+        assert kept <= own
+    with pytest.raises(InputError, match="61 points of 60; ask for fewer"):
+        frame_points(Sampling(points="61"), 0, inputs, request, Frame(name="a"))
+
+
+def test_seeds_draw_other_points_and_only_where_something_is_random(root: Path) -> None:
+    sweep(root, "sensor=own,grid:40,uniform:40", seeds=3, refine={"seed": 5})
+    seeds: dict[str, list[int]] = {}
+    for line in journal(root / "out"):
+        if line["frame"] == "a" and "linear" in line["scores"]:
+            seeds.setdefault(line["points"], []).append(line["seed"])
+    assert sorted(map(len, seeds.values())) == [1, 1, 3]
+    rows = [e for e in lines(root / "out/sweep_frames.csv") if e["sensor"] == "uniform:40"]
+    assert len({each["mae_linear"] for each in rows if each["frame"] == "a"}) == 3
+
+
+def test_the_count_of_sample_is_of_its_pattern_and_not_of_other_sensors(
+    root: Path, tmp_path: Path
+) -> None:
+    calib = tmp_path / "calib.txt"
+    calib.write_text(CALIB)
+    record = sweep(
+        root,
+        "sensor=uniform,grid,own,vlp-16",
+        sampling=read_sampling("30"),
+        refine={"scan": ScanOptions(calib=calib)},
+    )
+    points = [cell["points"] for cell in record["studies"][0]["cells"]]
+    assert points[0] == 30
+    assert 20 < points[1] < 40
+    assert points[2] == 60
+    assert points[3] > 500
+
+
+def test_frames_without_sparse_depth_have_points_of_the_truth(root: Path, tmp_path: Path) -> None:
+    listed = tmp_path / "frames.csv"
+    listed.write_text(f"image,gt\n{root}/rgb/a.png,{root}/gt/a.png\n")
+    listener = RecordingListener()
+    sweep(root, "points=10,5%", source=listed, listener=listener)
+    assert any("points: uniform of the ground truth" in text for text in listener.messages)
+    with pytest.raises(UsageError, match="needs a number of points"):
+        sweep(root, "lr=1%,3%", source=listed)
+
+
+# means
+
+
+def row(frame: str, seed: int, refined: Sequence[float], plain: float = 2.0) -> dict[str, Any]:
+    """Scores of one frame; the measures are rmse, mae, mre and δ1."""
+    scores = {
+        f"{measure.key}_{method}": value
+        for measure, after in zip(SWEPT, refined, strict=True)
+        for method, value in zip(METHODS, (plain, 4.0, after), strict=True)
+    }
+    return {"frame": frame, "seed": seed, "status": "done", "points_used": 10 * (seed + 1),
+            "time_s": 1.0 + seed, **scores}  # fmt: skip
+
+
+FAILED = {"frame": "b", "seed": 1, "status": "failed", "points_used": 0}
+
+
+def test_a_mean_is_over_frames_of_each_frames_mean_over_seeds() -> None:
+    summary = summarise(
+        [row("a", 0, [1, 1, 1, 3]), row("a", 1, [2, 1, 1, 3]), row("b", 0, [3, 1, 1, 3])],
+        resamples=200,
+    )
+    rmse, mae, delta1 = (summary["measures"][key] for key in ("rmse", "mae", "delta1"))
+    assert summary["frames"] == 2
+    assert rmse["refined"] == (1.5 + 3) / 2
+    assert (rmse["refined_low"], rmse["refined_high"]) == (None, None)  # of two frames
+    assert mae["gain"] == 50
+    assert mae["gain_over_linear"] == 75
+    assert delta1["gain"] == 50  # of δ1 more is better
+    assert delta1["gain_over_linear"] == -25
+    assert summary["points"] == (10 + 20 + 10) / 3
+    assert summary["time_s"] == (1 + 2 + 1) / 3
+
+
+def test_the_interval_of_a_cell_is_over_its_frames() -> None:
+    rows = [
+        row(name, 0, [value, 1, 1, 3])
+        for name, value in zip("abcdef", (3, 6, 1, 5, 2, 4), strict=True)
+    ]
+    rmse, mae = (summarise(rows, resamples=500)["measures"][key] for key in ("rmse", "mae"))
+    assert 1 < rmse["refined_low"] < rmse["refined"] == 3.5 < rmse["refined_high"]
+    assert rmse["gain_low"] < rmse["gain"] < rmse["gain_high"]
+    assert (mae["gain_low"], mae["gain_high"]) == pytest.approx((50, 50))
+    two_sequences = [row(f"{of}_{n:03}", 0, [1, 1, 1, 3]) for of in "ab" for n in range(3)]
+    assert summarise(two_sequences, resamples=50)["measures"]["rmse"]["refined_low"] is None
+
+
+def test_one_frame_has_no_interval_and_a_frame_that_failed_once_is_left_out() -> None:
+    summary = summarise([row("a", 0, [1] * 4), row("b", 0, [9] * 4), FAILED], resamples=10)
+    assert (summary["frames"], summary["failed"]) == (1, 1)
+    assert summary["measures"]["rmse"]["refined"] == 1
+    assert summary["measures"]["rmse"]["refined_low"] is None
+    assert summarise([FAILED], resamples=10)["measures"] is None
+
+
+# what can be wrong
+
+
+def test_a_failed_frame_is_reported_counted_and_left_out_of_the_mean(root: Path) -> None:
+    (root / "rgb/b.png").write_bytes(b"")
+    listener = RecordingListener()
+    record = sweep(root, "iterations=0,2", listener=listener)
+    assert [row["status"] for row in listener.rows] == ["done", "done", "failed", "failed"]
+    cell = record["studies"][0]["cells"][1]
+    assert (cell["frames"], cell["failed"]) == (1, 1)
+    again = RecordingListener()
+    sweep(root, "iterations=0,2", listener=again)
+    assert again.names == ["b", "b"]  # it is tried again
+
+
+def test_frames_without_ground_truth_are_reported_and_none_at_all_is_an_error(root: Path) -> None:
+    (root / "gt/a.png").unlink()
+    listener = RecordingListener()
+    assert sweep(root, "iterations=0,2", listener=listener)["frames"] == ["b"]
+    assert "warning: 1 frames have no ground truth and are left out" in listener.messages
+    (root / "gt/b.png").unlink()
+    (root / "gt").rmdir()
+    with pytest.raises(InputError, match="none of its 2 frames has ground truth"):
+        sweep(root, "iterations=0,2")
+
+
+def test_a_folder_that_is_locked_or_holds_other_results_is_refused(root: Path) -> None:
+    out = root / "out"
+    out.mkdir()
+    with (
+        locked_folder(out, None, lambda: None),
+        pytest.raises(OutputError, match="wait for it to end"),
+    ):
+        sweep(root, "iterations=0,2")
+    (out / "sweep.csv").write_text("mine")
+    with pytest.raises(OutputError, match="no sweep wrote it"):
+        sweep(root, "iterations=0,2")
+    assert (out / "sweep.csv").read_text() == "mine"
+
+
+def test_a_missing_layer_is_an_error_before_anything_is_computed(root: Path) -> None:
+    listener = RecordingListener()
+    with pytest.raises(LayerError, match="midle"):
+        sweep(root, "layer=encode,midle", listener=listener)
+    assert listener.rows == []
+
+
+BAD = [
+    ("point=20", "no parameter 'point'"),
+    ("points", "give values after ="),
+    ("points=20,", "with commas"),
+    ("points=20,20", "comes twice"),
+    ("points=many", "neither a number"),
+    ("points=0", "at least one point"),
+    ("points=200%", "at most 100 %"),
+    ("iterations=1.5", "not a whole number"),
+    ("iterations=-1", ">= 0, got -1"),
+    ("lr=0", "not a step size"),
+    ("loss=l3", "not one of l1, l2"),
+    ("update=newton", "sign"),
+    ("outliers=2", "<= 1, got 2"),
+    ("noise=-1", ">= 0, got -1"),
+    ("blur=inf", "finite"),
+    ("noise=nan", "finite"),
+    ("sensor=vlp-17", "no sensor 'vlp-17'"),
+    ("sensor=gird:40", "no sensor 'gird:40'"),
+    ("sensor=grid:x", "neither a number"),
+    ("sensor=no.toml", "no.toml"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD)
+def test_what_cannot_be_varied_is_named_with_the_way_out(text: str, message: str) -> None:
+    with pytest.raises(PnpDepthError) as raised:
+        read_axis(text)
+    assert message in str(raised.value)
+    assert raised.value.exit_code in (2, 3)
+
+
+def test_more_than_two_make_no_grid_and_none_no_sweep() -> None:
+    axes = [read_axis(text) for text in ("points=1,2", "lr=1,2", "loss=l1,l2")]
+    with pytest.raises(UsageError, match="--one-by-one"):
+        studies_of(axes, one_by_one=False)
+    assert len(studies_of(axes, one_by_one=True)) == 3
+    with pytest.raises(UsageError, match="two --vary"):
+        studies_of([axes[0], axes[0]], one_by_one=True)
+    with pytest.raises(UsageError, match="nothing to vary"):
+        studies_of([], one_by_one=False)
+
+
+def test_a_sensor_with_its_own_number_does_not_go_with_points(root: Path) -> None:
+    with pytest.raises(UsageError, match="says how many points"):
+        sweep(root, "points=20,40", "sensor=grid:30,uniform")
+
+
+# plots
+
+
+def test_every_study_has_a_plot(root: Path) -> None:
+    record = sweep(
+        root, "layer=0,1", "loss=l1,log", "points=20,50%", one_by_one=True, plots="png", seeds=2
+    )
+    for study in record["studies"]:
+        plot = cv2.imread(str(root / "out" / study["plot"]))
+        assert plot.shape == (580, 1640, 3)
+        assert (plot < 128).mean() > 0.005
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "along"),
+    [
+        ("points=20,60", "iterations=0,1,2", "iterations"),
+        ("iterations=0,1,2", "points=20,60", "iterations"),
+        ("loss=l1,l2,log", "lr=1%,3%", "lr"),
+        ("loss=l1,l2,log", "update=sign,sgd", "loss"),
+        ("points=20,60", "lr=1%,3%", "lr"),
+    ],
+)
+def test_numbers_are_on_the_x_axis_and_more_values_before_fewer(
+    first: str, second: str, along: str
+) -> None:
+    axes = read_axis(first), read_axis(second)
+    assert across_and_apart(*axes)[0].name == along
+    assert across_and_apart(*axes)[1].name in {axis.name for axis in axes} - {along}
+
+
+def test_axes_have_units_and_numbers_only_where_all_values_are_of_one_kind() -> None:
+    assert read_axis("lr=1%,3%").title() == "step (% of the deviation of z)"
+    assert read_axis("lr=0.01,0.1").title() == "step"
+    assert read_axis("lr=0.01,3%").numbers() is None
+    assert read_axis("layer=0,0.5").title() == "layer cut at (0 first, 1 last)"
+    assert read_axis("layer=encode,middle").title() == "layer cut at"
+    assert read_axis("points=1%,100%").numbers() == [1, 100]
+    assert {each.shown.title for each in PARAMETERS.values()} > {"sensor", "loss"}
+
+
+def test_without_matplotlib_an_error_names_the_extra_at_once(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setattr("pnpdepth_cli.commands.sweep.plots.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'pnpdepth\[plot\]'"):
+        sweep(root, "iterations=0,2", plots="png")
+    assert not (root / "out").exists()
+    assert sweep(root, "iterations=0,2")["studies"][0]["plot"] is None
+
+
+def test_a_sweep_over_what_moves_refines_each_for_itself(root: Path) -> None:
+    record = sweep(root, "parameters=elements,weights", refine={"lr": "0.001", "iterations": 3})
+    gains = [cell["measures"]["mae"]["gain"] for cell in record["studies"][0]["cells"]]
+    assert gains[0] != gains[1] != 0
+    weights = alone(root, lr="0.001", iterations=3, parameters="weights")
+    (line,) = [
+        each
+        for each in lines(root / "out/sweep_frames.csv")
+        if (each["parameters"], each["frame"]) == ("weights", "a")
+    ]
+    assert float(line["mae_refined"]) == weights["after"]["mae"]
+
+
+def test_each_network_has_its_own_cells(root: Path) -> None:
+    net, weights = root / "net" / "my_net.py", root / "net" / "my_net.safetensors"
+    other = root / "net" / "other.safetensors"
+    state = {name: 1.1 * value for name, value in load_file(weights).items()}
+    save_file(state, other)
+    models = [f"{net}@{weights}", f"{net}@{other}"]
+    record = sweep(root, f"model={','.join(models)}", "points=20,60", refine={"checkpoint": None})
+    cells = record["studies"][0]["cells"]
+    assert [cell["parameters"]["model"] for cell in cells] == [m for m in models for _ in range(2)]
+    for model, checkpoint in zip(models, (weights, other), strict=True):
+        alone = sweep(
+            root, "points=20,60", refine={"checkpoint": checkpoint}, output=root / checkpoint.stem
+        )
+        own = [cell["measures"] for cell in cells if cell["parameters"]["model"] == model]
+        assert own == [cell["measures"] for cell in alone["studies"][0]["cells"]]
+    assert cells[0]["measures"] != cells[2]["measures"]
+    assert [record["model"]["checkpoint"], record["more_models"][0]["checkpoint"]] == [
+        str(weights),
+        str(other),
+    ]
+    with pytest.raises(UsageError, match="vary model=NETWORK@WEIGHTS"):
+        sweep(root, f"model={net}")
+
+
+def test_each_seed_is_a_draw_of_the_points(root: Path) -> None:
+    record = sweep(root, "seed=0,3", sampling=read_sampling("40"))
+    drawn = [cell["measures"]["mae"]["refined"] for cell in record["studies"][0]["cells"]]
+    both = sweep(root, "points=40", seeds=4, sampling=read_sampling("40"), output=root / "both")
+    assert both["frames"] == record["frames"]
+    with (root / "both" / "sweep_frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for seed, value in zip((0, 3), drawn, strict=True):
+        own = [float(row["mae_refined"]) for row in rows if row["seed"] == str(seed)]
+        assert value == pytest.approx(np.mean(own))
+
+
+def test_presets_are_varied(root: Path) -> None:
+    record = sweep(root, "preset=paper", refine={"propagate": None})
+    (paper,) = (cell["measures"]["mae"]["refined"] for cell in record["studies"][0]["cells"])
+    alone = sweep(
+        root, "iterations=5", refine={"preset": "paper", "propagate": None}, output=root / "alone"
+    )
+    assert paper == alone["studies"][0]["cells"][0]["measures"]["mae"]["refined"]
+
+
+def test_the_cost_stands_beside_the_error_where_it_is_asked_for(root: Path) -> None:
+    record = sweep(root, "iterations=0,1,4", cost=True)
+    times = [cell["time_s"] for cell in record["studies"][0]["cells"]]
+    assert 0 < times[0] <= times[1] < times[2]
+    with (root / "out" / "sweep.csv").open(newline="") as file:
+        assert [float(row["time_s"]) for row in csv.DictReader(file)] == times
+    assert "time_s" not in sweep(root, "iterations=0,1,4")["studies"][0]["cells"][0]
+
+
+def test_a_column_of_the_csv_has_a_name_of_its_own(root: Path) -> None:
+    sweep(root, "points=20,60", cost=True)
+    with (root / "out" / "sweep.csv").open(newline="") as file:
+        header = next(csv.reader(file))
+    assert len(set(header)) == len(header)
+
+
+def test_tables_are_written_as_latex(root: Path) -> None:
+    record = sweep(root, "points=20,60", "iterations=0,5")
+    lines = (root / "out" / "sweep.tex").read_text().splitlines()
+    (mae,) = {f"{record['studies'][0]['cells'][0]['measures']['mae']['refined']:.4f}"}
+    first = lines[lines.index(r"\midrule") + 1]
+    assert first.startswith("20 & 0 & ")
+    assert first.split(" & ")[4] == mae
+    assert sum(line.endswith(r"\\") for line in lines) == 5
+
+
+@pytest.mark.parametrize(("kind", "start"), [("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_plots_can_be_vector_graphics_of_the_same_bytes(
+    root: Path, kind: str, start: bytes
+) -> None:
+    plot = root / "out" / f"sweep_iterations.{kind}"
+    written = []
+    for _ in range(2):
+        sweep(root, "iterations=0,1", plots=kind, cost=True)
+        written.append(plot.read_bytes())
+    assert written[0].startswith(start)
+    assert written[0] == written[1]

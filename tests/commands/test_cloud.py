@@ -1,0 +1,207 @@
+"""`pnpdepth cloud` writes one cloud of the depth maps it is given."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError, UsageError
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.scans import read_scan
+
+HEIGHT, WIDTH = 24, 32
+
+
+def frame(folder: Path, name: str, depth: float = 2.0) -> Path:
+    """A depth file as `refine` writes it, with its image and record."""
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{name}_depth.png"
+    write_depth(path, np.full((HEIGHT, WIDTH), depth, np.float32))
+    image = folder / f"{name}.png"
+    cv2.imwrite(str(image), np.full((HEIGHT, WIDTH, 3), (10, 20, 30), np.uint8))
+    (folder / f"{name}.json").write_text(json.dumps({"inputs": {"image": {"path": str(image)}}}))
+    return path
+
+
+def written(path: Path, output: Path, **values: Any) -> dict[str, Any]:
+    request = {"fov_deg": 60.0, "edge": 0.05} | values
+    return write_depth_cloud(CloudRequest(depth=path, output=output, **request))
+
+
+def points_of(path: Path) -> np.ndarray:
+    return read_scan(path).points[:, :3]
+
+
+def test_the_colours_come_from_the_image_that_the_record_names(tmp_path: Path) -> None:
+    record = written(frame(tmp_path, "a"), tmp_path / "a.ply")
+    assert record["coloured"]
+    assert record["points"] == HEIGHT * WIDTH
+    row = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1][:27]
+    assert list(row[24:27]) == [30, 20, 10]  # OpenCV wrote blue, green, red
+    assert json.loads((tmp_path / "a.ply.json").read_text()) == record
+
+
+def test_the_field_of_view_is_that_of_the_outer_pixels(tmp_path: Path) -> None:
+    written(frame(tmp_path, "a"), tmp_path / "a.ply", fov_deg=90.0)
+    x = points_of(tmp_path / "a.ply")[:, 0]
+    assert x.max() == pytest.approx(2 * (WIDTH - 1) / WIDTH, rel=1e-5)
+
+
+def test_a_calibration_file_gives_the_camera(tmp_path: Path) -> None:
+    (tmp_path / "k.txt").write_text(f"30 0 {WIDTH / 2} 0 30 {HEIGHT / 2} 0 0 1\n")
+    path = frame(tmp_path, "a")
+    written(path, tmp_path / "a.ply", fov_deg=None, calib=tmp_path / "k.txt")
+    points = points_of(tmp_path / "a.ply")
+    assert points[0] == pytest.approx([-WIDTH / 2 / 15, -HEIGHT / 2 / 15, 2], rel=1e-5)
+
+
+def with_camera(path: Path, pose: list[list[float]] | None) -> Path:
+    """The depth file, with a camera in its record."""
+    record = path.with_name(path.name.replace("_depth.png", ".json"))
+    camera = {
+        "intrinsics": [[20, 0, 0], [0, 20, 0], [0, 0, 1]], "lens": "radial-tangential",
+        "distortion": [], "source": "made up", "pose": pose,
+    }  # fmt: skip
+    entries = {"camera": camera, "size": [WIDTH, HEIGHT], "unit": "model units"}
+    record.write_text(json.dumps(json.loads(record.read_text()) | entries))
+    return path
+
+
+def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
+    pose = [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]
+    path = with_camera(frame(tmp_path, "a"), pose)
+    record = written(path, tmp_path / "a.ply", fov_deg=None)
+    assert (record["frame"], record["unit"]) == ("world", "model units")
+    assert record["notes"] == ["camera: made up (from the record)"]
+    assert points_of(tmp_path / "a.ply")[-1] == pytest.approx(
+        [5 + 2 * (WIDTH - 1) / 20, 2 * (HEIGHT - 1) / 20, 2]
+    )
+
+
+def test_frames_with_and_without_a_pose_are_not_mixed(tmp_path: Path) -> None:
+    with_camera(frame(tmp_path / "out", "a"), [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]])
+    with_camera(frame(tmp_path / "out", "b"), None)
+    with pytest.raises(InputError, match=r"b_depth\.png has no pose in its record"):
+        written(tmp_path / "out", tmp_path / "o.ply", fov_deg=None)
+
+
+def test_a_depth_of_another_size_than_its_record_needs_its_own_camera(tmp_path: Path) -> None:
+    path = with_camera(frame(tmp_path, "a"), None)
+    write_depth(path, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))
+    with pytest.raises(SizeError, match="unlike its record"):
+        written(path, tmp_path / "o.ply", fov_deg=None)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"intrinsics": [1, 2]},
+        {"intrinsics": [[0, 0, 0]] * 3},
+        {"intrinsics": [[1e999, 0, 0], [0, 1, 0], [0, 0, 1]]},
+        {"distortion": ["x"]},
+        {"lens": "pinhole"},
+        {"pose": [1, 2]},
+    ],
+)
+def test_a_damaged_camera_in_a_record_is_one_line(tmp_path: Path, changes: dict[str, Any]) -> None:
+    path = with_camera(frame(tmp_path, "a"), None)
+    record = json.loads((tmp_path / "a.json").read_text())
+    record["camera"] |= changes
+    (tmp_path / "a.json").write_text(json.dumps(record).replace("Infinity", "1e999"))
+    with pytest.raises(FileFormatError, match="the camera in the record beside it is damaged"):
+        written(path, tmp_path / "o.ply", fov_deg=None)
+
+
+def test_pixels_beyond_the_limits_are_left_out(tmp_path: Path) -> None:
+    depth = np.linspace(1, 5, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.float32)
+    write_depth(tmp_path / "d.exr", depth)
+    record = written(tmp_path / "d.exr", tmp_path / "d.ply", edge=0, max_depth=3)
+    assert record["points"] == int((depth <= 3).sum())
+    assert not record["coloured"]
+
+
+def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:
+    path = frame(tmp_path, "a")
+    valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    valid[:4] = 0
+    cv2.imwrite(str(tmp_path / "a_valid.png"), valid)
+    sigma = np.full((HEIGHT, WIDTH), 0.05, np.float32)
+    sigma[:, :8] = 0.5
+    write_depth(tmp_path / "a_sigma.exr", sigma)
+    assert written(path, tmp_path / "a.ply")["points"] == (HEIGHT - 4) * WIDTH
+    record = written(path, tmp_path / "b.ply", max_sigma=0.1)
+    assert record["points"] == (HEIGHT - 4) * (WIDTH - 8)
+
+
+def test_frames_with_poses_are_one_cloud_in_the_world_frame(tmp_path: Path) -> None:
+    for name in "ab":
+        frame(tmp_path / "out", name)
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 100 0 1 0 0 0 0 1 0\n")
+    record = written(tmp_path / "out", tmp_path / "w.ply", poses=tmp_path / "poses.txt")
+    points = points_of(tmp_path / "w.ply")
+    assert record["frame"] == "world"
+    assert len(points) == 2 * HEIGHT * WIDTH
+    first, second = np.split(points, 2)
+    assert second == pytest.approx(first + np.array([100, 0, 0]), abs=1e-4)
+
+
+def test_voxels_merge_what_two_frames_see(tmp_path: Path) -> None:
+    for name in "ab":
+        frame(tmp_path / "out", name)
+    whole = written(tmp_path / "out", tmp_path / "a.ply")["points"]
+    merged = written(tmp_path / "out", tmp_path / "b.ply", voxel=0.5)["points"]
+    points = points_of(tmp_path / "a.ply")
+    assert whole == 2 * HEIGHT * WIDTH
+    assert merged == len(np.unique(np.floor(points / 0.5), axis=0))
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        ({"fov_deg": None}, UsageError, "give --calib or --fov"),
+        ({"calib": Path("k.txt")}, UsageError, "--calib and --fov both"),
+        ({"fov_deg": 0.0}, UsageError, "--fov is 0"),
+        ({"voxel": 0.0}, UsageError, "--voxel"),
+        ({"edge": math.inf}, UsageError, "--edge"),
+        ({"max_depth": 0.5}, InputError, "no pixel is left"),
+        ({"min_views": 2}, UsageError, "--min-views 2 needs"),
+        ({"max_sigma": 0.1}, InputError, "--uncertainty"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_writes_nothing(
+    tmp_path: Path, values: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    path = frame(tmp_path, "a")
+    with pytest.raises(error, match=message):
+        written(path, tmp_path / "o.ply", **values)
+    assert not (tmp_path / "o.ply").exists()
+
+
+def test_an_existing_output_is_kept_without_overwrite(tmp_path: Path) -> None:
+    path = frame(tmp_path, "a")
+    (tmp_path / "o.ply").write_text("mine")
+    with pytest.raises(OutputError, match="--overwrite"):
+        written(path, tmp_path / "o.ply")
+    assert (tmp_path / "o.ply").read_text() == "mine"
+    assert written(path, tmp_path / "o.ply", overwrite=True)["points"]
+
+
+def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
+    path = frame(tmp_path, "a")
+    cv2.imwrite(str(tmp_path / "big.png"), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))
+    with pytest.raises(SizeError, match="--image"):
+        written(path, tmp_path / "o.ply", image=tmp_path / "big.png")
+
+
+def test_poses_that_do_not_belong_to_the_files_are_refused(tmp_path: Path) -> None:
+    frame(tmp_path / "out", "a")
+    (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    with pytest.raises(InputError, match="2 poses for 1"):
+        written(tmp_path / "out", tmp_path / "o.ply", poses=tmp_path / "p.txt")

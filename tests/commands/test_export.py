@@ -1,0 +1,279 @@
+"""Exports are read back by the programs they are for, or by their published layouts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pnpdepth_cli.choices import EXPORTS
+from pnpdepth_cli.commands.export import ExportRequest, export_results
+from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
+from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
+from pnpdepth_cli.commands.sparse.options import ColmapOptions
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
+from pnpdepth_cli.io.depth import write_depth
+from tests.colmap_models import HEIGHT, WIDTH, write_text_model
+
+DEPTH = (3.6 + 0.01 * np.mgrid[:HEIGHT, :WIDTH][1]).astype(np.float32)
+NAMES = ("a", "b", "c")
+
+
+def project(root: Path, camera: str = "PINHOLE") -> Path:
+    """A COLMAP project of three images."""
+    write_text_model(root / "sparse", names=tuple(f"{n}.png" for n in NAMES), camera=camera)
+    (root / "images").mkdir()
+    pixels = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    for name in NAMES:
+        cv2.imwrite(str(root / "images" / f"{name}.png"), pixels)
+    return root
+
+
+def results(root: Path, depth: np.ndarray = DEPTH, unit_scale: float | None = None) -> Path:
+    """What `batch` writes for the project that the exports read."""
+    folder = root / "out"
+    folder.mkdir()
+    options = ColmapOptions(unit_scale=unit_scale)
+    for name in NAMES:
+        image = root / "images" / f"{name}.png"
+        seen = read_colmap_points(root, options, image, (HEIGHT, WIDTH), any_size=False)
+        camera = FrameCamera(camera=seen.camera, source="model", pose=seen.pose)
+        write_depth(folder / f"{name}_depth.exr", depth * np.float32(unit_scale or 1))
+        record = {
+            "unit": seen.unit,
+            "camera": camera.record(),
+            "size": [WIDTH, HEIGHT],
+            "points": {"farthest": 4.5 * (unit_scale or 1)},
+            "inputs": {"image": {"path": str(image)}, "sparse": seen.record},
+        }
+        (folder / f"{name}.json").write_text(json.dumps(record))
+    return folder
+
+
+def export(folder: Path, to: str, output: Path, **values: Any) -> dict[str, Any]:
+    return export_results(ExportRequest(results=folder, to=to, output=output, **values))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return project(tmp_path)
+
+
+def test_the_exports_are_the_files_of_their_folder() -> None:
+    assert list(EXPORTS) == ["colmap", "nerfstudio", "gaussian-splatting"]
+
+
+def test_colmap_reads_the_depth_maps_it_is_given(root: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    export(results(root), "colmap", root)
+    maps = pycolmap.DepthMap()
+    maps.read(str(root / "stereo/depth_maps/b.png.geometric.bin"))
+    assert (maps.width, maps.height) == (WIDTH, HEIGHT)
+    assert (maps.to_array() == DEPTH).all()
+    assert (root / "stereo/fusion.cfg").read_text() == "a.png\nb.png\nc.png\n"
+
+
+def test_maps_have_the_layout_that_colmap_publishes(root: Path) -> None:
+    export(results(root), "colmap", root)
+    for kind, channels in (("depth", 1), ("normal", 3)):
+        data = (root / f"stereo/{kind}_maps/a.png.geometric.bin").read_bytes()
+        *header, rest = data.split(b"&", 3)
+        assert [int(each) for each in header] == [WIDTH, HEIGHT, channels]
+        columns_first = np.frombuffer(rest, "<f4").reshape((WIDTH, HEIGHT, channels), order="F")
+        values = columns_first.transpose(1, 0, 2)
+        if kind == "depth":
+            assert (values[..., 0] == DEPTH).all()
+        else:
+            assert np.linalg.norm(values, axis=2) == pytest.approx(1, abs=1e-5)
+            assert (values[..., 2] < 0).all()  # towards the camera
+
+
+def test_colmap_fuses_the_maps_into_the_surface(root: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    depth = np.full((HEIGHT, WIDTH), 4, np.float32)  # all cameras look along z at a wall
+    export(results(root, depth), "colmap", root)
+    options = pycolmap.StereoFusionOptions()
+    options.min_num_pixels = 3
+    (root / "fused").mkdir()
+    fused = pycolmap.stereo_fusion(root / "fused", root, options=options)
+    xyz = np.array([point.xyz for point in fused.points3D.values()])
+    assert len(xyz) > 500
+    assert xyz[:, 2] == pytest.approx(4, abs=1e-3)
+
+
+@pytest.mark.parametrize("unit_scale", [None, 0.25])
+def test_depth_maps_are_in_model_units_whatever_the_unit_of_the_depth(
+    root: Path, unit_scale: float | None
+) -> None:
+    export(results(root, unit_scale=unit_scale), "colmap", root / "dense")
+    data = (root / "dense/stereo/depth_maps/a.png.geometric.bin").read_bytes()
+    values = np.frombuffer(data.split(b"&", 3)[3], "<f4").reshape(HEIGHT, WIDTH)
+    assert values == pytest.approx(DEPTH, rel=1e-6)
+
+
+def test_3dgs_gets_the_inverse_depth_of_the_model(root: Path) -> None:
+    export(results(root, unit_scale=0.25), "gaussian-splatting", root)
+    parameters = json.loads((root / "sparse/0/depth_params.json").read_text())
+    assert set(parameters) == set(NAMES)
+    for name, each in parameters.items():
+        png = cv2.imread(str(root / f"inverse_depths/{name}.png"), cv2.IMREAD_UNCHANGED)
+        assert png.dtype == np.uint16
+        inverse = png.astype(np.float32) / float(2**16) * each["scale"] + each["offset"]
+        assert inverse == pytest.approx(1 / DEPTH, rel=2e-4)
+
+
+def test_no_pixel_is_infinitely_far_in_3dgs_and_masks_mark_what_is_not_known(root: Path) -> None:
+    depth = DEPTH.copy()
+    depth[:2] = 0  # unknown: taken from the nearest pixel
+    folder = results(root, depth)
+    valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    valid[5] = 0  # not valid: its own depth
+    for name in NAMES:
+        cv2.imwrite(str(folder / f"{name}_valid.png"), valid)
+    record = export(folder, "gaussian-splatting", root)
+    assert f"warning: {3 * 3 * WIDTH:,} pixels are unknown or not valid" in "".join(record["notes"])
+    scale = json.loads((root / "sparse/0/depth_params.json").read_text())["a"]["scale"]
+    png = cv2.imread(str(root / "inverse_depths/a.png"), cv2.IMREAD_UNCHANGED)
+    expected = np.concatenate([DEPTH[[2, 2]], DEPTH[2:]])
+    assert png / 2**16 * scale == pytest.approx(1 / expected, rel=2e-4)
+    mask = cv2.imread(str(root / "depth_masks/a.png"), cv2.IMREAD_UNCHANGED)
+    assert ((mask == 255) == ((depth > 0) & (valid > 0))).all()
+
+
+@pytest.mark.parametrize("unit_scale", [None, 0.25])
+def test_transforms_put_every_pixel_where_the_model_has_it(
+    root: Path, unit_scale: float | None
+) -> None:
+    scene = root / "scene"
+    export(results(root, unit_scale=unit_scale), "nerfstudio", scene)
+    content = json.loads((scene / "transforms.json").read_text())
+    assert content["camera_model"] == "OPENCV"
+    assert len(content["frames"]) == 3
+    entry = content["frames"][1]
+    assert (scene / entry["file_path"]).read_bytes() == (root / "images/b.png").read_bytes()
+    depth = cv2.imread(str(scene / entry["depth_file_path"]), cv2.IMREAD_UNCHANGED) * 1e-3
+    assert content["enable_depth_loading"]  # Instant-NGP's names
+    assert (content["integer_depth_scale"], entry["depth_path"]) == (1e-3, entry["depth_file_path"])
+    u, v = 10, 20
+    # Nerfstudio's ray of a pixel centre, in OpenGL's axes; depth is z
+    ray = [(u + 0.5 - entry["cx"]) / entry["fl_x"], -(v + 0.5 - entry["cy"]) / entry["fl_y"], -1]
+    world = np.array(entry["transform_matrix"]) @ [*(depth[v, u] * np.array(ray)), 1]
+    # The model of tests/colmap_models: 50 and 52 pixels, centre at 32.5 and 23, b at x = -0.1
+    expected = np.array([(u - 32) / 50 * DEPTH[v, u] - 0.1, (v - 22.5) / 52 * DEPTH[v, u]])
+    expected = np.array([*expected, DEPTH[v, u]]) * (unit_scale or 1)
+    factor = world[2] / expected[2]
+    assert np.log2(factor) == pytest.approx(0 if unit_scale else round(np.log2(factor)), abs=1e-3)
+    assert world[:3] == pytest.approx(expected * factor, rel=1e-3)
+
+
+def test_images_in_the_folder_itself_are_not_copied(root: Path) -> None:
+    export(results(root), "nerfstudio", root)
+    content = json.loads((root / "transforms.json").read_text())
+    assert [each["file_path"] for each in content["frames"]] == [f"images/{n}.png" for n in NAMES]
+
+
+def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path: Path) -> None:
+    folder = results(project(tmp_path, "OPENCV"))
+    export(folder, "nerfstudio", tmp_path / "scene")
+    entry = json.loads((tmp_path / "scene/transforms.json").read_text())["frames"][0]
+    names = ("k1", "k2", "p1", "p2", "k3")
+    assert [entry[name] for name in names] == [-0.1, 0.02, 0.001, -0.002, 0]
+    for to in ("colmap", "gaussian-splatting"):
+        notes = "".join(export(folder, to, tmp_path / to)["notes"])
+        assert "3 of 3 images have lens distortion" in notes
+
+
+def test_a_lens_that_nerfstudio_does_not_know_is_refused_and_nothing_is_written(
+    tmp_path: Path,
+) -> None:
+    folder = results(project(tmp_path, "FOV"))
+    with pytest.raises(InputError, match="undistort the images first"):
+        export(folder, "nerfstudio", tmp_path / "scene")
+    assert list((tmp_path / "scene").rglob("*.*")) == []
+
+
+NO_CAMERA: dict[str, Any] = {
+    "intrinsics": np.eye(3).tolist(),
+    "lens": "radial-tangential",
+    "distortion": [],
+    "pose": None,
+    "source": "x",
+}
+BAD_CAMERAS: list[dict[str, Any]] = [
+    {"intrinsics": [[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]},
+    {"pose": [[10**400, 0, 0, 0]] * 3},
+    {"distortion": [10**400]},
+    {"lens": 5},
+]
+BAD_NAMES = ["../../../ESC", "/etc/x.png", "a\nb.png", 7, "..", "n" * 201, "a\\b.png", "x/../../y"]
+
+
+def change(path: Path, **entries: Any) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | entries))
+
+
+@pytest.mark.parametrize(
+    ("entries", "error", "message"),
+    [
+        ({"camera": None}, InputError, "a_depth.exr lacks a record with its camera"),
+        ({"inputs": {}}, InputError, "a_depth.exr lacks its image"),
+        ({"unit": "m"}, InputError, "in different units"),
+        ({"size": [9, 9]}, SizeError, "--protocol whole"),
+        *(
+            (entries, FileFormatError, "beside it is damaged; refine it again")
+            for entries in (
+                {"points": None},
+                {"points": {"farthest": 10**400}},
+                {"points": {"farthest": -1}},
+                {"size": "big"},
+                {"size": [WIDTH, 1.5]},
+                *({"camera": NO_CAMERA | change} for change in BAD_CAMERAS),
+                *({"inputs": {"sparse": {"unit_scale": value}}} for value in (10**400, -1, "x")),
+                *({"inputs": {"sparse": {"image": name}}} for name in BAD_NAMES),
+            )
+        ),
+    ],
+)
+def test_results_that_cannot_be_exported_are_one_line(
+    root: Path, entries: dict[str, Any], error: type[PnpDepthError], message: str
+) -> None:
+    folder = results(root)
+    inputs = entries.get("inputs")
+    if inputs:
+        known = json.loads((folder / "a.json").read_text())["inputs"]
+        entries = {"inputs": known | {"sparse": known["sparse"] | inputs["sparse"]}}
+    change(folder / "a.json", **entries)
+    before = sorted(root.parent.rglob("*"))
+    with pytest.raises(error, match=message) as caught:
+        export(folder, "colmap", root / "dense")
+    assert "\n" not in str(caught.value)
+    assert sorted(root.parent.rglob("*")) == before
+
+
+def test_two_frames_of_one_image_name_are_refused(root: Path) -> None:
+    folder = results(root)
+    known = json.loads((folder / "a.json").read_text())["inputs"]
+    change(folder / "a.json", inputs=known | {"sparse": known["sparse"] | {"image": "b.png"}})
+    with pytest.raises(InputError, match="two frames have one image name"):
+        export(folder, "colmap", root / "dense")
+
+
+def test_depth_without_poses_is_no_scene_of_nerfstudio(root: Path) -> None:
+    folder = results(root)
+    camera = json.loads((folder / "c.json").read_text())["camera"]
+    change(folder / "c.json", camera=camera | {"pose": None})
+    with pytest.raises(InputError, match=r"c_depth\.exr has no pose"):
+        export(folder, "nerfstudio", root / "scene")
+    export(folder, "colmap", root / "dense")
+
+
+def test_existing_files_are_kept_without_overwrite(root: Path) -> None:
+    folder = results(root)
+    export(folder, "colmap", root)
+    with pytest.raises(OutputError, match="--overwrite"):
+        export(folder, "colmap", root)
+    export(folder, "colmap", root, overwrite=True)

@@ -1,0 +1,40 @@
+from __future__ import annotations
+
+import threading
+import time
+from itertools import count
+
+import pytest
+
+from pnpdepth_cli.commands.ordered_pool import in_order
+
+
+def test_results_come_in_the_order_of_the_items() -> None:
+    def slow_at_first(number: int) -> int:
+        time.sleep(0.02 if number == 0 else 0)
+        return number
+
+    assert list(in_order(slow_at_first, range(20), 3)) == list(range(20))
+
+
+def test_few_items_are_taken_ahead_of_what_is_asked_for() -> None:
+    taken = count(1)
+    results = in_order(lambda item: item, taken, 2)
+    assert [next(results) for _ in range(10)] == list(range(1, 11))
+    results.close()
+    assert next(taken) <= 14
+
+
+def test_an_error_comes_out_and_ends_the_work() -> None:
+    done: list[int] = []
+
+    def work(number: int) -> int:
+        if number == 3:
+            raise ValueError("three")
+        done.append(number)
+        return number
+
+    with pytest.raises(ValueError, match="three"):
+        list(in_order(work, range(1000), 2))
+    assert len(done) < 12
+    assert threading.active_count() < 10
