@@ -1,4 +1,4 @@
-"""Cutting any network at any layer: f = f_rear ∘ f_front, without rewriting the network.
+"""Cutting any network at any layer or at its arguments: f = f_rear ∘ f_front, without rewriting.
 
 The front runs the network's own forward up to the cut and stops there. It saves the output of every
 *outermost* submodule that has finished: what ran before z existed cannot depend on z. The rear runs
@@ -30,7 +30,6 @@ from pnpdepth_cli.core.split.replay import CutReached, Interception, Recording, 
 from pnpdepth_cli.core.split.tensors import NetworkState, tensors_in
 from pnpdepth_cli.core.split.watch import Watch
 from pnpdepth_cli.core.user_code import wrap_user_errors
-from pnpdepth_cli.errors import LayerError
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -134,11 +133,12 @@ class Split:
             self._run(replay)
         except CutReached:
             return
-        raise self._never_ran(replay, {call.module for call in replay.recording.calls})
+        ran = {call.module for call in replay.recording.calls}
+        raise self._cut.never_ran(ran, replay.calls[self._cut.module])
 
     def _record_front(self, arguments: Sequence[Any]) -> Replay:
         assert self._interception is not None
-        self._interception.all()
+        self._interception.only(None)
         while True:
             replay = Replay(self._cut, arguments)
             watch = Watch(
@@ -153,7 +153,7 @@ class Split:
                     continue  # once more, to cache what lies inside those
                 recorder.finish_front(promised_static=self._promised_static)
                 return replay
-            raise self._never_ran(replay, recorder.ran)
+            raise self._cut.never_ran(recorder.ran, replay.calls[self._cut.module])
 
     def _record_rear(self, replay: Replay, varying: Sequence[Tensor] = ()) -> Any:
         """A watched pass; what depends on z, or on these tensors, is not cached."""
@@ -191,9 +191,6 @@ class Split:
                     return self._network(*arguments.fresh())
         finally:
             replay.recorder = None
-
-    def _never_ran(self, replay: Replay, ran: set[nn.Module]) -> LayerError:
-        return self._cut.never_ran(ran, replay.calls[self._cut.module])
 
 
 class InputSplit(Split):
@@ -235,8 +232,15 @@ class InputSplit(Split):
             ):
                 replay.next_frame(arguments)
                 return self._run(replay)
-            self._varying = frozenset(varying)
-            return self._learn(arguments)
+            assert self._interception is not None
+            self._varying, self._replay = frozenset(varying), None  # frees the last frame's tensors
+            self._interception.only(None)
+            self._replay = replay = Replay(self._cut, arguments)
+            replay.recording = Recording(cut=_BEFORE_ALL_CALLS, static_graph=True)
+            value = replay.arguments.value
+            return self._record_rear(
+                replay, [t for index in sorted(varying) for _, t in tensors_in(value[index])]
+            )
 
     def again(self, *arguments: Any) -> Any:
         """Returns what the network returns for other values of the varying arguments."""
@@ -245,19 +249,6 @@ class InputSplit(Split):
             raise RuntimeError("again() needs first() first")
         replay.change_arguments(arguments)
         return self._run(replay)
-
-    def _learn(self, arguments: Sequence[Any]) -> Any:
-        assert self._interception is not None
-        self._replay = None  # frees the tensors of the last frame
-        self._interception.all()
-        replay = Replay(self._cut, arguments)
-        replay.recording = Recording(cut=_BEFORE_ALL_CALLS, static_graph=True)
-        self._replay = replay
-        return self._record_rear(replay, self._varying_tensors(replay))
-
-    def _varying_tensors(self, replay: Replay) -> list[Tensor]:
-        value = replay.arguments.value
-        return [t for index in sorted(self._varying) for _, t in tensors_in(value[index])]
 
 
 def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:
