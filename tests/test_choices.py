@@ -12,7 +12,7 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.choices import Table
 from pnpdepth_cli.completion import baselines, propagations
 from pnpdepth_cli.core import losses, update_rules
-from pnpdepth_cli.core.step_sizes import SCHEDULES
+from pnpdepth_cli.core.update_rules import SCHEDULES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.models.precision import dtype_of

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.core.step_sizes import step_size
+from pnpdepth_cli.core.update_rules import step_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import PAPER, Settings
 

@@ -26,8 +26,7 @@ from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.masks import Masks
 from pnpdepth_cli.core.split import InputSplit
-from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
-from pnpdepth_cli.core.update_rules import Update
+from pnpdepth_cli.core.update_rules import SCHEDULES, Update, step_size
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.core.weights_refinement import FrameOfPoints
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError

@@ -19,24 +19,6 @@ from torch import Tensor
 DELTA_THRESHOLDS = (1.25, 1.25**2, 1.25**3)
 """Thresholds of δ1 to δ3 (Eigen et al. 2014)."""
 
-SUMS = (
-    "pixels",
-    "known",
-    "squared",
-    "absolute",
-    "relative",
-    "squared_relative",
-    "log",
-    "log_absolute",
-    "log_squared",
-    "inverse",
-    "inverse_squared",
-    "delta1",
-    "delta2",
-    "delta3",
-)
-"""The quantities summed over pixels, in the order of the last axis of sums tensors."""
-
 _CHUNK = 1 << 20
 """Pixels processed at once, so that memory is bounded for any image."""
 
@@ -46,19 +28,13 @@ class Measure:
     """A measure and how it is shown."""
 
     key: str
-    """Name in files."""
     title: str
-    """Name in tables."""
     unit: str = ""
-    """Unit of its values in files."""
     higher_is_better: bool = False
-    """Whether larger values are better."""
     decimals: int = 4
-    """Decimals in tables."""
     percent: bool = False
-    """Whether tables show the fraction as a percentage."""
     shown_unit: str = ""
-    """Unit in tables; empty: `unit`."""
+    """Unit in tables; empty: `unit`, which is that in files."""
     shown_factor: float = 1.0
     """Factor from `unit` to the unit in tables."""
 
@@ -194,6 +170,10 @@ def _terms(p: Tensor, g: Tensor, thresholds: tuple[float, float, float]) -> dict
         "inverse_squared": inverse_error.square(),
         **{f"delta{k}": (ratio < limit).double() for k, limit in enumerate(thresholds, start=1)},
     }
+
+
+SUMS = ("known", *_terms(torch.empty(0), torch.empty(0), DELTA_THRESHOLDS))
+"""The quantities summed over pixels, in the order of the last axis of sums tensors."""
 
 
 def measures_of(sums: Tensor) -> Tensor:

@@ -8,29 +8,55 @@ equations 2 and 3:
     depth   = f_rear(z_K)
 
 `refine_from` is that loop. L and D_s are those of `core.losses` and `points`, U one of
-`core.update_rules`, α and its schedule those of `core.step_sizes`. `core.weights_refinement` is the
-same for weights of the network.
+`core.update_rules`, as are α and its schedule. `core.weights_refinement` is the same for weights of
+the network.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.core.refinement import DepthOf, FrameRefinement, Refinement
+from pnpdepth_cli.choices import LOSSES, UPDATES
+from pnpdepth_cli.core.losses import Loss, proximity_loss
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
-from pnpdepth_cli.errors import BatchError, LayerError, PnpDepthError
+from pnpdepth_cli.core.update_rules import SCHEDULES, Channels, Update, blurred, step_size
+from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, ModelError, PnpDepthError
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
 
-__all__ = ["DepthOf", "Refinement", "frame_parts", "refine", "refine_from"]
-
 _LOSS_SCALE = 1024.0
 """Factor on the loss where float16 is involved, whose smallest number exceeds many gradients."""
+
+DepthOf = Callable[[Any], Tensor]
+"""Turns the network's output for one frame into depth (1, 1, h, w) in metres, differentiably."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """The result of a refinement."""
+
+    before: Tensor
+    """Depth (1, 1, h, w) in metres of z_0."""
+    after: Tensor
+    """Depth (1, 1, h, w) in metres of z_kept."""
+    losses: tuple[float, ...]
+    """L(z_0) … L(z_K)."""
+    step: float
+    """α as a number."""
+    kept: int
+    """Number of updates after which `after` was predicted: K, or those of the lowest loss."""
+    depths: Mapping[int, Tensor] = field(default_factory=dict)
+    """Depth (1, 1, h, w) after each of the chosen numbers of updates, as far as they were made."""
+    z: Tensor | None = None
+    """z_K; None where weights moved."""
+    warm: bool = False
+    """Whether it began where the frame before ended."""
 
 
 def refine(
@@ -102,10 +128,10 @@ def refine_from(
     Raises:
         BatchError: z or the output does not have one part per frame; refine them one at a time.
     """
-    settings = settings.complete()
+    settings, count = settings.complete(), len(points)
     frames = [
-        FrameRefinement(settings, z0, at, read, keep_depths)
-        for z0, at, read in zip(frame_parts(z, len(points)), points, depth_of, strict=True)
+        _FrameRefinement(settings, z0, at, read, keep_depths)
+        for z0, at, read in zip(frame_parts(z, count), points, depth_of, strict=True)
     ]
     for iteration in range(settings.iterations):
         z = z.detach().requires_grad_(True)
@@ -115,7 +141,11 @@ def refine_from(
                 break
             gradient = _gradient(torch.stack(losses).sum(), z, split)
         with torch.no_grad():
-            z = _updated(frames, z.detach(), gradient)
+            parts = zip(
+                frames, frame_parts(z.detach(), count), frame_parts(gradient, count), strict=True
+            )
+            moved = [frame.updated(*part) for frame, *part in parts]
+            z = torch.cat(moved) if count > 1 else moved[0]
         if running := [frame.losses[-1] for frame in frames if frame.error is None]:
             on_iteration(iteration, sum(running) / len(running))
     else:
@@ -145,13 +175,13 @@ def frame_parts(structure: Any, frames: int) -> list[Any]:
             )
     parts = {path: tensor.tensor_split(frames) for path, tensor in tensors_in(structure)}
 
-    def of_frame(index: int) -> Any:
-        return map_tensors(structure, lambda path, _: parts[path][index])
+    return [
+        map_tensors(structure, lambda path, _, index=index: parts[path][index])
+        for index in range(frames)
+    ]
 
-    return [of_frame(index) for index in range(frames)]
 
-
-def _losses(frames: Sequence[FrameRefinement], output: Any) -> list[Tensor]:
+def _losses(frames: Sequence[_FrameRefinement], output: Any) -> list[Tensor]:
     """L(f_rear(z_k), D_s) of every frame that has not ended."""
     parts = zip(frames, frame_parts(output, len(frames)), strict=True)
     losses = [frame.loss(part) for frame, part in parts if frame.error is None]
@@ -170,10 +200,110 @@ def _gradient(loss: Tensor, z: Tensor, split: Split) -> Tensor:
     return gradient / _LOSS_SCALE if split.in_half else gradient
 
 
-def _updated(frames: Sequence[FrameRefinement], z: Tensor, gradient: Tensor) -> Tensor:
-    """z_{k+1} = z_k − α·U(∂L/∂z_k), frame by frame."""
-    if len(frames) == 1:
-        return frames[0].updated(z, gradient)
-    count = len(frames)
-    parts = zip(frames, z.tensor_split(count), gradient.tensor_split(count), strict=True)
-    return torch.cat([frame.updated(*part) for frame, *part in parts])
+class _FrameRefinement:
+    """The refinement of one frame between updates: losses, depths, and the error that ended it.
+
+    The arguments are those of `refine`, for this frame.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        z0: Tensor,
+        points: SparsePoints,
+        depth_of: DepthOf,
+        keep_depths: Collection[int],
+    ) -> None:
+        self._settings, self._points, self._depth_of = settings, points, depth_of
+        self._step, self._halvings = step_size(settings.lr, z0), 0
+        self._loss: Loss = LOSSES[settings.loss]
+        self._update: Update = UPDATES[settings.update]()
+        self._channels = Channels(z0) if settings.parameters == "channels" else None
+        self._best: tuple[Tensor, Tensor] | None = None  # z of the lowest loss and its direction
+        self._first: Tensor | None = None  # depth of z_0
+        self._after: Tensor | None = None  # depth of z_kept
+        self._kept = 0
+        self._keep_depths = frozenset(keep_depths)
+        self._z = z0
+        self._depths: dict[int, Tensor] = {}
+        self.losses: list[float] = []
+        self.error: PnpDepthError | None = None
+
+    def loss(self, output: Any) -> Tensor | None:
+        """Returns L of the network's output for this frame; None once the frame has ended."""
+        try:
+            depth = self._depth_of(output)
+        except PnpDepthError as error:
+            self.error = error
+            return None
+        at_points = self._points.sample(depth)
+        loss = self._loss(at_points, self._points.depth)
+        if self._settings.proximity and self._first is not None:
+            loss = loss + self._settings.proximity * proximity_loss(depth, self._first)
+        if self._settings.iterations and not bool(loss.isfinite()):
+            self.error = self._diverged("loss", len(self.losses))
+            if not self.losses and not bool(at_points.isfinite().all()):
+                self.error = bad_prediction(at_points)
+            return None
+        updates, depth = len(self.losses), depth.detach()
+        self.losses.append(float(loss.detach()))
+        if self._first is None:
+            self._first = depth
+        if not self._settings.gives_best or self.losses[-1] <= min(self.losses):
+            self._kept, self._after = updates, depth
+        if updates in self._keep_depths:
+            self._depths[updates] = depth
+        return loss
+
+    def updated(self, z: Tensor, gradient: Tensor) -> Tensor:
+        """Returns z_{k+1} = z_k − α·U(gradient); the same z_k once the frame has ended."""
+        updates = len(self.losses) - 1
+        if self.error is None and not bool(gradient.isfinite().all()):
+            self.error = self._diverged("gradient", updates)
+        if self.error is not None:
+            return z
+        if self._best is not None and self._kept < updates:  # the last update raised the loss
+            self._halvings += 1
+            z, direction = self._best
+        else:
+            gradient = blurred(gradient, self._points, self._settings.blur)
+            if self._channels is None:
+                direction = self._update(gradient)
+            else:
+                moved = self._update(self._channels.gradient(gradient))
+                direction = self._channels.change_of_z(moved)
+            if self._settings.line_search:
+                self._best = z, direction
+        alpha = self._step * SCHEDULES[self._settings.schedule](updates / self._settings.iterations)
+        self._z = z - alpha * 0.5**self._halvings * direction
+        return self._z
+
+    def result(self) -> Refinement:
+        """Returns the refinement as far as it has come."""
+        assert self._first is not None
+        assert self._after is not None
+        return Refinement(
+            before=self._first,
+            after=self._after,
+            losses=tuple(self.losses),
+            step=self._step,
+            kept=self._kept,
+            depths=dict(self._depths),
+            z=self._z.detach(),
+        )
+
+    def _diverged(self, quantity: str, updates: int) -> DivergedError:
+        return DivergedError(
+            f"the {quantity} is not finite after {updates} update{'s' if updates != 1 else ''} of z"
+            f" (step {self._step:.3g}); try a smaller --lr or fewer --iterations",
+            self.result() if self.losses else None,
+        )
+
+
+def bad_prediction(at_points: Tensor) -> ModelError:
+    """Returns the error of a plain prediction (N,) at the points that is not finite."""
+    return ModelError(
+        f"the network's prediction is not finite at {int((~at_points.isfinite()).sum()):,} of"
+        f" {len(at_points):,} sparse points, before any update of z; are its weights, its input"
+        " range (--normalise) and --precision right?"
+    )

@@ -24,9 +24,8 @@ from torch import Tensor
 from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.masks import SET_ASIDE, Masks, set_aside
-from pnpdepth_cli.core.refinement import DepthOf, Refinement, bad_prediction
-from pnpdepth_cli.core.step_sizes import SCHEDULES, step_size
-from pnpdepth_cli.core.update_rules import Update
+from pnpdepth_cli.core.refine import DepthOf, Refinement, bad_prediction
+from pnpdepth_cli.core.update_rules import SCHEDULES, Update, step_size
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError, LayerError
@@ -77,7 +76,7 @@ def refine_weights(
         weights: The weights that move, θ_0.
         settings: What is updated and how.
         carried: θ* of the frame before, which moves instead where its L is lower than that of θ_0
-            at the points set aside.
+            at the points set aside, or without any at all inliers.
         on_iteration: Called after each step k with k and L(θ_k).
 
     Raises:
@@ -85,63 +84,40 @@ def refine_weights(
         ModelError: As of `refine`.
         LayerError: The depth depends on no weight behind the cut.
     """
-    state = WeightsRefinement(frame, weights, settings)
-    state.begin()
-    if carried is not None and state.takes(carried):
-        weights = carried
+    state = _WeightsRefinement(frame, weights, settings.complete())
+    if carried is not None:
+        state.start_from(carried)
     for iteration in range(state.iterations):
-        shown, hidden = state.mask()
-        with torch.enable_grad(), weights.in_place(requires_grad=True) as theta:
-            loss = state.loss(frame.predict_in_steps(shown), hidden)
-            gradients = _gradients(loss, theta)
-        state.update(loss, gradients)
-        if state.error is not None:
-            break
+        state.step()
         on_iteration(iteration, state.losses[-1])
         if state.finished():
             break
-    if state.error is not None:
-        state.error.last_good = state.result()
-        raise state.error
     return state.result()
 
 
-def _gradients(loss: Tensor, theta: Sequence[Tensor]) -> list[Tensor | None]:
-    """∂L/∂θ_k; None for what L does not depend on."""
-    if loss.requires_grad:
-        with wrap_user_errors("the gradient of the network"):
-            loss.backward()  # type: ignore[no-untyped-call]
-    return [value.grad for value in theta]
-
-
-class WeightsRefinement:
-    """The state of a refinement by moving weights: masks, losses, and the best weights.
-
-    Args:
-        frame: The frame.
-        weights: The weights that move.
-        settings: What is updated and how.
-    """
+class _WeightsRefinement:
+    """The state of a refinement by moving weights: masks, losses, and the best weights."""
 
     def __init__(self, frame: FrameOfPoints, weights: MovingWeights, settings: Settings) -> None:
-        settings = settings.complete()
         self._frame, self._weights, self._settings = frame, weights, settings
         self._loss: Loss = LOSSES[settings.loss]
         generator = torch.Generator().manual_seed(settings.seed)
-        masked = settings.masked
-        fraction = SET_ASIDE if masked else 0.0
+        fraction = SET_ASIDE if settings.masked else 0.0
         aside = set_aside(frame.inliers, fraction, generator)
         self._shown, self._aside = frame.inliers.select(~aside), frame.inliers.select(aside)
         self._masks = Masks(self._shown, settings, generator)
         self._rules: list[Update] = []
         self._steps: list[float] = []
-        self._errors: dict[int, float] = {}
-        self._checked: dict[int, list[Tensor]] = {0: list(weights.theta)}
+        self._errors: dict[int, float] = {}  # loss at the points set aside, by number of steps
+        self._checked: dict[int, list[Tensor]] = {}  # weights, by number of steps
         self._started = time.monotonic()
-        self._before = torch.empty(0)
         self._warm = False
         self.losses: list[float] = []
-        self.error: DivergedError | None = None
+        self._before = frame.depth_of(frame.output).detach()
+        at_points = frame.points.sample(self._before)
+        if not bool(at_points.isfinite().all()):
+            raise bad_prediction(at_points)
+        self._check()
 
     @property
     def iterations(self) -> int:
@@ -149,51 +125,45 @@ class WeightsRefinement:
         enough = len(self._frame.inliers) >= MIN_POINTS or not self._settings.masked
         return self._settings.iterations if enough else 0
 
-    def begin(self) -> None:
-        """Predicts the depth before any step. Raises ModelError where it is not finite."""
-        self._before = self._frame.depth_of(self._frame.output).detach()
-        at_points = self._frame.points.sample(self._before)
-        if not bool(at_points.isfinite().all()):
-            raise bad_prediction(at_points)
-        self._check(0)
-
-    def takes(self, carried: MovingWeights) -> bool:
-        """Begins with the weights of another frame, if L at the points set aside is lower there.
-
-        Without points set aside, L is taken at all inliers.
-        """
+    def start_from(self, carried: MovingWeights) -> None:
+        """Replaces θ_0 by the weights of another frame, if L is lower with them."""
         at = self._aside if len(self._aside) else self._frame.inliers
-        cold = float(self._loss(at.sample(self._predicted(self._shown)), at.depth))
-        plain, self._weights = self._weights, carried
-        warm = float(self._loss(at.sample(self._predicted(self._shown)), at.depth))
-        self._warm = warm < cold
-        if not self._warm:
+        plain, cold = self._weights, self._error_at(at)
+        self._weights = carried
+        self._warm = self._error_at(at) < cold
+        if self._warm:
+            self._check()
+        else:
             self._weights = plain
-            return False
-        self._check(0)
-        return True
 
-    def mask(self) -> tuple[SparsePoints, SparsePoints]:
-        """Returns the points that the network is given, and those that L is taken at."""
-        if not self._settings.masked:
-            return self._shown, self._shown
-        away = self._masks.next()
-        return self._shown.select(~away), self._shown.select(away)
+    def step(self) -> None:
+        """Moves the weights: θ_{k+1} = θ_k − α·U(∂L/∂θ_k).
 
-    def loss(self, output: Any, points: SparsePoints) -> Tensor:
-        """Returns L of the network's output at these points."""
-        return self._loss(points.sample(self._frame.depth_of(output)), points.depth)
-
-    def update(self, loss: Tensor, gradients: Sequence[Tensor | None]) -> None:
-        """Moves the weights: θ_{k+1} = θ_k − α·U(∂L/∂θ_k). Sets `error` where that diverges."""
+        Raises:
+            DivergedError: L or its gradient is not finite.
+            LayerError: No weight can move.
+        """
+        shown = hidden = self._shown
+        if self._settings.masked:
+            away = self._masks.next()
+            shown, hidden = self._shown.select(~away), self._shown.select(away)
+        with torch.enable_grad(), self._weights.in_place(requires_grad=True) as theta:
+            depth = self._frame.depth_of(self._frame.predict_in_steps(shown))
+            loss = self._loss(hidden.sample(depth), hidden.depth)
+            if loss.requires_grad:
+                with wrap_user_errors("the gradient of the network"):
+                    loss.backward()  # type: ignore[no-untyped-call]
         done = len(self.losses)
         if not done:
-            self._start_rules(gradients)
-        known = [gradient for gradient in gradients if gradient is not None]
+            self._start_rules([value.grad for value in theta])
+        known = [value.grad for value in theta if value.grad is not None]
         finite = loss.isfinite().all() & torch.stack([g.isfinite().all() for g in known]).all()
         if not bool(finite):
-            self.error = self._diverged(done)
-            return
+            raise DivergedError(
+                f"the loss or its gradient is not finite after {done} steps of the weights; try a"
+                " smaller --lr",
+                self.result(),
+            )
         self.losses.append(float(loss.detach()))
         factor = SCHEDULES[self._settings.schedule](done / self._planned())
         self._weights.theta = [
@@ -208,12 +178,22 @@ class WeightsRefinement:
         steps, of = len(self.losses), self._settings.iterations
         last = steps >= self._planned()
         if last or steps * CHECKS // of > (steps - 1) * CHECKS // of:
-            self._check(steps)
-        return last or self._getting_worse()
+            self._check()
+        if last or not self._errors:
+            return last
+        best = min(self._errors, key=self._errors.__getitem__)
+        later = [steps for steps in self._errors if steps > best]
+        return sum(self._beyond_chance(best, steps) for steps in later) >= PATIENCE
 
     def result(self) -> Refinement:
-        """Returns the refinement with the best weights, given all points."""
-        kept = self._kept()
+        """Returns the refinement with the best weights, given all points.
+
+        Those of the last check, unless another is better beyond chance.
+        """
+        kept = max(self._checked)
+        if self._errors:
+            best = min(self._errors, key=self._errors.__getitem__)
+            kept = best if self._beyond_chance(best, kept) else kept
         self._weights.theta = self._checked[kept]
         return Refinement(
             before=self._before,
@@ -224,20 +204,14 @@ class WeightsRefinement:
             warm=self._warm,
         )
 
-    def _check(self, steps: int) -> None:
-        """Notes the loss at the points set aside; without any, that the last weights count."""
-        self._checked[steps] = list(self._weights.theta)
+    def _check(self) -> None:
+        """Notes the weights, and the loss at the points set aside if there are any."""
+        self._checked[len(self.losses)] = list(self._weights.theta)
         if len(self._aside):
-            at_points = self._aside.sample(self._predicted(self._shown))
-            self._errors[steps] = float(self._loss(at_points, self._aside.depth))
+            self._errors[len(self.losses)] = self._error_at(self._aside)
 
-    def _kept(self) -> int:
-        """The step that counts: the last, unless another is better beyond chance."""
-        last = max(self._checked)
-        if not self._errors:
-            return last
-        best = min(self._errors, key=lambda steps: self._errors[steps])
-        return best if self._beyond_chance(best, last) else last
+    def _error_at(self, points: SparsePoints) -> float:
+        return float(self._loss(points.sample(self._predicted(self._shown)), points.depth))
 
     def _beyond_chance(self, better: int, worse: int) -> bool:
         """Whether one check is better than another by more than a mean over so few points varies.
@@ -251,13 +225,6 @@ class WeightsRefinement:
     def _predicted(self, points: SparsePoints) -> Tensor:
         with torch.no_grad(), self._weights.in_place():
             return self._frame.depth_of(self._frame.predict(points)).detach()
-
-    def _getting_worse(self) -> bool:
-        if not self._errors:
-            return False
-        best = min(self._errors, key=lambda steps: self._errors[steps])
-        later = [steps for steps in self._errors if steps > best]
-        return sum(self._beyond_chance(best, steps) for steps in later) >= PATIENCE
 
     def _planned(self) -> int:
         """Number of steps in all: those of the settings, or as many as fit in the time budget.
@@ -283,9 +250,3 @@ class WeightsRefinement:
         lr, update = self._settings.lr, self._settings.update
         self._rules = [UPDATES[update]() for _ in self._weights.theta]
         self._steps = [step_size(lr, parameter) for parameter in self._weights.parameters()]
-
-    def _diverged(self, steps: int) -> DivergedError:
-        return DivergedError(
-            f"the loss or its gradient is not finite after {steps} steps of the weights; try a"
-            " smaller --lr"
-        )

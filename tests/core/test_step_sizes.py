@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pnpdepth_cli.core.step_sizes import SCHEDULES, Channels, blurred, step_size
+from pnpdepth_cli.core.update_rules import SCHEDULES, Channels, blurred, step_size
 from pnpdepth_cli.errors import LayerError, UsageError
 from pnpdepth_cli.points import SparsePoints
 

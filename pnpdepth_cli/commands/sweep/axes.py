@@ -12,7 +12,7 @@ import torch
 
 from pnpdepth_cli.commands.refinement.request import count_or_fraction
 from pnpdepth_cli.commands.sweep.points import read_sampling
-from pnpdepth_cli.core.step_sizes import step_size
+from pnpdepth_cli.core.update_rules import step_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import LARGEST_SEED, OptionField, Settings, options_of
 from pnpdepth_cli.settings import Axis as Shown

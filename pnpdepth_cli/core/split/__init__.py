@@ -1,5 +1,263 @@
-"""Cutting any network at any layer, or at its arguments: f = f_rear ∘ f_front."""
+"""Cutting any network at any layer or at its arguments: f = f_rear ∘ f_front, without rewriting.
 
-from pnpdepth_cli.core.split.split import InputSplit, Split, gradient_at
+The front runs the network's own forward up to the cut and stops there. It saves the output of every
+*outermost* submodule that has finished: what ran before z existed cannot depend on z. The rear runs
+the network's own forward again, but those submodules return their saved outputs and the cut layer
+returns z. Skip connections and plain Python between the layers are right by construction.
 
-__all__ = ["InputSplit", "Split", "gradient_at"]
+The first front and the first rear are learning passes, watched operation by operation (`Recorder`
+with a `Watch`). They find the submodules that cannot be cached, because they do more than return an
+output: they work in place on their input, or hooks listen to their parts. Saved tensors are
+protected from in-place operations. Submodules behind the cut that do not depend on z are cached as
+well.
+
+The resulting `Recording` holds for other arguments of the same shapes, if no value of a tensor
+reached Python, where the network could branch on it. Then further frames are only replayed
+(`Replay`), neither watched nor copied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from pnpdepth_cli.core.split.cut_point import CutPoint
+from pnpdepth_cli.core.split.recorder import Recorder
+from pnpdepth_cli.core.split.replay import CutReached, Interception, Recording, Replay
+from pnpdepth_cli.core.split.tensors import NetworkState, tensors_in
+from pnpdepth_cli.core.split.watch import Watch
+from pnpdepth_cli.core.user_code import wrap_user_errors
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+_LOW_PRECISION = (torch.float16, torch.bfloat16)
+
+_BEFORE_ALL_CALLS = -1
+"""Position of the cut among the recorded calls."""
+
+
+class Split:
+    """A network cut at a layer, as a context manager; on exit the network is as before.
+
+    with Split(network, "decoder.up1") as split:
+        z = split.front(rgb)        # once for each frame
+        output = split.rear(z)      # many times; differentiable in z
+
+    While open, the network is in eval mode and only z requires gradient.
+
+    Args:
+        network: Any module.
+        layer: Name of a submodule; `NAME#2` for its second call, `NAME[KEY]` for one output.
+        static_graph: Promises that the network runs the same submodules in the same order for all
+            arguments of the same shapes. Without a promise, it is learned anew for every frame if
+            values of tensors reach Python.
+
+    Raises:
+        LayerError: The layer does not exist, never runs, or runs or returns several times without a
+            choice.
+    """
+
+    def __init__(self, network: nn.Module, layer: str, *, static_graph: bool = False) -> None:
+        self.layer = layer
+        self._network, self._promised_static = network, static_graph
+        self._cut = self._find_cut()
+        self._uncacheable: set[nn.Module] = set()
+        self._interception: Interception | None = None
+        self._replay: Replay | None = None
+
+    def _find_cut(self) -> CutPoint:
+        return CutPoint.find(self._network, self.layer)
+
+    def __enter__(self) -> Self:
+        self._state = NetworkState(self._network)
+        try:
+            self._interception = Interception(dict.fromkeys(self._cut.modules.values()))
+            self._network.eval()
+            self._state.freeze()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._interception is not None:
+            self._interception.close()
+        self._state.close()
+        self._replay = None
+
+    @property
+    def static_graph(self) -> bool:
+        """Whether the network is known to treat all arguments of these shapes alike.
+
+        It is if no value of a tensor reaches Python, or if it was promised.
+        """
+        recording = None if self._replay is None else self._replay.recording
+        return recording is not None and recording.complete and recording.static_graph
+
+    @property
+    def in_half(self) -> bool:
+        """Whether the cut layer gives float16 for this frame, in which gradients may underflow."""
+        z0 = None if self._replay is None else self._replay.z0
+        return z0 is not None and z0.dtype == torch.float16
+
+    def front(self, *arguments: Any) -> Tensor:
+        """Returns z_0, the output of the cut layer for these arguments of the network.
+
+        In float32 if the layer gives a shorter type, in which small steps would be rounded away.
+        """
+        if self._replay is not None and self._replay.recording.holds_for(arguments):
+            self._replay_front(self._replay, arguments)
+        else:
+            self._replay = None  # frees the tensors of the last frame
+            self._replay = self._record_front(arguments)
+        z0 = self._replay.z0
+        assert z0 is not None
+        # A copy, because the network may go on to change the memory of z_0.
+        return z0.to(torch.float32 if z0.dtype in _LOW_PRECISION else z0.dtype, copy=True)
+
+    def rear(self, z: Tensor) -> Any:
+        """Returns what the network returns when the cut layer gives z."""
+        replay = self._replay
+        if replay is None or replay.z0 is None:
+            raise RuntimeError("rear() needs front() first")
+        replay.z = z
+        return self._run(replay) if replay.recording.complete else self._record_rear(replay)
+
+    def _replay_front(self, replay: Replay, arguments: Sequence[Any]) -> None:
+        replay.next_frame(arguments)
+        try:
+            self._run(replay)
+        except CutReached:
+            return
+        ran = {call.module for call in replay.recording.calls}
+        raise self._cut.never_ran(ran, replay.calls[self._cut.module])
+
+    def _record_front(self, arguments: Sequence[Any]) -> Replay:
+        assert self._interception is not None
+        self._interception.only(None)
+        while True:
+            replay = Replay(self._cut, arguments)
+            watch = Watch(
+                (replay.arguments, *self._state.tensors), escapes=not self._promised_static
+            )
+            recorder = Recorder(self._cut, watch, replay, self._uncacheable)
+            uncacheable = len(self._uncacheable)
+            try:
+                self._run(replay, recorder)
+            except CutReached:
+                if len(self._uncacheable) > uncacheable:
+                    continue  # once more, to cache what lies inside those
+                recorder.finish_front(promised_static=self._promised_static)
+                return replay
+            raise self._cut.never_ran(recorder.ran, replay.calls[self._cut.module])
+
+    def _record_rear(self, replay: Replay, varying: Sequence[Tensor] = ()) -> Any:
+        """A watched pass; what depends on z, or on these tensors, is not cached."""
+        assert self._interception is not None
+        saved = [output for output in replay.outputs if output is not None]
+        tensors = (replay.arguments, *saved, *self._state.tensors)
+        watch = Watch(tensors, reads=True, escapes=not self._promised_static)
+        for tensor in varying:
+            watch.touch(tensor)
+        recorder = Recorder(self._cut, watch, replay, self._uncacheable)
+        try:
+            output = self._run(replay, recorder)
+            recorder.finish_rear(output, promised_static=self._promised_static)
+        except BaseException:
+            recorder.abandon()
+            raise
+        self._interception.only(replay.recording.intercepted())
+        return output
+
+    def _run(self, replay: Replay, recorder: Recorder | None = None) -> Any:
+        """One pass of the network, learning if there is a recorder."""
+        assert self._interception is not None
+        self._state.restore()
+        replay.calls.clear()
+        replay.recorder = recorder
+        arguments = replay.arguments
+        try:
+            with (
+                self._interception.handled_by(replay.handle, replay.handle_outside),
+                wrap_user_errors("the network's forward"),
+            ):
+                if recorder is None:
+                    return self._network(*arguments.fresh())
+                with recorder.watch, recorder.watch.seeing_escapes():
+                    return self._network(*arguments.fresh())
+        finally:
+            replay.recorder = None
+
+
+class InputSplit(Split):
+    """A network cut at some of its arguments, as a context manager.
+
+    with InputSplit(network) as split:
+        output = split.first(rgb, sparse, varying={1})     # once for each frame
+        output = split.again(rgb, fewer_points)            # many times
+
+    In `again`, submodules that do not depend on a varying argument return what they gave in
+    `first`, as the image encoder of a network that takes image and sparse depth. A network that
+    branches on values of its arguments runs as a whole, unless `static_graph` promises otherwise.
+
+    Args:
+        network: Any module.
+        static_graph: As of `Split`.
+    """
+
+    def __init__(self, network: nn.Module, *, static_graph: bool = False) -> None:
+        super().__init__(network, "", static_graph=static_graph)
+        self._varying: frozenset[int] = frozenset()
+
+    def _find_cut(self) -> CutPoint:
+        return CutPoint.at_arguments(self._network)
+
+    def first(self, *arguments: Any, varying: Collection[int]) -> Any:
+        """Returns what the network returns, without gradients, and remembers what is fixed.
+
+        Args:
+            *arguments: Of the network's forward.
+            varying: Positions of the arguments that `again` may change.
+        """
+        replay = self._replay
+        with torch.no_grad():
+            if (
+                replay is not None
+                and self._varying == frozenset(varying)
+                and replay.recording.holds_for(arguments)
+            ):
+                replay.next_frame(arguments)
+                return self._run(replay)
+            assert self._interception is not None
+            self._varying, self._replay = frozenset(varying), None  # frees the last frame's tensors
+            self._interception.only(None)
+            self._replay = replay = Replay(self._cut, arguments)
+            replay.recording = Recording(cut=_BEFORE_ALL_CALLS, static_graph=True)
+            value = replay.arguments.value
+            return self._record_rear(
+                replay, [t for index in sorted(varying) for _, t in tensors_in(value[index])]
+            )
+
+    def again(self, *arguments: Any) -> Any:
+        """Returns what the network returns for other values of the varying arguments."""
+        replay = self._replay
+        if replay is None:
+            raise RuntimeError("again() needs first() first")
+        replay.change_arguments(arguments)
+        return self._run(replay)
+
+
+def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:
+    """Returns ∂value/∂z for a fresh leaf z; None where no gradient comes back to it.
+
+    Raises:
+        ModelError: The network cannot be differentiated.
+    """
+    if value.requires_grad:
+        with wrap_user_errors("the gradient of the network"):
+            value.backward()  # type: ignore[no-untyped-call]
+    return z.grad

@@ -62,7 +62,11 @@ class CutPoint:
         name = LayerName.parse(layer)
         modules = dict(network.named_modules(remove_duplicate=False))
         if name.module not in modules or not name.module:
-            raise LayerError(_unknown(name.module, [known for known in modules if known]))
+            near = difflib.get_close_matches(name.module, filter(None, modules), n=3, cutoff=0.5)
+            hint = (
+                f"did you mean {', '.join(near)}?" if near else "`pnpdepth layers --all` lists all"
+            )
+            raise LayerError(f"layer {name.module!r} is not in this network; {hint}")
         return cls(
             layer=layer,
             name=name,
@@ -96,20 +100,18 @@ class CutPoint:
             for path, tensor in tensors_in(output)
             if tensor.is_floating_point() and tensor.layout == torch.strided
         ]
+        key = self.name.key
+        chosen = [(path, tensor) for path, tensor in candidates if key in (None, path)]
+        if len(chosen) == 1:
+            return chosen[0][0], chosen[0][1].detach()
         names = ", ".join(self.name.of_output(path) for path, _ in candidates)
-        if self.name.key is None and len(candidates) == 1:
-            return candidates[0][0], candidates[0][1].detach()
-        if self.name.key is None:
-            problem = (
-                f"returns several tensors; say which: {names}"
-                if candidates
-                else "returns no tensor"
-            )
-            raise LayerError(f"layer {self.layer!r} {problem}")
-        for path, tensor in candidates:
-            if path == self.name.key:
-                return path, tensor.detach()
-        raise LayerError(f"layer {self.layer!r} has no such output; it has {names}")
+        if key is not None:
+            problem = f"has no such output; it has {names}"
+        elif candidates:
+            problem = f"returns several tensors; say which: {names}"
+        else:
+            problem = "returns no tensor"
+        raise LayerError(f"layer {self.layer!r} {problem}")
 
     def never_ran(self, ran: Collection[nn.Module], calls: int) -> LayerError:
         """Returns the error of a pass that did not reach the cut.
@@ -155,16 +157,9 @@ def _containers(inner: nn.Module, modules: Mapping[str, nn.Module]) -> frozenset
 
 def _around_hooks(modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
     hooked = [name for name, m in modules.items() if m._forward_hooks or m._forward_pre_hooks]
-    return frozenset(m for part, m in modules.items() for name in hooked if _is_within(name, part))
-
-
-def _is_within(name: str, part: str) -> bool:
-    return name != part and (not part or name.startswith(f"{part}."))
-
-
-def _unknown(name: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    hint = (
-        f"did you mean {', '.join(near)}?" if near else "`pnpdepth layers --all` lists all of them"
+    return frozenset(
+        module
+        for part, module in modules.items()
+        for name in hooked
+        if name != part and (not part or name.startswith(f"{part}."))
     )
-    return f"layer {name!r} is not in this network; {hint}"

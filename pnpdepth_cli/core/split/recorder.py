@@ -151,7 +151,11 @@ class Recorder:
             if call.saved is None or call.saved.copied:  # copies were handed out and may be read
                 continue
             call.unread = frozenset(
-                path for path, t in tensors_in(call.saved.value) if not _is_read(t, self.watch)
+                path
+                for path, tensor in tensors_in(call.saved.value)
+                if not self.watch.was_read(tensor)
+                and not tensor.is_inference()
+                and tensor.layout == torch.strided
             )
             call.saved.value = call.recorded().save(call.saved.value).value
 
@@ -160,11 +164,6 @@ class Recorder:
             if call.saved is not None:
                 call.saved.value = None  # the watch would hold its tensors
         del self._calls[first:]
-
-
-def _is_read(tensor: Tensor, watch: Watch) -> bool:
-    """True unless it is known that nobody looks into the tensor's memory."""
-    return watch.was_read(tensor) or tensor.is_inference() or tensor.layout != torch.strided
 
 
 def _same_tensors(one: Iterable[tuple[Any, Tensor]], other: Iterable[tuple[Any, Tensor]]) -> bool:

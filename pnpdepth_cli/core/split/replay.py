@@ -35,19 +35,15 @@ class Interception:
         self._own = {module: module.__dict__.get("forward") for module in modules}
         self._stand_ins = {module: self._stand_in(module, module.forward) for module in self._own}
 
-    def only(self, modules: Collection[nn.Module]) -> None:
-        """Intercepts the calls of these submodules and of no others."""
+    def only(self, modules: Collection[nn.Module] | None) -> None:
+        """Intercepts the calls of these submodules and of no others; None: of all."""
         for module, own_forward in self._own.items():
-            if module in modules:
+            if modules is None or module in modules:
                 module.__dict__["forward"] = self._stand_ins[module]
             elif own_forward is None:
                 module.__dict__.pop("forward", None)
             else:
                 module.__dict__["forward"] = own_forward
-
-    def all(self) -> None:
-        """Intercepts the calls of all submodules."""
-        self.only(self._own)
 
     def close(self) -> None:
         """Gives every submodule its own forward back, and lets go of the handler."""
@@ -173,7 +169,7 @@ class Replay:
 
     def next_frame(self, arguments: Sequence[Any]) -> None:
         """Forgets the frame at hand; `arguments` are those of the next one."""
-        self.arguments = SavedTensors(_copies(arguments), self.arguments.copied)
+        self.change_arguments(arguments)
         self.outputs, self.z0, self.z = [None] * len(self.recording.calls), None, None
 
     def change_arguments(self, arguments: Sequence[Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,10 +86,6 @@ class SavedTensors:
         )
 
 
-def _own(tensors: Mapping[str, Tensor | None]) -> list[Tensor]:
-    return [tensor for tensor in tensors.values() if tensor is not None]
-
-
 class NetworkState:
     """Values, gradient flags and modes of a network at the time this object is created.
 
@@ -101,8 +97,14 @@ class NetworkState:
         modules = list(network.modules())  # going through a deep network takes a while: once
         # Frozen torch scripts have neither a mode nor buffers that can be set.
         plain = [m for m in modules if not isinstance(m, torch.jit.ScriptModule)]
-        parameters = list(dict.fromkeys(p for m in modules for p in _own(m._parameters)))
-        buffers = dict.fromkeys(b for m in modules for b in _own(m._buffers))
+        parameters, buffers = (
+            [
+                t
+                for t in dict.fromkeys(t for own in of_modules for t in own.values())
+                if t is not None
+            ]
+            for of_modules in ([m._parameters for m in modules], [m._buffers for m in modules])
+        )
         self.tensors = [SavedTensors(t) for t in (*parameters, *buffers)]
         self._originals = [saved.value for saved in self.tensors]
         self._learning = [(p, p.requires_grad) for p in parameters]

@@ -34,13 +34,11 @@ _FUSED = (
 
 @dataclass(frozen=True)
 class Moment:
-    """A time in a watched pass, by the numbers of events before it."""
+    """A time in a watched pass: the operations, results that depend on z, and writes before it."""
 
     operations: int
     touches: int
-    """Results that depend on z."""
     writes: int
-    """In-place changes."""
 
 
 class Watch(TorchDispatchMode):
@@ -48,10 +46,6 @@ class Watch(TorchDispatchMode):
 
     It tracks which tensors depend on z, which operation created which storage, and which storages
     change in place. A saved tensor is cloned just before it would be changed in place.
-
-    Args:
-        saved: Tensors to protect from in-place operations.
-        reads: Whether to note which storages are read.
     """
 
     escaped: bool
@@ -121,7 +115,8 @@ class Watch(TorchDispatchMode):
         So it did not depend on z, changed nothing older than itself in place, and its output
         consists of tensors that it created, no two of them in the same memory.
         """
-        if self._marked and not (is_transparent(inputs) and not self._any_marked(inputs)):
+        marked_input = any(self._is_marked(tensor) for _, tensor in tensors_in(inputs))
+        if self._marked and (marked_input or not is_transparent(inputs)):
             self._touches += 1  # a native extension may read its arguments unnoticed
         created_inside = [_storage(tensor) for _, tensor in tensors_in(output)]
         created_inside = [s for s in created_inside if self._created.get(s, 0) > since.operations]
@@ -183,7 +178,11 @@ class Watch(TorchDispatchMode):
             inputs = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
             self.note_reads(inputs)
         self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in inputs)
-        written = [t for index, name in facts.writes for t in _argument(index, name, args, kwargs)]
+        written = [
+            tensor
+            for index, name in facts.writes
+            for tensor in _tensors(args[index] if index < len(args) else kwargs.get(name))
+        ]
         for tensor in written:
             self._before_write(tensor)
         marked = bool(self._marked) and any(map(self._is_marked, inputs))
@@ -218,9 +217,6 @@ class Watch(TorchDispatchMode):
         for saved in self._protected.pop(storage, []):
             saved.value = map_tensors(saved.value, lambda _, t: t.clone())
             saved.copied = True
-
-    def _any_marked(self, value: Any) -> bool:
-        return any(self._is_marked(tensor) for _, tensor in tensors_in(value))
 
     def _is_marked(self, tensor: Tensor) -> bool:
         # Only z requires gradient, so a tensor that does was computed from it.
@@ -283,10 +279,6 @@ def _facts(func: Any) -> _Facts:
         escapes=torch.Tag.data_dependent_output in func.tags
         or torch.Tag.dynamic_output_shape in func.tags,
     )
-
-
-def _argument(index: int, name: str, args: Sequence[Any], kwargs: Any) -> list[Tensor]:
-    return _tensors(args[index] if index < len(args) else kwargs.get(name))
 
 
 def _tensors(value: Any) -> list[Tensor]:
