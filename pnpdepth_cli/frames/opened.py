@@ -140,10 +140,7 @@ class OpenNetwork:
             before = reader(split.rear(z0))
         with coarse(self.network.module):
             (result,) = refine_from(split, z0, points, settings, depth_of=(reader,))
-        if not isinstance(result, Refinement) or result.z is None:
-            return result
-        with torch.no_grad():
-            return replace(result, before=before, after=reader(split.rear(result.z)))
+        return replace(result, before=before) if isinstance(result, Refinement) else result
 
     def _plain(
         self, prepared: PreparedFrame, reader: AlignedDepth, settings: Settings
