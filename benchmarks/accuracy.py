@@ -42,7 +42,7 @@ from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.frames.frame import DepthMap, is_dense
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.frames.uncertainty import uncertainty
+from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.settings import PAPER, Settings
 
@@ -101,7 +101,7 @@ def measure(
     if args.sigma:
         known = (frame.gt > 0) & (default.after > 0)
         error = np.abs(frame.gt - default.after)[known]
-        within = float((error <= uncertainty(default).sigma[known]).mean())
+        within = float((error <= with_uncertainty(default).sigma[known]).mean())
     scores = errors_of(depths, torch.from_numpy(frame.gt))
     return {
         name: {"mae": mae, "rmse": rmse, "cpu_s": seconds[name], "within": within}

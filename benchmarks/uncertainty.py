@@ -20,7 +20,7 @@ from benchmarks.frames import (
     print_row,
     without_occluded,
 )
-from pnpdepth_cli.frames.uncertainty import uncertainty
+from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network
 
 MULTIPLES = (1, 2, 3, 4)
@@ -41,7 +41,7 @@ def coverage(network: Network, frame: EvalFrame, count: int | None) -> list[floa
     if count is None:
         frame = without_occluded(frame)
     result = by_default(network, drawn_inputs(frame, count, 0))
-    sigma = uncertainty(result).sigma
+    sigma = with_uncertainty(result).sigma
     known = frame.gt > 0
     ratio = np.abs(frame.gt - result.after)[known] / sigma[known]
     return [float((ratio <= multiple).mean()) for multiple in MULTIPLES]

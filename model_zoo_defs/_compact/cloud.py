@@ -8,7 +8,6 @@ from itertools import accumulate
 from typing import NamedTuple, Self
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from model_zoo_defs._compact.points import Points
@@ -18,6 +17,8 @@ NEIGHBOURS = 12
 CELL_POINTS = 3
 # So many points are searched at a time: bounds the memory.
 CHUNK = 4096
+# The colour of a point is the mean of 5 x 5 pixels.
+AROUND = torch.arange(-2, 3)
 
 
 class Cloud(NamedTuple):
@@ -52,8 +53,10 @@ class Cloud(NamedTuple):
         spacing = max(1.0, math.sqrt(mask.numel() / max(1, len(rows))))
         position = torch.stack([rows, columns], 1).float() / spacing
         near, found = neighbours(position)
-        padded = F.pad(rgb[None].float(), (2, 2, 2, 2), mode="replicate")
-        colour = F.avg_pool2d(padded, 5, 1)[0, :, rows, columns].t()
+        down, right = torch.meshgrid(AROUND, AROUND, indexing="ij")
+        y = (rows.unsqueeze(1) + down.flatten().to(rows.device)).clamp(0, rgb.shape[1] - 1)
+        x = (columns.unsqueeze(1) + right.flatten().to(rows.device)).clamp(0, rgb.shape[2] - 1)
+        colour = rgb.float().flatten(1)[:, y * rgb.shape[2] + x].mean(2).t()
         log_spacing = torch.full_like(position[:, 0], math.log(spacing))
         return cls(value[mask], colour, position, log_spacing, near, found, (len(rows),))
 

@@ -26,12 +26,13 @@ class SamePaddedConv(nn.Conv2d):
     """A convolution padded as TensorFlow's SAME does for even sizes: the odd pixel at the end."""
 
     def __init__(self, channels: int, out: int, kernel: int, stride: int = 1, groups: int = 1):
-        super().__init__(channels, out, kernel, stride, groups=groups)
-        before = (kernel - stride) // 2
-        self.margins = (before, kernel - stride - before) * 2
+        super().__init__(channels, out, kernel, stride, padding=(kernel - 1) // 2, groups=groups)
 
     def forward(self, x: Tensor) -> Tensor:
-        return super().forward(F.pad(x, self.margins))
+        # A kernel with a first row and column of zeros is padded alike at both ends, without a copy
+        # of x.
+        weight = self.weight if self.stride == (1, 1) else F.pad(self.weight, (1, 0, 1, 0))
+        return self._conv_forward(x, weight, self.bias)
 
 
 class InvertedBottleneck(nn.Module):

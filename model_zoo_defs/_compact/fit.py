@@ -73,7 +73,7 @@ class PointFit(nn.Module):
         features = F.relu(self.near(near) + resize(self.far(far), near.shape[-2:]))
         queries = self._per_head(self.query(features))
         keys = self._per_head(self.key(features))
-        cells = self._cells(points, prior, height, width)
+        cells = self._cells(points, prior)
         seen = cells[-1].any(0)
         if not bool(seen.any()):
             return self._without_points(near, prior)
@@ -114,22 +114,24 @@ class PointFit(nn.Module):
         return x.float().reshape(len(x), FIT_HEADS, FIT_KEY, -1).transpose(2, 3)
 
     @staticmethod
-    def _cells(points: Points, prior: Prior | None, height: int, width: int) -> list[Tensor]:
+    def _cells(points: Points, prior: Prior | None) -> list[Tensor]:
         """Weighted means over the points of each cell, (B, cells) each.
 
         In order: position (B, 2, cells), value and log weight; with a prior, the residual against
         it and the fraction of points where it is known; last, whether the cell has a point.
         """
-        weight = points.weight
-        pixel = (_cell_grid(weight.shape[-2], weight.shape[-1], weight) / 16.0).unsqueeze(0)
-        maps = [points.mask, weight, points.value * weight, pixel * weight.detach()]
-        count, density, value, at = (F.avg_pool2d(x, 16) for x in maps)
+        weight, value = points.at(points.weight), points.at(points.value)
+        here = [position / 16.0 * weight.detach() for position in points.positions()]
+        parts = [torch.ones_like(weight), weight, value * weight, *here]
+        if prior is not None:
+            parts += [prior.weight, prior.weight * prior.residual]
+        means = points.pooled(parts, 16)
+        count, density, value, at, of_prior = means.tensor_split((1, 2, 3, 5), 1)
         safe = density.clamp(min=1e-6)
         reliability = torch.log((density / count.clamp(min=1e-6)).clamp(min=1e-6))
         cells = [(at / safe.detach()).flatten(2), (value / safe).flatten(1), reliability.flatten(1)]
         if prior is not None:
-            maps = [prior.weight, prior.weight * prior.residual]
-            both, residual = (F.avg_pool2d(x, 16) for x in maps)
+            both, residual = of_prior.tensor_split(2, 1)
             cells += [(residual / both.clamp(min=1e-6)).flatten(1), (both / safe).flatten(1)]
         return [*cells, (count > 0).flatten(1)]
 

@@ -43,12 +43,11 @@ class InlierWeights(nn.Module):
 
     def forward(self, points: Points, cloud: Cloud) -> Tensor:
         """The weights (B, 1, H, W), 1 away from the points; the cloud is of these points."""
-        at, nothing = points.mask > 0, torch.zeros_like(points.mask)
         with torch.autocast(points.mask.device.type, enabled=False):
-            log_odds = self.log_odds(cloud)
-        logits = nothing.masked_scatter(at, log_odds)
-        weights = torch.sigmoid(STEEPNESS * (logits + self._margin(points, logits) - THRESHOLD))
-        return torch.where(at, weights, 1.0)
+            images = torch.split(self.log_odds(cloud), list(cloud.counts))
+        log_odds = torch.cat([logits + self._margin(logits) for logits in images])
+        weights = torch.sigmoid(STEEPNESS * (log_odds - THRESHOLD))
+        return torch.ones_like(points.mask).masked_scatter(points.mask > 0, weights)
 
     def log_odds(self, cloud: Cloud) -> Tensor:
         """Log odds (n,) of being an inlier."""
@@ -60,10 +59,9 @@ class InlierWeights(nn.Module):
         return cast(Tensor, self.leave(F.relu(self.score(state))).squeeze(1))
 
     @staticmethod
-    def _margin(points: Points, logits: Tensor) -> Tensor:
-        """Log odds (B, 1, 1, 1) that spare doubtful points of images with hardly any outlier."""
-        count = points.mask.sum((1, 2, 3), keepdim=True).clamp(min=1.0)
-        outliers = (points.mask * torch.sigmoid(-logits)).sum((1, 2, 3), keepdim=True) / count
+    def _margin(logits: Tensor) -> Tensor:
+        """Log odds that spare doubtful points of an image with hardly any outlier."""
+        outliers = torch.sigmoid(-logits).sum() / max(1, len(logits))
         return CLEAN_MARGIN * (1.0 - (outliers / CLEAN_FRACTION - 1.0).clamp(0.0, 1.0))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -20,6 +21,7 @@ class Points:
 
     def __init__(self, sparse: Tensor):
         self.mask = (sparse > 0).to(torch.float32)
+        self._image, _, self._row, self._column = torch.nonzero(self.mask, as_tuple=True)
         log_depth = torch.log(torch.where(sparse > 0, sparse, 1.0).to(torch.float32))
         rows = zip(log_depth.flatten(1), self.mask.flatten(1) > 0, strict=True)
         known = (row[seen] for row, seen in rows)
@@ -38,9 +40,31 @@ class Points:
         Sums over 2 x 2 pixels are all the residuals need; finer positions change them by less
         than half a pixel's slope.
         """
-        weighted = self.weight * self.value
-        parts = [self.mask, self.weight, weighted, weighted * self.value]
-        return F.avg_pool2d(torch.cat(parts, dim=1), 2)
+        weight, value = self.at(self.weight), self.at(self.value)
+        return self.pooled([torch.ones_like(weight), weight, weight * value, weight * value**2], 2)
+
+    def at(self, values: Tensor) -> Tensor:
+        """A map (B, 1, H, W) at the points (n,), image after image, row after row."""
+        return values[self._image, 0, self._row, self._column]
+
+    def positions(self) -> tuple[Tensor, Tensor]:
+        """Rows and columns (n,) of the points' pixel centres."""
+        return self._row + 0.5, self._column + 0.5
+
+    def pooled(self, values: Sequence[Tensor], stride: int) -> Tensor:
+        """Means over cells (B, k, H / stride, W / stride) of maps that are 0 beside the points.
+
+        Args:
+            values: The k maps at the points, (n,) each.
+            stride: A cell's side in pixels.
+        """
+        count, (height, width) = len(self.mask), (n // stride for n in self.mask.shape[-2:])
+        row = self._image * height + self._row // stride
+        cell = row * width + self._column // stride
+        sums = self.mask.new_zeros(len(values), count * height * width)
+        of_cell = torch.stack([value / stride**2 for value in values])
+        sums = sums.scatter_add(1, cell.expand_as(of_cell), of_cell)
+        return sums.view(len(values), count, height, width).transpose(0, 1)
 
 
 class Residual(NamedTuple):

@@ -21,8 +21,8 @@ EXPLAINED = 0.99
 class Prior:
     """A dense depth in the units of `Points`, 0 where unknown, and where it is known.
 
-    value, valid: (B, 1, H, W). weight, residual: of the points against the prior, on the pixels
-    where both are known (B, 1, H, W). moments: their sums over 2 x 2 pixels (B, 4, H / 2, W / 2).
+    value, valid: (B, 1, H, W). weight, residual: of the points against the prior (n,), 0 where it
+    is unknown. moments: their sums over 2 x 2 pixels (B, 4, H / 2, W / 2).
     """
 
     value: Tensor
@@ -40,14 +40,12 @@ class Prior:
         known = (depth > 0) & torch.isfinite(depth)
         log_depth = torch.log(torch.where(known, depth, 1.0).to(torch.float32)) - points.median
         log_depth = log_depth.clamp(-PRIOR_RANGE, PRIOR_RANGE)
-        valid = known * explains(points.value - log_depth, known, points, cloud)
-        value = log_depth * valid
-        weight = points.weight * valid
-        residual = (points.value - value) * valid * points.mask
-        weighted = weight * residual
-        parts = [points.mask * valid, weight, weighted, weighted * residual]
-        moments = F.avg_pool2d(torch.cat(parts, dim=1), 2)
-        return cls(value, valid, weight, residual, moments)
+        residual = points.at(points.value) - points.at(log_depth)
+        valid = known * explains(residual, points.at(known), points, cloud)
+        at_points = points.at(valid)
+        weight, residual = points.at(points.weight) * at_points, residual * at_points
+        moments = points.pooled([at_points, weight, weight * residual, weight * residual**2], 2)
+        return cls(log_depth * valid, valid, weight, residual, moments)
 
     def at(self, stride: int) -> tuple[Tensor, Tensor]:
         """Value and validity at the centre pixels of the cells of `stride` pixels."""
@@ -72,13 +70,12 @@ def explains(residual: Tensor, known: Tensor, points: Points, cloud: Cloud) -> T
     without two neighbouring points.
 
     Args:
-        residual: Log depth of the points minus that of the prior (B, 1, H, W).
-        known: Where the prior is known (B, 1, H, W).
+        residual: Log depth of the points minus that of the prior (n,).
+        known: Whether the prior is known there (n,).
         points: The points.
         cloud: The same points with their neighbours.
     """
-    at = points.mask > 0
-    known, weight, near = known[at], points.weight[at], cloud.near
+    weight, near = points.at(points.weight), cloud.near
     square = (cloud.position[near] - cloud.position.unsqueeze(1)).square().sum(2)
     share = cloud.found * known[near] * weight[near] / (square + 0.1)
     share = share / share.sum(1, keepdim=True).clamp(min=1e-6)
@@ -88,5 +85,5 @@ def explains(residual: Tensor, known: Tensor, points: Points, cloud: Cloud) -> T
         per_point = predicted * (value - (share * value[near]).sum(1)).abs()
         return torch.stack([image.sum() for image in torch.split(per_point, list(cloud.counts))])
 
-    explained = error(residual[at]) <= EXPLAINED * error(cloud.value)
+    explained = error(residual) <= EXPLAINED * error(cloud.value)
     return explained.to(torch.float32).view(-1, 1, 1, 1)

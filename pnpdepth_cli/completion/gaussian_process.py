@@ -127,11 +127,11 @@ def leave_one_out(
         near: (B, k) numbers of points of each neighbourhood.
         weight: (N,) 0…1 of each point as a predictor; one of 0 predicts nothing.
     """
-    _, u, system = _systems(field, near)
+    _, _, system = _systems(field, near)
     weight = torch.ones_like(field.residual) if weight is None else weight
     extra_noise = field.kernel.noise * (weight[near].clamp_min(_MIN_SCORED_WEIGHT) ** -2 - 1)
-    system = system + torch.diag_embed(extra_noise)
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky(system + _trend(u)))
+    system.diagonal(dim1=1, dim2=2).add_(extra_noise)
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky(system))
     variance = 1 / inverse.diagonal(dim1=1, dim2=2)
     error = (inverse @ field.residual[near][..., None])[..., 0] * variance
     inner = _INNER if near.shape[0] > 1 else None
@@ -184,7 +184,7 @@ def _solve(field: ResidualField, near: Tensor, queries: Tensor) -> Tensor:
     for first in range(0, blocks, many):
         some = slice(first, first + many)
         at, u, system = _systems(field, near[some])
-        factor = torch.linalg.cholesky(system + _trend(u))
+        factor = torch.linalg.cholesky(system)
         alpha = torch.cholesky_solve(field.residual[near[some]][..., None], factor)
         beta = torch.stack([CONSTANT * alpha[..., 0].sum(1), SLOPE * (u * alpha[..., 0]).sum(1)])
         for start in range(0, per_block, step):
@@ -196,26 +196,22 @@ def _solve(field: ResidualField, near: Tensor, queries: Tensor) -> Tensor:
 
 
 def _systems(field: ResidualField, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Scaled features, u, and the covariances of f and noise, of points near (B, k)."""
-    at = field.at.double()[near]
-    scaled = field.kernel.scaled(at)
-    noise = field.kernel.noise * torch.eye(near.shape[1], dtype=at.dtype)
-    return scaled, at[..., 2], _covariance(scaled, scaled) + noise
-
-
-def _trend(u: Tensor) -> Tensor:
-    """Covariances (B, k, k) of β₀ + β₁·u."""
-    trend: Tensor = CONSTANT + SLOPE * u[:, :, None] * u[:, None, :]
-    return trend
+    """Scaled features, u, and the covariances of r, of points near (B, k)."""
+    at = field.at[near].double()
+    scaled, u = field.kernel.scaled(at), at[..., 2]
+    system = _covariance(scaled, scaled).double()
+    system.baddbmm_(u[:, :, None], u[:, None, :], alpha=SLOPE).add_(CONSTANT)
+    system.diagonal(dim1=1, dim2=2).add_(field.kernel.noise)
+    return scaled, u, system
 
 
 def _covariance(a: Tensor, b: Tensor) -> Tensor:
-    """exp(−|a − b|) (B, Q, k) of a (B, Q, F) and b (B, k, F)."""
+    """exp(−|a − b|) (B, Q, k) float32 of a (B, Q, F) and b (B, k, F)."""
     middle = b.mean(dim=1, keepdim=True)  # small numbers, so that the squares cancel well
     a, b = a - middle, b - middle
     squares = torch.baddbmm(b.square().sum(dim=2)[:, None, :], a, b.transpose(1, 2), alpha=-2)
     squares += a.square().sum(dim=2)[:, :, None]
-    closeness: Tensor = squares.clamp_min_(0).sqrt_().neg_().exp_()
+    closeness: Tensor = squares.float().clamp_min_(0).sqrt_().neg_().exp_()
     return closeness
 
 

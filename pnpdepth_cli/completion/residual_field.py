@@ -108,7 +108,9 @@ def features_of(log_depth: Tensor, rgb: Tensor | None) -> tuple[Tensor, ...]:
     y, x = (torch.arange(float(n)) / max(height, width) for n in (height, width))
     known = log_depth.isfinite()
     values = log_depth if bool(known.all()) else log_depth[known]  # picking them is slow
-    std, mean = torch.std_mean(values.double(), correction=0)
+    values = values.double().flatten()
+    mean = values.mean()
+    std = (values.dot(values) / len(values) - mean.square()).clamp_min(0).sqrt()
     u = torch.where(known, (log_depth - mean) / (std + _FLAT_DEPTH), 0.0)
     maps = x.expand(height, width), y[:, None].expand(height, width), u.float()
     return maps if rgb is None else (*maps, *_colour(rgb))

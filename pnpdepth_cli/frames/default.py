@@ -92,7 +92,12 @@ def refine_default(
     rejected = () if hidden is None else hidden.rejected
     fused = fusion.fuse(inliers, user=user, rejected=rejected, until=until)
     propagated = propagate(fused.after, inliers.points, inliers.rgb, kind=propagation)
-    check, notes = None, _notes_on_points(frame, inliers)
+    check, notes = None, tuple[str, ...]()
+    if left_out := len(frame.points) - len(inliers.points):
+        notes = (
+            f"outliers: {left_out:,} of {len(frame.points):,} points left out, inconsistent with"
+            " the others",
+        )
     completion = _completion(fusion, fused, rejected)
     depth = final = _with_completion(propagated.depth, completion)
     if hidden is not None:
@@ -116,16 +121,9 @@ def refine_default(
 
 
 def check_fixed(
-    refined: Refined, again: Refined, hidden: SparsePoints, kept: SparsePoints
+    refined: Refined, again: Refined, kept: SparsePoints, hidden: SparsePoints
 ) -> Check:
-    """Returns the check of a fixed method, which was run again without the hidden points.
-
-    Args:
-        refined: The frame refined with all points.
-        again: The frame refined with the kept points.
-        hidden: The hidden points.
-        kept: The others.
-    """
+    """Returns the check of a fixed method that was run with all points, and with those kept."""
     before, after = (torch.from_numpy(depth) for depth in (again.before, again.after))
     return Check(
         hidden=hidden,
@@ -298,14 +296,4 @@ def _blind(
     return (
         propagate(whole, frame.points, grey, kind=propagation).depth,
         propagate_at(part, kept, grey, xy, kind=propagation),
-    )
-
-
-def _notes_on_points(frame: Frame, inliers: Frame) -> tuple[str, ...]:
-    count = len(frame.points) - len(inliers.points)
-    if not count:
-        return ()
-    return (
-        f"outliers: {count:,} of {len(frame.points):,} points left out, inconsistent with the"
-        " others",
     )

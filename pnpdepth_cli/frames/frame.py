@@ -9,14 +9,14 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import Alignment
 from pnpdepth_cli.completion.image_registration import ImageRegistration, estimated, evidence
 from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.core.weights import MovingWeights
-from pnpdepth_cli.errors import DivergedError, UsageError
+from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.models.definition import DENSE_SPACING
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -27,6 +27,8 @@ Registration = str | tuple[float, float, float]
 """What the user says of the registration: "auto", "off", or zoom, right and down in pixels."""
 Register = ImageRegistration | Literal["auto"] | None
 """How an image is to be moved into the frame of the points; "auto": as the points say."""
+FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
+"""Value of white by the type of an image's integers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,15 +114,12 @@ class Refined:
     used: SparsePoints
     """The points that the depth was fitted to."""
     held_out: SparsePoints
-    """The points that were kept out, to score at."""
     refinement: Refinement
-    """Losses and step sizes of the refinement."""
     diverged: DivergedError | None
     """Why the refinement stopped early. None if it did not."""
     alignment: Alignment | None = None
     """Alignment of the network's output with the points. None where the output is in metres."""
     notes: tuple[str, ...] = ()
-    """What a person should know."""
     sigma: DepthMap | None = None
     """(H, W) metres, standard deviation of `after`. None if it was not asked for."""
     valid: NDArray[np.bool_] | None = None
@@ -160,7 +159,6 @@ class Check:
     hidden: SparsePoints
     """The M hidden points."""
     kept: SparsePoints
-    """The other points."""
     network: Tensor
     """(H, W) metres, 0 = unknown: the user's network, aligned with the kept points."""
     weights: Tensor
@@ -222,3 +220,58 @@ def is_dense(points: SparsePoints) -> bool:
 def no_points(points: SparsePoints) -> SparsePoints:
     """Returns an empty selection of the points."""
     return points.select(torch.zeros(len(points), dtype=torch.bool))
+
+
+def frame_of_arrays(
+    image: ArrayLike | None, sparse: ArrayLike | SparsePoints, register: Register = None
+) -> Frame:
+    """Returns the frame of an image and its sparse depth; see `Refiner.refine`.
+
+    Raises:
+        InputError: Image or points cannot be used.
+    """
+    rgb = None if image is None else _rgb(image)
+    size = None if rgb is None else (rgb.shape[0], rgb.shape[1])
+    points = _points(sparse, size).resized(*size) if size else _points(sparse, None)
+    inside = points.cropped(0, 0, *points.size)
+    if not len(inside):
+        raise NoPointsError(f"none of the {len(points)} sparse points lies in the image")
+    return Frame(rgb=None if rgb is None else tensor_of(rgb), points=inside, register=register)
+
+
+def _rgb(image: ArrayLike) -> NDArray[np.float32]:
+    values = np.asarray(image)
+    if values.ndim != 3 or values.shape[2] != 3:
+        raise InputError(f"an image has shape (H, W, 3), not {values.shape}")
+    if values.dtype in FULL_SCALE:
+        return (values / FULL_SCALE[values.dtype]).astype(np.float32)
+    if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
+        raise InputError(
+            f"an image is uint8, uint16 or float in 0..1; this one is {values.dtype} in"
+            f" {values.min()}..{values.max()}"
+        )
+    return values.astype(np.float32)
+
+
+def _points(sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None) -> SparsePoints:
+    """The points in their own frame, which is the image's for rows of x, y, depth."""
+    if isinstance(sparse, SparsePoints):
+        return sparse.tensors()
+    values = np.asarray(sparse, dtype=np.float32)
+    if values.ndim != 2:
+        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
+    if values.shape[1] == 3 and values.shape != size:
+        if size is None:
+            raise SizeError("rows of x, y and depth need an image for the size of the frame")
+        known = np.isfinite(values).all(axis=1) & (values[:, 2] > 0)
+        xy, depth = values[known, :2], values[known, 2]
+    else:
+        if size is not None and values.shape != size:
+            raise SizeError(f"the sparse depth map is {values.shape} but the image is {size}")
+        size = (values.shape[0], values.shape[1])
+        rows, columns = np.nonzero(np.isfinite(values) & (values > 0))
+        xy = np.stack([columns, rows], axis=1).astype(np.float32)
+        depth = values[rows, columns]
+    if not len(depth):
+        raise NoPointsError("the sparse depth has no value above 0")
+    return SparsePoints(xy=xy, depth=depth, size=size).tensors()

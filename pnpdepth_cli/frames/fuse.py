@@ -14,6 +14,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -170,25 +171,21 @@ class Fusion:
         first, *others = self.members
         if user is None or (until is not None and first.hidden_points is not None):
             user = self._refined(first, frame, updates=updates, until=until)
-        alone, guided = {first: user}, list[Refined]()
-        for member in others:
-            if not member.takes_prior:
-                self._add(alone, member, frame, updates, until)
+        tried = partial(self._tried, updates=updates, until=until)
+        alone = {first: user} | tried([m for m in others if not m.takes_prior], frame)
         guides = [m for m in alone if m not in rejected and _guides(m, alone[m])]
-        for member in others:
-            if member.takes_prior and (not guides or len(frame.points) < FEW_POINTS):
-                self._add(alone, member, frame, updates, until)
-        for member in self.members:
-            for guide in guides if member.takes_prior else ():
-                prior = torch.from_numpy(alone[guide].before)
-                one: dict[Member, Refined] = {}
-                self._add(one, member, replace(frame, prior=prior), updates, until)
-                guided += one.values()
+        if not guides or len(frame.points) < FEW_POINTS:
+            alone |= tried([m for m in others if m.takes_prior], frame)
+        guided = list[Refined]()
+        for guide in guides:
+            with_prior = replace(frame, prior=torch.from_numpy(alone[guide].before))
+            takers = [m for m in self.members if m.takes_prior]
+            guided += tried(takers, with_prior).values()
         parts = _weighted(alone, guided)
         return Fused(
             alone=alone,
-            before=weighted_mean([(torch.from_numpy(each.before), w) for each, w in parts]),
-            after=weighted_mean([(torch.from_numpy(each.after), w) for each, w in parts]),
+            before=weighted_mean([(torch.from_numpy(part.before), w) for part, w in parts]),
+            after=weighted_mean([(torch.from_numpy(part.after), w) for part, w in parts]),
             steps=self._steps,
         )
 
@@ -196,16 +193,15 @@ class Fusion:
         """Returns the frame refined by one network without a prior and without updates of z."""
         return self._refined(member, frame, updates=False)
 
-    def _add(
-        self,
-        to: dict[Member, Refined],
-        member: Member,
-        frame: Frame,
-        updates: bool,
-        until: float | None,
-    ) -> None:
-        with suppress(PnpDepthError):
-            to[member] = self._refined(member, frame, updates=updates, until=until)
+    def _tried(
+        self, members: Sequence[Member], frame: Frame, *, updates: bool, until: float | None
+    ) -> dict[Member, Refined]:
+        """The frame refined by each of the networks, without those that fail."""
+        refined: dict[Member, Refined] = {}
+        for member in members:
+            with suppress(PnpDepthError):
+                refined[member] = self._refined(member, frame, updates=updates, until=until)
+        return refined
 
     def _refined(
         self, member: Member, frame: Frame, *, updates: bool = True, until: float | None = None

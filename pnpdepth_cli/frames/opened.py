@@ -136,14 +136,11 @@ class OpenNetwork:
         coarse, points = self.network.definition.coarse, (prepared.points,)
         if coarse is None:
             return refine_from(split, z0, points, settings, depth_of=(reader,))[0]
-        with torch.no_grad():
-            before = reader(split.rear(z0))
-        with coarse(self.network.module):
+        with coarse(self.network.module) as at_full_size:
             (result,) = refine_from(split, z0, points, settings, depth_of=(reader,))
-        if not isinstance(result, Refinement) or result.z is None:
-            return result
-        with torch.no_grad():
-            return replace(result, before=before, after=reader(split.rear(result.z)))
+        if isinstance(result, Refinement):
+            result = replace(result, before=reader(at_full_size[0]))
+        return result
 
     def _plain(
         self, prepared: PreparedFrame, reader: AlignedDepth, settings: Settings

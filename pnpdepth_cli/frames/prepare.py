@@ -24,15 +24,13 @@ class PreparedFrame:
     """A frame as the network takes it."""
 
     network: Network
-    """The network."""
     frame: Frame
-    """The frame in the image frame."""
+    """The same in the image frame."""
     map: FrameMap
     """From the image frame to the network's frame."""
     image: Tensor | None
-    """The image as the network takes it. None if it takes none."""
+    """None if the network takes none."""
     arguments: tuple[Tensor, ...]
-    """Arguments of the network."""
     points: SparsePoints
     """The points that the network sees, in its frame and on its device, without outliers."""
     prior: Tensor | None = None
@@ -41,12 +39,8 @@ class PreparedFrame:
     @property
     def varying(self) -> tuple[int, ...]:
         """Positions of the arguments that depend on the points."""
-        fewer = self.arguments_for(self.points)
-        return tuple(
-            index
-            for index, (one, other) in enumerate(zip(self.arguments, fewer, strict=True))
-            if one is not other
-        )
+        pairs = zip(self.arguments, self.arguments_for(self.points), strict=True)
+        return tuple(index for index, (one, other) in enumerate(pairs) if one is not other)
 
     def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
         """Returns the arguments of the network for some of the points; the image is the same."""
@@ -80,12 +74,9 @@ class PreparedFrame:
             settings: How it is aligned with the points.
             alignment: Of the frame before, in place of the first fit.
         """
+        every = settings.align_every
         return AlignedDepth(
-            self.network,
-            self.points,
-            settings.align,
-            every=settings.align_every,
-            alignment=alignment,
+            self.network, self.points, settings.align, every=every, alignment=alignment
         )
 
     def to_image(self, depth: Tensor) -> DepthMap:

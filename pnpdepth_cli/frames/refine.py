@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -81,8 +81,8 @@ def refine_frames(
     settings = settings.complete()
     with out_of_memory_is_a_device_error(network.device):
         prepared = [prepare(network, frame) for frame in frames]
-        seen = [each for each in prepared if len(each.points)]
-        readers = [each.depth_reader(settings) for each in seen]
+        seen = [frame for frame in prepared if len(frame.points)]
+        readers = [frame.depth_reader(settings) for frame in seen]
         results: list[Refinement | PnpDepthError] = []
         if seen and settings.moves_weights:
             if len(seen) > 1:
@@ -90,15 +90,11 @@ def refine_frames(
             results = [refine_frame_weights(split, settings, seen[0], readers[0], on_iteration)]
         elif seen:
             with torch.no_grad():
-                z = split.front(*_stacked([each.arguments for each in seen]))
+                z = split.front(*_stacked([frame.arguments for frame in seen]))
             results = refine_from(
-                split,
-                z,
-                [each.points for each in seen],
-                settings,
-                depth_of=readers,
+                split, z, [frame.points for frame in seen], settings, depth_of=readers,
                 on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
-            )
+            )  # fmt: skip
     refined = iter(
         to_refined_frame(*each, propagation=propagation)
         for each in zip(seen, readers, results, strict=True)
@@ -115,22 +111,15 @@ def refine_frame_weights(
 ) -> Refinement | PnpDepthError:
     """Returns the refinement of one frame by updates of weights, or its error.
 
-    Args:
-        split: The network cut at its sparse depth, or at a layer; open.
-        settings: What is updated and how.
-        frame: The frame, with at least one point.
-        reader: Reads depth from the network's output.
-        on_iteration: As of `refine_frame`.
+    The split is at the network's sparse depth, or at a layer. The frame has at least one point.
     """
     weights = MovingWeights(frame.network.module, settings.parameters, settings.seed)
     try:
         with opened_frame(split, frame, reader, settings.mask_scale) as seen:
             return refine_weights(
-                seen,
-                weights,
-                settings,
+                seen, weights, settings,
                 on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
-            )
+            )  # fmt: skip
     except PnpDepthError as error:
         return error
 
@@ -143,45 +132,34 @@ def opened_frame(
 
     A split at a layer stays at z_0. One at the points predicts the steps from a reduced image.
     """
-    if not isinstance(split, InputSplit):
-        with torch.no_grad():
-            z0 = split.front(*frame.arguments)
-            output = split.rear(z0)
+    predict: Predict
+    in_steps: Predict
+    with ExitStack() as stack:
+        if isinstance(split, InputSplit):
+            output = split.first(*frame.arguments, varying=frame.varying)
+            predict = in_steps = lambda points: split.again(*frame.arguments_for(points))
+            reduced = frame.reduced(scale)
+            if reduced is not None:
+                small = stack.enter_context(frame.network.cut_at_points())
+                small.first(*reduced.arguments, varying=reduced.varying)
 
-        def from_z(points: SparsePoints) -> Any:
-            return split.rear(z0)
+                def reduced_steps(points: SparsePoints, frame: PreparedFrame = reduced) -> Any:
+                    return small.again(*frame.arguments_for(points.resized(*frame.points.size)))
 
-        yield _frame_of_points(frame, reader, output, from_z, from_z)
-        return
-    output = split.first(*frame.arguments, varying=frame.varying)
-
-    def predict(points: SparsePoints) -> Any:
-        return split.again(*frame.arguments_for(points))
-
-    reduced = frame.reduced(scale)
-    if reduced is None:
-        yield _frame_of_points(frame, reader, output, predict, predict)
-        return
-    with frame.network.cut_at_points() as small:
-        small.first(*reduced.arguments, varying=reduced.varying)
-
-        def predict_reduced(points: SparsePoints) -> Any:
-            return small.again(*reduced.arguments_for(points.resized(*reduced.points.size)))
-
-        yield _frame_of_points(frame, reader, output, predict, predict_reduced)
-
-
-def _frame_of_points(
-    frame: PreparedFrame, reader: AlignedDepth, output: Any, predict: Predict, in_steps: Predict
-) -> FrameOfPoints:
-    return FrameOfPoints(
-        points=frame.points,
-        inliers=_inliers(frame.points),
-        output=output,
-        predict=predict,
-        predict_in_steps=in_steps,
-        depth_of=reader,
-    )
+                in_steps = reduced_steps
+        else:
+            with torch.no_grad():
+                z0 = split.front(*frame.arguments)
+                output = split.rear(z0)
+            predict = in_steps = lambda points: split.rear(z0)
+        yield FrameOfPoints(
+            points=frame.points,
+            inliers=_inliers(frame.points),
+            output=output,
+            predict=predict,
+            predict_in_steps=in_steps,
+            depth_of=reader,
+        )
 
 
 def _inliers(points: SparsePoints) -> SparsePoints:

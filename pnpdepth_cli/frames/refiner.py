@@ -6,6 +6,7 @@ it.
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -23,7 +24,6 @@ from pnpdepth_cli.completion.image_registration import (
 )
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
-from pnpdepth_cli.frames.arrays import frame_of_arrays
 from pnpdepth_cli.frames.default import check_fixed, refine_default, split_hidden
 from pnpdepth_cli.frames.frame import (
     METRES,
@@ -31,6 +31,7 @@ from pnpdepth_cli.frames.frame import (
     Refined,
     Registration,
     WarmStart,
+    frame_of_arrays,
     is_dense,
     no_points,
     registration_to_make,
@@ -39,7 +40,7 @@ from pnpdepth_cli.frames.fuse import Fusion, Member
 from pnpdepth_cli.frames.refine import OnIteration, refine_frames
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
 from pnpdepth_cli.frames.tiles import refine_tiled
-from pnpdepth_cli.frames.uncertainty import uncertainty
+from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.frames.warm_start import refine_next
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.rank_layers import default_layer
@@ -174,17 +175,24 @@ class Refiner:
             until = None if seconds is None else time.monotonic() + seconds
             refined = refine_default(opened, frame, seed=seed, until=until)
         else:
-            refined = self._fixed(opened, frame, on_iteration)
+            settings, propagation = self.settings, self.settings.propagate
+            if settings.tile is None:
+                (result,) = refine_frames(
+                    self.network, opened, settings, (frame,),
+                    propagation=propagation, on_iteration=on_iteration,
+                )  # fmt: skip
+                if isinstance(result, PnpDepthError):
+                    raise result
+                refined = result
+            else:
+                refined = refine_tiled(
+                    self.network, opened, settings, frame,
+                    propagation=propagation, on_iteration=on_iteration,
+                )  # fmt: skip
             if self._check:
-                refined = self._checked(opened, frame, refined, on_iteration)
+                refined = self._checked(frame, refined)
         if self._uncertainty:
-            estimate = uncertainty(refined)
-            refined = replace(
-                refined,
-                sigma=estimate.sigma,
-                valid=estimate.valid,
-                notes=(*refined.notes, estimate.note),
-            )
+            refined = with_uncertainty(refined)
         return _finished(refined, frame)
 
     def refine_next(self, frame: Frame, carried: WarmStart) -> Refined:
@@ -308,25 +316,7 @@ class Refiner:
         settings = replace(settings, iterations=iterations)
         return replace(member, settings=settings, hidden_points=hidden_points)
 
-    def _fixed(self, split: Split, frame: Frame, on_iteration: OnIteration) -> Refined:
-        """The frame refined by the fixed method."""
-        settings = self.settings
-        if settings.tile is not None:
-            return refine_tiled(
-                self.network, split, settings, frame, settings.tile,
-                propagation=settings.propagate, on_iteration=on_iteration,
-            )  # fmt: skip
-        (refined,) = refine_frames(
-            self.network, split, settings, (frame,),
-            propagation=settings.propagate, on_iteration=on_iteration,
-        )  # fmt: skip
-        if isinstance(refined, PnpDepthError):
-            raise refined
-        return refined
-
-    def _checked(
-        self, split: Split, frame: Frame, refined: Refined, on_iteration: OnIteration
-    ) -> Refined:
+    def _checked(self, frame: Frame, refined: Refined) -> Refined:
         """The refined frame with the fixed method's check, for which it is run again.
 
         It is returned as it is where its points are too few or the method fails.
@@ -335,11 +325,13 @@ class Refiner:
         if parts is None:
             return refined
         kept, hidden = parts
+        unchecked = copy.copy(self)
+        unchecked._check = unchecked._uncertainty = False
         try:
-            again = self._fixed(split, frame.with_points(kept), on_iteration)
+            again = unchecked.refine_frame(frame.with_points(kept))
         except PnpDepthError:
             return refined
-        return replace(refined, check=check_fixed(refined, again, hidden, kept))
+        return replace(refined, check=check_fixed(refined, again, kept, hidden))
 
 
 def _finished(refined: Refined, frame: Frame) -> Refined:

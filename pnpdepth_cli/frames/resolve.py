@@ -200,14 +200,12 @@ def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[N
     listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
     if len(frames) > 1:
         listed += f", mean of {len(frames)} frames"
-    if rival is None:
-        return candidates[chosen], (
-            f"input: rgb range {chosen!r} (error after alignment: {listed}); --normalise changes it"
-        )
-    return candidates[chosen], (
-        f"input: rgb range {chosen!r}, unsure (error after alignment: {listed}); --normalise"
-        f" {chosen} confirms it, --normalise {rival} is the next likely"
-    )
+    unsure, hint = "", "--normalise changes it"
+    if rival is not None:
+        hint = f"--normalise {chosen} confirms it, --normalise {rival} is the next likely"
+        unsure = ", unsure"
+    note = f"input: rgb range {chosen!r}{unsure} (error after alignment: {listed}); {hint}"
+    return candidates[chosen], note
 
 
 def chosen_input_range(errors: Mapping[str, float]) -> tuple[str, str | None]:
@@ -227,25 +225,22 @@ def chosen_input_range(errors: Mapping[str, float]) -> tuple[str, str | None]:
 
 
 def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
-    """The mean over frames with points in the network's view; infinite where the network fails."""
-    errors = []
+    """The relative error at the points after the best alignment, in the mean over the frames.
+
+    Frames without points in the network's view are left out; infinite where the network fails.
+    """
+    stated, errors = network.definition.output_kind, list[float]()
+    spaces = (stated,) if stated in SPACES else ("depth", "inverse")
     for frame in frames:
         try:
-            errors.append(_alignment_error(network, frame))
+            prepared = prepare(network, frame)
+            with torch.no_grad():
+                output = network.module(*prepared.arguments)
+            points = prepared.points.tensors()
+            at_points = points.sample(network.raw_of(output).cpu())
+            errors.append(align(at_points, points, spaces, "auto").error)
         except NoPointsError:
             continue
         except ModelError:
             return float("inf")
     return sum(errors) / len(errors) if errors else float("inf")
-
-
-def _alignment_error(network: Network, frame: Frame) -> float:
-    """The relative error at the points after the best alignment."""
-    prepared = prepare(network, frame)
-    points = prepared.points.tensors()
-    with torch.no_grad():
-        output = network.module(*prepared.arguments)
-    at_points = points.sample(network.raw_of(output).cpu())
-    stated = network.definition.output_kind
-    spaces = (stated,) if stated in SPACES else ("depth", "inverse")
-    return align(at_points, points, spaces, "auto").error

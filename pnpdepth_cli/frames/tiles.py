@@ -34,13 +34,9 @@ class Tile:
     """Rows top … top + height and columns left … left + width of a frame."""
 
     top: int
-    """First row."""
     left: int
-    """First column."""
     height: int
-    """Number of rows."""
     width: int
-    """Number of columns."""
 
     def of(self, depth: DepthMap) -> DepthMap:
         """Returns this part of a map (H, W) as a view."""
@@ -87,23 +83,23 @@ def refine_tiled(
     split: Split,
     settings: Settings,
     frame: Frame,
-    side: int,
     *,
     propagation: str = "none",
     on_iteration: OnIteration = lambda done, loss: None,
 ) -> Refined:
-    """Returns the frame refined in tiles of at most side × side pixels.
+    """Returns the frame refined in tiles of at most `settings.tile` pixels on each side.
 
     A frame of one tile is refined as it is. For others, the whole frame is refined at reduced size
     too: it fills tiles with few points, and the result reports its losses, step size and alignment.
     Other arguments and errors are those of `refine_frame`.
     """
-    tiles = tiles_of(frame.size, side)
+    assert settings.tile is not None
+    tiles = tiles_of(frame.size, settings.tile)
     if len(tiles) == 1:
         return refine_frame(
             network, split, settings, frame, propagation=propagation, on_iteration=on_iteration
         )
-    reduced = _reduced(frame, side)
+    reduced = _reduced(frame, settings.tile)
     whole = refine_frame(network, split, settings, reduced, on_iteration=on_iteration)
     before, after = (
         _WHOLE_FRAME_WEIGHT * _enlarged(depth, frame.size) for depth in (whole.before, whole.after)

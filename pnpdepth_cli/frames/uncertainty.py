@@ -17,7 +17,7 @@ points at which depth is asked for: a LiDAR's are whole scan lines.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -50,20 +50,8 @@ _BEYOND_HULL = 2.0  # typical distances to the nearest point, outside the hull o
 _SAMPLED = 4000  # pixels, for the typical distance
 
 
-@dataclass(frozen=True, kw_only=True)
-class Uncertainty:
-    """The standard deviation of a depth map."""
-
-    sigma: DepthMap
-    """(H, W) metres."""
-    valid: NDArray[np.bool_]
-    """(H, W): where depth is supported by points and σ is small; see `valid_depth`."""
-    note: str
-    """How it was calibrated."""
-
-
-def uncertainty(frame: Refined) -> Uncertainty:
-    """Returns the standard deviation of the depth of a refined frame with its check."""
+def with_uncertainty(frame: Refined) -> Refined:
+    """Returns a refined frame with its standard deviation, calibrated by its check."""
     points, depth = frame.used, frame.after
     network = torch.from_numpy(frame.before)
     shape = relative_shape(points, network, torch.from_numpy(depth))
@@ -76,7 +64,7 @@ def uncertainty(frame: Refined) -> Uncertainty:
     valid = valid_depth(points, depth, sigma_m)
     if not valid.all():
         note += f"; {100 * float((~valid).mean()):.0f} % of the pixels have no valid depth"
-    return Uncertainty(sigma=sigma_m, valid=valid, note=note)
+    return replace(frame, sigma=sigma_m, valid=valid, notes=(*frame.notes, note))
 
 
 def _calibrating(check: Check) -> tuple[Tensor, Tensor]:

@@ -72,7 +72,9 @@ def everywhere(size: tuple[int, int], step: int = 8) -> Frame:
 
 def tiled(module: nn.Module, settings: Settings, one: Frame, propagation: str = "none") -> Refined:
     with Split(module, "features") as split:
-        return refine_tiled(network(module), split, settings, one, SIDE, propagation=propagation)
+        return refine_tiled(
+            network(module), split, replace(settings, tile=SIDE), one, propagation=propagation
+        )
 
 
 @given(height=st.integers(1, 300), width=st.integers(1, 300), side=st.integers(16, 128))
@@ -193,11 +195,11 @@ def test_the_split_is_as_before_for_the_next_frame(
 ) -> None:
     frame = frame_on_disk(tmp_path_factory.mktemp("frame"))
     loaded, one = load_network(str(frame.model), frame.checkpoint), everywhere((100, 150))
-    settings = Settings(iterations=3)
+    settings = Settings(iterations=3, tile=SIDE)
     with Split(loaded.module, "middle") as split:
-        first = refine_tiled(loaded, split, settings, one, SIDE)
+        first = refine_tiled(loaded, split, settings, one)
         small = refine_frame(loaded, split, settings, everywhere((60, 64)))
-        again = refine_tiled(loaded, split, settings, one, SIDE)
+        again = refine_tiled(loaded, split, settings, one)
     assert np.array_equal(first.after, again.after)
     with Split(loaded.module, "middle") as split:
         alone = refine_frame(loaded, split, settings, everywhere((60, 64)))
