@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pnpdepth_cli.commands.batch.state import remove_all_leftovers
 
 from pnpdepth_cli.commands.batch import ray_workers
 from pnpdepth_cli.commands.batch.request import ClusterOptions
-from pnpdepth_cli.commands.batch.state import remove_all_leftovers
 from pnpdepth_cli.errors import ClusterError
 from tests.commands.batch.ray_nodes import three_nodes
 from tests.commands.batches import (

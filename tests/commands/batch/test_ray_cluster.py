@@ -4,8 +4,8 @@ import socket
 import sys
 
 import pytest
-
 from pnpdepth_cli.commands.batch.ray_cluster import connected
+
 from pnpdepth_cli.commands.batch.request import (
     LOCAL,
     ClusterOptions,
