@@ -92,8 +92,9 @@ def run_batch(
             full disk.
     """
     batch = _Batch(request, listener.say)
+    request = batch.request
     if not request.refine.outputs.overwrite:
-        batch.records.check_new(task_of(batch.request, frame) for frame in batch.found.chosen)
+        batch.records.check_new(task_of(request, frame) for frame in batch.found.chosen)
     with ExitStack() as stack:
         local = batch.opened_output(stack)
         to_do = [frame for frame, _ in batch.to_do()]
@@ -131,16 +132,19 @@ class _Batch:
     """
 
     def __init__(self, request: BatchRequest, say: Callable[[str], None]) -> None:
-        self.workers = ray_workers_of(request.refine.network.device, request.cluster)
+        refine = request.refine
+        self.workers = ray_workers_of(refine.network.device, request.cluster)
         if self.workers is not None:
-            refine = request.refine.with_fields(device=self.workers.device)
-            request = replace(request, refine=refine)
+            refine = refine.with_fields(device=self.workers.device)
             if request.sequence.warm_start:
                 raise UsageError(
                     "--warm-start refines frames in order, in one process; give each process a"
                     " --shard of the windows instead of --ray"
                 )
-        self.request, self._say, self.found = request, say, find_frames(request)
+        if request.html_3d:
+            refine = refine.with_fields(view_3d=True)
+        self.request = request = replace(request, refine=refine)
+        self._say, self.found = say, find_frames(request)
         self.model = model_identity(request.refine)
         self.report = self._report()
         for note in self._notes():
@@ -227,25 +231,29 @@ class _Batch:
     ) -> Generator[Row, None, None]:
         """Refines frames in this process or on Ray workers; yields a row as each is done."""
         # these import torch, which a run with nothing to do does not need
-        from pnpdepth_cli.commands.batch.ray_workers import rows_of_workers
-        from pnpdepth_cli.commands.batch.running import opened_network, references_of, refine_tasks
+        from pnpdepth_cli.commands.batch import running
 
         request, say = self.request, listener.say
-        references = references_of(request, self.found.frames)
+        references = running.references_of(request, self.found.frames)
         worked = len(to_do) < len(self.found.chosen)
-        if self.workers is not None:
+        if references is None:
+            listener.begin(len(to_do))
+            yield from running.rows_of_unreadable(self._tasks(to_do), self.records)
+        elif self.workers is not None:
+            from pnpdepth_cli.commands.batch.ray_workers import rows_of_workers
+
             listener.begin(len(to_do))
             yield from rows_of_workers(
                 request, self.workers, references, to_do, self.records,
                 settings_worked=worked, say=say, stopped=stopped,
             )  # fmt: skip
-            return
-        with opened_network(request, references, say) as network:
-            listener.begin(len(to_do))
-            yield from refine_tasks(
-                self._tasks(to_do), network, self.records,
-                threads=request.workers, settings_worked=worked, stopped=stopped,
-            )  # fmt: skip
+        else:
+            with running.opened_network(request, references, say) as network:
+                listener.begin(len(to_do))
+                yield from running.refine_tasks(
+                    self._tasks(to_do), network, self.records,
+                    threads=request.workers, settings_worked=worked, stopped=stopped,
+                )  # fmt: skip
 
     def _tasks(self, to_do: list[Frame]) -> Iterator[Task]:
         """The frames to refine in their order, and within windows those that they begin with."""

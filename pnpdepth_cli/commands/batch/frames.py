@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path, PurePosixPath
 
-from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.sequence import (
     check_warm_start,
     in_windows,
@@ -176,11 +176,9 @@ def _chosen(request: BatchRequest, frames: list[Frame]) -> list[Frame]:
     return [frame for window in windows for frame in window]
 
 
-def task_of(request: BatchRequest, frame: Frame) -> Task:
+def task_of(request: FrameSelection, frame: Frame) -> Task:
     """Returns the frame's task; options of the user go before what the data set states."""
     refine = request.refine
-    if request.html_3d:
-        refine = refine.with_fields(view_3d=True)
     needs_camera = refine.outputs.needs_camera or bool(frame.neighbours)
     files = _files_of(request, frame, needs_camera=needs_camera)
     neighbours = (
@@ -202,7 +200,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     )
 
 
-def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> FrameFiles:
+def _files_of(request: FrameSelection, frame: Frame, *, needs_camera: bool) -> FrameFiles:
     """The files of a frame, without its neighbours and window."""
     base = request.refine.files
     sparse = frame.sparse if base.sample is None else None

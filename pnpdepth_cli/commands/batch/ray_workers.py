@@ -44,7 +44,7 @@ class Worker:
     def __init__(
         self,
         request: BatchRequest,
-        references: References | None,
+        references: References,
         model: dict[str, Any],
         versions: Mapping[str, str],
         shared: Sequence[Path],
@@ -119,7 +119,7 @@ def check_node(versions: Mapping[str, str], shared: Sequence[Path]) -> None:
 def rows_of_workers(
     request: BatchRequest,
     workers: RayWorkers,
-    references: References | None,
+    references: References,
     to_do: Sequence[Frame],
     records: Records,
     *,

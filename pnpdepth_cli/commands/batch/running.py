@@ -123,18 +123,15 @@ def registering(frames: Sequence[Item], first: int) -> list[Item]:
 
 @contextmanager
 def opened_network(
-    request: BatchRequest, references: References | None, say: Callable[[str], None]
-) -> Iterator[OpenNetwork | None]:
+    request: BatchRequest, references: References, say: Callable[[str], None]
+) -> Iterator[OpenNetwork]:
     """Yields the network, resolved on the frames that decide, open for any number of frames.
 
     Args:
         request: The batch.
-        references: Of `references_of`; None yields None.
+        references: Of `references_of`.
         say: Receives what was decided.
     """
-    if references is None:
-        yield None
-        return
     task = task_of(request, references.first)
     first = read_frame(task)
     for note in first.notes:
@@ -196,7 +193,7 @@ class FrameInMemory:
 
 def refine_tasks(
     tasks: Iterable[Task],
-    network: OpenNetwork | None,
+    network: OpenNetwork,
     records: Records,
     *,
     threads: int,
@@ -207,7 +204,7 @@ def refine_tasks(
 
     Args:
         tasks: The frames to refine.
-        network: The network; None if no frame could be read.
+        network: The network.
         records: Writes the results.
         threads: Number of threads that read, and of threads that write.
         settings_worked: True if a frame was refined with these settings before.
@@ -234,7 +231,7 @@ def refine_tasks(
                     yield frame
 
     def written(frame: FrameInMemory) -> Row:
-        return _write(frame, network, records)
+        return _write(frame, network.refiner, records)
 
     with (
         closing(in_order(_read, tasks, threads)) as reading,
@@ -243,9 +240,15 @@ def refine_tasks(
         yield from rows
 
 
-def _groups(
-    frames: Iterable[FrameInMemory], network: OpenNetwork | None
-) -> Iterator[list[FrameInMemory]]:
+def rows_of_unreadable(tasks: Iterable[Task], records: Records) -> Iterator[Row]:
+    """Writes for each task why it cannot be read; yields the summary's rows."""
+    for task in tasks:
+        result = _read(task).result
+        later = InputError("no frame could be read when the batch began; run it again")
+        yield records.fail(task, _message(result if isinstance(result, Exception) else later))
+
+
+def _groups(frames: Iterable[FrameInMemory], network: OpenNetwork) -> Iterator[list[FrameInMemory]]:
     """The frames in their order, in groups of those that go through the network together.
 
     A frame that could not be read is in the group of those before it.
@@ -257,23 +260,18 @@ def _groups(
             yield group
             group = []
         group.append(frame)
-        if network is None or len(group) >= network.batch_size:
+        if len(group) >= network.batch_size:
             yield group
             group = []
     if group:
         yield group
 
 
-def _refine(group: Sequence[FrameInMemory], network: OpenNetwork | None) -> None:
+def _refine(group: Sequence[FrameInMemory], network: OpenNetwork) -> None:
     """Sets the results of the frames that were read."""
     frames = [frame for frame in group if frame.inputs is not None]
     start = time.perf_counter()
-    results: Sequence[Refined | Exception]
-    if network is None:
-        error = InputError("no frame could be read when the batch began; run it again")
-        results = [error] * len(frames)
-    else:
-        results = network.refine([frame.inputs for frame in frames if frame.inputs is not None])
+    results = network.refine([frame.inputs for frame in frames if frame.inputs is not None])
     for frame, result in zip(frames, results, strict=True):
         frame.watch.add("refine", (time.perf_counter() - start) / len(frames))
         frame.result = result
@@ -309,25 +307,19 @@ class OpenNetwork:
     def _together(self, group: Sequence[Inputs]) -> list[Refined | Exception]:
         """The frames refined in one pass. PnpDepthError if the network does not take them so."""
         frames = self.refiner.refine_together(group)
-        if not self._checked:
-            self._check_independent(group[0], frames[0])
+        first, alone = frames[0], None if self._checked else self._alone(group[0])
+        if isinstance(alone, Refined) and isinstance(first, Refined):
+            self._checked = True
+            split = self.refiner.split
+            if split is None or not split.static_graph:
+                raise BatchError("the network's control flow depends on image values")
+            if not np.allclose(alone.before, first.before, rtol=_ROUNDING, atol=0):
+                raise BatchError("frames that go together influence each other")
         note = f"refined together with {len(group) - 1} others, which alters the last bits"
         return [
             replace(frame, notes=(*frame.notes, note)) if isinstance(frame, Refined) else frame
             for frame in frames
         ]
-
-    def _check_independent(self, inputs: Inputs, together: Refined | PnpDepthError) -> None:
-        """Raises BatchError if the frames of a group influence each other."""
-        alone = self._alone(inputs)
-        if not isinstance(alone, Refined) or not isinstance(together, Refined):
-            return
-        self._checked = True
-        split = self.refiner.split
-        if split is None or not split.static_graph:
-            raise BatchError("the network's control flow depends on image values")
-        if not np.allclose(alone.before, together.before, rtol=_ROUNDING, atol=0):
-            raise BatchError("frames that go together influence each other")
 
     def _alone(self, inputs: Inputs) -> Refined | Exception:
         try:
@@ -352,21 +344,21 @@ def _read(task: Task) -> FrameInMemory:
     return frame
 
 
-def _write(frame: FrameInMemory, network: OpenNetwork | None, records: Records) -> Row:
+def _write(frame: FrameInMemory, refiner: Refiner, records: Records) -> Row:
     """Writes a frame's results, or why there are none; returns the summary's row."""
     inputs, result = frame.inputs, frame.result
-    if isinstance(result, Refined) and network is not None and inputs is not None:
-        refiner = network.refiner
+    if isinstance(result, Refined) and inputs is not None:
+        refined = result
         try:
             return records.write(
                 frame.task,
                 frame.fingerprints,
-                lambda outputs: write_refined(outputs, refiner, inputs, result, frame.watch),
+                lambda outputs: write_refined(outputs, refiner, inputs, refined, frame.watch),
             )
         except StorageError:
             raise
         except Exception as error:
-            return records.fail(frame.task, _message(error))
+            result = error
     assert isinstance(result, Exception)
     return records.fail(frame.task, _message(result))
 
