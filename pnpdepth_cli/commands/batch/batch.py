@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from pnpdepth_cli.commands.batch.frames import Task, find_frames, source_files, task_of
 from pnpdepth_cli.commands.batch.records import (
+    DAMAGED,
     Records,
     Row,
+    damaged,
     model_identity,
     remove_all_leftovers,
     settings_of,
@@ -277,7 +279,10 @@ class _Batch:
         with tempfile.TemporaryFile("w+", dir=local, **TEXT) as file:
             for row in itertools.chain(refused, known):
                 if row is not None:
-                    tally.add(row)
+                    try:
+                        tally.add(row)
+                    except DAMAGED as error:
+                        raise damaged(request.output / f"{row['name']}.json") from error
                     file.write(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n")
             summary = self._head(tally)
             if request.profile:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.batch.frames import Task
-from pnpdepth_cli.commands.batch.summary import CSV, JSON, Row, Tally, failed_row, row_of
+from pnpdepth_cli.commands.batch.summary import CSV, JSON, Row, failed_row, row_of
 from pnpdepth_cli.commands.refinement.output_files import Outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError, OutputError
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _ENTRY = "batch"
 _OWN_SUMMARY = b'{\n  "command": "batch"'
 _ONLY_IF_SET = {"window", "neighbours", "calibration"}
-_DAMAGED = (AttributeError, IndexError, KeyError, TypeError)
+DAMAGED = (AttributeError, IndexError, KeyError, TypeError)
 """What a record that holds less than it should leads to."""
 
 
@@ -101,7 +101,7 @@ class Records:
                 wanted = kind in entry["outputs"] or path not in may_lack
                 if wanted and path.name not in names:
                     return f"result missing: {path.name}"
-        except _DAMAGED:
+        except DAMAGED:
             return "record damaged"
         return None
 
@@ -116,11 +116,9 @@ class Records:
         if entry.get("settings") != self._digest(task):
             return None
         try:
-            row = _row(task, record, entry)
-            Tally().add(row)  # takes all that the summary takes
-        except _DAMAGED as error:
-            raise FileFormatError(f"{task.record} is damaged; remove it, and run again") from error
-        return row
+            return _row(task, record, entry)
+        except DAMAGED as error:
+            raise damaged(task.record) from error
 
     def write(
         self,
@@ -176,6 +174,11 @@ class Records:
         digest = hashlib.sha256(text.encode()).hexdigest()
         self._last = None if arrays else (files, digest)
         return digest
+
+
+def damaged(record: Path) -> FileFormatError:
+    """Returns the error of a record that holds less than it should."""
+    return FileFormatError(f"{record} is damaged; remove it, and run again")
 
 
 def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> dict[str, Any]:
