@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.batch.frames import registering
+from pnpdepth_cli.commands.batch.running import registering
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.completion.image_registration import estimated, evidence
 from pnpdepth_cli.core.metrics import score

@@ -92,8 +92,8 @@ def batch(
     missing or whose settings or files have changed. OUTPUT/summary.json and OUTPUT/summary.csv list
     all frames; the record NAME.json beside a result says how it was made.
     """
-    from pnpdepth_cli.commands.batch.bags import unpacked
     from pnpdepth_cli.commands.batch.batch import plan_batch
+    from pnpdepth_cli.commands.batch.frames import unpacked
 
     own = options.taken(BatchRequest, values)
     own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, values))
@@ -110,10 +110,10 @@ def batch(
     if dry_run:
         planned = plan_batch(request, lambda text: click.echo(printable(text), err=True))
         if as_json:
-            click.echo(json.dumps([{"name": p.name, "why": p.why} for p in planned], indent=2))
+            click.echo(json.dumps([{"name": name, "why": why} for name, why in planned], indent=2))
         else:
-            for each in planned:
-                click.echo(f"{printable(each.name)}  ({printable(each.why)})")
+            for name, why in planned:
+                click.echo(f"{printable(name)}  ({printable(why)})")
         return
     raise click.exceptions.Exit(_run(request, as_json))
 

@@ -21,7 +21,6 @@ from pnpdepth_cli import __version__
 from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.commands.adapt_request import AdaptRequest
 from pnpdepth_cli.commands.batch.frames import Task, task_of
-from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.masks import Masks
@@ -33,10 +32,7 @@ from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError
 from pnpdepth_cli.frames.frame import is_dense
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refine import opened_frame
-from pnpdepth_cli.frames.resolve import (
-    resolve_definition,
-    resolve_settings,
-)
+from pnpdepth_cli.frames.resolve import resolve_definition, resolve_settings
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path
 from pnpdepth_cli.io.layouts import list_frames
 from pnpdepth_cli.models.network import Network, load_network
@@ -67,13 +63,11 @@ class Adapted:
     output: str
     training_frames: int
     validation_frames: int
-    """Frames that decided which weights are written."""
     steps: int
     kept: int
     """Updates after which the weights are those written; 0 leaves them as they were."""
     lr: float
     seed: int
-    """Of masks and order."""
     loss: str
     hidden: float
     """Fraction of the points that was hidden at every update."""
@@ -89,10 +83,7 @@ class Adapted:
 def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) -> Adapted:
     """Writes the adapted weights and their card; returns what was learnt.
 
-    Args:
-        request: The frames and the network.
-        say: Receives notes, one line each.
-        on_step: Called after the updates of each visit of a frame.
+    `say` receives notes, and `on_step` is called after the updates of each visit of a frame.
 
     Raises:
         InputError: There are fewer than two frames, or a file cannot be used.
@@ -100,7 +91,12 @@ def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) ->
         DivergedError: The loss is not finite.
         OutputError: A file cannot be written.
     """
-    tasks = _tasks(request)
+    layout, listing = list_frames(request.source, request.layout)
+    tasks = [task_of(request, frame) for frame in listing.frames[: request.limit]]
+    if len(tasks) < 2:
+        raise InputError(
+            f"{request.source} ({layout}) gives {len(tasks)} frame; an adaptation needs 2 or more"
+        )
     choice, seed = request.refine.network, request.refine.method.seed
     network = load_network(choice.model, choice.checkpoint, choice.device)
     first = read_inputs(tasks[0].request)
@@ -117,10 +113,8 @@ def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) ->
     for note in (*first.notes, *network.notes):
         say(note)
     adaptation = _Adaptation(network, settings, tasks)
-    say(
-        f"frames to learn from: {len(adaptation.training)}; for validation:"
-        f" {len(adaptation.validation)}"
-    )
+    training, validation = len(adaptation.training), len(adaptation.validation)
+    say(f"frames to learn from: {training}; for validation: {validation}")
     with network.cut_at_points() as split:
         losses = adaptation.run(split, on_step)
     adapted = Adapted(
@@ -128,8 +122,8 @@ def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) ->
         checkpoint=None if choice.checkpoint is None else str(choice.checkpoint),
         source=str(request.source),
         output=str(request.output),
-        training_frames=len(adaptation.training),
-        validation_frames=len(adaptation.validation),
+        training_frames=training,
+        validation_frames=validation,
         steps=request.steps,
         kept=adaptation.kept,
         lr=request.lr,
@@ -142,29 +136,10 @@ def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) ->
     return adapted
 
 
-def _tasks(request: AdaptRequest) -> list[Task]:
-    layout, listing = list_frames(request.source, request.layout)
-    frames = listing.frames[: request.limit]
-    if len(frames) < 2:
-        raise InputError(
-            f"{request.source} ({layout}) has {len(frames)} frame; an adaptation needs 2 or more"
-        )
-    batch = BatchRequest(
-        source=request.source,
-        output=request.output,
-        refine=request.refine,
-        protocol=request.protocol,
-    )
-    return [task_of(batch, frame) for frame in frames]
-
-
 class _Adaptation:
     """The state of an adaptation: its frames, the weights, and the best of them.
 
-    Args:
-        network: The network.
-        settings: Of the masked updates; their iterations are those of all frames together.
-        tasks: The frames.
+    The iterations of the settings are those of all frames together.
     """
 
     def __init__(self, network: Network, settings: Settings, tasks: Sequence[Task]) -> None:
@@ -275,11 +250,7 @@ def _write(
     module: nn.Module,
     moved: Mapping[nn.Parameter, Tensor],
 ) -> None:
-    """Writes all tensors of the network with those that moved, and the card; both or none.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Writes all tensors of the network with those that moved, and the card; both or none."""
     state = dict(module.state_dict())
     for name, parameter in module.named_parameters(remove_duplicate=False):
         if parameter in moved:

@@ -9,23 +9,19 @@ from pnpdepth_cli.commands.batch.request import FrameSelection
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.settings import option
 
-SUFFIX = ".safetensors"
-
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptRequest(FrameSelection):
     """Which frames a network learns from, and how. `output` is the file of its weights."""
 
-    steps: int = option(200, "Number of updates of the weights.", metavar="N", show_default=True)
+    steps: int = option(
+        200, "Number of updates of the weights.", metavar="N", least=1, show_default=True
+    )
     lr: float = option(2e-4, "Step size at the start.", metavar="NUMBER", show_default=True)
 
     def __post_init__(self) -> None:
-        if self.output.suffix != SUFFIX:
-            raise UsageError(f"{self.output}: name the file of the weights NAME{SUFFIX}")
-        if self.steps < 1:
-            raise UsageError(f"--steps {self.steps}: give 1 or more")
-        if self.limit is not None and self.limit < 2:
-            raise UsageError(f"--limit {self.limit}: an adaptation needs 2 frames or more")
+        if self.output.suffix != ".safetensors":
+            raise UsageError(f"{self.output}: name the file of the weights NAME.safetensors")
         for path in (self.output, self.card):
             if path.exists() and not self.refine.outputs.overwrite:
                 raise OutputError(f"{path} exists; --overwrite replaces it, -o names another file")

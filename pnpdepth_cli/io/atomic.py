@@ -93,8 +93,8 @@ def make_folder(folder: Path) -> None:
 
 def remove_leftovers(folder: Path) -> int:
     """Removes what killed writers left, while nobody writes there; returns how many there were."""
-    paths = folder.iterdir() if folder.is_dir() else ()
-    leftovers = [path for path in paths if _TEMPORARY.fullmatch(path.name)]
+    names = [entry.name for entry in os.scandir(folder)] if folder.is_dir() else []
+    leftovers = [folder / name for name in names if _TEMPORARY.fullmatch(name)]
     for path in leftovers:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.batch.settings import settings_of
+from pnpdepth_cli.commands.batch.records import settings_of
 from pnpdepth_cli.commands.refinement.refine import refine_image
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.io.depth import read_depth

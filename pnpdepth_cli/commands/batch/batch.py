@@ -11,16 +11,24 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from pnpdepth_cli.commands.batch.frames import Task, find_frames, source_files, task_of
+from pnpdepth_cli.commands.batch.records import (
+    DAMAGED,
+    Records,
+    Row,
+    damaged,
+    model_identity,
+    remove_all_leftovers,
+    settings_of,
+)
 from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions, ray_workers_of
 from pnpdepth_cli.commands.batch.sequence import in_windows, note_of_poses
-from pnpdepth_cli.commands.batch.settings import model_identity, settings_of
-from pnpdepth_cli.commands.batch.state import BatchState, Row, remove_all_leftovers
 from pnpdepth_cli.commands.batch.summary import (
     CSV,
     JSON,
+    TEXT,
     Tally,
     failed_row,
     profile_of,
@@ -71,13 +79,6 @@ class BatchOutcome:
     """True if it was stopped before all frames were done."""
 
 
-class Planned(NamedTuple):
-    """A frame that is to be done, and why, such as "new" or "other settings"."""
-
-    name: str
-    why: str
-
-
 def run_batch(
     request: BatchRequest, listener: Listener, stopped: Callable[[], bool] = lambda: False
 ) -> BatchOutcome:
@@ -93,10 +94,13 @@ def run_batch(
             full disk.
     """
     batch = _Batch(request, listener.say)
+    request = batch.request
+    if not request.refine.outputs.overwrite:
+        batch.records.check_new(task_of(request, frame) for frame in batch.found.chosen)
     with ExitStack() as stack:
         local = batch.opened_output(stack)
-        to_do = [frame for frame, _ in batch.to_do(check=not request.refine.outputs.overwrite)]
-        batch.state.mark()
+        to_do = [frame for frame, _ in batch.to_do()]
+        batch.records.mark()
         if batch.report is not None:
             batch.report.begin()
         began, refined, start = 0, 0, time.perf_counter()
@@ -116,10 +120,9 @@ def run_batch(
     return BatchOutcome(summary=summary, stopped=began < len(to_do))
 
 
-def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[Planned]:
-    """Returns the frames that `run_batch` would do, and why; nothing is written."""
-    batch = _Batch(request, say)
-    return [Planned(frame.name, why) for frame, why in batch.to_do(check=False)]
+def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[tuple[str, str]]:
+    """Returns the names of the frames that `run_batch` would do, and why; nothing is written."""
+    return [(frame.name, why) for frame, why in _Batch(request, say).to_do()]
 
 
 class _Batch:
@@ -131,25 +134,24 @@ class _Batch:
     """
 
     def __init__(self, request: BatchRequest, say: Callable[[str], None]) -> None:
-        self.workers = ray_workers_of(request.refine.network.device, request.cluster)
+        refine = request.refine
+        self.workers = ray_workers_of(refine.network.device, request.cluster)
         if self.workers is not None:
-            refine = request.refine.with_fields(device=self.workers.device)
-            request = replace(request, refine=refine)
-        if self.workers is not None and request.sequence.warm_start:
-            raise UsageError(
-                "--warm-start refines frames in order, in one process; give each process a --shard"
-                " of the windows instead of --ray"
-            )
-        self.request, self._say, self.found = request, say, find_frames(request)
+            refine = refine.with_fields(device=self.workers.device)
+            if request.sequence.warm_start:
+                raise UsageError(
+                    "--warm-start refines frames in order, in one process; give each process a"
+                    " --shard of the windows instead of --ray"
+                )
+        if request.html_3d:
+            refine = refine.with_fields(view_3d=True)
+        self.request = request = replace(request, refine=refine)
+        self._say, self.found = say, find_frames(request)
         self.model = model_identity(request.refine)
         self.report = self._report()
         for note in self._notes():
             say(note)
-        self.state = self._new_state()
-
-    def _new_state(self) -> BatchState:
-        """The state as it is now; what changes later in a folder is not seen."""
-        return BatchState(self.request.output, self.model)
+        self.records = Records(request.output, self.model)
 
     def _report(self) -> BatchReport | None:
         """The report, if one is wanted. OutputError if it cannot or may not be written there."""
@@ -210,28 +212,18 @@ class _Batch:
         stack.enter_context(locked_folder(output, self.request.shard, clean))
         return output
 
-    def to_do(self, *, check: bool) -> list[tuple[Frame, str]]:
-        """Returns the frames that are to be done, and why, and says how many.
-
-        OutputError, if `check`, where a result would replace a file that no batch wrote.
-        """
-        state, chosen = self.state, self.found.chosen
-        if check:
-            state.check_replaceable(self.request.output / name for name in (CSV, JSON))
-
-        def reason(frame: Frame) -> tuple[Frame, str] | None:
-            task = task_of(self.request, frame)
-            why = state.reason_to_refine(task)
-            if why is not None and check:
-                state.check_replaceable(task.outputs.paths(), task.record)
-            return None if why is None else (frame, why)
-
-        to_do = [each for each in _read_in_parts(reason, chosen) if each is not None]
+    def to_do(self) -> list[tuple[Frame, str]]:
+        """Returns the frames that are to be done, and why, and says how many."""
+        records, chosen = self.records, self.found.chosen
+        reasons = _read_in_parts(
+            lambda frame: records.reason_to_refine(task_of(self.request, frame)), chosen
+        )
+        to_do = [(frame, why) for frame, why in zip(chosen, reasons, strict=True) if why]
         kinds = Counter(why.split(":")[0] for _, why in to_do)
-        reasons = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
+        counts = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
         frames, done = _count(len(chosen), "frame"), len(chosen) - len(to_do)
         if to_do:
-            self._say(f"{frames}: {done:,} done already, {len(to_do):,} to do ({reasons})")
+            self._say(f"{frames}: {done:,} done already, {len(to_do):,} to do ({counts})")
         else:
             self._say(f"{frames}, all of them done already")
         return to_do
@@ -241,25 +233,29 @@ class _Batch:
     ) -> Generator[Row, None, None]:
         """Refines frames in this process or on Ray workers; yields a row as each is done."""
         # these import torch, which a run with nothing to do does not need
-        from pnpdepth_cli.commands.batch.ray_workers import rows_of_workers
-        from pnpdepth_cli.commands.batch.running import opened_network, references_of, refine_tasks
+        from pnpdepth_cli.commands.batch import running
 
         request, say = self.request, listener.say
-        references = references_of(request, self.found.frames)
+        references = running.references_of(request, self.found.frames)
         worked = len(to_do) < len(self.found.chosen)
-        if self.workers is not None:
+        if references is None:
+            listener.begin(len(to_do))
+            yield from running.rows_of_unreadable(self._tasks(to_do), self.records)
+        elif self.workers is not None:
+            from pnpdepth_cli.commands.batch.ray_workers import rows_of_workers
+
             listener.begin(len(to_do))
             yield from rows_of_workers(
-                request, self.workers, references, to_do, self.state,
+                request, self.workers, references, to_do, self.records,
                 settings_worked=worked, say=say, stopped=stopped,
             )  # fmt: skip
-            return
-        with opened_network(request, references, say) as network:
-            listener.begin(len(to_do))
-            yield from refine_tasks(
-                self._tasks(to_do), network, self.state,
-                threads=request.workers, settings_worked=worked, stopped=stopped,
-            )  # fmt: skip
+        else:
+            with running.opened_network(request, references, say) as network:
+                listener.begin(len(to_do))
+                yield from running.refine_tasks(
+                    self._tasks(to_do), network, self.records,
+                    threads=request.workers, settings_worked=worked, stopped=stopped,
+                )  # fmt: skip
 
     def _tasks(self, to_do: list[Frame]) -> Iterator[Task]:
         """The frames to refine in their order, and within windows those that they begin with."""
@@ -275,14 +271,19 @@ class _Batch:
 
     def summarise(self, local: Path, profile: dict[str, Any]) -> dict[str, Any]:
         """Writes the summaries and the report; returns the summary without its frames."""
-        request, state, tally = self.request, self._new_state(), Tally()
+        request, tally = self.request, Tally()
         refused = (failed_row(frame.name, {}, why) for frame, why in self.found.refused)
-        known = _read_in_parts(lambda frame: state.row(task_of(request, frame)), self.found.frames)
-        with tempfile.TemporaryFile("w+", dir=local, encoding="utf-8") as file:
+        known = _read_in_parts(
+            lambda frame: self.records.row(task_of(request, frame)), self.found.frames
+        )
+        with tempfile.TemporaryFile("w+", dir=local, **TEXT) as file:
             for row in itertools.chain(refused, known):
                 if row is not None:
-                    tally.add(row)
-                    file.write(json.dumps(row) + "\n")
+                    try:
+                        tally.add(row)
+                    except DAMAGED as error:
+                        raise damaged(request.output / f"{row['name']}.json") from error
+                    file.write(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n")
             summary = self._head(tally)
             if request.profile:
                 summary["profile"] = profile
@@ -291,7 +292,7 @@ class _Batch:
                 file.seek(0)
                 return map(json.loads, file)
 
-            write_summaries(local, summary, rows(), tally.baseline_names)
+            write_summaries(local, summary, file, list(tally.baselines))
             if self.report is not None:
                 self.report.write(summary, rows)
         if isinstance(request.output, RemotePath):
@@ -320,13 +321,11 @@ class _Batch:
                 "with_warnings": tally.warned,
             },
             "unit": tally.unit,
-            "mean": tally.mean(),
-            "linear": tally.mean_linear(),
-            "baselines": tally.mean_baselines(),
+            **tally.means(),
             "unmatched": [str(each) for each in found.unmatched],
         }
         if tally.unsure:
-            head["unsure"] = tally.unsure
+            head["unsure"] = list(tally.unsure)
         if request.sequence != SequenceOptions():
             head["sequence"] = plain(asdict(request.sequence))
         return head

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
 
-from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.sequence import (
     check_warm_start,
     in_windows,
@@ -21,7 +19,9 @@ from pnpdepth_cli.commands.batch.sequence import (
 from pnpdepth_cli.commands.batch.summary import CSV, JSON
 from pnpdepth_cli.commands.refinement.output_files import Outputs
 from pnpdepth_cli.commands.refinement.request import FrameFiles, NeighbourFiles, RefineRequest
+from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.io.bags.bag import is_bag
 from pnpdepth_cli.io.colmap.reading import model_files
 from pnpdepth_cli.io.dataset.frame import (
     SCAN_ONLY_SUFFIXES,
@@ -35,10 +35,6 @@ from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
 from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.remote.address import RemotePath
-
-Item = TypeVar("Item")
-REGISTERING = 16
-"""Frames that decide together how images are moved into the frame of the points."""
 
 _LISTS = (".csv", ".jsonl")
 _IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"
@@ -77,6 +73,48 @@ class Task:
         """The record of the results, which is the last file that is written."""
         assert self.outputs.record is not None
         return self.outputs.record
+
+
+def unpacked(
+    request: BatchRequest,
+    options: BagOptions,
+    say: Callable[[str], None],
+    *,
+    may_write: bool = True,
+) -> BatchRequest:
+    """Returns the request with the frames of its bag as source; any other request as it is.
+
+    The frames are written to OUTPUT_frames, and stay there for the next run. Their poses are used
+    where points are accumulated and no others are given.
+
+    Raises:
+        UsageError: Options of a bag are given for another source, or the frames are not written
+            yet and may not be.
+    """
+    if not is_bag(request.source):
+        if options != BagOptions():
+            raise UsageError(f"{request.source} is no bag; leave out --topics and --tolerance")
+        return request
+    from pnpdepth_cli.commands.sparse.frames import (
+        POSES_FILE,
+        FramesRequest,
+        write_frames,
+        written_before,
+    )
+
+    folder = request.output.with_name(f"{request.output.name}_frames")
+    frames = FramesRequest(
+        bag=request.source, output=folder, options=options, limit=request.limit, overwrite=True
+    )
+    if not written_before(frames):
+        if not may_write:
+            raise UsageError(f"--dry-run writes nothing; run `pnpdepth frames {request.source}`")
+        record = write_frames(frames, say)
+        say(f"bag: wrote {record['frames']:,} frames to {folder}")
+    sequence, poses = request.sequence, folder / POSES_FILE
+    if sequence.accumulate and sequence.poses is None and poses.is_file():
+        sequence = replace(sequence, poses=poses)
+    return replace(request, source=folder, sequence=sequence)
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:
@@ -138,11 +176,9 @@ def _chosen(request: BatchRequest, frames: list[Frame]) -> list[Frame]:
     return [frame for window in windows for frame in window]
 
 
-def task_of(request: BatchRequest, frame: Frame) -> Task:
+def task_of(request: FrameSelection, frame: Frame) -> Task:
     """Returns the frame's task; options of the user go before what the data set states."""
     refine = request.refine
-    if request.html_3d:
-        refine = refine.with_fields(view_3d=True)
     needs_camera = refine.outputs.needs_camera or bool(frame.neighbours)
     files = _files_of(request, frame, needs_camera=needs_camera)
     neighbours = (
@@ -164,7 +200,7 @@ def task_of(request: BatchRequest, frame: Frame) -> Task:
     )
 
 
-def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> FrameFiles:
+def _files_of(request: FrameSelection, frame: Frame, *, needs_camera: bool) -> FrameFiles:
     """The files of a frame, without its neighbours and window."""
     base = request.refine.files
     sparse = frame.sparse if base.sample is None else None
@@ -194,19 +230,6 @@ def _files_of(request: BatchRequest, frame: Frame, *, needs_camera: bool) -> Fra
         scan=scan,
         protocol=protocol,
     )
-
-
-def reference_frames(frames: Sequence[Item], first: int) -> list[Item]:
-    """Returns the frames behind the first readable one that decide input ranges with it."""
-    count = len(frames) - first - 1
-    return [frames[first + 1 + i] for i in sorted({count // 2, count - 1})] if count else []
-
-
-def registering(frames: Sequence[Item], first: int) -> list[Item]:
-    """Returns the frames, the first readable one among them, that decide the registration."""
-    count = len(frames) - first
-    chosen = {first + i * (count - 1) // (REGISTERING - 1) for i in range(REGISTERING)}
-    return [frames[i] for i in sorted(chosen)]
 
 
 def _reads_scan(files: FrameFiles, sparse: Path | None, gt: Source | None) -> bool:
@@ -295,42 +318,25 @@ def _with_own_files(
     Names that differ in Unicode normalisation only are one file on macOS.
     """
     endings = [path.name for path in Outputs.in_folder(Path(), "", refine).paths()]
-    pairs = itertools.permutations(endings, 2)
-    between = tuple({one.removesuffix(two) for one, two in pairs if one.endswith(two)})
-    of_summary = {own.removesuffix(each) for own in (CSV, JSON) for each in endings}
-    names, seen = {_normalised(frame.name) for frame in frames}, set[str]()
-
-    def problem(name: str) -> str | None:
-        if why := name_problem(name):
-            return why
-        if name in seen:
-            return "is that of another frame"
-        top, slash, _ = name.partition("/")
-        if name in of_summary or (slash and (top in (CSV, JSON) or fnmatch(top, LOCKS))):
-            return "needs a file of the batch's own"
-        if not slash and not name.endswith(between):
-            return None
-        folders = [str(parent) for parent in PurePosixPath(name).parents] if slash else []
-        clashes = itertools.product([name], between), itertools.product(folders, endings)
-        for path, ending in itertools.chain(*clashes):
-            if path.endswith(ending) and path.removesuffix(ending) in names:
-                return f"needs a file of frame {one_line(path.removesuffix(ending))!r}"
-        return None
-
+    owners = dict.fromkeys((CSV, JSON), "the summary")  # of files, and of folders with results
+    folders = dict[str, str]()
     kept, refused = list[Frame](), list[tuple[Frame, str]]()
     for frame in frames:
-        name = _normalised(frame.name)
-        why = problem(name)
-        seen.add(name)
-        if why is None:
-            kept.append(frame)
-        else:
-            refused.append((frame, f"the name {one_line(frame.name)!r} {why}; rename it"))
+        name, shown = unicodedata.normalize("NFC", frame.name), one_line(frame.name)
+        files = [name + ending for ending in endings]
+        above = [str(folder) for folder in PurePosixPath(name).parents][:-1] if "/" in name else []
+        other = next(filter(None, map(owners.get, (*files, *above))), None)
+        other = other or next(filter(None, map(folders.get, files)), None)
+        why = name_problem(name) or (f"needs a file of {other}" if other else None)
+        if why is None and above and fnmatch(above[-1], LOCKS):
+            why = "needs a file of the lock"
+        if why is not None:
+            refused.append((frame, f"the name {shown!r} {why}; rename it"))
+            continue
+        kept.append(frame)
+        owners |= dict.fromkeys(files, f"frame {shown!r}")
+        folders |= dict.fromkeys(above, f"frame {shown!r}")
     return kept, refused
-
-
-def _normalised(name: str) -> str:
-    return unicodedata.normalize("NFC", name)
 
 
 def _is_inside(path: Path, folder: Path) -> bool:

@@ -19,9 +19,9 @@ _ADDRESS = re.compile(r"(ray://)?[^/]+:\d+")
 def parse_shard(text: str) -> tuple[int, int]:
     """Returns (I, N) of `I/N`. Raises UsageError for any other text."""
     number, slash, of = text.partition("/")
-    if not (slash and number.isdecimal() and of.isdecimal()):
-        raise UsageError(f"shard {text!r} is not of the form I/N, such as 1/4")
-    return int(number), int(of)
+    if slash and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of):
+        return int(number), int(of)
+    raise UsageError(f"--shard must be I/N with I from 1 to N, such as 1/4, got {text}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class FrameSelection:
         "Crop and depth range of the frames.  [default: the layout's own]",
         choices=FRAME_PROTOCOLS,
     )
-    limit: int | None = option(None, "Only the first N frames.", metavar="N")
+    limit: int | None = option(None, "Only the first N frames.", metavar="N", least=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +54,7 @@ class SequenceOptions:
         "Add the points of the N frames before and after, moved by the camera's poses or, without"
         " poses, by its motion as estimated from images or scans.",
         metavar="N",
+        least=0,
     )
     poses: Path | None = option(
         None,
@@ -68,8 +69,6 @@ class SequenceOptions:
     )
 
     def __post_init__(self) -> None:
-        if self.accumulate < 0:
-            raise UsageError(f"--accumulate must be 0 or more, got {self.accumulate}")
         if self.warm_start < 0 or self.warm_start == 1:
             raise UsageError(f"--warm-start must be a window of 2 or more, got {self.warm_start}")
         if self.poses is not None and not self.accumulate:
@@ -124,6 +123,7 @@ class BatchRequest(FrameSelection):
         2,
         "Number of threads that read, and of threads that write.",
         metavar="N",
+        least=1,
         show_default=True,
     )
     html: Path | None = option(
@@ -141,6 +141,7 @@ class BatchRequest(FrameSelection):
         "Frames of one size that go through a fixed network together; more than 1 changes the last"
         " bits of the results.",
         metavar="N",
+        least=1,
         show_default=True,
     )
     shard: tuple[int, int] | None = option(
@@ -153,21 +154,8 @@ class BatchRequest(FrameSelection):
     """The Ray workers, if any."""
 
     def __post_init__(self) -> None:
-        from pnpdepth_cli.io.dataset.protocols import find_protocol
-
         if self.html_3d and self.html is None:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
-        counts = {"workers": self.workers, "batch-size": self.batch_size, "limit": self.limit}
-        for name, count in counts.items():
-            if count is not None and count < 1:
-                raise UsageError(f"--{name} must be 1 or more, got {count}")
-        if self.shard is not None and not 1 <= self.shard[0] <= self.shard[1]:
-            number, of = self.shard
-            raise UsageError(
-                f"--shard must be I/N with I from 1 to N, such as 1/4, got {number}/{of}"
-            )
-        if self.protocol is not None:
-            find_protocol(self.protocol)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,20 +9,19 @@ from __future__ import annotations
 import functools
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from pnpdepth_cli.commands.batch.frames import Task, reference_frames, registering, task_of
-from pnpdepth_cli.commands.batch.reading import read_frame, read_task
+from pnpdepth_cli.commands.batch.frames import Task, task_of
+from pnpdepth_cli.commands.batch.records import Records, Row
 from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.batch.state import BatchState, Row
 from pnpdepth_cli.commands.ordered_pool import in_order
-from pnpdepth_cli.commands.refinement.inputs import Inputs
+from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.refine import load_refiner, write_refined
 from pnpdepth_cli.commands.stopwatch import Stopwatch
 from pnpdepth_cli.errors import (
@@ -36,10 +35,53 @@ from pnpdepth_cli.errors import (
 from pnpdepth_cli.frames.frame import Refined, WarmStart
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.dataset.frame import Frame
-from pnpdepth_cli.io.fingerprint import Fingerprint
+from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
+from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote.store import local_files, renamed
 
+Item = TypeVar("Item")
+REGISTERING = 16
+"""Frames that decide together how images are moved into the frame of the points."""
 _ROUNDING = 1e-3
 """A larger relative difference of plain predictions is more than rounding."""
+
+
+def read_frame(task: Task, known: dict[str, Fingerprint] | None = None) -> Inputs:
+    """Returns the contents of a frame's files, those in a store through local copies.
+
+    Names in records and messages are those of the task, not of copies.
+
+    Args:
+        task: The frame.
+        known: Gets the fingerprints of the files, by part.
+
+    Raises:
+        PnpDepthError: As of `read_inputs` and `local_files`.
+    """
+    with local_files(task.inputs.values()) as copies:
+        if known is not None:
+            known |= {part: fingerprint(p, copies.get(p)) for part, p in task.inputs.items()}
+        if not copies:
+            return read_inputs(task.request)
+        names = {str(copy): str(path) for path, copy in copies.items()}
+        try:
+            inputs = read_inputs(_with_copies(task.request, copies))
+        except PnpDepthError as error:
+            raise type(error)(renamed(str(error), names)) from error
+        texts = {"record": renamed(inputs.record, names), "notes": renamed(inputs.notes, names)}
+        return replace(inputs, **texts)
+
+
+def _with_copies(value: Any, copies: Mapping[Path, Path]) -> Any:
+    """The request with the copies in the positions of the files in a store."""
+    if isinstance(value, RemotePath):
+        return copies.get(value, value)
+    if isinstance(value, tuple):
+        return tuple(_with_copies(item, copies) for item in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        names = [field.name for field in fields(value) if field.init]
+        return replace(value, **{n: _with_copies(getattr(value, n), copies) for n in names})
+    return value
 
 
 class References(NamedTuple):
@@ -66,26 +108,30 @@ def references_of(request: BatchRequest, frames: Sequence[Frame]) -> References 
     return None
 
 
+def reference_frames(frames: Sequence[Item], first: int) -> list[Item]:
+    """Returns the frames behind the first readable one that decide input ranges with it."""
+    count = len(frames) - first - 1
+    return [frames[first + 1 + i] for i in sorted({count // 2, count - 1})] if count else []
+
+
+def registering(frames: Sequence[Item], first: int) -> list[Item]:
+    """Returns the frames, the first readable one among them, that decide the registration."""
+    count = len(frames) - first
+    chosen = {first + i * (count - 1) // (REGISTERING - 1) for i in range(REGISTERING)}
+    return [frames[i] for i in sorted(chosen)]
+
+
 @contextmanager
 def opened_network(
-    request: BatchRequest, references: References | None, say: Callable[[str], None]
-) -> Iterator[OpenNetwork | None]:
+    request: BatchRequest, references: References, say: Callable[[str], None]
+) -> Iterator[OpenNetwork]:
     """Yields the network, resolved on the frames that decide, open for any number of frames.
 
     Args:
         request: The batch.
-        references: Of `references_of`; None yields None.
+        references: Of `references_of`.
         say: Receives what was decided.
     """
-    if references is None:
-        yield None
-        return
-    refiner = _load(request, references, say)
-    with refiner:
-        yield OpenNetwork(refiner, request.batch_size, say)
-
-
-def _load(request: BatchRequest, references: References, say: Callable[[str], None]) -> Refiner:
     task = task_of(request, references.first)
     first = read_frame(task)
     for note in first.notes:
@@ -116,7 +162,8 @@ def _load(request: BatchRequest, references: References, say: Callable[[str], No
             f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
             f" updates of z ({s.update}, {s.loss}, step {s.lr})"
         )
-    return refiner
+    with refiner:
+        yield OpenNetwork(refiner, request.batch_size, say)
 
 
 def _readable(task: Task) -> Inputs | None:
@@ -146,8 +193,8 @@ class FrameInMemory:
 
 def refine_tasks(
     tasks: Iterable[Task],
-    network: OpenNetwork | None,
-    state: BatchState,
+    network: OpenNetwork,
+    records: Records,
     *,
     threads: int,
     settings_worked: bool,
@@ -157,8 +204,8 @@ def refine_tasks(
 
     Args:
         tasks: The frames to refine.
-        network: The network; None if no frame could be read.
-        state: Writes the results.
+        network: The network.
+        records: Writes the results.
         threads: Number of threads that read, and of threads that write.
         settings_worked: True if a frame was refined with these settings before.
         stopped: True if no further frame is to be begun.
@@ -184,7 +231,7 @@ def refine_tasks(
                     yield frame
 
     def written(frame: FrameInMemory) -> Row:
-        return _write(frame, network, state)
+        return _write(frame, network.refiner, records)
 
     with (
         closing(in_order(_read, tasks, threads)) as reading,
@@ -193,9 +240,15 @@ def refine_tasks(
         yield from rows
 
 
-def _groups(
-    frames: Iterable[FrameInMemory], network: OpenNetwork | None
-) -> Iterator[list[FrameInMemory]]:
+def rows_of_unreadable(tasks: Iterable[Task], records: Records) -> Iterator[Row]:
+    """Writes for each task why it cannot be read; yields the summary's rows."""
+    for task in tasks:
+        result = _read(task).result
+        later = InputError("no frame could be read when the batch began; run it again")
+        yield records.fail(task, _message(result if isinstance(result, Exception) else later))
+
+
+def _groups(frames: Iterable[FrameInMemory], network: OpenNetwork) -> Iterator[list[FrameInMemory]]:
     """The frames in their order, in groups of those that go through the network together.
 
     A frame that could not be read is in the group of those before it.
@@ -207,23 +260,18 @@ def _groups(
             yield group
             group = []
         group.append(frame)
-        if network is None or len(group) >= network.batch_size:
+        if len(group) >= network.batch_size:
             yield group
             group = []
     if group:
         yield group
 
 
-def _refine(group: Sequence[FrameInMemory], network: OpenNetwork | None) -> None:
+def _refine(group: Sequence[FrameInMemory], network: OpenNetwork) -> None:
     """Sets the results of the frames that were read."""
     frames = [frame for frame in group if frame.inputs is not None]
     start = time.perf_counter()
-    results: Sequence[Refined | Exception]
-    if network is None:
-        error = InputError("no frame could be read when the batch began; run it again")
-        results = [error] * len(frames)
-    else:
-        results = network.refine([frame.inputs for frame in frames if frame.inputs is not None])
+    results = network.refine([frame.inputs for frame in frames if frame.inputs is not None])
     for frame, result in zip(frames, results, strict=True):
         frame.watch.add("refine", (time.perf_counter() - start) / len(frames))
         frame.result = result
@@ -259,25 +307,19 @@ class OpenNetwork:
     def _together(self, group: Sequence[Inputs]) -> list[Refined | Exception]:
         """The frames refined in one pass. PnpDepthError if the network does not take them so."""
         frames = self.refiner.refine_together(group)
-        if not self._checked:
-            self._check_independent(group[0], frames[0])
+        first, alone = frames[0], None if self._checked else self._alone(group[0])
+        if isinstance(alone, Refined) and isinstance(first, Refined):
+            self._checked = True
+            split = self.refiner.split
+            if split is None or not split.static_graph:
+                raise BatchError("the network's control flow depends on image values")
+            if not np.allclose(alone.before, first.before, rtol=_ROUNDING, atol=0):
+                raise BatchError("frames that go together influence each other")
         note = f"refined together with {len(group) - 1} others, which alters the last bits"
         return [
             replace(frame, notes=(*frame.notes, note)) if isinstance(frame, Refined) else frame
             for frame in frames
         ]
-
-    def _check_independent(self, inputs: Inputs, together: Refined | PnpDepthError) -> None:
-        """Raises BatchError if the frames of a group influence each other."""
-        alone = self._alone(inputs)
-        if not isinstance(alone, Refined) or not isinstance(together, Refined):
-            return
-        self._checked = True
-        split = self.refiner.split
-        if split is None or not split.static_graph:
-            raise BatchError("the network's control flow depends on image values")
-        if not np.allclose(alone.before, together.before, rtol=_ROUNDING, atol=0):
-            raise BatchError("frames that go together influence each other")
 
     def _alone(self, inputs: Inputs) -> Refined | Exception:
         try:
@@ -296,29 +338,29 @@ def _read(task: Task) -> FrameInMemory:
     frame = FrameInMemory(task=task)
     try:
         with frame.watch("read"):
-            frame.inputs, frame.fingerprints = read_task(task)
+            frame.inputs = read_frame(task, frame.fingerprints)
     except Exception as error:  # concerns this frame only
         frame.result = error
     return frame
 
 
-def _write(frame: FrameInMemory, network: OpenNetwork | None, state: BatchState) -> Row:
+def _write(frame: FrameInMemory, refiner: Refiner, records: Records) -> Row:
     """Writes a frame's results, or why there are none; returns the summary's row."""
     inputs, result = frame.inputs, frame.result
-    if isinstance(result, Refined) and network is not None and inputs is not None:
-        refiner = network.refiner
+    if isinstance(result, Refined) and inputs is not None:
+        refined = result
         try:
-            return state.write(
+            return records.write(
                 frame.task,
                 frame.fingerprints,
-                lambda outputs: write_refined(outputs, refiner, inputs, result, frame.watch),
+                lambda outputs: write_refined(outputs, refiner, inputs, refined, frame.watch),
             )
         except StorageError:
             raise
         except Exception as error:
-            return state.fail(frame.task, _message(error))
+            result = error
     assert isinstance(result, Exception)
-    return state.fail(frame.task, _message(result))
+    return records.fail(frame.task, _message(result))
 
 
 def _message(error: Exception) -> str:

@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain
 
+Row = Mapping[str, Any]
+"""What the summary says of a frame."""
+# a file name that is no UTF-8 has surrogates; JSON escapes them so
+TEXT: Any = {"encoding": "utf-8", "errors": "backslashreplace", "newline": "\n"}
+"""How files of the summary are opened."""
 CSV, JSON = "summary.csv", "summary.json"
 
 _POINT_ERRORS = ("mae", "rmse")
@@ -28,7 +33,6 @@ _MEASURED = {
 _OF_LINEAR = ("scores", "held_out_error")
 _RUN_STAGES = ("read", "refine", "write")
 _CHECKED = {"before": "aligned", "after": "result", "linear": "linear"}
-BASELINE_MEASURES = ("held_out_mae", "mae", "rmse")
 _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 
 
@@ -101,19 +105,19 @@ class Tally:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter({"done": 0, "diverged": 0, "failed": 0})
         self.warned = 0
-        self.unsure: list[str] = []
+        self.unsure: dict[str, None] = {}
         """What was guessed of the network and may be wrong, each once."""
+        self.baselines: defaultdict[str, _Means] = defaultdict(_Means)
+        """Errors of the baselines, in the order of the records."""
         self._units: set[str] = set()
         self._compared, self._worse = 0, 0
         self._means: defaultdict[tuple[str, str], _Means] = defaultdict(_Means)
-        self._baselines: defaultdict[str, _Means] = defaultdict(_Means)
-        self._check = _Means()
 
-    def add(self, row: Mapping[str, Any]) -> None:
+    def add(self, row: Row) -> None:
         """Adds one row."""
         self.counts[row["status"]] += 1
         self.warned += bool(row.get("warnings"))
-        self.unsure += [note for note in row.get("unsure", ()) if note not in self.unsure]
+        self.unsure |= dict.fromkeys(row.get("unsure", ()))
         self._units |= {row["unit"]} if "unit" in row else set()
         for key, values in _measured(row).items():
             self._means[key].add(values)
@@ -124,52 +128,40 @@ class Tally:
         if linear.get("worse") is not None:
             self._compared += 1
             self._worse += linear["worse"]
-            if linear.get("check"):
-                self._check.add({key: linear["check"][name] for key, name in _CHECKED.items()})
+            if check := linear.get("check"):
+                self._means["check", ""].add({key: check[name] for key, name in _CHECKED.items()})
         for name, entry in (row.get("baselines") or {}).items():
-            self._baselines[name].add(_of_baseline(entry))
+            self.baselines[name].add(_of_baseline(entry))
 
     @property
     def unit(self) -> str:
         """The unit of all depths."""
         return " and ".join(sorted(self._units)) or "m"
 
-    @property
-    def baseline_names(self) -> list[str]:
-        """The baselines of any row, in the order of the records."""
-        return list(self._baselines)
+    def means(self) -> dict[str, Any]:
+        """Returns the means of the results, of linear interpolation and of the baselines.
 
-    def mean(self) -> dict[str, Any]:
-        """Returns {"scores": {"frames": 9, "before": {"rmse": …}, …}, …}; None without frames."""
-        means: dict[str, Any] = {}
+        "mean" has {"scores": {"frames": 9, "before": {"rmse": …}, …}, …}, or None without frames;
+        "linear" also how many frames are worse, and the errors of all at the hidden points.
+        """
+        mean: dict[str, Any] = {}
         for kind in _MEASURED:
             before, after = self._means[kind, "before"], self._means[kind, "after"]
             frames = max(before.frames, after.frames)
             both = {"frames": frames, "before": before.values(), "after": after.values()}
-            means[kind] = both if frames else None
-        return means
-
-    def mean_linear(self) -> dict[str, Any]:
-        """Returns the means of linear interpolation's scores, and how many frames are worse.
-
-        "check" has the mean errors of all three at the hidden points.
-        """
-        return {
+            mean[kind] = both if frames else None
+        check = self._means["check", ""]
+        linear = {
             **{kind: self._means[kind, "linear"].values() for kind in _OF_LINEAR},
-            "check": self._check.values() | {"frames": self._check.frames}
-            if self._check.frames
-            else None,
+            "check": check.values() | {"frames": check.frames} if check.frames else None,
             "frames": self._compared,
             "worse": self._worse,
         }
-
-    def mean_baselines(self) -> dict[str, dict[str, Any]] | None:
-        """Returns {"linear": {"frames": 9, "held_out_mae": …, "mae": …, "rmse": …}, …}."""
-        means = self._baselines.items()
-        return {name: {"frames": mean.frames, **mean.values()} for name, mean in means} or None
+        baselines = {n: {"frames": m.frames, **m.values()} for n, m in self.baselines.items()}
+        return {"mean": mean, "linear": linear, "baselines": baselines or None}
 
 
-def _measured(row: Mapping[str, Any]) -> dict[tuple[str, str], dict[str, float | None]]:
+def _measured(row: Row) -> dict[tuple[str, str], dict[str, float | None]]:
     """The errors of a row by kind and stage."""
     return {
         (kind, stage): {measure: (row[kind][stage] or {}).get(measure) for measure in measures}
@@ -181,8 +173,8 @@ def _measured(row: Mapping[str, Any]) -> dict[tuple[str, str], dict[str, float |
 
 def _of_baseline(entry: Mapping[str, Any]) -> dict[str, float | None]:
     scores = entry.get("scores") or {}
-    measured = {"held_out_mae": entry.get("held_out_mae")}
-    return measured | {measure: scores.get(measure) for measure in ("mae", "rmse")}
+    errors = {measure: scores.get(measure) for measure in ("mae", "rmse")}
+    return {"held_out_mae": entry.get("held_out_mae"), **errors}
 
 
 def profile_of(seconds: Mapping[str, float], frames: int, wall_s: float) -> dict[str, Any]:
@@ -200,35 +192,30 @@ def profile_of(seconds: Mapping[str, float], frames: int, wall_s: float) -> dict
 
 
 def write_summaries(
-    folder: Path,
-    head: Mapping[str, Any],
-    rows: Iterable[Mapping[str, Any]],
-    baselines: Sequence[str],
+    folder: Path, head: Mapping[str, Any], rows: TextIO, baselines: Sequence[str]
 ) -> None:
     """Writes `summary.json`, the head with the rows as its list `frames`, and `summary.csv`.
 
-    The errors of the baselines make the last columns of the table.
+    Args:
+        folder: Where they are written.
+        head: The summary without its frames.
+        rows: A file opened as TEXT, with a row in each line as JSON.
+        baselines: Names of the baselines, whose errors make the last columns of the table.
     """
     text = json.dumps(plain(head), indent=2, ensure_ascii=False, allow_nan=False)
-    with (
-        atomic_path(folder / JSON) as json_path,
-        atomic_path(folder / CSV) as csv_path,
-        _text_file(json_path) as file,
-        _text_file(csv_path) as table,
-    ):
+    with atomic_path(folder / JSON) as path, path.open("w", **TEXT) as file:
         file.write(text.removesuffix("\n}") + ',\n  "frames": [')
-
-        def cells() -> Iterator[list[Any]]:
-            for number, row in enumerate(rows):
-                line = json.dumps(row, ensure_ascii=False, allow_nan=False)
-                file.write(f"{',' if number else ''}\n    {line}")
-                yield list(_columns(row, baselines).values())
-
-        write_csv(table, list(_columns(failed_row("", {}, ""), baselines)), cells())
+        rows.seek(0)
+        for number, line in enumerate(rows):
+            file.write(f"{',' if number else ''}\n    {line.removesuffix(chr(10))}")
         file.write("\n  ]\n}\n")
+    with atomic_path(folder / CSV) as path, path.open("w", **TEXT) as file:
+        header = list(_columns(failed_row("", {}, ""), baselines))
+        rows.seek(0)
+        write_csv(file, header, ([*_columns(json.loads(r), baselines).values()] for r in rows))
 
 
-def _columns(row: Mapping[str, Any], baselines: Sequence[str]) -> dict[str, Any]:
+def _columns(row: Row, baselines: Sequence[str]) -> dict[str, Any]:
     """The cells of a row by the name of their column; None where a row has no value."""
     points, seconds, measured = row.get("points") or {}, row.get("seconds") or {}, _measured(row)
     cells = {
@@ -248,10 +235,5 @@ def _columns(row: Mapping[str, Any], baselines: Sequence[str]) -> dict[str, Any]
     cells |= {f"seconds_{stage}": seconds.get(stage) for stage in _RUN_STAGES}
     for name in baselines:
         values = _of_baseline((row.get("baselines") or {}).get(name, {}))
-        cells |= {f"baseline_{name}_{measure}": values[measure] for measure in BASELINE_MEASURES}
+        cells |= {f"baseline_{name}_{measure}": value for measure, value in values.items()}
     return cells
-
-
-def _text_file(path: Path) -> Any:
-    # a file name that is no UTF-8 has surrogates; JSON escapes them so
-    return path.open("w", encoding="utf-8", errors="backslashreplace", newline="")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.commands.batch.frames import Task
-from pnpdepth_cli.commands.batch.settings import model_identity, settings_of
+from pnpdepth_cli.commands.batch.records import model_identity, settings_of
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.sweep.axes import Cell, values_of
 from pnpdepth_cli.commands.sweep.points import OWN, Sampling

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.commands.batch.reading import read_frame
+from pnpdepth_cli.commands.batch.running import read_frame
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.sweep.plan import Method, Run
 from pnpdepth_cli.commands.sweep.points import frame_points

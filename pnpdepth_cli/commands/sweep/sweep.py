@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.commands.batch.batch import Listener
-from pnpdepth_cli.commands.batch.frames import Task, find_frames, reference_frames, task_of
-from pnpdepth_cli.commands.batch.reading import read_frame
+from pnpdepth_cli.commands.batch.frames import Task, find_frames, task_of
 from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
+from pnpdepth_cli.commands.batch.running import read_frame, reference_frames
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.refinement.record import model_record
 from pnpdepth_cli.commands.refinement.refine import load_refiner

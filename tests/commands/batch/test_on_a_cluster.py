@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,10 +14,9 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.batch import ray_workers
+from pnpdepth_cli.commands.batch.records import remove_all_leftovers
 from pnpdepth_cli.commands.batch.request import ClusterOptions
-from pnpdepth_cli.commands.batch.state import remove_all_leftovers
 from pnpdepth_cli.errors import ClusterError
-from tests.commands.batch.ray_nodes import three_nodes
 from tests.commands.batches import (
     RecordingListener,
     add_frame,
@@ -39,8 +36,17 @@ DEADLY = "        if float(rgb.mean()) > 0.99:\n            import os\n         
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    with three_nodes() as nodes:
-        yield nodes
+    """Three nodes of one CPU each, which are addresses of loopback."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    from ray.cluster_utils import Cluster
+
+    node = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
+    head = {**node, "node_ip_address": "127.0.0.2", "include_dashboard": False}
+    nodes = Cluster(initialize_head=True, head_node_args=head)
+    for number in (3, 4):
+        nodes.add_node(**node, node_ip_address=f"127.0.0.{number}")
+    yield nodes
+    nodes.shutdown()
 
 
 @pytest.fixture(scope="module")
@@ -116,32 +122,6 @@ def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
     assert rows["bad"]["status"] == "failed"
     assert rows["bad"]["message"].startswith("its worker died 2 times")
     assert {row["status"] for name, row in rows.items() if name != "bad"} == {"done"}
-
-
-def test_a_killed_driver_is_resumed(cluster: Any, root: Path) -> None:
-    program = (
-        "import sys; from pathlib import Path\n"
-        "from tests.commands.batches import RecordingListener, batch\n"
-        "from pnpdepth_cli.commands.batch.request import ClusterOptions\n"
-        "class Telling(RecordingListener):\n"
-        "    def frame(self, row): print(row['name'], flush=True)\n"
-        "options = ClusterOptions(ray=sys.argv[2], ray_workers=1)\n"
-        "batch(Path(sys.argv[1]), Telling(), cluster=options)\n"
-    )
-    driver = subprocess.Popen(
-        [sys.executable, "-c", program, str(root), cluster.address],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    )  # fmt: skip
-    assert driver.stdout is not None
-    first = driver.stdout.readline().strip()
-    os.kill(driver.pid, signal.SIGKILL)
-    driver.wait()
-    driver.stdout.close()
-    assert (root / "out" / f"{first}.json").exists()
-    listener = RecordingListener()
-    batch(root, listener)
-    assert first not in listener.names
-    assert different(root) == []
 
 
 def test_what_is_wrong_with_a_cluster_is_an_error(

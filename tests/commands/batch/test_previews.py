@@ -7,46 +7,24 @@ from pathlib import Path
 
 from tests.commands.batches import RecordingListener, batch, pairs_on_disk
 
-IMAGES = ("preview", "improvement")
 
-
-def with_images(root: Path) -> set[str]:
-    """Frames with images; each has both or none."""
-    names = {
-        kind: {p.name.split("_")[0] for p in root.glob(f"out/*_{kind}.png")} for kind in IMAGES
-    }
-    assert names["preview"] == names["improvement"]
-    return names["preview"]
-
-
-def worse(root: Path) -> set[str]:
-    records = {p.stem: json.loads(p.read_text()) for p in root.glob("out/?.json")}
-    return {name for name, record in records.items() if record["linear"]["worse"]}
+def with_images(root: Path) -> list[set[str]]:
+    kinds = ("preview", "improvement", "depth")
+    return [{path.name[0] for path in root.glob(f"out/*_{kind}.png")} for kind in kinds]
 
 
 def test_all_frames_none_or_those_worse_than_linear_interpolation_have_images(
     tmp_path: Path,
 ) -> None:
-    root = pairs_on_disk(tmp_path, ("a", "b"))
+    root, report = pairs_on_disk(tmp_path / "frames", ("a", "b")), tmp_path / "report"
     batch(root)
-    assert with_images(root) == {"a", "b"}
+    assert with_images(root) == [{"a", "b"}] * 3
     batch(root, refine={"previews": "worst"})
-    assert with_images(root) == worse(root)
-    batch(root, refine={"previews": "none"})
-    assert with_images(root) == set()
-    assert {p.name for p in root.glob("out/*_depth.png")} == {"a_depth.png", "b_depth.png"}
-
-
-def test_a_batch_without_images_is_done_when_it_runs_again(tmp_path: Path) -> None:
-    root = pairs_on_disk(tmp_path, ("a", "b"))
-    batch(root, refine={"previews": "none"})
-    listener = RecordingListener()
-    batch(root, listener, refine={"previews": "none"})
-    assert listener.to_do == 0
-
-
-def test_the_report_has_frames_without_images(tmp_path: Path) -> None:
-    root, report = pairs_on_disk(tmp_path / "frames", ("a",)), tmp_path / "report"
-    batch(root, refine={"previews": "none"}, html=report)
-    assert (report / "index.html").exists()
+    records = {path.stem: json.loads(path.read_text()) for path in root.glob("out/?.json")}
+    worse = {name for name, record in records.items() if record["linear"]["worse"]}
+    assert with_images(root) == [worse, worse, {"a", "b"}]
+    for to_do in (2, 0):
+        listener = RecordingListener()
+        batch(root, listener, refine={"previews": "none"}, html=report)
+        assert (listener.to_do, with_images(root)) == (to_do, [set(), set(), {"a", "b"}])
     assert not list((report / "images").glob("*.jpg"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,13 +13,19 @@ import pytest
 
 from pnpdepth_cli.commands.batch.ray_workers import (
     check_node,
+    connected,
     reason_of,
     rows_of_actors,
     software,
 )
-from pnpdepth_cli.errors import ClusterError, ModelError, StorageError
+from pnpdepth_cli.commands.batch.request import (
+    LOCAL,
+    ClusterOptions,
+    parse_address,
+    ray_workers_of,
+)
+from pnpdepth_cli.errors import ClusterError, ModelError, StorageError, UsageError
 
-CAUSES = "Some common causes include: (1) the process was killed by the OOM killer"
 Refine = Callable[[Sequence[int], bool], list[dict[str, Any]]]
 
 
@@ -50,12 +58,8 @@ class Calls:
             raise RayTaskError(error) from None
 
 
-def actor(refine: Refine, starts: Callable[[], None] = lambda: None) -> Any:
-    ready = SimpleNamespace(remote=lambda: lambda: starts())
-    return SimpleNamespace(
-        ready=SimpleNamespace(options=lambda **_: ready),
-        refine=SimpleNamespace(remote=lambda *arguments: lambda: (refine(*arguments), ["note"])),
-    )
+def dies() -> None:
+    raise SystemExit
 
 
 def results(
@@ -64,21 +68,22 @@ def results(
     *,
     worked: bool = False,
     starts: Callable[[], None] = lambda: None,
-    **options: Any,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> tuple[dict[Any, Any], list[str]]:
-    """The result of each frame, which is a number, and the messages."""
+    """The row of each frame, which is a number, and the messages."""
     messages: list[str] = []
     to_do: Any = range(count)
-    given = list(
+    ready = SimpleNamespace(options=lambda **_: SimpleNamespace(remote=lambda: lambda: starts()))
+    refining = SimpleNamespace(remote=lambda *given: lambda: (refine(*given), ["note"]))
+    rows = list(
         rows_of_actors(
-            Calls(), [actor(refine, starts) for _ in range(3)], to_do,
-            worked=worked, say=messages.append,
+            Calls(), [SimpleNamespace(ready=ready, refine=refining) for _ in range(3)], to_do,
+            retries=2, worked=worked, say=messages.append, stopped=stopped,
             lost=lambda frame, why: {"name": frame, "status": "failed", "message": why},
-            **{"stopped": lambda: False, "retries": 2} | options,
         )
     )  # fmt: skip
-    by_frame = {row["name"]: row for row in given}
-    assert len(given) == len(by_frame), "a frame was reported twice"
+    by_frame = {row["name"]: row for row in rows}
+    assert len(rows) == len(by_frame), "a frame was reported twice"
     return by_frame, messages
 
 
@@ -86,22 +91,13 @@ def rows_of(frames: Sequence[int], failed: Sequence[int] = ()) -> list[dict[str,
     return [{"name": f, "status": "failed" if f in failed else "done"} for f in frames]
 
 
-def test_every_frame_has_its_row_and_a_note_is_said_once() -> None:
-    rows, messages = results(lambda frames, worked: rows_of(frames), 40)
-    assert sorted(rows) == list(range(40))
-    assert messages == ["note"]
-
-
-def test_a_frame_that_kills_its_workers_is_lost_and_no_other() -> None:
-    def refine(frames: Sequence[int], worked: bool) -> list[dict[str, Any]]:
-        if 17 in frames:
-            raise SystemExit
-        return rows_of(frames)
-
-    rows, messages = results(refine, 40)
+def test_a_frame_that_kills_its_workers_is_lost_and_no_other_and_a_note_is_said_once() -> None:
+    rows, messages = results(lambda frames, _: dies() if 17 in frames else rows_of(frames), 40)
     assert rows.pop(17)["message"].startswith("its worker died 3 times")
+    assert sorted(rows) == [number for number in range(40) if number != 17]
     assert {row["status"] for row in rows.values()} == {"done"}
     assert sum("Ray starts another one" in text for text in messages) == 4
+    assert messages.count("note") == 1
 
 
 def raising(bad: Sequence[int], error: Exception) -> Refine:
@@ -119,9 +115,6 @@ def test_an_error_of_the_settings_is_of_its_frame_alone_once_others_succeeded() 
     for worked, bad in ((False, [4]), (True, range(9))):
         rows, _ = results(raising(bad, ModelError("bad")), 9, worked=worked)
         assert [name for name in sorted(rows) if rows[name]["status"] == "failed"] == list(bad)
-
-
-def test_a_full_disk_ends_the_run_whatever_succeeded() -> None:
     with pytest.raises(StorageError, match="full"):
         results(raising([5], StorageError("full")), 9, worked=True)
 
@@ -139,9 +132,6 @@ def test_nothing_is_handed_out_once_stopped() -> None:
 
 
 def test_workers_that_do_not_start_end_the_run() -> None:
-    def dies() -> None:
-        raise SystemExit
-
     with pytest.raises(ClusterError, match="a worker died 100 times"):
         results(raising((), OSError()), 1, starts=dies)
 
@@ -163,11 +153,65 @@ def test_a_node_must_have_the_versions_of_the_driver_and_see_its_files(tmp_path:
             "ModuleNotFoundError: No module named 'torch'\n",
             "ModuleNotFoundError: No module named 'torch'",
         ),
-        ("ModuleNotFoundError: No module named 'pnpdepth_cli'", "pnpdepth is not installed on"),
         ("The actor died because its node has died. Node Id: 5", "its node is gone"),
         ("Task was killed due to the node running low on memory (OOM).", "out of memory"),
-        (f"Worker exit type: SYSTEM_ERROR. {CAUSES}", "its process ended unexpectedly"),
+        ("SYSTEM_ERROR. Some common causes include: (1) the OOM", "its process ended unexpectedly"),
     ],
 )
 def test_the_death_of_a_worker_in_a_few_words(text: str, reason: str) -> None:
-    assert reason_of(RuntimeError(text)).startswith(reason)
+    assert reason_of(RuntimeError(text)) == reason
+
+
+def connect(address: str) -> None:
+    workers = ray_workers_of("cpu", ClusterOptions(ray=address))
+    assert workers is not None
+    with connected(workers):
+        raise AssertionError("there is no cluster")
+
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UsageError, match=r"--ray needs Ray: pip install 'pnpdepth\[ray\]'"):
+        connect(LOCAL)
+
+
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_where_nothing_answers_is_an_error_at_once(scheme: str) -> None:
+    pytest.importorskip("ray")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        with pytest.raises(ClusterError, match=r"cannot be used: Connection refused; check the"):
+            connect(f"{scheme}127.0.0.1:{port}")
+
+
+def test_addresses_of_clusters_and_what_is_none() -> None:
+    for text in ("auto", "local", "host:6379", "ray://host:10001", "[::1]:6379"):
+        assert parse_address(text) == text
+    for text in ("frames/", "out", "ray://host", "a/b:1"):
+        with pytest.raises(UsageError, match="is no address of a Ray cluster"):
+            parse_address(text)
+
+
+@pytest.mark.parametrize(
+    ("device", "options", "expected"),
+    [
+        ("cuda:1", {}, None),
+        ("cuda:0,cuda:2", {}, (LOCAL, "cuda", (0, 2))),
+        ("all", {}, (LOCAL, "cuda", ())),
+        ("cpu", {"ray": "auto"}, ("auto", "cpu", ())),
+        ("cuda:1", {"ray_workers": 2}, "are of Ray workers; add --ray"),
+        ("cuda:0,cuda:0", {}, "name each GPU once"),
+        ("cuda,cuda", {}, "name each GPU once"),
+        ("cpu,cuda:0", {}, "workers run on cpu, cuda"),
+        ("mps,mps", {}, "workers run on cpu, cuda"),
+        ("cuda:0,cuda:1", {"ray": "auto"}, "take --device cuda, and --ray-workers 2"),
+    ],
+)
+def test_which_devices_are_workers(device: str, options: dict[str, Any], expected: Any) -> None:
+    if isinstance(expected, str):
+        with pytest.raises(UsageError, match=expected):
+            ray_workers_of(device, ClusterOptions(**options))
+        return
+    workers = ray_workers_of(device, ClusterOptions(**options))
+    assert (workers and (workers.address, workers.device, workers.indices)) == expected

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -133,58 +129,29 @@ def test_a_second_run_does_only_what_changed_in_the_store(root: Path, bucket: Bu
     assert [row["name"] for row in summary["frames"]] == list(NAMES)
 
 
-def test_a_killed_run_is_resumed_from_the_store_alone(
+def test_a_stopped_run_is_resumed_from_the_store_alone(
     root: Path, bucket: Bucket, tmp_path: Path
 ) -> None:
-    program = (
-        "import sys; from pathlib import Path\n"
-        "from pnpdepth_cli.io.remote.address import path_of\n"
-        "from tests.commands.batches import RecordingListener, batch\n"
-        "class Telling(RecordingListener):\n"
-        "    def frame(self, row):\n"
-        "        print(row['name'], flush=True)\n"
-        "        sys.stdin.read()\n"
-        "source, output = map(path_of, sys.argv[2:])\n"
-        "batch(Path(sys.argv[1]), Telling(), source=source, output=output, workers=1)\n"
-    )
-    address = bucket.address
-    killed = subprocess.Popen(
-        [sys.executable, "-c", program, str(root), f"{address}/drive/list.csv", f"{address}/out"],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-    )  # fmt: skip
-    assert killed.stdout is not None
-    first = killed.stdout.readline().strip()
-    os.kill(killed.pid, signal.SIGKILL)
-    killed.communicate()
+    stops = iter([False, True])
+    in_store(root, bucket, stopped=lambda: next(stops))
+    bucket.put("out/b_depth.png", b"of a run that was killed before it wrote the record")
+    bucket.client.delete_object(Bucket=bucket.name, Key="out/summary.json")
     listener = RecordingListener()
     in_store(root, bucket, listener)
-    assert first == "a"
-    assert first not in listener.names
-    assert any("done already" in text and " 0 done" not in text for text in listener.messages)
+    assert listener.names == ["b", "c", "d"]
     resumed = fetched(bucket, tmp_path / "resumed")
-    in_store(root, bucket, output=path_of(f"{address}/whole"))
+    in_store(root, bucket, output=path_of(f"{bucket.address}/whole"))
     bucket.fetch("whole", tmp_path / "whole")
     whole = {n: f for n, f in results(tmp_path / "whole").items() if n[0] != "."}
     assert without_names(resumed) == without_names(whole)
 
 
-def test_a_frame_whose_object_is_missing_is_named(root: Path, bucket: Bucket) -> None:
-    bucket.client.delete_object(Bucket=bucket.name, Key="drive/sparse/c.png")
-    listener = RecordingListener()
-    in_store(root, bucket, listener)
-    rows = {row["name"]: row for row in listener.rows}
-    assert {name: row["status"] for name, row in rows.items()} == {
-        "a": "done", "b": "done", "c": "failed", "d": "done",
-    }  # fmt: skip
-    assert rows["c"]["message"] == (
-        f"{bucket.address}/drive/sparse/c.png: no such object; check the address"
-    )
-
-
-def test_messages_of_readers_name_the_object(root: Path, bucket: Bucket) -> None:
+def test_frames_that_cannot_be_read_fail_with_the_name_of_the_object(
+    root: Path, bucket: Bucket
+) -> None:
     bucket.put("drive/rgb/a.png", b"no image")
     bucket.put("drive/rgb/b.png", b"x" * 2_000_000)
+    bucket.client.delete_object(Bucket=bucket.name, Key="drive/sparse/c.png")
     listener = RecordingListener()
     set_max_pixels(100_000)
     try:
@@ -192,8 +159,11 @@ def test_messages_of_readers_name_the_object(root: Path, bucket: Bucket) -> None
     finally:
         set_max_pixels(None)
     messages = {row["name"]: row["message"] for row in listener.rows}
-    assert messages["a"].startswith(f"{bucket.address}/drive/rgb/a.png ")
-    assert messages["b"].startswith(f"{bucket.address}/drive/rgb/b.png has 2,000,000 bytes, more ")
+    at = f"{bucket.address}/drive"
+    assert messages["a"].startswith(f"{at}/rgb/a.png ")
+    assert messages["b"].startswith(f"{at}/rgb/b.png has 2,000,000 bytes, more ")
+    assert messages["c"] == f"{at}/sparse/c.png: no such object; check the address"
+    assert messages["d"] is None
 
 
 def test_results_that_no_batch_wrote_are_replaced_only_if_asked(root: Path, bucket: Bucket) -> None:

@@ -48,21 +48,15 @@ def test_a_frame_begins_where_the_one_before_ended_and_a_window_anew(tmp_path: P
         assert of_windows[index]["sparse_error"]["before"] == alone[index]["sparse_error"]["before"]
 
 
-def test_the_bytes_do_not_depend_on_the_shards(tmp_path: Path) -> None:
-    root = drive_on_disk(tmp_path, frames=5)
+def test_a_shard_has_whole_windows_so_the_bytes_do_not_depend_on_it(tmp_path: Path) -> None:
+    root, listener = drive_on_disk(tmp_path, frames=5), RecordingListener()
     warm(root, length=2)
     whole = depths(root)
     without_results(root)
     for number in (2, 1):
-        warm(root, length=2, shard=(number, 2))
-    assert len(whole) == 5
+        warm(root, listener=listener, length=2, shard=(number, 2))
+    assert listener.names == [f"drive_00{number}" for number in (2, 3, 0, 1, 4)]
     assert depths(root) == whole
-
-
-def test_a_shard_has_whole_windows(tmp_path: Path) -> None:
-    root, listener = drive_on_disk(tmp_path, frames=5), RecordingListener()
-    warm(root, listener=listener, length=2, shard=(1, 2))
-    assert listener.names == ["drive_000", "drive_001", "drive_004"]
 
 
 def test_a_missing_result_is_made_again_from_the_start_of_its_window(tmp_path: Path) -> None:
@@ -74,11 +68,6 @@ def test_a_missing_result_is_made_again_from_the_start_of_its_window(tmp_path: P
     warm(root, listener=listener)
     assert listener.names == ["drive_002"]
     assert depths(root) == whole
-
-
-def test_a_change_of_a_frame_makes_the_rest_of_its_window_be_done_again(tmp_path: Path) -> None:
-    root = drive_on_disk(tmp_path, frames=5)
-    warm(root)
     image = cv2.imread(str(root / "rgb/drive_001.png"))
     cv2.imwrite(str(root / "rgb/drive_001.png"), 255 - image)
     listener = RecordingListener()

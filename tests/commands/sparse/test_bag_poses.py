@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from pnpdepth_cli.commands.batch.bags import unpacked
+from pnpdepth_cli.commands.batch.frames import unpacked
 from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.sparse.options import BagOptions

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.batch.frames import task_of
+from pnpdepth_cli.commands.batch.records import settings_of
 from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.batch.settings import settings_of
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError

@@ -18,30 +18,31 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.batch.frames import Task
-from pnpdepth_cli.commands.batch.settings import settings_of
-from pnpdepth_cli.commands.batch.summary import JSON, Tally, failed_row, row_of
+from pnpdepth_cli.commands.batch.summary import CSV, JSON, Row, failed_row, row_of
 from pnpdepth_cli.commands.refinement.output_files import Outputs
+from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
-from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.remote.address import RemotePath
 from pnpdepth_cli.io.remote.store import Listing, read_object, remove, renamed, upload
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.refinement.refine import RefineOutcome
 
-Row = dict[str, Any]
-NEW = "new"
 _ENTRY = "batch"
 _OWN_SUMMARY = b'{\n  "command": "batch"'
-_LOCK = ".batch.lock"
+_ONLY_IF_SET = {"window", "neighbours", "calibration"}
+DAMAGED = (AttributeError, IndexError, KeyError, TypeError)
+"""What a record that holds less than it should leads to."""
 
 
-class BatchState:
-    """What an output folder holds of a batch.
+class Records:
+    """The records in an output folder; what changes later in a listed folder is not seen.
 
     Args:
         output: The folder.
@@ -52,16 +53,28 @@ class BatchState:
         self.output, self.model = output, model
         self._last: tuple[dict[str, Any], str] | None = None
         self._listing = Listing()
-        names = self._listing.names(output)
-        self._is_ours = any(fnmatch(name, LOCKS) for name in names) or (
-            JSON in names and (_content(output / JSON) or b"").startswith(_OWN_SUMMARY)
-        )
+
+    def check_new(self, tasks: Iterable[Task]) -> None:
+        """Raises OutputError if no batch has written to the folder, and a result exists there."""
+        names_in = Listing().names
+        names = names_in(self.output)
+        if not names or any(fnmatch(name, LOCKS) for name in names):
+            return
+        if JSON in names and (_content(self.output / JSON) or b"").startswith(_OWN_SUMMARY):
+            return
+        results = (path for task in tasks for path in task.outputs.paths())
+        for path in (self.output / CSV, self.output / JSON, *results):
+            if path.name in names_in(path.parent):
+                raise OutputError(
+                    f"{path} exists, and no batch wrote it; --overwrite replaces such files, -o"
+                    " names another folder"
+                )
 
     def mark(self) -> None:
         """Marks a folder in a store as a batch's own; a lock does so on a disk."""
-        if isinstance(self.output, RemotePath) and not self._is_ours:
+        if isinstance(self.output, RemotePath):
             with tempfile.NamedTemporaryFile() as empty:
-                upload(Path(empty.name), self.output / _LOCK)
+                upload(Path(empty.name), self.output / LOCKS.replace("*", ""))
 
     def reason_to_refine(self, task: Task) -> str | None:
         """Returns why a frame is to be refined; None if it is done with its settings and files.
@@ -70,47 +83,27 @@ class BatchState:
         """
         names, files = self._listing.names(task.record.parent), task.outputs.by_kind()
         if task.record.name not in names:
-            return "interrupted" if any(path.name in names for path in files.values()) else NEW
-        entry = _entry(_record(task.record))
-        if entry is None:
-            return NEW
+            return "interrupted" if any(path.name in names for path in files.values()) else "new"
+        entry, digest = _entry(_record(task.record)), self._digest(task)
         if "failed" in entry:
             return "failed before"
-        if entry["settings"] != self._digest(task):
-            return "other settings"
-        if entry["inputs"].keys() != task.inputs.keys():
-            return "other input files"
-        for part, path in task.inputs.items():
-            try:
+        try:
+            if entry["settings"] != digest:
+                return "other settings"
+            if entry["inputs"].keys() != task.inputs.keys():
+                return "other input files"
+            for part, path in task.inputs.items():
                 known = Fingerprint(**entry["inputs"][part])
-            except TypeError:
-                return "record damaged"
-            if not is_unchanged(path, known, self._listing):
-                return f"input changed: {part}"
-        may_lack = task.outputs.optional()
-        for kind, path in files.items():
-            wanted = kind in entry["outputs"] or path not in may_lack
-            if wanted and path.name not in names:
-                return f"result missing: {path.name}"
+                if not is_unchanged(path, known, self._listing):
+                    return f"input changed: {part}"
+            may_lack = task.outputs.optional()
+            for kind, path in files.items():
+                wanted = kind in entry["outputs"] or path not in may_lack
+                if wanted and path.name not in names:
+                    return f"result missing: {path.name}"
+        except DAMAGED:
+            return "record damaged"
         return None
-
-    def check_replaceable(self, paths: Iterable[Path], record: Path | None = None) -> None:
-        """Raises OutputError if one of the files exists, and no batch wrote it.
-
-        Args:
-            paths: Files that are to be written.
-            record: The record among them. Without one, the others are of an interrupted run if the
-                folder is a batch's own.
-        """
-        for path in paths:
-            if path.name not in self._listing.names(path.parent):
-                continue
-            by_batch = _entry(_record(path)) is not None if path == record else self._is_ours
-            if not by_batch:
-                raise OutputError(
-                    f"{path} exists, and no batch wrote it; --overwrite replaces such files, -o"
-                    " names another folder"
-                )
 
     def row(self, task: Task) -> Row | None:
         """Returns the summary's row of a frame with its present settings; None if there is none.
@@ -120,14 +113,12 @@ class BatchState:
         """
         record = _record(task.record)
         entry = _entry(record)
-        if record is None or entry is None or entry["settings"] != self._digest(task):
+        if entry.get("settings") != self._digest(task):
             return None
         try:
-            row = _row(task, record, entry)
-            Tally().add(row)  # takes all that the summary takes
-        except (AttributeError, IndexError, KeyError, TypeError) as error:
-            raise FileFormatError(f"{task.record} is damaged; remove it, and run again") from error
-        return row
+            return _row(task, record, entry)
+        except DAMAGED as error:
+            raise damaged(task.record) from error
 
     def write(
         self,
@@ -148,11 +139,10 @@ class BatchState:
             outcome = write(replace(stage, record=None))
             staged = stage.by_kind()
             written = [*outcome.outputs.by_kind(), "record"]
-            paths = {kind: planned[kind].relative_to(self.output).as_posix() for kind in written}
             entry = {
                 "settings": self._digest(task),
-                "inputs": {part: each.as_record() for part, each in inputs.items()},
-                "outputs": paths,
+                "inputs": {part: known.as_record() for part, known in inputs.items()},
+                "outputs": {k: planned[k].relative_to(self.output).as_posix() for k in written},
             }
             record = {_ENTRY: entry} | outcome.record
             if isinstance(self.output, RemotePath):
@@ -186,6 +176,63 @@ class BatchState:
         return digest
 
 
+def damaged(record: Path) -> FileFormatError:
+    """Returns the error of a record that holds less than it should."""
+    return FileFormatError(f"{record} is damaged; remove it, and run again")
+
+
+def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> dict[str, Any]:
+    """Returns the settings that decide a frame's result, in JSON's own types.
+
+    The files of the frame, its calibration among them, are compared by their content elsewhere.
+
+    Args:
+        request: How the frame is refined.
+        model: The `model_identity` of the request.
+        *groups: Names of the request's groups. None: all of them.
+    """
+    fields = {
+        name: value
+        for name, value in request.settings(*groups).items()
+        if name != "more_models" and (value or name not in _ONLY_IF_SET)
+    }
+    if "neighbours" in fields:
+        fields["neighbours"] = [(other.motion, other.apart) for other in fields["neighbours"]]
+    if "device" in fields:  # devices of one kind give equal results, so shards may use one each
+        fields["device"] = fields["device"].split(":")[0]
+    settings: dict[str, Any] = plain(fields | model)
+    for name in ("calib", "extrinsics"):
+        settings.get("scan", {}).pop(name, None)
+    return settings
+
+
+def model_identity(request: RefineRequest) -> dict[str, Any]:
+    """Returns the program's version and the digests of the network's files.
+
+    A file's name with its :ATTRIBUTE or :OUTPUT counts; its folder does not.
+    """
+    network = request.network
+    identity = {
+        "version": __version__,
+        **_identity(network.model),
+        "checkpoint": None if network.checkpoint is None else sha256_of(network.checkpoint),
+    }
+    more = [_identity(spec) for spec in network.more_models]
+    return identity | ({"more_models": more} if more else {})
+
+
+def _identity(spec: str) -> dict[str, Any]:
+    path, colon, choice = Path(spec), "", ""
+    if not path.exists() and ":" in spec:
+        start, colon, choice = spec.rpartition(":")
+        path = Path(start)
+    files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
+    return {
+        "model": f"{path.name}{colon}{choice}" if files else spec,
+        "model_files": {p.name: sha256_of(p) for p in files},
+    }
+
+
 def remove_all_leftovers(output: Path) -> int:
     """Removes the half-written files of a killed run below the folder; returns how many."""
     try:
@@ -201,22 +248,19 @@ def _row(task: Task, record: Mapping[str, Any], entry: Mapping[str, Any]) -> Row
     return row_of(task.name, inputs, record, entry["outputs"])
 
 
-def _entry(record: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """What a batch says in a record; None if none wrote it."""
-    entry: Any = None if record is None else record.get(_ENTRY)
-    if not isinstance(entry, dict) or "settings" not in entry:
-        return None
-    whole = all(isinstance(entry.get(name), dict) for name in ("inputs", "outputs"))
-    return entry if whole or "failed" in entry else None
-
-
-def _record(path: Path) -> dict[str, Any] | None:
-    """The content of a record; None if there is none, or another file."""
+def _record(path: Path) -> dict[str, Any]:
+    """The content of a record; empty if there is none, or it is no JSON object."""
     try:
         record = json.loads(_content(path) or b"")
     except (ValueError, RecursionError):
-        return None
-    return record if isinstance(record, dict) else None
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def _entry(record: Mapping[str, Any]) -> dict[str, Any]:
+    """What a batch says in a record; empty if none wrote it."""
+    entry = record.get(_ENTRY)
+    return entry if isinstance(entry, dict) else {}
 
 
 def _content(path: Path) -> bytes | None:
