@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.models.weights import pickle_reader
 from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
 from pnpdepth_cli.models.weights.pickle_reader import StandIn
 from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_torch_file
@@ -199,16 +200,16 @@ BOMBS = {
 }
 LONG_BOMBS = {
     "a dict copied again and again": b"\x80\x02ccollections\nOrderedDict\nq\x00]("
-    + b"K\x01K\x02\x86" * 10**5
+    + b"K\x01K\x02\x86" * 10**3
     + b"eq\x01\x85q\x02R("
-    + b"h\x00h\x02R" * 10**5
+    + b"h\x00h\x02R" * 10**3
     + b"t.",
     "a long name joined again and again": b"\x80\x04"
     + LONG_NAME
     + b"q\x00h\x00\x93("
     + b"h\x00h\x00\x93" * 10**4
     + b"t.",
-    "steps without end": b"\x80\x02" + b"]0" * (4 * 10**6) + b"N.",
+    "steps without end": b"\x80\x02" + b"]0" * 10**5 + b"N.",
 }
 
 
@@ -221,10 +222,14 @@ def test_a_small_pickle_takes_no_time_and_no_memory(kind: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("kind", LONG_BOMBS)
-def test_a_pickle_of_many_steps_is_refused(kind: str, tmp_path: Path) -> None:
+def test_a_pickle_of_many_steps_is_refused(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pickle_reader, "MAX_STEPS", 10**5)
     path = archive_of(tmp_path / "bomb.pt", LONG_BOMBS[kind])
-    with little(megabytes=400, seconds=8):
-        refused(path)
+    with little(megabytes=20, seconds=3):
+        message = refused(path)
+    assert "without end" in message or "more than 100,000 steps" in message
 
 
 def test_a_length_that_no_file_has_is_refused_in_the_older_layout_too(tmp_path: Path) -> None:
@@ -283,14 +288,9 @@ def test_names_of_buffers_that_are_large_when_hashed_take_no_time() -> None:
         assert list(module_state(StandIn("a.B", state=state))) == ["kept"]
 
 
-def test_integers_too_long_to_print_are_no_names(tmp_path: Path) -> None:
-    path = save({10**7000: torch.ones(1), "epoch": 1}, tmp_path / "x.pt")
-    assert "no state dict; it holds int, epoch" in refused(path)
-
-
 @pytest.mark.parametrize(
     "opcode",
-    [b"\x82\x01", b"\x83\x01\x00", b"\x84\x01\x00\x00\x00", b"\x97", b"\x98", b"P1\n", b"\xff"],
+    [b"\x82\x01", b"\x83\x01\x00", b"\x97", b"\x98", b"P1\n", b"(ios\nsystem\n", b"\xff"],
 )
 def test_opcodes_of_extensions_and_of_things_outside_are_refused(
     opcode: bytes, tmp_path: Path
