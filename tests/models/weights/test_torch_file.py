@@ -120,11 +120,9 @@ def test_nothing_of_a_hostile_pickle_runs(tmp_path: Path, kind: str, how: str) -
 
 
 def test_the_hostile_pickles_do_run_where_torch_itself_reads_them(tmp_path: Path) -> None:
-    for kind in ("exec", "eval", "os.system"):
-        marker = tmp_path / kind
-        path = save({"x": hostile(marker)[kind]}, tmp_path / "bad.pt")
-        torch.load(path, weights_only=False)
-        assert marker.exists()
+    path = save({"x": hostile(tmp_path / "ran")["exec"]}, tmp_path / "bad.pt")
+    torch.load(path, weights_only=False)
+    assert (tmp_path / "ran").exists()
 
 
 @both_layouts
@@ -217,8 +215,10 @@ LONG_BOMBS = {
 def test_a_small_pickle_takes_no_time_and_no_memory(kind: str, tmp_path: Path) -> None:
     path = archive_of(tmp_path / "bomb.pt", BOMBS[kind], b"\0" * 4)
     assert path.stat().st_size < 2500
+    (tmp_path / "alone.pt").write_bytes(BOMBS[kind])
     with little(megabytes=50):
         refused(path)
+        refused(tmp_path / "alone.pt")
 
 
 @pytest.mark.parametrize("kind", LONG_BOMBS)
@@ -230,11 +230,6 @@ def test_a_pickle_of_many_steps_is_refused(
     with little(megabytes=20, seconds=3):
         message = refused(path)
     assert "without end" in message or "more than 100,000 steps" in message
-
-
-def test_a_length_that_no_file_has_is_refused_in_the_older_layout_too(tmp_path: Path) -> None:
-    (tmp_path / "x.pt").write_bytes(b"\x80\x05\x8d" + struct.pack("<Q", 2**62) + b"a.")
-    refused(tmp_path / "x.pt")
 
 
 def test_tensors_of_one_storage_use_the_same_memory(tmp_path: Path) -> None:
@@ -278,14 +273,6 @@ def test_modules_that_hold_themselves_again_and_again_are_refused() -> None:
     for module in (inner, ring):
         with pytest.raises(CheckpointError, match="without end"):
             module_state(module)
-
-
-def test_names_of_buffers_that_are_large_when_hashed_take_no_time() -> None:
-    buffers = {"fleeting": torch.ones(1), "kept": torch.ones(2)}
-    fleeting = [(), [], "fleeting", pickle.loads(NESTED + b".")]
-    state = {"_buffers": buffers, "_parameters": {}, "_non_persistent_buffers_set": fleeting}
-    with little():
-        assert list(module_state(StandIn("a.B", state=state))) == ["kept"]
 
 
 @pytest.mark.parametrize(
