@@ -7,7 +7,6 @@ network can be cut at it.
 
 from __future__ import annotations
 
-import graphlib
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -88,10 +87,6 @@ class OnnxNode(nn.Module):
         except Unsupported as error:
             reason = f"{self.node.op} with {error} is not covered"
             raise ModelError(f"ONNX node {self.node.name!r}: {reason}") from None
-
-    def extra_repr(self) -> str:
-        """Returns the operator, for `print(network)`."""
-        return self.node.op
 
 
 @dataclass(frozen=True)
@@ -252,55 +247,6 @@ def _check_operators(nodes: Sequence[Any], path: Path) -> None:
             " rounding has no gradient; use the file with float weights, or one where only weights"
             " are quantised"
         )
-
-
-def needed_nodes(model: Any, output: str, path: Path) -> bool:
-    """Leaves in the model that output and the nodes that it needs, each after those it reads.
-
-    The order is that of the file if possible; files converted to half precision are not in order.
-
-    Args:
-        model: An onnx.ModelProto, which is changed in place.
-        output: Name of the wanted output.
-        path: The file, for messages.
-
-    Returns:
-        Whether anything was left out.
-
-    Raises:
-        ModelError: A node reads a value that nothing gives, or nodes read each other in a circle.
-    """
-    graph = model.graph
-    nodes, outputs = list(graph.node), [o for o in graph.output if o.name == output]
-    known = {*(t.name for t in graph.initializer), *(i.name for i in graph.input)}
-    producer = {name: n for n, proto in enumerate(nodes) for name in proto.output if name}
-    reads: dict[int, set[int]] = {}
-    pending = [producer[output]] if output in producer else []
-    while pending:
-        n = pending.pop()
-        if n in reads:
-            continue
-        inputs = {name for name in nodes[n].input if name and name not in known}
-        absent = sorted(inputs - producer.keys())
-        if absent:
-            raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
-        reads[n] = {producer[name] for name in inputs}
-        pending += reads[n]
-    order = sorted(reads)
-    if any(before >= n for n, befores in reads.items() for before in befores):
-        try:
-            by_number = dict(sorted(reads.items()))
-            order = [*graphlib.TopologicalSorter(by_number).static_order()]
-        except graphlib.CycleError:
-            raise ModelError(f"ONNX file {path}: its nodes read each other in a circle") from None
-    pruned = len(order) < len(nodes) or len(outputs) < len(graph.output)
-    kept = type(graph)()
-    kept.node.extend(nodes[n] for n in order)
-    kept.output.extend(outputs)
-    graph.ClearField("node")
-    graph.ClearField("output")
-    graph.MergeFrom(kept)
-    return pruned
 
 
 def _names(nodes: Iterable[Any]) -> list[str]:

@@ -6,6 +6,7 @@ pnpdepth[onnx]`.
 
 from __future__ import annotations
 
+import graphlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
-from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph, needed_nodes
+from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph
 from pnpdepth_cli.models.formats.onnx.limits import inlined
 
 MISMATCH = 1e-3
@@ -45,7 +46,7 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
     channels_last = _channels_last(input_shape)
     height, width = input_shape[1:3] if channels_last else input_shape[2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
-    pruned = needed_nodes(model, chosen, file)
+    is_part = _pruned(model, chosen, file)
     return ModelDefinition(
         name=file.stem,
         input_kind="rgb",
@@ -63,8 +64,48 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         arguments=lambda rgb, _: (_as_input(rgb, channels_last),),
         output=_as_map,
         # From the file, onnxruntime reads weights that lie beside it.
-        verify=_FirstImageCheck(model.SerializeToString() if pruned else str(file), file),
+        verify=_FirstImageCheck(model.SerializeToString() if is_part else str(file), file),
     )
+
+
+def _pruned(model: Any, output: str, path: Path) -> bool:
+    """True if not all of the model was needed: in it stay that output and the nodes that it needs.
+
+    Each node comes after those it reads. The order is that of the file if possible; files converted
+    to half precision are not in order. ModelError if a node reads a value that nothing gives, or
+    nodes read each other in a circle.
+    """
+    graph = model.graph
+    nodes, outputs = list(graph.node), [o for o in graph.output if o.name == output]
+    known = {*(t.name for t in graph.initializer), *(i.name for i in graph.input)}
+    producer = {name: n for n, proto in enumerate(nodes) for name in proto.output if name}
+    reads: dict[int, set[int]] = {}
+    pending = [producer[output]] if output in producer else []
+    while pending:
+        n = pending.pop()
+        if n in reads:
+            continue
+        inputs = {name for name in nodes[n].input if name and name not in known}
+        absent = sorted(inputs - producer.keys())
+        if absent:
+            raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
+        reads[n] = {producer[name] for name in inputs}
+        pending += reads[n]
+    order = sorted(reads)
+    if any(before >= n for n, befores in reads.items() for before in befores):
+        try:
+            by_number = dict(sorted(reads.items()))
+            order = [*graphlib.TopologicalSorter(by_number).static_order()]
+        except graphlib.CycleError:
+            raise ModelError(f"ONNX file {path}: its nodes read each other in a circle") from None
+    pruned = len(order) < len(nodes) or len(outputs) < len(graph.output)
+    kept = type(graph)()
+    kept.node.extend(nodes[n] for n in order)
+    kept.output.extend(outputs)
+    graph.ClearField("node")
+    graph.ClearField("output")
+    graph.MergeFrom(kept)
+    return pruned
 
 
 def _as_input(rgb: Tensor | None, channels_last: bool) -> Tensor:
