@@ -14,6 +14,7 @@ last convolution, before the ReLU. Own code from the papers and the layers' name
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -136,49 +137,38 @@ def read_two_files(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 LAYERS = ("coarse.conv2", "coarse.conv3", "coarse.conv4", "coarse.conv5", "coarse.fc1", "coarse")
-PAPER = "Eigen et al., Depth Map Prediction from a Single Image, NIPS 2014"
 DEFAULTS = Settings(layer="coarse.conv5")
 TINY = Path(__file__).parent / "weights" / "eigen-tiny.safetensors"
 
-definitions = {
-    "eigen": ModelDefinition(
-        name="eigen",
-        summary="coarse and fine network, log depth, indoors",
-        paper=PAPER,
-        licence="no published weights",
-        input_kind="rgb",
-        size=Fixed(*NYU),
-        output_kind="log",
-        layers=LAYERS,
-        defaults=DEFAULTS,
-        build=Eigen,
-        read_checkpoint=read_two_files,
-    ),
-    "eigen-kitti": ModelDefinition(
-        name="eigen-kitti",
-        summary="the same for the size of KITTI, street scenes",
-        paper=PAPER,
-        licence="no published weights",
-        input_kind="rgb",
-        size=Fixed(*KITTI),
-        output_kind="log",
-        layers=LAYERS,
-        defaults=DEFAULTS,
-        build=partial(Eigen, KITTI),
-        read_checkpoint=read_two_files,
-    ),
-    "eigen-tiny": ModelDefinition(
-        name="eigen-tiny",
-        summary="the same as `eigen`, narrower, trained on rendered rooms only",
-        paper=PAPER,
-        licence="Apache-2.0",
-        input_kind="rgb",
-        size=Fixed(*NYU),
-        normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
-        output_kind="log",
-        layers=LAYERS,
-        defaults=Settings(layer="coarse.conv5", update="adam", lr="10%", iterations=20),
-        build=partial(Eigen, channels=(40, 80, 112, 112, 64), hidden=128, fine=48),
-        checkpoint=TINY,
-    ),
-}
+_NYU = ModelDefinition(
+    name="eigen",
+    summary="coarse and fine network, log depth, indoors",
+    paper="Eigen et al., Depth Map Prediction from a Single Image, NIPS 2014",
+    licence="no published weights",
+    input_kind="rgb",
+    size=Fixed(*NYU),
+    output_kind="log",
+    layers=LAYERS,
+    defaults=DEFAULTS,
+    build=Eigen,
+    read_checkpoint=read_two_files,
+)
+_KITTI = replace(
+    _NYU,
+    name="eigen-kitti",
+    summary="the same for the size of KITTI, street scenes",
+    size=Fixed(*KITTI),
+    build=partial(Eigen, KITTI),
+)
+_TINY = replace(
+    _NYU,
+    name="eigen-tiny",
+    summary="the same as `eigen`, narrower, trained on rendered rooms only",
+    licence="Apache-2.0",
+    normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
+    defaults=replace(DEFAULTS, update="adam", lr="10%", iterations=20),
+    build=partial(Eigen, channels=(40, 80, 112, 112, 64), hidden=128, fine=48),
+    checkpoint=TINY,
+    read_checkpoint=None,
+)
+definitions = {one.name: one for one in (_NYU, _KITTI, _TINY)}

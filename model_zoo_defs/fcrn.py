@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -214,35 +215,33 @@ def module_of(layer: str) -> str:
 
 
 LAYERS = ("res4f", "res5c", "layer1_BN", *UP_PROJECTIONS[:3])
-PAPER = "Laina et al., Deeper Depth Prediction with Fully Convolutional Residual Networks, 3DV 2016"
 DEFAULTS = Settings(layer="layer1_BN")
 TINY = Path(__file__).parent / "weights" / "fcrn-tiny.safetensors"
 
-definitions = {
-    "fcrn": ModelDefinition(
-        name="fcrn",
-        summary="ResNet-50 with up-projections, metres, indoors",
-        paper=PAPER,
-        licence="published weights: Simplified BSD, not shipped",
-        input_kind="rgb",
-        size=Fixed(*SIZE),
-        normalisation=Normalisation(std=(1 / 255, 1 / 255, 1 / 255)),  # 0..255 goes in
-        layers=LAYERS,
-        defaults=DEFAULTS,
-        build=FCRN,
-        read_checkpoint=read_authors,
-    ),
-    "fcrn-tiny": ModelDefinition(
-        name="fcrn-tiny",
-        summary="the same at a seventh of the width and half the size, trained on rendered rooms",
-        paper=PAPER,
-        licence="Apache-2.0",
-        input_kind="rgb",
-        size=Fixed(SIZE[0] // 2, SIZE[1] // 2),
-        normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
-        layers=LAYERS,
-        defaults=Settings(layer="layer1_BN", update="adam", lr="10%", iterations=20),
-        build=partial(FCRN, width=9),
-        checkpoint=TINY,
-    ),
-}
+_NYU = ModelDefinition(
+    name="fcrn",
+    summary="ResNet-50 with up-projections, metres, indoors",
+    paper="Laina et al., Deeper Depth Prediction with Fully Convolutional Residual Networks,"
+    " 3DV 2016",
+    licence="published weights: Simplified BSD, not shipped",
+    input_kind="rgb",
+    size=Fixed(*SIZE),
+    normalisation=Normalisation(std=(1 / 255, 1 / 255, 1 / 255)),  # 0..255 goes in
+    layers=LAYERS,
+    defaults=DEFAULTS,
+    build=FCRN,
+    read_checkpoint=read_authors,
+)
+_TINY = replace(
+    _NYU,
+    name="fcrn-tiny",
+    summary="the same at a seventh of the width and half the size, trained on rendered rooms",
+    licence="Apache-2.0",
+    size=Fixed(SIZE[0] // 2, SIZE[1] // 2),
+    normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
+    defaults=replace(DEFAULTS, update="adam", lr="10%", iterations=20),
+    build=partial(FCRN, width=9),
+    checkpoint=TINY,
+    read_checkpoint=None,
+)
+definitions = {one.name: one for one in (_NYU, _TINY)}

@@ -12,6 +12,7 @@ Layers, names and sizes are those of ClementPinard/SfmLearner-Pytorch, whose
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -127,38 +128,31 @@ def read_published(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
 
 
 LAYERS = ("conv7", "iconv7", "iconv6", "iconv5", "iconv4", "iconv3", "iconv2")
-PAPER = "Zhou et al., Unsupervised Learning of Depth and Ego-Motion from Video, CVPR 2017"
 TINY = Path(__file__).parent / "weights" / "sfmlearner-tiny.safetensors"
 
-definitions = {
-    "sfmlearner": ModelDefinition(
-        name="sfmlearner",
-        summary="DispNet of SfMLearner, disparity up to scale, street scenes",
-        paper=PAPER,
-        licence="published weights: MIT, not shipped",
-        input_kind="rgb",
-        size=Fixed(128, 416),
-        normalisation=Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
-        output_kind="inverse",
-        output_scale="scale",
-        layers=LAYERS,
-        defaults=Settings(),
-        build=DispNet,
-        read_checkpoint=read_published,
-    ),
-    "sfmlearner-tiny": ModelDefinition(
-        name="sfmlearner-tiny",
-        summary="the same at 6/32 of the width, trained on rendered streets only",
-        paper=PAPER,
-        licence="Apache-2.0",
-        input_kind="rgb",
-        size=Fixed(128, 416),
-        normalisation=Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
-        output_kind="inverse",
-        output_scale="scale",
-        layers=LAYERS,
-        defaults=Settings(layer="iconv5", lr="10%", iterations=20),
-        build=lambda: DispNet(width=6),
-        checkpoint=TINY,
-    ),
-}
+_KITTI = ModelDefinition(
+    name="sfmlearner",
+    summary="DispNet of SfMLearner, disparity up to scale, street scenes",
+    paper="Zhou et al., Unsupervised Learning of Depth and Ego-Motion from Video, CVPR 2017",
+    licence="published weights: MIT, not shipped",
+    input_kind="rgb",
+    size=Fixed(128, 416),
+    normalisation=Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
+    output_kind="inverse",
+    output_scale="scale",
+    layers=LAYERS,
+    defaults=Settings(),
+    build=DispNet,
+    read_checkpoint=read_published,
+)
+_TINY = replace(
+    _KITTI,
+    name="sfmlearner-tiny",
+    summary="the same at 6/32 of the width, trained on rendered streets only",
+    licence="Apache-2.0",
+    defaults=Settings(layer="iconv5", lr="10%", iterations=20),
+    build=lambda: DispNet(width=6),
+    checkpoint=TINY,
+    read_checkpoint=None,
+)
+definitions = {one.name: one for one in (_KITTI, _TINY)}

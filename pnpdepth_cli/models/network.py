@@ -69,26 +69,15 @@ class Network:
             )
         return InputSplit(self.module, static_graph=self.definition.static_graph)
 
-    def arguments(
-        self, frame: FrameMap, rgb: Tensor | None, points: SparsePoints
-    ) -> tuple[Tensor, ...]:
-        """Returns the positional arguments of the network's forward for one frame.
-
-        Args:
-            frame: Maps the image frame to the network's frame.
-            rgb: (1, 3, H, W) in 0…1 in the image frame; None if the network takes none.
-            points: In the network's frame.
-
-        Raises:
-            UsageError: The network takes an rgb image and there is none.
-            ModelError: The definition's `arguments` raises or does not return a tuple.
-        """
-        return self.arguments_of(self.image_of(frame, rgb), points)
-
     def image_of(self, frame: FrameMap, rgb: Tensor | None) -> Tensor | None:
         """Returns the image as the network takes it, (1, 3, h, w); None if it takes none.
 
-        Arguments and errors are those of `arguments`.
+        Args:
+            frame: Maps the image frame to the network's frame.
+            rgb: (1, 3, H, W) in 0…1 in the image frame; None if there is none.
+
+        Raises:
+            UsageError: The network takes an rgb image and there is none.
         """
         if "rgb" not in self.definition.input_kind:
             return None
@@ -108,11 +97,11 @@ class Network:
 
         Args:
             image: From `image_of`.
-            points: As of `arguments`.
+            points: In the network's frame.
             prior: (1, 1, h, w) metres, 0 = unknown, for a network that takes one; None without.
 
         Raises:
-            ModelError: As of `arguments`.
+            ModelError: The definition's `arguments` raises or does not return a tuple.
         """
         takes_points = "sparse" in self.definition.input_kind
         sparse = points.scatter().to(self.device) if takes_points else None
@@ -128,7 +117,7 @@ class Network:
     def synthetic_arguments(self, frame: FrameMap) -> tuple[Tensor, ...]:
         """Returns the arguments for a synthetic frame of this size."""
         rgb, points = synthetic_frame(frame.image)
-        return self.arguments(frame, rgb, frame.points_to_network(points))
+        return self.arguments_of(self.image_of(frame, rgb), frame.points_to_network(points))
 
     def verified(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
         """Returns the notes of the definition's `verify` on the network's arguments for a frame.

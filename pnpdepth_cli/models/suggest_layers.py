@@ -79,30 +79,11 @@ def suggest_layers(
                 " numpy? take that out"
             )
     useful = [m for m in run.maps if m.area > 1 and _has_aspect_of(m.output, sides)]
-    reached = [m for m in _reached(run.prediction, useful) if m.output.shape[1] > 1]
-    chosen = _last_of_each_resolution(reached)
-    if len(_with_gradient(run.prediction, chosen)) < len(chosen):
-        # Something in between has a gradient of 0, as rounding has: ask for those of all maps.
-        chosen = _last_of_each_resolution(_with_gradient(run.prediction, reached))
+    gradients = _gradients(run.prediction, [m.output for m in useful])
+    reached = [m for m, g in zip(useful, gradients, strict=True) if g is not None and bool(g.any())]
+    chosen = _last_of_each_resolution([m for m in reached if m.output.shape[1] > 1])
     finest = run.prediction.shape[-2] * run.prediction.shape[-1]
     return tuple(m.name for m in chosen if m.area < finest or len(chosen) == 1)
-
-
-def _reached(prediction: Tensor, maps: list[_FeatureMap]) -> list[_FeatureMap]:
-    """The maps that lie on a path of torch's graph of gradients to the prediction."""
-    seen, pending = set(), [prediction.grad_fn]
-    while pending:
-        node = pending.pop()
-        if node is not None and node not in seen:
-            seen.add(node)
-            pending += [before for before, _ in node.next_functions]
-    return [m for m in maps if m.output.grad_fn in seen]
-
-
-def _with_gradient(prediction: Tensor, maps: list[_FeatureMap]) -> list[_FeatureMap]:
-    """The maps whose gradient is not 0."""
-    gradients = _gradients(prediction, [m.output for m in maps])
-    return [m for m, g in zip(maps, gradients, strict=True) if g is not None and bool(g.any())]
 
 
 def _gradients(prediction: Tensor, tensors: list[Tensor]) -> tuple[Tensor | None, ...]:

@@ -9,21 +9,24 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from model_zoo_defs.eigen import definitions, read_two_files
+from model_zoo_defs.eigen import Eigen, definitions, read_two_files
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 
 COARSE = {
-    "conv1": (96, 3, 11, 11),
-    "conv2": (256, 96, 5, 5),
-    "conv3": (384, 256, 3, 3),
-    "conv4": (384, 384, 3, 3),
-    "conv5": (256, 384, 3, 3),
-    "fc1": (4096, 12288),
-    "fc2": (4070, 4096),
-}
-COARSE_KITTI = COARSE | {"fc1": (4096, 17408), "fc2": (5822, 4096)}
-FINE = {"conv1": (63, 3, 9, 9), "conv2": (64, 64, 5, 5), "conv3": (1, 64, 5, 5)}
+    "conv1": (6, 3, 11, 11), "conv2": (8, 6, 5, 5), "conv3": (10, 8, 3, 3),
+    "conv4": (9, 10, 3, 3), "conv5": (7, 9, 3, 3), "fc1": (20, 7 * 6 * 8), "fc2": (4070, 20),
+}  # fmt: skip
+FINE = {"conv1": (11, 3, 9, 9), "conv2": (12, 12, 5, 5), "conv3": (1, 12, 5, 5)}
+PUBLISHED = {
+    "coarse.conv1.weight": (96, 3, 11, 11), "coarse.conv2.weight": (256, 96, 5, 5),
+    "coarse.conv3.weight": (384, 256, 3, 3), "coarse.conv4.weight": (384, 384, 3, 3),
+    "coarse.conv5.weight": (256, 384, 3, 3), "coarse.fc1.weight": (4096, 12288),
+    "coarse.fc2.weight": (4070, 4096), "fine.conv1.weight": (63, 3, 9, 9),
+    "fine.conv2.weight": (64, 64, 5, 5), "fine.conv3.weight": (1, 64, 5, 5),
+}  # fmt: skip
+PUBLISHED_KITTI = {"coarse.fc1.weight": (4096, 17408), "coarse.fc2.weight": (5822, 4096)}
 
 
 def weights(shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
@@ -63,55 +66,53 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_folder_with_both_published_files_loads_and_gives_what_their_tensors_say(
     folder: Path,
 ) -> None:
-    network = load_network("eigen", folder)
-    assert "coarse_model_12.pth, fine_model_7.pth" in network.notes[0]
+    network = Eigen(channels=(6, 8, 10, 9, 7), hidden=20, fine=12).eval()
+    notes = load_checkpoint(network, definitions["eigen"], folder)
+    assert "coarse_model_12.pth, fine_model_7.pth" in notes[0]
     coarse, fine = weights(COARSE), weights(FINE)
-    own = network.module.state_dict()
+    own = network.state_dict()
     assert len(own) == len(coarse) + len(fine)
     assert torch.equal(own["coarse.fc2.weight"], coarse["fc2.weight"])
     rgb = torch.rand(1, 3, 228, 304)
     with torch.no_grad():
-        log_depth = network.module(rgb)
+        log_depth = network(rgb)
         expected = reference(rgb, coarse, fine)
     assert log_depth.shape == (1, 1, 55, 74)
     assert torch.allclose(log_depth, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
-    assert torch.equal(network.depth_of(log_depth), log_depth.exp())
+    depth = Network(
+        definition=definitions["eigen"], module=network, device=rgb.device, checkpoint=None
+    ).depth_of(log_depth)
+    assert torch.equal(depth, log_depth.exp())
 
 
-@pytest.mark.parametrize("part", ["coarse_model_12.pth", "fine_model_7.pth"])
-def test_one_file_alone_is_an_error_that_names_both(folder: Path, part: str) -> None:
-    with pytest.raises(
-        CheckpointError, match=rf"this is the {part.partition('_')[0]} network only"
-    ):
-        load_network("eigen", folder / part)
-
-
-def test_a_folder_with_one_file_names_what_is_missing(folder: Path, tmp_path: Path) -> None:
+def test_one_file_alone_is_an_error_that_names_what_is_missing(
+    folder: Path, tmp_path: Path
+) -> None:
     (tmp_path / "coarse_model_12.pth").symlink_to(folder / "coarse_model_12.pth")
-    with pytest.raises(CheckpointError, match="this is the coarse network only; name a folder"):
-        load_network("eigen", tmp_path)
+    for part, path in (
+        ("coarse", folder / "coarse_model_12.pth"),
+        ("fine", folder / "fine_model_7.pth"),
+        ("coarse", tmp_path),
+    ):
+        with pytest.raises(CheckpointError, match=f"this is the {part} network only; name a fold"):
+            load_checkpoint(Eigen(hidden=2), definitions["eigen"], path)
 
 
 def test_two_files_for_one_part_are_named() -> None:
     state = {f"{file}.conv1.weight": torch.zeros(1) for file in ("fine_model_1", "fine_model_2")}
-    with pytest.raises(
-        ValueError, match=r"fine_model_1 and fine_model_2 are both the fine network"
-    ):
+    with pytest.raises(ValueError, match="fine_model_1 and fine_model_2 are both the fine netw"):
         read_two_files(state)
 
 
-def test_weights_for_kitti_name_the_network_they_are_for(tmp_path: Path) -> None:
-    for name, shapes in (("coarse", COARSE_KITTI), ("fine", FINE)):
-        state = {f"{layer}.weight": torch.zeros(1).expand(shape) for layer, shape in shapes.items()}
-        state |= {f"{layer}.bias": torch.zeros(shape[0]) for layer, shape in shapes.items()}
-        torch.save(state, tmp_path / f"{name}.pth")
-    with pytest.raises(CheckpointError, match="this is eigen-kitti; use --model eigen-kitti"):
-        load_network("eigen", tmp_path)
-
-
-def test_the_output_is_as_large_as_the_fine_features_at_both_sizes() -> None:
+def test_both_sizes_have_the_published_shapes_and_the_papers_outputs() -> None:
     with torch.device("meta"):
-        for name, size in (("eigen", (55, 74)), ("eigen-kitti", (41, 142))):
+        for name, size, shapes in (
+            ("eigen", (55, 74), PUBLISHED),
+            ("eigen-kitti", (41, 142), PUBLISHED | PUBLISHED_KITTI),
+        ):
             definition = definitions[name]
+            network = definition.build()
+            own = {n: tuple(t.shape) for n, t in network.state_dict().items()}
+            assert {n: shape for n, shape in own.items() if n.endswith("weight")} == shapes
             rgb = torch.empty(1, 3, definition.size.height, definition.size.width)
-            assert definition.build()(rgb).shape == (1, 1, *size)
+            assert network(rgb).shape == (1, 1, *size)

@@ -15,14 +15,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model_zoo_defs.fcrn import (
-    FCRN,
-    Bottleneck,
-    MaxPoolSame,
-    Unpooling,
-    definitions,
-    read_authors,
-)
+from model_zoo_defs.fcrn import FCRN, definitions, read_authors
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
@@ -163,35 +156,14 @@ def pooled_by_loop(x: Tensor) -> Tensor:
 # ------------------------------------------------------------------ the authors' file
 
 
-def test_every_array_of_the_published_file_loads_into_its_parameter(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    arrays = authors(64, lambda shape: rng.random(shape, dtype=np.float32))
-    path = write_npy(tmp_path / "NYU_ResNet-UpProj.npy", arrays)
-    values = sum(array.size for layer in arrays.values() for array in layer.values())
-    own = load_network("fcrn", path).module.state_dict()
-    held = {name: t for name, t in own.items() if not name.endswith("num_batches_tracked")}
-    assert sum(tensor.numel() for tensor in held.values()) == values == 63_633_665
-    assert len(held) == sum(len(layer) for layer in arrays.values())
-    for name, layer, kind in (
-        ("conv1.weight", "conv1", "weights"),
-        ("conv1.bias", "conv1", "biases"),
-        ("bn_conv1.running_var", "bn_conv1", "variance"),
-        ("res4f.branch2b.weight", "res4f_branch2b", "weights"),
-        ("res3a.bn_branch1.running_mean", "bn3a_branch1", "mean"),
-        ("res5c.bn_branch2c.weight", "bn5c_branch2c", "scale"),
-        ("layer1.bias", "layer1", "biases"),
-        ("layer1_BN.bias", "layer1_BN", "offset"),
-        ("layer2x.br1.ConvB.weight", "layer2x_br1_ConvB", "weights"),
-        ("layer16x.br2.ConvC.bias", "layer16x_br2_ConvC", "biases"),
-        ("layer8x.Conv.weight", "layer8x_Conv", "weights"),
-        ("layer8x.BN.weight", "layer8x_BN", "scale"),
-        ("layer4x.br2.BN.running_mean", "layer4x_br2_BN", "mean"),
-        ("ConvPred.weight", "ConvPred", "weights"),
-    ):
-        expected = arrays[layer][kind]
-        if expected.ndim == 4:
-            expected = expected.transpose(3, 2, 0, 1)
-        assert np.array_equal(own[name].numpy(), expected), name
+def test_the_network_has_as_many_values_as_the_published_file() -> None:
+    with torch.device("meta"):
+        own = FCRN().state_dict()
+    held = [tensor for name, tensor in own.items() if not name.endswith("num_batches_tracked")]
+    shapes = authors(64, lambda shape: np.broadcast_to(np.float32(1), shape))
+    assert len(held) == sum(len(layer) for layer in shapes.values())
+    assert sum(tensor.numel() for tensor in held) == 63_633_665
+    assert sum(array.size for layer in shapes.values() for array in layer.values()) == 63_633_665
 
 
 def narrow(arrays: Arrays, path: Path, width: int = 4) -> FCRN:
@@ -202,7 +174,7 @@ def narrow(arrays: Arrays, path: Path, width: int = 4) -> FCRN:
     return network.eval()
 
 
-@pytest.mark.parametrize("size", [(228, 304), (97, 130), (64, 65)])
+@pytest.mark.parametrize("size", [(228, 304), (97, 130)])
 def test_the_graph_is_the_authors_for_even_and_odd_sizes(
     size: tuple[int, int], tmp_path: Path
 ) -> None:
@@ -217,27 +189,15 @@ def test_the_graph_is_the_authors_for_even_and_odd_sizes(
     assert torch.allclose(depth, expected, rtol=1e-3, atol=1e-3 * float(expected.amax()))
 
 
-@pytest.mark.parametrize(
-    ("gone", "message"),
-    [
-        (("conv1", "biases"), r"1 missing \(conv1\.bias\)"),
-        (("layer1", "biases"), r"1 missing \(layer1\.bias\)"),
-        (("bn3b_branch2a", "variance"), r"1 missing \(res3b\.bn_branch2a\.running_var\)"),
-    ],
-)
-def test_an_array_that_is_missing_is_named(
-    gone: tuple[str, str], message: str, tmp_path: Path
-) -> None:
+def test_an_array_that_is_missing_or_left_over_is_named(tmp_path: Path) -> None:
     arrays = authors(4, random_arrays(1))
-    del arrays[gone[0]][gone[1]]
-    with pytest.raises(CheckpointError, match=message):
-        narrow(arrays, tmp_path)
-
-
-def test_an_array_left_over_is_named(tmp_path: Path) -> None:
-    arrays = authors(4, random_arrays(1))
+    del arrays["conv1"]["biases"], arrays["bn3b_branch2a"]["variance"]
     arrays["res4g_branch2a"] = {"weights": np.zeros((1, 1, 64, 16), np.float32)}
-    with pytest.raises(CheckpointError, match=r"1 unexpected \(res4g_branch2a\.weight\)"):
+    message = (
+        r"2 missing \(conv1\.bias, res3b\.bn_branch2a\.running_var\)"
+        r"; 1 unexpected \(res4g_branch2a\.weight\)"
+    )
+    with pytest.raises(CheckpointError, match=message):
         narrow(arrays, tmp_path)
     arrays["conv1"]["momentum"] = np.zeros(4, np.float32)
     with pytest.raises(CheckpointError, match=r"conv1\.momentum is none of weights"):
@@ -248,15 +208,6 @@ def test_what_the_optimiser_left_in_a_tensorflow_checkpoint_is_no_weight() -> No
     left = {"conv1.weights.Momentum": torch.zeros(7, 7, 3, 4), "global_step": torch.tensor(7)}
     weights = {"conv1.weights": torch.ones(7, 7, 3, 4), "conv1.biases": torch.ones(4)}
     assert list(read_authors(weights | left)) == ["conv1.weight", "conv1.bias"]
-
-
-def test_a_state_dict_of_ours_loads_too(tmp_path: Path) -> None:
-    network = FCRN(4)
-    torch.save(network.state_dict(), tmp_path / "x.pt")
-    other = FCRN(4)
-    definition = replace(definitions["fcrn"], build=partial(FCRN, 4))
-    load_checkpoint(other, definition, tmp_path / "x.pt")
-    assert torch.equal(other.conv1.weight, network.conv1.weight)
 
 
 @pytest.mark.parametrize(
@@ -274,63 +225,8 @@ def test_files_of_ports_are_an_error_that_names_another_network(
         load_network("fcrn", tmp_path / "checkpoint.pth.tar")
 
 
-# ------------------------------------------------------------------ what ports change
-
-
-@pytest.mark.parametrize("size", [(6, 8), (7, 9), (6, 9), (2, 2), (1, 5)])
-def test_the_pooling_is_that_of_a_loop_over_windows(size: tuple[int, int]) -> None:
-    x = torch.randn(1, 2, *size, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(MaxPoolSame()(x), pooled_by_loop(x))
-
-
-def test_at_even_sizes_that_is_not_torchs_pooling() -> None:
-    x = torch.arange(36.0).reshape(1, 1, 6, 6)
-    assert not torch.equal(MaxPoolSame()(x), F.max_pool2d(x, 3, 2, 1))
-
-
-def test_an_unpooling_is_zero_insertion_and_a_5x5_convolution_but_for_swapped_neighbours() -> None:
-    torch.manual_seed(0)
-    unpooling = Unpooling(3, 2).eval()
-    a, b, c, d = (getattr(unpooling, f"Conv{x}") for x in "ABCD")
-    bias = torch.randn(2)
-    kernel = torch.zeros(2, 3, 5, 5)
-    kernel[..., 0::2, 0::2], kernel[..., 1::2, 0::2] = a.weight, b.weight
-    kernel[..., 0::2, 1::2], kernel[..., 1::2, 1::2] = c.weight, d.weight
-    for conv in (a, b, c, d):
-        conv.bias.data = bias
-    x = torch.randn(1, 3, 4, 6)
-    inserted = torch.zeros(1, 3, 8, 12)
-    inserted[..., 1::2, 1::2] = x
-    whole = F.conv2d(inserted, kernel, bias, padding=2)
-    with torch.no_grad():
-        rows = unpooling(x).reshape(1, 2, 4, 2, 6, 2)
-    swapped = rows.flip(3, 5).reshape(1, 2, 8, 12)
-    assert torch.allclose(swapped, whole / (1 + 1e-4) ** 0.5, atol=1e-5)
-
-
-def test_rows_come_from_a_and_b_and_columns_from_a_and_c() -> None:
-    unpooling = Unpooling(1, 1).eval()
-    for number, letter in enumerate("ABCD"):
-        conv = getattr(unpooling, f"Conv{letter}")
-        conv.weight.data.zero_()
-        conv.bias.data.fill_(float(number))
-    with torch.no_grad():
-        tile = unpooling(torch.zeros(1, 1, 1, 1))[0, 0] * (1 + 1e-4) ** 0.5
-    assert torch.allclose(tile, torch.tensor([[0.0, 2.0], [1.0, 3.0]]))  # A C / B D
-
-
-def test_a_stride_leaves_out_rows_before_anything_else_looks_at_them() -> None:
-    torch.manual_seed(0)
-    strided = Bottleneck(8, 4, 2, project=True).eval()
-    plain = Bottleneck(8, 4, 1, project=True).eval()
-    plain.load_state_dict(strided.state_dict())
-    x = torch.randn(1, 8, 7, 10)
-    with torch.no_grad():
-        assert torch.allclose(strided(x), plain(x[..., ::2, ::2]), atol=1e-6)
-
-
 def test_depth_is_never_negative_and_rgb_goes_in_as_bytes() -> None:
-    network = built(definitions["fcrn"])
+    network = built(replace(definitions["fcrn"], build=partial(FCRN, 4)))
     normalisation = network.definition.normalisation
     assert normalisation is not None
     assert [(1.0 - m) / s for m, s in zip(normalisation.mean, normalisation.std, strict=True)] == [

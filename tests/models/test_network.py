@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
-from pnpdepth_cli.models import network as module_under_test
-from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Normalisation
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import (
     FARTHEST_DEPTH,
@@ -41,7 +41,8 @@ def network(**more: Any) -> Network:
 
 
 def arguments(of: Network, rgb: Tensor | None) -> tuple[Tensor, ...]:
-    return of.arguments(FrameMap.fit(Multiple(1), 2, 3), rgb, POINTS)
+    image = of.image_of(FrameMap.fit(Multiple(1), 2, 3), rgb)
+    return of.arguments_of(image, POINTS)
 
 
 def test_a_image_is_normalised_and_points_are_scattered() -> None:
@@ -67,21 +68,14 @@ def test_arguments_that_raise_or_are_no_tuple_are_the_definitions_fault() -> Non
         arguments(network(arguments=lambda rgb, sparse: rgb), rgb)
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 2, 3), (1, 2, 3), (2, 3)])
-def test_one_depth_map_in_any_shape_is_depth(shape: tuple[int, ...]) -> None:
-    depth = network().depth_of(torch.full(shape, 2.0, dtype=torch.float64))
-    assert depth.dtype == torch.float32
-    assert torch.equal(depth, torch.full((1, 1, 2, 3), 2.0))
-
-
-BAD_SHAPES = [(2, 1, 2, 3), (1, 2, 2, 3), (2, 2, 3), (3,), (), (1, 1, 1, 2, 3)]
-
-
-@pytest.mark.parametrize("shape", BAD_SHAPES)
-def test_any_other_output_is_refused_with_its_shape(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ModelError, match="shape") as error:
-        network().depth_of(torch.zeros(shape))
-    assert str(shape) in str(error.value)
+def test_one_depth_map_in_any_shape_is_depth_and_any_other_output_is_refused() -> None:
+    for shape in ((1, 1, 2, 3), (1, 2, 3), (2, 3)):
+        depth = network().depth_of(torch.full(shape, 2.0, dtype=torch.float64))
+        assert depth.dtype == torch.float32
+        assert torch.equal(depth, torch.full((1, 1, 2, 3), 2.0))
+    for shape in ((2, 1, 2, 3), (1, 2, 2, 3), (2, 2, 3), (3,), (), (1, 1, 1, 2, 3)):
+        with pytest.raises(ModelError, match=re.escape(f"gives a tensor of shape {shape}")):
+            network().depth_of(torch.zeros(shape))
 
 
 def test_inverse_and_log_depth_become_metres() -> None:
@@ -101,18 +95,20 @@ def test_the_only_tensor_of_a_structure_is_the_output_and_several_need_a_choice(
     assert torch.equal(chosen.depth_of({"a": depth, "b": [depth]}), depth * 2)
 
 
-def test_an_output_that_raises_or_is_no_tensor_is_the_definitions_fault() -> None:
-    with pytest.raises(ModelError, match="output of network 'mine' raises KeyError"):
-        network(output=lambda output: output["x"]).depth_of({})
-    with pytest.raises(ModelError, match="gives a dict, where a tensor is expected"):
-        network(output=lambda output: output).depth_of({})
-
-
-def test_an_output_without_any_tensor_is_named() -> None:
-    with pytest.raises(ModelError, match="'mine' returns a NoneType without a tensor in it"):
-        network().depth_of(None)
-    with pytest.raises(ModelError, match="'mine' returns a dict without a tensor in it"):
-        network().raw_of({"depth": None})
+@pytest.mark.parametrize(
+    ("more", "output", "message"),
+    [
+        ({"output": lambda output: output["x"]}, {}, "output of network 'mine' raises KeyError"),
+        ({"output": lambda output: output}, {}, "gives a dict, where a tensor is expected"),
+        ({}, None, "'mine' returns a NoneType without a tensor in it"),
+        ({}, {"depth": None}, "'mine' returns a dict without a tensor in it"),
+    ],
+)
+def test_an_output_without_a_tensor_is_named(
+    more: dict[str, Any], output: Any, message: str
+) -> None:
+    with pytest.raises(ModelError, match=message):
+        network(**more).depth_of(output)
 
 
 def test_notes_of_verify_are_passed_on_and_what_it_raises_is_the_definitions_fault() -> None:
@@ -168,26 +164,30 @@ def test_weights_come_from_the_file_named_or_the_definitions_own(file: Path) -> 
 
 
 def test_random_weights_are_never_used(file: Path) -> None:
-    with pytest.raises(CheckpointError, match="comes without weights; name them with --checkpoint"):
-        load_network(str(file), None)
-    with pytest.raises(CheckpointError, match="loads them itself, say complete=True"):
+    message = "comes without weights; name them with --checkpoint, .* say complete=True"
+    with pytest.raises(CheckpointError, match=message):
         load_network(str(file), None)
     (file.parent / "own.safetensors").unlink()
     with pytest.raises(CheckpointError, match="does not exist"):
         load_network(f"{file}:owned", None)
+    assert load_network(f"{file}:empty", None).checkpoint is None  # has no weights
 
 
-def test_a_network_without_weights_needs_none(file: Path) -> None:
-    assert load_network(f"{file}:empty", None).checkpoint is None
-
-
-def test_a_build_that_raises_or_returns_no_module_is_refused(file: Path) -> None:
-    with pytest.raises(ModelError, match="build of network 'mine' raises ZeroDivisionError"):
-        load_network(f"{file}:raising", None)
-    with pytest.raises(ModelError, match="gives no torch module"):
-        load_network(f"{file}:text", None)
-    with pytest.raises(ModelError, match="build of network 'mine' is a Conv2d that is made alr"):
-        load_network(f"{file}:built", None)
+@pytest.mark.parametrize(
+    ("attribute", "message"),
+    [
+        ("raising", "build of network 'mine' raises ZeroDivisionError"),
+        ("text", "gives no torch module"),
+        ("built", "build of network 'mine' is a Conv2d that is made already"),
+    ],
+)
+def test_a_build_that_raises_or_returns_no_module_is_refused(
+    attribute: str, message: str, file: Path
+) -> None:
+    before = list(sys.path)
+    with pytest.raises(ModelError, match=message):
+        load_network(f"{file}:{attribute}", None)
+    assert sys.path == before
 
 
 def test_a_build_may_import_what_lies_beside_the_file_as_late_as_it_likes(tmp_path: Path) -> None:
@@ -198,13 +198,6 @@ def test_a_build_may_import_what_lies_beside_the_file_as_late_as_it_likes(tmp_pa
     (tmp_path / "net.py").write_text(build)
     before = list(sys.path)
     assert isinstance(load_network(f"{tmp_path / 'net.py'}:make", None).module, nn.AvgPool3d)
-    assert sys.path == before
-
-
-def test_the_search_path_is_as_before_after_a_build_that_raises(file: Path) -> None:
-    before = list(sys.path)
-    with pytest.raises(ModelError):
-        load_network(f"{file}:raising", None)
     assert sys.path == before
 
 
@@ -241,7 +234,7 @@ def test_a_forward_without_gradient_or_output_is_refused(
 # ------------------------------------------------------------------ the device
 
 
-@pytest.mark.parametrize("name", ["cuda:99", "meta", "xla", "nonsense", "", "privateuseone", "hpu"])
+@pytest.mark.parametrize("name", ["cuda:99", "meta", "nonsense", "", "hpu"])
 def test_a_missing_device_is_refused_with_a_remedy(name: str) -> None:
     with pytest.raises(DeviceError, match=r"cannot be used: .*; try --device cpu") as error:
         find_device(name)
@@ -251,10 +244,6 @@ def test_a_missing_device_is_refused_with_a_remedy(name: str) -> None:
 
 def test_a_network_prints_one_line(file: Path) -> None:
     assert repr(load_network(f"{file}:owned", None)) == "Network('mine', 2 parameters, 'cpu')"
-
-
-def test_the_cpu_is_always_there() -> None:
-    assert find_device("cpu") == torch.device("cpu")
 
 
 def raises(error: BaseException) -> Callable[..., Any]:
@@ -295,16 +284,9 @@ def test_memory_running_out_in_the_networks_forward_is_one_too() -> None:
         split.front(torch.zeros(1))
 
 
-def test_other_errors_stay_what_they_are() -> None:
-    with pytest.raises(ZeroDivisionError), out_of_memory_is_a_device_error(torch.device("cpu")):
-        raise ZeroDivisionError
-
-
 def test_points_stay_on_the_grid_through_a_padded_frame() -> None:
     frame = FrameMap.fit(Multiple(32), 2, 3)
-    sparse = network(input_kind="sparse").arguments(frame, None, frame.points_to_network(POINTS))[0]
+    sparse = network(input_kind="sparse").arguments_of(None, frame.points_to_network(POINTS))[0]
     assert tuple(sparse.shape) == (1, 1, 32, 32)
     assert (float(sparse[0, 0, 0, 0]), float(sparse[0, 0, 1, 2])) == (4, 2)
     assert int(sparse.count_nonzero()) == 2
-    assert Fixed(1, 1).fit == "stretch"
-    assert module_under_test.FARTHEST_DEPTH == 1e4

@@ -7,7 +7,6 @@ takes the tensors out and runs nothing.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
-from pnpdepth_cli.models.weights.pickle_reader import PLAIN_NAMES, StandIn, brief
+from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, StandIn
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
 from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_torch_file
 
@@ -89,8 +88,12 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
             f"checkpoint {path} does not fit network {definition.name!r}: this is"
             f" {_some(fitting, ' or ')}; use --model {fitting[0]}"
         ) from None
-    parameters = dict(network.named_parameters())
-    broken = [n for n, t in state.items() if n in parameters and not _is_finite(t)]
+    # A sum shows a value that is not finite, without a copy of the tensor.
+    broken = [
+        name
+        for name, _ in network.named_parameters()
+        if name in state and not state[name].sum(dtype=torch.float64).isfinite()
+    ]
     if broken:
         raise CheckpointError(
             f"checkpoint {path}: {len(broken)} of its weights are NaN or infinite"
@@ -99,7 +102,9 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     try:
         network.load_state_dict({**own, **state})
     except RuntimeError as error:
-        raise _misfit(path, definition, describe(error)) from None
+        raise CheckpointError(
+            f"checkpoint {path} does not fit network {definition.name!r}: {describe(error)}"
+        ) from None
     return notes
 
 
@@ -110,18 +115,31 @@ def _fitted(
     path: Path,
 ) -> Mapping[str, Tensor]:
     """The state dict that replaces the network's own. CheckpointError if it does not fit."""
-    state = _converted(definition, stored, path)
-    differing = [n for n in own if n in state and state[n].shape != own[n].shape]
+    state = stored
+    if definition.read_checkpoint is not None:
+        try:
+            state = definition.read_checkpoint(stored)
+        except Exception as error:  # what a definition raises at an unknown layout is its own
+            raise CheckpointError(
+                f"checkpoint {path} is not in a layout that {definition.name!r} reads"
+                f" ({describe(error)})"
+            ) from None
+        if not isinstance(state, Mapping) or not _only_tensors(state):
+            raise ModelError(f"read_checkpoint of {definition.name!r} gives no named tensors")
     problems = {
         "missing": [n for n in own if n not in state and not n.endswith(_COUNTER)],
         "unexpected": [name for name in state if name not in own],
         "of another shape": [
-            f"{n} {tuple(state[n].shape)} for {tuple(own[n].shape)}" for n in differing
+            f"{n} {tuple(state[n].shape)} for {tuple(own[n].shape)}"
+            for n in own
+            if n in state and state[n].shape != own[n].shape
         ],
     }
     listed = [f"{len(some)} {what} ({_some(some)})" for what, some in problems.items() if some]
     if listed:
-        raise _misfit(path, definition, "; ".join(listed))
+        raise CheckpointError(
+            f"checkpoint {path} does not fit network {definition.name!r}: {'; '.join(listed)}"
+        )
     return state
 
 
@@ -144,10 +162,6 @@ def _networks_it_fits(stored: Mapping[str, Tensor], path: Path, wanted: str) -> 
     return sorted(fitting, key=lambda name: name.rpartition("-")[2] != ending)
 
 
-def _misfit(path: Path, definition: ModelDefinition, why: str) -> CheckpointError:
-    return CheckpointError(f"checkpoint {path} does not fit network {definition.name!r}: {why}")
-
-
 def _all_in_module(state: Mapping[str, Any]) -> bool:
     return bool(state) and all(name.startswith("module.") for name in state)
 
@@ -159,11 +173,6 @@ def _without_module(state: dict[str, Tensor], path: Path) -> tuple[dict[str, Ten
         state = {name.removeprefix("module."): tensor for name, tensor in state.items()}
         notes = [f"checkpoint {path.name}: prefix 'module.' of every key stripped"]
     return state, notes
-
-
-def _is_finite(tensor: Tensor) -> bool:
-    """True if no value is NaN or infinite; a sum shows it without a copy of the tensor."""
-    return not tensor.is_floating_point() or math.isfinite(tensor.sum(dtype=torch.float64).item())
 
 
 def _some(names: list[str], between: str = ", ") -> str:
@@ -197,15 +206,15 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     try:
         content = read(path)
     except Exception as error:  # nothing but the file decides what its readers raise
-        raise CheckpointError(
-            f"checkpoint {path} cannot be read as a {kind} ({brief(error)})"
-        ) from None
+        fact = "" if isinstance(error, BrokenFileError) else f"{type(error).__name__}: "
+        reason = " ".join(f"{fact}{error}"[:1000].split())[:160]  # parts may come out of the file
+        raise CheckpointError(f"checkpoint {path} cannot be read as a {kind} ({reason})") from None
     if isinstance(content, dict):
         return content, []
-    content, named = content
+    content, names = content
     notes = []
-    if others := [name for name in named if not PLAIN_NAMES.fullmatch(name)]:
-        notes = [f"checkpoint {path.name}: its pickle names {_some(others)}; nothing of it was run"]
+    if names:
+        notes = [f"checkpoint {path.name}: its pickle names {_some(names)}; nothing of it was run"]
     arguments = content.get("args") if isinstance(content, Mapping) else None
     arguments = getattr(arguments, "state", arguments)
     if isinstance(arguments, Mapping) and isinstance(data := arguments.get("data"), str):
@@ -244,37 +253,11 @@ def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
     for candidate in (content, *(content.get(key) for key in _STATE_KEYS)):
         if is_module(candidate):
             return module_state(candidate)
-        if isinstance(candidate, Mapping) and candidate:
-            for name, value in candidate.items():
-                _, is_tensor, kind = getattr(value, "path", "").partition("torch._utils._rebuild_")
-                if is_tensor:
-                    raise CheckpointError(
-                        f"checkpoint {path}: {_short(str(name))} is not a plain tensor"
-                        f" ({_short(kind)}); save its values as a dense tensor of floats"
-                    )
-            if _only_tensors(candidate):
-                return dict(candidate)
-    names = ", ".join(_short(str(key)) for key in list(content)[:8]) or "nothing"
-    raise CheckpointError(f"checkpoint {path} has no state dict; it holds {names}")
+        if isinstance(candidate, Mapping) and candidate and _only_tensors(candidate):
+            return dict(candidate)
+    names = _some([str(key) for key in content]) or "nothing"
+    raise CheckpointError(f"checkpoint {path} has no state dict of plain tensors; it holds {names}")
 
 
 def _only_tensors(mapping: Mapping[Any, Any]) -> bool:
     return all(isinstance(k, str) and isinstance(v, Tensor) for k, v in mapping.items())
-
-
-def _converted(
-    definition: ModelDefinition, state: Mapping[str, Tensor], path: Path
-) -> Mapping[str, Tensor]:
-    """The tensors as the definition reads them from a published file."""
-    if definition.read_checkpoint is None:
-        return state
-    try:
-        converted = definition.read_checkpoint(state)
-    except Exception as error:  # what a definition raises at a layout it does not know is its own
-        raise CheckpointError(
-            f"checkpoint {path} is not in a layout that {definition.name!r} reads"
-            f" ({describe(error)})"
-        ) from None
-    if not isinstance(converted, Mapping) or not _only_tensors(converted):
-        raise ModelError(f"read_checkpoint of {definition.name!r} gives no named tensors")
-    return converted

@@ -1,14 +1,15 @@
 """The named arrays of a numpy file as tensors; nothing in it is run.
 
 A .npz holds arrays by name. A .npy may hold a pickled dict of arrays, or of dicts of arrays, as
-converters from Caffe write it; numpy would run that pickle, `pickle_reader` reads it without a
-call. Memory stays bounded by the size of the file.
+converters from Caffe write it; numpy would run that pickle, `read_pickle` reads it without a call.
+Memory stays bounded by the size of the file.
 """
 
 from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator, Mapping
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pnpdepth_cli.models.weights.pickle_reader import (
-    MAX_AXES,
-    BrokenFileError,
-    PickleReader,
-    StandIn,
-)
+from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, StandIn, read_pickle
 
 _RECONSTRUCT = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 _MAX_DEPTH = 3  # dicts inside each other
@@ -52,14 +48,14 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
 
 
 def _read_pickled_dict(path: Path) -> dict[str, Tensor]:
-    left = path.stat().st_size
-    with path.open("rb") as file:
-        if npy.read_magic(file) != (1, 0):
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        if npy.read_magic(content) != (1, 0):
             raise BrokenFileError("it holds no dict of arrays")
-        shape, _, dtype = npy.read_array_header_1_0(file)
+        shape, _, dtype = npy.read_array_header_1_0(content)
         if not dtype.hasobject or shape != ():
             raise BrokenFileError(f"it holds one array of shape {shape}, not named arrays")
-        array = PickleReader(file).load()
+        array, _ = read_pickle(content)
+        left = len(content)
     objects = _state_of_array(array)[4]
     if not (isinstance(objects, list) and len(objects) == 1 and isinstance(objects[0], Mapping)):
         raise BrokenFileError("it holds no dict of arrays")
@@ -98,7 +94,7 @@ def _entries(
 def _unpickled(value: Any, name: str, most: int) -> Tensor:
     """The tensor of a pickled array of at most so many bytes."""
     _, shape, dtype, fortran, data = _state_of_array(value)
-    if not isinstance(shape, tuple) or len(shape) > MAX_AXES:
+    if not isinstance(shape, tuple):
         kind = value.path if isinstance(value, StandIn) else type(value).__name__
         raise BrokenFileError(f"{name} is a {kind}, not an array")
     shape, code, order = tuple(map(int, shape)), dtype.arguments[0], dtype.state[1]

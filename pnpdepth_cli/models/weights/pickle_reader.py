@@ -1,19 +1,18 @@
 """Reads a pickle without calling anything that it names.
 
-A pickle is a program that may call any function. `PickleReader` is the standard library's unpickler
-in pure Python. Names are never imported: a call of one gives a tensor, a plain container or an
-inert `StandIn`. Opcodes that call, set attributes or hash values of the file are replaced.
+A pickle is a program for a stack machine, which may call any function. Here no name is imported: a
+call of one gives a tensor, a plain container or an inert `StandIn`, and opcodes that files of
+weights do not have are refused.
 
 Time and memory are bounded by the file and by `MAX_STEPS`. torch.load(weights_only=True) is not
-used: it believes the sizes that a file states, hashes what the file holds, and refuses whole
+used: it allocates the sizes that a file states, hashes what the file holds, and refuses whole
 modules.
 """
 
 from __future__ import annotations
 
 import math
-import pickle
-import re
+import pickletools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
@@ -21,23 +20,24 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-MAX_STEPS = 6_000_000
-"""Reads from the file, about two per opcode, and values copied; 2,000 tensors take 200,000."""
+MAX_STEPS = 3_000_000
+"""Opcodes, and entries of dicts; the state dict of 2,000 tensors takes 100,000."""
 
 MAX_NAME = 1_000
 """Characters of a name in a pickle."""
 
-MAX_AXES = 64
-
-PLAIN_NAMES = re.compile(
-    r"torch\.(\w+Storage|Size|device|storage\.UntypedStorage|b?float\d+|u?int\d+|bool|complex\d+"
-    r"|_utils\._rebuild_(tensor(_v[23])?|parameter(_with_state)?)|nn\.parameter\.Parameter"
-    r"|_tensor\._rebuild_from_type_v2|Tensor)|collections\.(OrderedDict|defaultdict)"
-)
-"""What files of nothing but tensors name."""
-
+_MAX_AXES = 64
 _MAX_EXPANDED = 1 << 28  # elements of a tensor with strides of 0; nothing is allocated for them
 _DTYPES = {str(value): value for value in vars(torch).values() if isinstance(value, torch.dtype)}
+_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+_LITERALS = frozenset(
+    {
+        *("BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINSTRING"),
+        *("SHORT_BINSTRING", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES"),
+        *("SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"),
+    }
+)
+"""Opcodes of protocols 2 to 5 that put their argument on the stack."""
 
 
 class BrokenFileError(Exception):
@@ -49,11 +49,6 @@ class Name:
     """A function or class that the pickle names; it is never looked up."""
 
     path: str
-    call: Callable[[str, tuple[Any, ...]], Any]
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Returns what stands for the result of the call."""
-        return self.call(self.path, arguments)
 
 
 @dataclass(eq=False, repr=False)
@@ -64,100 +59,112 @@ class StandIn:
     arguments: tuple[Any, ...] = ()
     state: Any = None
 
-    def append(self, value: Any) -> None:
-        """Does nothing, as for a subclass of list."""
 
-    extend = append
+def read_pickle(
+    file: Any, load_storage: Callable[[tuple[Any, ...]], Tensor] | None = None
+) -> tuple[Any, list[str]]:
+    """Returns the content of one pickle, and the functions and classes of its stand-ins.
 
-
-def brief(error: Exception) -> str:
-    """Returns the error on one line of at most 160 characters; parts may come out of the file."""
-    kind = "" if isinstance(error, BrokenFileError) else f"{type(error).__name__}: "
-    return " ".join(f"{kind}{error}"[:1000].split())[:160]
-
-
-class PickleReader(pickle._Unpickler):
-    """Reads one pickle by `load()`, which raises BrokenFileError or what its parts raise.
-
-    named: afterwards all functions and classes that the pickle names.
+    A broken pickle raises BrokenFileError or what its parts raise.
 
     Args:
-        file: Stands at the first opcode; afterwards behind the last.
+        file: Stands at the first opcode, afterwards behind the last. In memory or mapped: its
+            `read` allocates no more than there is.
         load_storage: Returns the flat tensor for a persistent id
             ("storage", type, key, location, elements, ...); None refuses one.
     """
+    machine = _Machine(load_storage)
+    for opcode, argument, _ in pickletools.genops(file):
+        machine.charge(1)
+        machine.step(opcode.name, argument)
+    return machine.stack.pop(), list(machine.stood_for)
 
-    stack: list[Any]  # left out by the stubs of the standard library, like the next two
-    read: Callable[[int], bytes]
-    pop_mark: Callable[[], list[Any]]
 
-    def __init__(
-        self, file: Any, load_storage: Callable[[tuple[Any, ...]], Tensor] | None = None
-    ) -> None:
-        self._meter = _Meter(file)
-        super().__init__(self._meter, encoding="latin-1")
+class _Machine:
+    """The stack, the marks in it, and the memo of a pickle's program."""
+
+    def __init__(self, load_storage: Callable[[tuple[Any, ...]], Tensor] | None) -> None:
+        self.stack: list[Any] = []
+        self.stood_for: dict[str, None] = {}
+        self._marks: list[int] = []
+        self._memo: dict[int, Any] = {}
         self._load_storage = load_storage
-        self.named: dict[str, None] = {}
+        self._left = MAX_STEPS
 
-    def find_class(self, module: str, name: str) -> Name:
-        """Returns the name itself, that of Python 3; nothing is imported."""
-        if len(module) + len(name) > MAX_NAME:
-            raise BrokenFileError("its pickle has a name without end")
-        module = {"__builtin__": "builtins", "copy_reg": "copyreg"}.get(module, module)
-        self.named.setdefault(f"{module}.{name}")
-        return Name(f"{module}.{name}", self._called)
+    def charge(self, steps: int) -> None:
+        self._left -= steps
+        if self._left < 0:
+            raise BrokenFileError(f"its pickle takes more than {MAX_STEPS:,} steps")
 
-    def persistent_load(self, pid: Any) -> Any:
-        """Returns the storage, or the class without its source text, that the id stands for."""
-        kind = pid[0] if isinstance(pid, tuple) and len(pid) >= 4 else None
-        if kind == "module":
-            return pid[1]
-        if kind != "storage" or self._load_storage is None:
-            raise BrokenFileError("its pickle refers to something outside it")
-        return self._load_storage(pid)
+    def step(self, opcode: str, argument: Any) -> None:
+        """Does what the opcode says, except for a call; see `_called`."""
+        stack = self.stack
+        match opcode:
+            case "BINPUT" | "LONG_BINPUT":
+                self._memo[argument] = stack[-1]
+            case "MEMOIZE":
+                self._memo[len(self._memo)] = stack[-1]
+            case "BINGET" | "LONG_BINGET":
+                stack.append(self._memo[argument])
+            case "MARK":
+                self._marks.append(len(stack))
+            case "TUPLE":
+                stack.append(tuple(self._to_mark()))
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                count = int(opcode[-1])
+                stack[-count:] = [tuple(stack[-count:])]
+            case "EMPTY_LIST" | "EMPTY_SET":  # elements of a set would have to be hashed
+                stack.append([])
+            case "FROZENSET":
+                stack.append(self._to_mark())
+            case "EMPTY_DICT":
+                stack.append({})
+            case "APPEND":
+                self._extend([stack.pop()])
+            case "APPENDS" | "ADDITEMS":
+                self._extend(self._to_mark())
+            case "SETITEM":
+                self._set_items([stack.pop(-2), stack.pop()])
+            case "SETITEMS":
+                self._set_items(self._to_mark())
+            case "GLOBAL":
+                stack.append(self._name(*argument.split(" ", 1)))
+            case "STACK_GLOBAL":
+                stack.append(self._name(stack.pop(-2), stack.pop()))
+            case "REDUCE" | "NEWOBJ":
+                stack.append(self._called(stack.pop(-2), stack.pop()))
+            case "NEWOBJ_EX":  # the last are arguments by name
+                stack[-1:] = []
+                stack.append(self._called(stack.pop(-2), stack.pop()))
+            case "BUILD":
+                state = stack.pop()
+                if isinstance(stack[-1], StandIn):
+                    stack[-1].state = state
+            case "BINPERSID":
+                stack.append(self._persistent(stack.pop()))
+            case "POP":
+                stack.pop()
+            case "POP_MARK":
+                self._to_mark()
+            case "PROTO" | "FRAME" | "STOP":
+                pass
+            case _ if opcode in _LITERALS:
+                stack.append(argument)
+            case _ if opcode in _CONSTANTS:
+                stack.append(_CONSTANTS[opcode])
+            case _:
+                raise BrokenFileError(f"its pickle has an opcode {opcode}")
 
-    def _called(self, path: str, arguments: tuple[Any, ...]) -> Any:
-        """What stands for a call's result; only tensors and plain containers are made."""
-        first = arguments[0] if arguments else None
-        match path:
-            case "collections.OrderedDict" | "collections.defaultdict" | "builtins.dict":
-                pairs = first if isinstance(first, list) else []
-                return self._mapping([value for key, one in pairs for value in (key, one)])
-            case "builtins.set" | "builtins.frozenset":
-                return first if isinstance(first, list) else []
-            case "_codecs.encode" | "builtins.bytes" | "builtins.bytearray":
-                return "" if first is None else first  # text of Latin-1
-            case "torch.Size":
-                return first or ()
-            case "copyreg._reconstructor":
-                return StandIn(getattr(first, "path", "?"))
-            case "torch._utils._rebuild_tensor" | "torch._utils._rebuild_tensor_v2":
-                return view_of(*arguments[:4])
-            case "torch._utils._rebuild_tensor_v3":  # of a dtype that storages do not name
-                storage, offset, shape, stride = arguments[:4]
-                return view_of(storage, offset, shape, stride, arguments[6])
-            case "torch._tensor._rebuild_from_type_v2":  # it has attributes of its own
-                return self._call(first, arguments[2])
-            case _ if path.startswith("torch._utils._rebuild_parameter"):
-                return first
-            case "torch.nn.parameter.Parameter":
-                return first
-        return StandIn(path, arguments)
+    def _to_mark(self) -> list[Any]:
+        """What lies above the last mark, taken off the stack."""
+        start = self._marks.pop()
+        values = self.stack[start:]
+        del self.stack[start:]
+        return values
 
-    def _load_call(self) -> None:
-        arguments, function = self.stack.pop(), self.stack.pop()
-        self.stack.append(self._call(function, arguments))
-
-    def _call(self, function: Any, arguments: Any) -> Any:
-        if not isinstance(arguments, tuple) or not isinstance(function, Name):
-            raise BrokenFileError("its pickle calls something other than a function")
-        self._meter.charge(len(arguments))
-        return function(*arguments)
-
-    def _load_build(self) -> None:
-        state, target = self.stack.pop(), self.stack[-1]
-        if isinstance(target, StandIn):
-            target.state = state
+    def _extend(self, values: list[Any]) -> None:
+        if isinstance(self.stack[-1], list):  # and not the stand-in of another class
+            self.stack[-1].extend(values)
 
     def _set_items(self, values: list[Any]) -> None:
         if isinstance(self.stack[-1], dict):
@@ -165,32 +172,60 @@ class PickleReader(pickle._Unpickler):
 
     def _mapping(self, values: list[Any]) -> dict[Any, Any]:
         """Keys and values in turn as a dict; a key that may be costly to hash becomes its type."""
-        self._meter.charge(len(values))
+        self.charge(len(values))
         return dict(zip(map(_key, values[::2]), values[1::2], strict=True))
 
+    def _name(self, module: Any, name: Any) -> Name:
+        """The name itself, that of Python 3."""
+        if not isinstance(module, str) or not isinstance(name, str):
+            raise BrokenFileError("its pickle has a name that is no text")
+        if len(module) + len(name) > MAX_NAME:
+            raise BrokenFileError("its pickle has a name without end")
+        module = {"__builtin__": "builtins", "copy_reg": "copyreg"}.get(module, module)
+        return Name(f"{module}.{name}")
 
-class _Meter:
-    """A file that is read in so many steps at most; what is asked for must be there."""
+    def _persistent(self, pid: Any) -> Any:
+        """The storage, or the class without its source text, that the id stands for."""
+        kind = pid[0] if isinstance(pid, tuple) and len(pid) >= 4 else None
+        if kind == "module":
+            return pid[1]
+        if kind != "storage" or self._load_storage is None:
+            raise BrokenFileError("its pickle refers to something outside it")
+        return self._load_storage(pid)
 
-    def __init__(self, file: Any) -> None:
-        self._file, self._left = file, MAX_STEPS
-
-    def charge(self, steps: int) -> None:
-        self._left -= steps
-        if self._left < 0:
-            raise BrokenFileError(f"its pickle takes more than {MAX_STEPS:,} steps")
-
-    def read(self, count: int) -> bytes:
-        self.charge(1)
-        content: bytes = self._file.read(count)
-        if len(content) != count:
-            raise BrokenFileError("its pickle does not end")
-        return content
-
-    def readline(self) -> bytes:
-        self.charge(1)
-        line: bytes = self._file.readline(1 << 20)
-        return line
+    def _called(self, function: Any, arguments: Any) -> Any:
+        """What stands for a call's result; only tensors and plain containers are made."""
+        if not isinstance(arguments, tuple) or not isinstance(function, Name):
+            raise BrokenFileError("its pickle calls something other than a function")
+        first = arguments[0] if arguments else None
+        match function.path:
+            case "collections.OrderedDict" | "collections.defaultdict" | "builtins.dict":
+                pairs = first if isinstance(first, list) else []
+                self.charge(len(pairs))
+                return self._mapping([value for key, one in pairs for value in (key, one)])
+            case "builtins.set" | "builtins.frozenset":
+                return first if isinstance(first, list) else []
+            case "_codecs.encode" | "builtins.bytes" | "builtins.bytearray":
+                return "" if first is None else first  # text of Latin-1
+            case "torch.Size" | "torch.device":
+                return first or ()
+            case "copyreg._reconstructor" if isinstance(first, Name):
+                return self._called(first, ())
+            case "torch._utils._rebuild_tensor" | "torch._utils._rebuild_tensor_v2":
+                return view_of(*arguments[:4])
+            case "torch._utils._rebuild_tensor_v3":  # of a dtype that storages do not name
+                storage, *view = arguments[:4]
+                return view_of(storage.view(_DTYPES[arguments[6].path]), *view)
+            case "torch._tensor._rebuild_from_type_v2":  # it has attributes of its own
+                return self._called(first, arguments[2])
+            case (
+                "torch._utils._rebuild_parameter"
+                | "torch._utils._rebuild_parameter_with_state"
+                | "torch.nn.parameter.Parameter"
+            ):
+                return first
+        self.stood_for.setdefault(function.path)
+        return StandIn(function.path, arguments)
 
 
 def _key(key: Any) -> Any:
@@ -200,51 +235,16 @@ def _key(key: Any) -> Any:
     return key if small or isinstance(key, str | float | None) else type(key).__name__
 
 
-def view_of(storage: Any, offset: Any, shape: Any, stride: Any, dtype: Any = None) -> Tensor:
-    """Returns a tensor over a flat one, as torch.as_strided makes it, if it lies within it.
+def view_of(storage: Any, offset: Any, shape: Any, stride: Any) -> Tensor:
+    """Returns a tensor over a flat one by `as_strided`, which refuses what lies beyond it.
 
     Raises:
-        BrokenFileError: It lies beyond, or has more elements than the strides may repeat.
+        BrokenFileError: It has more axes than torch has, or far more elements than the flat one.
     """
-    if dtype is not None:
-        storage = storage.view(_DTYPES[dtype.path])
-    if max(len(shape), len(stride)) > MAX_AXES:
-        raise BrokenFileError(f"a tensor of more than {MAX_AXES} axes")
-    shape, stride, offset = tuple(map(int, shape)), tuple(map(int, stride)), int(offset)
-    if min(offset, *shape, *stride, 0) < 0:
-        raise BrokenFileError("a tensor of negative sizes or strides")
-    count, limit = math.prod(shape), len(storage)
-    last = offset + sum((n - 1) * s for n, s in zip(shape, stride, strict=True))
-    if count and (last >= limit or count > max(limit, _MAX_EXPANDED)):
-        raise BrokenFileError(
-            f"a tensor of {count:.6g} elements goes beyond its storage of {limit:,}"
-        )
-    return cast(Tensor, storage.as_strided(shape, stride, offset if count else 0))
-
-
-def _opcodes() -> dict[int, Callable[[Any], Any]]:
-    """Those of protocol 5, but none of extensions, which are imported, or of outside buffers."""
-    inherited = pickle._Unpickler.dispatch
-    own = {code: step for code, step in inherited.items() if code <= pickle.BYTEARRAY8[0]}
-    for extension in (pickle.EXT1, pickle.EXT2, pickle.EXT4):
-        del own[extension[0]]
-    replaced: dict[bytes, Callable[[Any], Any]] = {
-        **dict.fromkeys((pickle.REDUCE, pickle.NEWOBJ), PickleReader._load_call),
-        pickle.NEWOBJ_EX: lambda reader: (reader.stack.pop(), reader._load_call()),
-        pickle.BUILD: PickleReader._load_build,
-        pickle.SETITEM: lambda reader: reader._set_items(
-            [reader.stack.pop(-2), reader.stack.pop()]
-        ),
-        pickle.SETITEMS: lambda reader: reader._set_items(reader.pop_mark()),
-        pickle.DICT: lambda reader: reader.stack.append(reader._mapping(reader.pop_mark())),
-        pickle.FRAME: lambda reader: reader.read(8),  # only a hint how much to read ahead
-        # A set is a list, since its elements would have to be hashed; bytes will do for bytearray.
-        pickle.EMPTY_SET: inherited[pickle.EMPTY_LIST[0]],
-        pickle.ADDITEMS: inherited[pickle.APPENDS[0]],
-        pickle.FROZENSET: inherited[pickle.LIST[0]],
-        pickle.BYTEARRAY8: inherited[pickle.BINBYTES8[0]],
-    }
-    return own | {code[0]: step for code, step in replaced.items()}
-
-
-PickleReader.dispatch = _opcodes()
+    shape, stride = tuple(map(int, shape)), tuple(map(int, stride))
+    if len(shape) > _MAX_AXES:
+        raise BrokenFileError(f"a tensor of more than {_MAX_AXES} axes")
+    count = math.prod(shape)
+    if count > max(len(storage), _MAX_EXPANDED):
+        raise BrokenFileError(f"a tensor of {count:.6g} elements from {len(storage):,} stored ones")
+    return cast(Tensor, storage.as_strided(shape, stride, int(offset) if count else 0))

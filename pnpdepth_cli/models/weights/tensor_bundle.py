@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.budget import size_problem
-from pnpdepth_cli.models.weights.pickle_reader import MAX_AXES, BrokenFileError
+from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError
 
 _FOOTER, _MAGIC = 48, 0xDB4775248B80FB57
 _TYPES = {
@@ -28,8 +28,7 @@ _TYPES = {
 _TEXT = 7  # such as the graph of objects that TensorFlow 2 puts beside the variables
 _MAX_NAME = 1_000  # bytes of a variable's name
 
-_Fields = dict[int, list[Any]]
-"""The values of a protocol buffer's fields by number."""
+_Fields = dict[int, list[Any]]  # of a protocol buffer, by number
 
 
 def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
@@ -52,7 +51,12 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
             continue
         shard = _last(fields, 3)
         if shard not in shards:
-            shards[shard] = _values(index, f"{shard:05d}-of-{_last(header, 1):05d}")
+            path = index.with_name(f"{index.stem}.data-{shard:05d}-of-{_last(header, 1):05d}")
+            if not path.is_file():
+                raise BrokenFileError(f"{path.name} is not beside the index")
+            if problem := size_problem(path):
+                raise BrokenFileError(f"{path.name} {problem}")
+            shards[shard] = path.read_bytes()
             left += len(shards[shard])
         left -= _last(fields, 5)
         if left < 0:
@@ -61,30 +65,18 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
     return tensors
 
 
-def _values(index: Path, shard: str) -> bytes:
-    path = index.with_name(f"{index.stem}.data-{shard}")
-    if not path.is_file():
-        raise BrokenFileError(f"{path.name} is not beside the index")
-    if problem := size_problem(path):
-        raise BrokenFileError(f"{path.name} {problem}")
-    return path.read_bytes()
-
-
 def _tensor(name: str, fields: _Fields, content: bytes) -> Tensor:
     kind, offset, size = (_last(fields, number) for number in (1, 4, 5))
     if kind not in _TYPES:
         raise BrokenFileError(f"{name} is of TensorFlow's type {kind}, not of numbers")
     sides = _message(fields[2][-1]).get(2, []) if 2 in fields else []
-    shape = [_last(_message(side), 1) for side in sides[: MAX_AXES + 1]]
-    stored = math.prod(shape) * _TYPES[kind].itemsize
-    if stored != size or offset + size > len(content) or len(shape) > MAX_AXES:
+    shape = [_last(_message(side), 1) for side in sides]
+    if math.prod(shape) * _TYPES[kind].itemsize != size or offset + size > len(content):
         raise BrokenFileError(f"{name} of shape {str(shape)[:80]} goes beyond its {size} bytes")
+    if not size:
+        return torch.empty(shape, dtype=_TYPES[kind])
     part = bytearray(content[offset : offset + size])
-    return (
-        torch.frombuffer(part, dtype=_TYPES[kind]).reshape(shape)
-        if part
-        else (torch.empty(shape, dtype=_TYPES[kind]))
-    )
+    return torch.frombuffer(part, dtype=_TYPES[kind]).reshape(shape)
 
 
 def _table(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -130,19 +122,19 @@ def _message(data: bytes) -> _Fields:
     fields: _Fields = {}
     at = 0
     while at < len(data):
-        value: Any = None
         tag, at = _varint(data, at)
-        if tag & 7 == 0:
-            value, at = _varint(data, at)
-        elif tag & 7 == 2:
-            length, at = _varint(data, at)
-            value = data[at : at + length]
-            at += length
-        elif tag & 7 in (1, 5):
-            at += 8 if tag & 7 == 1 else 4  # checksums
-        else:
-            raise BrokenFileError("an entry is not a protocol buffer")
-        fields.setdefault(tag >> 3, []).append(value)
+        match tag & 7:
+            case 0:
+                value, at = _varint(data, at)
+                fields.setdefault(tag >> 3, []).append(value)
+            case 2:
+                length, at = _varint(data, at)
+                fields.setdefault(tag >> 3, []).append(data[at : at + length])
+                at += length
+            case 5:  # a checksum
+                at += 4
+            case _:
+                raise BrokenFileError("an entry is not a protocol buffer")
     return fields
 
 

@@ -11,8 +11,9 @@ import io
 import itertools
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import IO, Any, TypeGuard
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
@@ -22,8 +23,8 @@ from pnpdepth_cli.models.weights.pickle_reader import (
     MAX_NAME,
     BrokenFileError,
     Name,
-    PickleReader,
     StandIn,
+    read_pickle,
 )
 
 TORCHSCRIPT = "it is a TorchScript archive"
@@ -47,16 +48,10 @@ def read_torch_file(path: Path) -> tuple[Any, list[str]]:
     The content is tensors in plain containers, and a `StandIn` for all else; no name was run. A
     broken file raises whatever its parts do.
     """
-    with path.open("rb") as file:
-        return read_tensors(file)
-
-
-def read_tensors(file: IO[bytes]) -> tuple[Any, list[str]]:
-    """Returns what `read_torch_file` does, for an open file."""
-    size = file.seek(0, io.SEEK_END)
-    is_archive = zipfile.is_zipfile(file)
-    file.seek(0)
-    return _read_archive(file, size) if is_archive else _read_row_of_pickles(file, size)
+    if zipfile.is_zipfile(path):
+        return _read_archive(path)
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        return _read_row_of_pickles(content)
 
 
 def is_module(value: Any) -> TypeGuard[StandIn]:
@@ -90,63 +85,67 @@ def _walk(module: StandIn, prefix: str, visited: Iterator[int]) -> Iterator[tupl
                 yield f"{prefix}{name}", value
 
 
-def _read_archive(file: IO[bytes], size: int) -> tuple[Any, list[str]]:
-    with zipfile.ZipFile(file) as archive:
+def _read_archive(path: Path) -> tuple[Any, list[str]]:
+    with zipfile.ZipFile(path) as archive:
         entries = {info.filename: info for info in archive.infolist()}
         if any("/code/" in name for name in entries):
             raise BrokenFileError(f"{TORCHSCRIPT}; save the state_dict() of its module instead")
-        if any(info.compress_type != zipfile.ZIP_STORED for info in entries.values()):
-            raise BrokenFileError("it is compressed, which torch never does")
+        refuse_inflated(archive, path)
         pickles = [name for name in entries if name == "data.pkl" or name.endswith("/data.pkl")]
         if len(pickles) != 1:
             raise BrokenFileError(f"the archive has {len(pickles)} entries named data.pkl")
-        if sum(info.file_size for info in entries.values()) > size:
-            raise BrokenFileError("its entries are larger than the file")
         folder = pickles[0].removesuffix("data.pkl")
         order = entries.get(f"{folder}byteorder")
         if order is not None and archive.read(order).strip() == b"big":
             raise BrokenFileError("it was written on a big-endian machine")
         storages = _Storages(lambda key, _: bytearray(archive.read(entries[f"{folder}data/{key}"])))
-        with archive.open(pickles[0]) as pickled:
-            reader = PickleReader(pickled, storages.load)
-            return reader.load(), list(reader.named)
+        return read_pickle(io.BytesIO(archive.read(pickles[0])), storages.load)
 
 
-def _read_row_of_pickles(file: IO[bytes], size: int) -> tuple[Any, list[str]]:
+def refuse_inflated(archive: zipfile.ZipFile, path: Path) -> None:
+    """Raises BrokenFileError for an archive whose entries are compressed, or overlap."""
+    if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+        raise BrokenFileError("it is compressed, which torch never does")
+    if sum(info.file_size for info in archive.infolist()) > path.stat().st_size:
+        raise BrokenFileError("its entries are larger than the file")
+
+
+def _read_row_of_pickles(file: mmap) -> tuple[Any, list[str]]:
     """magic, protocol, system, content, keys of the storages; then each storage's length and bytes.
 
     The content comes before the storages, which are filled afterwards.
     """
     try:
-        begins = PickleReader(file).load()
+        begins, _ = read_pickle(file)
     except Exception:  # of another kind of file
         begins = None
     if begins != _MAGIC:
         raise BrokenFileError("it begins as no torch file does")
     for _ in ("protocol", "system"):
-        PickleReader(file).load()
+        read_pickle(file)
     promised = 0
 
     def room_for(key: str, count: int) -> bytearray:
         nonlocal promised
         promised += count
-        if not 0 <= count <= promised <= size:
+        if not 0 <= count <= promised <= len(file):
             raise BrokenFileError("its storages are larger than the file")
         return bytearray(count)
 
     storages = _Storages(room_for)
-    reader = PickleReader(file, storages.load)
-    content = reader.load()
-    keys = PickleReader(file).load()
+    content, named = read_pickle(file, storages.load)
+    keys, _ = read_pickle(file)
     plain = isinstance(keys, list) and all(isinstance(key, str | int) for key in keys)
     if not plain or {*map(str, keys)} != storages.contents.keys():
         raise BrokenFileError("its storages are not those that its pickle names")
     for key in map(str, keys):
-        memory, dtype = storages.contents[key], storages.dtypes[key]
-        count = int.from_bytes(file.read(8), "little") * dtype.itemsize
-        if count != len(memory) or file.readinto(memory) != count:  # type: ignore[attr-defined]
+        memory = storages.contents[key]
+        stored = int.from_bytes(file.read(8), "little") * storages.dtypes[key].itemsize
+        part = file.read(len(memory))
+        if not stored == len(memory) == len(part):
             raise BrokenFileError(f"storage {key[:20]} is shorter than it should be")
-    return content, list(reader.named)
+        memory[:] = part
+    return content, named
 
 
 class _Storages:

@@ -164,7 +164,7 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
     )  # fmt: skip
     at = frame.points_to_network(points)
     rgb = torch.rand(1, 3, 60, 90, generator=torch.Generator().manual_seed(0))
-    arguments = network.arguments(frame, rgb, at)
+    arguments = network.arguments_of(network.image_of(frame, rgb), at)
     with torch.no_grad():
         whole = network.raw_of(network.module(*arguments))
     metric = definition.output_scale == "metric"

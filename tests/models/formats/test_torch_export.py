@@ -75,14 +75,15 @@ class Dynamic(nn.Module):
         return 1 + torch.sigmoid(y) + mean
 
 
-@pytest.fixture
-def archive(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("archive")
     torch.manual_seed(0)
     sides = {2: 32 * Dim("rows", min=1, max=64), 3: 32 * Dim("columns", min=1, max=64)}
     net, image = Dynamic().eval(), torch.rand(1, 3, 64, 96)
     program = torch.export.export(net, (image,), dynamic_shapes=(sides,))
-    torch.export.save(program, tmp_path / "net.pt2")
-    return tmp_path / "net.pt2"
+    torch.export.save(program, folder / "net.pt2")
+    return folder / "net.pt2"
 
 
 def test_a_program_for_many_sizes_gives_what_the_network_gives_and_blocks_the_same_gradients(
@@ -96,14 +97,6 @@ def test_a_program_for_many_sizes_gives_what_the_network_gives_and_blocks_the_sa
     assert torch.equal(depth, expected)
     ours, theirs = (torch.autograd.grad(one.sum(), rgb)[0] for one in (depth, expected))
     torch.testing.assert_close(ours, theirs)
-
-
-def test_what_is_no_exported_program_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="does not exist"):
-        find_definition(str(tmp_path / "no.pt2"))
-    (tmp_path / "bad.pt2").write_bytes(b"no archive")
-    with pytest.raises(ModelError, match=r"torch\.export\.save"):
-        find_definition(str(tmp_path / "bad.pt2"))
 
 
 Change = Callable[[bytes], bytes]
@@ -162,12 +155,12 @@ HOSTILE: dict[str, tuple[str, Change, str]] = {
         )
     },
     "pickled weights": (WEIGHTS, first_weight(use_pickle=True), "is pickled"),
-    "a large weight": (WEIGHTS, first_weight(sizes=HUGE, strides=HUGE), "goes beyond"),
+    "a large weight": (WEIGHTS, first_weight(sizes=HUGE, strides=HUGE), "elements from"),
     "a repeated weight": (
-        WEIGHTS, first_weight(sizes=HUGE, strides=[{"as_int": 0}]), "goes beyond"
+        WEIGHTS, first_weight(sizes=HUGE, strides=[{"as_int": 0}]), "elements from"
     ),
     "a weight outside": (WEIGHTS, first_weight(path_name="../../../etc/hostname"), "KeyError"),
-    "a negative offset": (WEIGHTS, first_weight(storage_offset={"as_int": -1}), "negative"),
+    "a negative offset": (WEIGHTS, first_weight(storage_offset={"as_int": -1}), "offset"),
     "no JSON": (MODEL, lambda _: b"[" * 100_000, "RecursionError"),
     "a number without end": (MODEL, lambda _: b"9" * 10_000, "ValueError"),
 }  # fmt: skip
@@ -183,10 +176,16 @@ def test_what_could_do_more_than_compute_is_refused_in_one_line(archive: Path, k
     assert len(str(error.value)) < 500
 
 
-def test_a_compressed_archive_is_refused(archive: Path) -> None:
+def test_what_is_no_exported_program_is_refused(archive: Path, tmp_path: Path) -> None:
+    (tmp_path / "bad.pt2").write_bytes(b"no archive")
     packed = rewritten(archive, "data/x", lambda _: b"\0" * 10**7, zipfile.ZIP_DEFLATED)
-    with pytest.raises(ModelError, match="compressed"):
-        find_definition(str(packed))
+    for path, message in (
+        (tmp_path / "absent.pt2", "does not exist"),
+        (tmp_path / "bad.pt2", r"torch\.export\.save"),
+        (packed, "compressed"),
+    ):
+        with pytest.raises(ModelError, match=message):
+            find_definition(str(path))
 
 
 def test_pickles_libraries_and_code_in_an_archive_are_left_alone(
@@ -216,12 +215,6 @@ def test_pickles_libraries_and_code_in_an_archive_are_left_alone(
     assert trap.exists()  # where torch itself reads the file, it is run
 
 
-@pytest.mark.parametrize("suffix", [".pt", ".pth", ".torchscript", ".safetensors", ".pth.tar"])
-def test_weights_as_a_model_are_refused_with_a_remedy(suffix: str) -> None:
-    with pytest.raises(ModelError, match=r"--checkpoint.*ONNX"):
-        find_definition(f"net{suffix}")
-
-
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_torchscript_archive_and_a_pickled_module_are_named_with_the_lines_that_export_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -238,8 +231,9 @@ def test_a_torchscript_archive_and_a_pickled_module_are_named_with_the_lines_tha
         exec(lines, {"torch": torch})
         network = load_network(f"{Path(name).stem}.onnx", None)
         assert network.definition.size == Fixed(32, 48)
-    with pytest.raises(ModelError, match=r"a file of weights.*--checkpoint"):
-        find_definition("weights.pth")
+    for name in ("weights.pth", "absent.safetensors", "absent.pth.tar"):
+        with pytest.raises(ModelError, match=r"a file of weights.*--checkpoint.*ONNX"):
+            find_definition(name)
 
 
 BARE = """
@@ -283,10 +277,5 @@ def test_a_bare_class_or_factory_is_a_network_and_its_assumptions_are_printed(
     assert network.definition.layers[0] == "block"
     assert network.definition.default_alignment == "auto"
     assert "assumed: one rgb image in" in network.notes[0]
-
-
-def test_a_factory_that_needs_arguments_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "bare.py"
-    file.write_text(BARE)
     with pytest.raises(ModelError, match=r"needs arguments \(width\)"):
         find_definition(f"{file}:needs")

@@ -27,6 +27,8 @@ from tests.models.weights.files import (
     write_npy,
 )
 
+RING: dict[str, Any] = {}
+RING["again"] = RING
 WRITERS = ["python 2", "2", "3", "4"]
 
 
@@ -58,7 +60,7 @@ def test_a_pickled_dict_of_dicts_gives_its_arrays_to_the_bit(
     assert arrays["conv1.weights"].is_contiguous()
 
 
-@pytest.mark.parametrize("written_by", WRITERS)
+@pytest.mark.parametrize("written_by", ["python 2", "4"])
 @pytest.mark.parametrize("code", ["<f2", "<f4", "<f8", ">f4", ">i2", "|i1", "|u1", "<i4", "|b1"])
 def test_every_type_order_and_shape_is_read(code: str, written_by: str, tmp_path: Path) -> None:
     base = np.arange(24).reshape(2, 3, 4).astype(np.dtype(code))
@@ -87,9 +89,6 @@ def test_an_array_named_twice_is_read_once(tmp_path: Path) -> None:
     assert arrays["a"].data_ptr() == arrays["b"].data_ptr()
 
 
-# ------------------------------------------------------------------ what is no such file
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -101,6 +100,7 @@ def test_an_array_named_twice_is_read_once(tmp_path: Path) -> None:
         ({"a": np.array([1 + 2j])}, "a is an array of <c16, not of numbers"),
         ({"a": np.array([{}, 1], dtype=object)}, "a holds objects"),
         ({"a": {"b": {"c": {"d": np.ones(1)}}}}, "nested deeper than the layers"),
+        (RING, "nested deeper than the layers"),
         ({"a": torch.nn.Identity()}, "a is a torch.nn"),
     ],
 )
@@ -117,20 +117,12 @@ def test_a_plain_array_or_several_objects_are_no_checkpoint(tmp_path: Path) -> N
     assert "cannot be read as a numpy file" in refused(tmp_path / "c.npz")
 
 
-def test_a_dict_in_itself_is_refused(tmp_path: Path) -> None:
-    ring: dict[str, Any] = {}
-    ring["again"] = ring
-    assert "deeper" in refused(npy_of(tmp_path / "x.npy", pickled(ring, "4")))
-
-
-@pytest.mark.parametrize("written_by", WRITERS)
+@pytest.mark.parametrize("written_by", ["python 2", "4"])
 @pytest.mark.parametrize("kind", hostile(Path("x")))
 def test_nothing_of_a_hostile_pickle_runs(kind: str, written_by: str, tmp_path: Path) -> None:
-    marker = tmp_path / "ran"
+    marker, before = tmp_path / "ran", set(sys.modules)
     content = {"w": {"weights": np.ones(2)}, "x": hostile(marker)[kind]}
-    path = npy_of(tmp_path / "bad.npy", pickled(content, written_by))
-    before = set(sys.modules)
-    refused(path)
+    refused(npy_of(tmp_path / "bad.npy", pickled(content, written_by)))
     assert not marker.exists()
     assert set(sys.modules) == before
 
@@ -158,13 +150,6 @@ def test_calls_inside_an_array_are_not_run(field: str, tmp_path: Path) -> None:
     else:
         refused(path)
     assert not marker.exists()
-
-
-def test_the_hostile_files_do_run_where_numpy_itself_reads_them(tmp_path: Path) -> None:
-    marker = tmp_path / "ran"
-    path = npy_of(tmp_path / "bad.npy", pickled({"x": hostile(marker)["exec"]}, "python 2"))
-    np.load(path, allow_pickle=True, encoding="latin1")
-    assert marker.exists()
 
 
 def array_of(shape: tuple[int, ...], data: bytes, code: str = "f4") -> Any:
@@ -201,16 +186,13 @@ def test_what_claims_to_be_larger_than_the_file_is_refused(kind: str, tmp_path: 
 def test_an_archive_that_inflates_far_beyond_its_size_is_refused(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "x.npz", a=np.zeros(10**7))
     assert "far larger than the file" in refused(tmp_path / "x.npz")
-
-
-def test_an_archive_whose_header_claims_more_than_is_there_is_refused(tmp_path: Path) -> None:
     header = io.BytesIO()
     claim = {"descr": "<f4", "fortran_order": False, "shape": (10**10,)}
     np.lib.format.write_array_header_1_0(header, claim)
-    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+    with zipfile.ZipFile(tmp_path / "y.npz", "w") as archive:
         archive.writestr("a.npy", header.getvalue() + b"\0" * 4)
     with little():
-        refused(tmp_path / "x.npz")
+        refused(tmp_path / "y.npz")
 
 
 def with_directory_size(path: Path, size: int) -> None:
@@ -227,21 +209,10 @@ def test_an_archive_that_inflates_beyond_its_directory_takes_no_memory(
 ) -> None:
     path = tmp_path / "x.npz"
     with zipfile.ZipFile(path, "w", getattr(zipfile, f"ZIP_{method}")) as archive:
-        archive.writestr("a.npy", b"\0" * 300_000_000 if method != "STORED" else b"\0" * 1000)
+        archive.writestr("a.npy", b"\0" * 60_000_000 if method != "STORED" else b"\0" * 1000)
     with_directory_size(path, 100)
-    with little():
+    with little(megabytes=30):
         refused(path)
-
-
-@pytest.mark.parametrize("method", ["DEFLATED", "BZIP2", "LZMA"])
-def test_a_corrupt_compressed_archive_is_refused(method: str, tmp_path: Path) -> None:
-    path = tmp_path / "x.npz"
-    with zipfile.ZipFile(path, "w", getattr(zipfile, f"ZIP_{method}")) as archive:
-        archive.writestr("a.npy", np.random.default_rng(0).bytes(5000))
-    data = bytearray(path.read_bytes())
-    data[60:200] = b"\xff" * 140
-    path.write_bytes(data)
-    refused(path)
 
 
 @pytest.mark.parametrize("suffix", ["npy", "npz"])
@@ -257,30 +228,19 @@ def test_a_file_cut_anywhere_is_refused(suffix: str, tmp_path: Path) -> None:
         refused(path)
 
 
-@given(data=st.binary(max_size=200), kind=st.sampled_from(["raw", "header", "pickle", "archive"]))
-@settings(
-    max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+HEADER = st.text(alphabet="{}[]()'\":,. \ndescrfotashp|O<4i-L0", max_size=80).map(
+    lambda text: b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
 )
-def test_any_other_bytes_are_refused(data: bytes, kind: str, tmp_path: Path) -> None:
-    path = tmp_path / "fuzz.npy"
-    if kind == "pickle":
-        npy_of(path, data)
-    elif kind == "archive":
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr("a.npy", b"\x93NUMPY\x01\x00" + data)
-    else:
-        path.write_bytes((b"\x93NUMPY\x01\x00" if kind == "header" else b"") + data)
-    refused(path)
 
 
-@given(text=st.text(alphabet="{}[]()'\":,. \ndescrfotashp|O<4i-L0", max_size=80))
+@given(data=st.binary(max_size=200), header=HEADER, kind=st.sampled_from(["header", "pickle"]))
 @settings(
-    max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-def test_any_other_header_is_refused(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "fuzz.npy"
-    header = text.encode()
-    path.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+def test_any_other_bytes_are_refused(data: bytes, header: bytes, kind: str, tmp_path: Path) -> None:
+    path = npy_of(tmp_path / "fuzz.npy", data)
+    if kind == "header":
+        path.write_bytes(header + data)
     refused(path)
 
 

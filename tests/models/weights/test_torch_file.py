@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.models.weights import pickle_reader
 from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
 from pnpdepth_cli.models.weights.pickle_reader import StandIn
 from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_torch_file
@@ -119,11 +120,9 @@ def test_nothing_of_a_hostile_pickle_runs(tmp_path: Path, kind: str, how: str) -
 
 
 def test_the_hostile_pickles_do_run_where_torch_itself_reads_them(tmp_path: Path) -> None:
-    for kind in ("exec", "eval", "os.system"):
-        marker = tmp_path / kind
-        path = save({"x": hostile(marker)[kind]}, tmp_path / "bad.pt")
-        torch.load(path, weights_only=False)
-        assert marker.exists()
+    path = save({"x": hostile(tmp_path / "ran")["exec"]}, tmp_path / "bad.pt")
+    torch.load(path, weights_only=False)
+    assert (tmp_path / "ran").exists()
 
 
 @both_layouts
@@ -199,16 +198,16 @@ BOMBS = {
 }
 LONG_BOMBS = {
     "a dict copied again and again": b"\x80\x02ccollections\nOrderedDict\nq\x00]("
-    + b"K\x01K\x02\x86" * 10**5
+    + b"K\x01K\x02\x86" * 10**3
     + b"eq\x01\x85q\x02R("
-    + b"h\x00h\x02R" * 10**5
+    + b"h\x00h\x02R" * 10**3
     + b"t.",
     "a long name joined again and again": b"\x80\x04"
     + LONG_NAME
     + b"q\x00h\x00\x93("
     + b"h\x00h\x00\x93" * 10**4
     + b"t.",
-    "steps without end": b"\x80\x02" + b"]0" * (4 * 10**6) + b"N.",
+    "steps without end": b"\x80\x02" + b"]0" * 10**5 + b"N.",
 }
 
 
@@ -216,20 +215,21 @@ LONG_BOMBS = {
 def test_a_small_pickle_takes_no_time_and_no_memory(kind: str, tmp_path: Path) -> None:
     path = archive_of(tmp_path / "bomb.pt", BOMBS[kind], b"\0" * 4)
     assert path.stat().st_size < 2500
+    (tmp_path / "alone.pt").write_bytes(BOMBS[kind])
     with little(megabytes=50):
         refused(path)
+        refused(tmp_path / "alone.pt")
 
 
 @pytest.mark.parametrize("kind", LONG_BOMBS)
-def test_a_pickle_of_many_steps_is_refused(kind: str, tmp_path: Path) -> None:
+def test_a_pickle_of_many_steps_is_refused(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pickle_reader, "MAX_STEPS", 10**5)
     path = archive_of(tmp_path / "bomb.pt", LONG_BOMBS[kind])
-    with little(megabytes=400, seconds=8):
-        refused(path)
-
-
-def test_a_length_that_no_file_has_is_refused_in_the_older_layout_too(tmp_path: Path) -> None:
-    (tmp_path / "x.pt").write_bytes(b"\x80\x05\x8d" + struct.pack("<Q", 2**62) + b"a.")
-    refused(tmp_path / "x.pt")
+    with little(megabytes=20, seconds=3):
+        message = refused(path)
+    assert "without end" in message or "more than 100,000 steps" in message
 
 
 def test_tensors_of_one_storage_use_the_same_memory(tmp_path: Path) -> None:
@@ -275,22 +275,9 @@ def test_modules_that_hold_themselves_again_and_again_are_refused() -> None:
             module_state(module)
 
 
-def test_names_of_buffers_that_are_large_when_hashed_take_no_time() -> None:
-    buffers = {"fleeting": torch.ones(1), "kept": torch.ones(2)}
-    fleeting = [(), [], "fleeting", pickle.loads(NESTED + b".")]
-    state = {"_buffers": buffers, "_parameters": {}, "_non_persistent_buffers_set": fleeting}
-    with little():
-        assert list(module_state(StandIn("a.B", state=state))) == ["kept"]
-
-
-def test_integers_too_long_to_print_are_no_names(tmp_path: Path) -> None:
-    path = save({10**7000: torch.ones(1), "epoch": 1}, tmp_path / "x.pt")
-    assert "no state dict; it holds int, epoch" in refused(path)
-
-
 @pytest.mark.parametrize(
     "opcode",
-    [b"\x82\x01", b"\x83\x01\x00", b"\x84\x01\x00\x00\x00", b"\x97", b"\x98", b"P1\n", b"\xff"],
+    [b"\x82\x01", b"\x83\x01\x00", b"\x97", b"\x98", b"P1\n", b"(ios\nsystem\n", b"\xff"],
 )
 def test_opcodes_of_extensions_and_of_things_outside_are_refused(
     opcode: bytes, tmp_path: Path

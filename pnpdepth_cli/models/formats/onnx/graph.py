@@ -7,7 +7,6 @@ network can be cut at it.
 
 from __future__ import annotations
 
-import graphlib
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -20,8 +19,14 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.formats.onnx import (  # noqa: F401  (each registers its operators)
+    arithmetic,
+    layers,
+    resizing,
+    tensors,
+)
 from pnpdepth_cli.models.formats.onnx.limits import SizeLimit
-from pnpdepth_cli.models.formats.onnx.operators import HOST_INPUTS, OPERATORS, Node, Unsupported
+from pnpdepth_cli.models.formats.onnx.table import HOST_INPUTS, OPERATORS, Node, Unsupported
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
@@ -83,10 +88,6 @@ class OnnxNode(nn.Module):
             reason = f"{self.node.op} with {error} is not covered"
             raise ModelError(f"ONNX node {self.node.name!r}: {reason}") from None
 
-    def extra_repr(self) -> str:
-        """Returns the operator, for `print(network)`."""
-        return self.node.op
-
 
 @dataclass(frozen=True)
 class _Step:
@@ -111,29 +112,25 @@ class OnnxGraph(nn.Module):
     beyond _ACTIVATION_ELEMENTS.
 
     Args:
-        model: The onnx.ModelProto, without functions of its own.
+        model: The onnx.ModelProto, without functions of its own, its nodes in order.
         path: Its file, for messages.
-        outputs: Names of the wanted outputs; None takes all of the graph's.
 
     Raises:
         ModelError: An operator is not covered; the message names every one.
     """
 
-    def __init__(self, model: Any, path: Path, outputs: Sequence[str] | None = None) -> None:
+    def __init__(self, model: Any, path: Path) -> None:
         super().__init__()
         graph = model.graph
+        _check_operators(graph.node, path)
         opset = max((o.version for o in model.opset_import if o.domain in _STANDARD), default=1)
         constants = {t.name: _tensor(t, path) for t in graph.initializer}
+        self.is_half = any(t.data_type == t.FLOAT16 for t in graph.initializer)
         self.input_names = tuple(i.name for i in graph.input if i.name not in constants)
-        self.output_names = tuple(outputs or (o.name for o in graph.output))
-        known = {*constants, *self.input_names}
-        order = order_of_nodes(graph.node, known, self.output_names, path)
-        _check_operators([graph.node[n] for n in order], path)
-        names = _names(graph.node)
-        nodes = [(names[n], graph.node[n]) for n in order]
+        self.output_names = tuple(o.name for o in graph.output)
         self._stored = sum(constant.numel() for constant in constants.values())
-        steps = self._steps_of(nodes, opset, constants, path)
-        self._steps = _with_ends(steps, self.output_names)
+        nodes = zip(_names(graph.node), graph.node, strict=True)
+        self._steps = _with_ends(self._steps_of(nodes, opset, constants, path), self.output_names)
         self._constants = {n: constants[n] for n in self.output_names if n in constants}
         self._allowed: set[tuple[torch.Size, ...]] = set()  # sizes of inputs
         for step in self._steps:
@@ -250,43 +247,6 @@ def _check_operators(nodes: Sequence[Any], path: Path) -> None:
             " rounding has no gradient; use the file with float weights, or one where only weights"
             " are quantised"
         )
-
-
-def order_of_nodes(
-    nodes: Sequence[Any], known: set[str], outputs: Sequence[str], path: Path
-) -> list[int]:
-    """Returns the indices of the nodes that the outputs need, each after those it reads.
-
-    The order is that of the file if possible; files converted to half precision are not in order.
-
-    Args:
-        nodes: The nodes of an onnx.GraphProto.
-        known: Names of the graph's inputs and stored constants.
-        outputs: Names of the wanted values.
-        path: The file, for messages.
-
-    Raises:
-        ModelError: A node reads a value that nothing gives, or nodes read each other in a circle.
-    """
-    producer = {name: n for n, proto in enumerate(nodes) for name in proto.output if name}
-    reads: dict[int, set[int]] = {}
-    pending = [producer[name] for name in outputs if name in producer]
-    while pending:
-        n = pending.pop()
-        if n in reads:
-            continue
-        inputs = {name for name in nodes[n].input if name and name not in known}
-        absent = sorted(inputs - producer.keys())
-        if absent:
-            raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
-        reads[n] = {producer[name] for name in inputs}
-        pending += reads[n]
-    if all(before < n for n, befores in reads.items() for before in befores):
-        return sorted(reads)
-    try:
-        return [*graphlib.TopologicalSorter(dict(sorted(reads.items()))).static_order()]
-    except graphlib.CycleError:
-        raise ModelError(f"ONNX file {path}: its nodes read each other in a circle") from None
 
 
 def _names(nodes: Iterable[Any]) -> list[str]:

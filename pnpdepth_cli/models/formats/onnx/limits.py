@@ -8,6 +8,7 @@ ConstantOfShape, Tile, Pad, Expand and many other operators can turn a few bytes
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -16,10 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._pytree import tree_flatten, tree_map_only
+from torch.utils._pytree import tree_flatten
 
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.formats.onnx.operators import Unsupported
+from pnpdepth_cli.models.formats.onnx.table import Unsupported
 
 _MAX_WRITTEN_OUT = 1 << 28  # bytes
 _NODE_BYTES = 1 << 12  # that a node takes in memory at least; depth networks have up to 10,000
@@ -83,7 +84,7 @@ class SizeLimit(TorchFunctionMode):
     ) -> Any:
         """Runs the operation if its result fits; see TorchFunctionMode."""
         kwargs = kwargs or {}
-        self._refuse(_elements_at_most(func, args, kwargs, self._largest))
+        self._refuse(_elements_at_most(func, args, kwargs))
         result = func(*args, **kwargs)
         elements = sum(part.numel() for part in _tensors_in(result) if part._base is None)
         self._left -= elements
@@ -95,71 +96,21 @@ class SizeLimit(TorchFunctionMode):
             raise Unsupported(f"a result of {elements:.3g} elements")
 
 
-def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any], largest: int) -> float:
+def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any]) -> float:
     """An upper bound on the elements of the result.
 
-    For most functions it is known. Elsewhere the product of all sizes and numbers bounds the
-    result; each factor is at least 2, so that it bounds sums too. If that exceeds `largest`, the
-    shape is inferred on the meta device, where nothing is allocated (its import takes a second).
+    Most functions give no more than their tensors broadcast together; `_GROWING` has the others
+    that operators call.
     """
-    name = getattr(func, "__name__", "")
-    leaves = tree_flatten((args, kwargs))[0]
-    shapes = [leaf.shape for leaf in leaves if isinstance(leaf, Tensor)]
-    known = _KNOWN.get(name)
-    if shapes and (known is not None or name in _ELEMENTWISE):
-        return known(*args, **kwargs) if known is not None else _broadcast(shapes)
-    if shapes and name in _NO_LARGER:
-        return shapes[0].numel()
-    bound: float = math.prod(max(2, shape.numel()) for shape in shapes)
-    bound *= math.prod(2 + abs(leaf) for leaf in leaves if isinstance(leaf, int | float))
-    # The result of arange is larger the smaller its step.
-    if bound <= largest and name != "arange":
-        return bound
-    args, kwargs = tree_map_only(Tensor, _without_values, (args, kwargs))
-    if kwargs.get("device") is not None:
-        kwargs = {**kwargs, "device": "meta"}
-    try:
-        with torch.device("meta"):
-            result = func(*args, **kwargs)
-    except (RuntimeError, NotImplementedError):  # its size depends on values; it makes few of them
-        return 0
-    return max((part.numel() for part in _tensors_in(result)), default=0)
-
-
-_ELEMENTWISE = frozenset(
-    {
-        *("add", "sub", "rsub", "mul", "div", "true_divide", "floor_divide", "pow", "remainder"),
-        *("__add__", "__sub__", "__mul__", "__truediv__", "__pow__", "maximum", "minimum", "where"),
-        *("__radd__", "__rsub__", "__rmul__", "__rtruediv__", "fmod", "eq", "gt", "lt", "ge", "le"),
-    }
-)
-"""Functions whose result has the elements of their tensors broadcast together."""
-
-_NO_LARGER = frozenset(
-    {
-        *("relu", "sigmoid", "tanh", "erf", "exp", "log", "sqrt", "neg", "abs", "clamp", "softmax"),
-        *("leaky_relu", "elu", "hardswish", "gelu", "softplus", "batch_norm", "layer_norm"),
-        *("instance_norm", "group_norm", "mean", "sum", "amax", "amin", "square", "clone", "to"),
-        *("float", "long", "contiguous", "reshape", "view", "permute", "transpose", "squeeze"),
-        *(
-            "unsqueeze",
-            "movedim",
-            "split",
-            "pixel_shuffle",
-            "max_pool2d",
-            "max_pool2d_with_indices",
-        ),
-        *("boolean_dispatch", "_max_pool2d", "avg_pool2d", "detach", "cpu"),
-    }
-)
-"""Functions whose result is no larger than their first tensor."""
+    growing = _GROWING.get(getattr(func, "__name__", ""))
+    if growing is not None:
+        return growing(*args, **kwargs)
+    return _broadcast([tensor.shape for tensor in _tensors_in((args, kwargs))])
 
 
 def _broadcast(shapes: list[torch.Size]) -> int:
-    axes = max(map(len, shapes))
-    padded = [(*(1 for _ in range(axes - len(shape))), *shape) for shape in shapes]
-    sides: list[int] = [max(along) for along in zip(*padded, strict=True)]
-    return math.prod(sides)
+    sides = itertools.zip_longest(*(reversed(shape) for shape in shapes), fillvalue=1)
+    return math.prod(max(along) for along in sides)
 
 
 def _of_convolution(
@@ -182,24 +133,38 @@ def _of_product(a: Tensor, b: Tensor) -> int:
     return _broadcast([a.shape[:-2], b.shape[:-2]]) * a.shape[-2] * b.shape[-1]
 
 
-_KNOWN: dict[str, Callable[..., int]] = {
+def _of_range(start: float, end: float, step: float = 1) -> float:
+    return abs((end - start) / step) + 1 if step else math.inf
+
+
+def _of_item(x: Tensor, index: Any) -> int:
+    parts = index if isinstance(index, tuple) else (index,)
+    if not all(isinstance(part, Tensor) for part in parts):
+        return x.numel()
+    return _broadcast([part.shape for part in parts]) * x.shape[len(parts) :].numel()
+
+
+_GROWING: dict[str, Callable[..., float]] = {
     **{f"conv{axes}d": _of_convolution for axes in (1, 2, 3)},
     **{f"conv_transpose{axes}d": _of_transposed for axes in (1, 2, 3)},
     **dict.fromkeys(("matmul", "__matmul__"), _of_product),
-    "interpolate": lambda x, size, **_: x.shape[:2].numel() * math.prod(size),
     **dict.fromkeys(("cat", "stack"), lambda tensors, *_, **__: sum(map(torch.numel, tensors))),
+    **dict.fromkeys(("ones", "zeros"), lambda *sides, **_: math.prod(sides)),
+    "einsum": lambda by, *tensors: torch.einsum(by, *(t.to("meta") for t in tensors)).numel(),
+    "grid_sample": lambda x, grid, **_: x.shape[:2].numel() * grid.numel(),
+    "interpolate": lambda x, size, **_: x.shape[:2].numel() * math.prod(size),
     "index_select": lambda x, axis, at: x.numel() // max(1, x.shape[axis]) * at.numel(),
+    "__getitem__": _of_item,
     "expand": lambda _, *sizes: math.prod(sizes[0] if len(sizes) == 1 else sizes),
+    "repeat": lambda x, times: x.numel() * math.prod(times),
+    "repeat_interleave": lambda x, times: x.numel() * times,
+    "arange": lambda *ends, **_: _of_range(*(ends if len(ends) > 1 else (0, *ends))),
     "pad": lambda x, pads, **_: math.prod(
         n + sum(pads[2 * at : 2 * at + 2]) for at, n in enumerate(reversed(x.shape))
     ),
 }
-"""Elements of the results of functions that may be far larger than their tensors."""
+"""Functions whose result may be far larger than their tensors."""
 
 
 def _tensors_in(value: Any) -> list[Tensor]:
     return [leaf for leaf in tree_flatten(value)[0] if isinstance(leaf, Tensor)]
-
-
-def _without_values(tensor: Tensor) -> Tensor:
-    return torch.empty_strided(tensor.shape, tensor.stride(), dtype=tensor.dtype, device="meta")

@@ -6,6 +6,8 @@ pnpdepth[onnx]`.
 
 from __future__ import annotations
 
+import graphlib
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
-from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph, order_of_nodes
-from pnpdepth_cli.models.formats.onnx.input_range import stated_input_range
+from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph
 from pnpdepth_cli.models.formats.onnx.limits import inlined
 
 MISMATCH = 1e-3
@@ -45,16 +46,16 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
     channels_last = _channels_last(input_shape)
     height, width = input_shape[1:3] if channels_last else input_shape[2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
-    stated = stated_input_range(model)
+    is_part = _pruned(model, chosen, file)
     return ModelDefinition(
         name=file.stem,
         input_kind="rgb",
         size=Fixed(int(height), int(width))
         if fixed
         else Multiple(_patch_size(model) or _ASSUMED_MULTIPLE),
-        build=lambda: OnnxGraph(model, file, [chosen]),
+        build=lambda: OnnxGraph(model, file),
         complete=True,
-        normalisation=None if stated is None else stated[0],
+        normalisation=None,
         defaults=UNTUNED_DEFAULTS,
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
         output_kind="unknown",
@@ -62,11 +63,49 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         checkpoint=file,
         arguments=lambda rgb, _: (_as_input(rgb, channels_last),),
         output=_as_map,
-        verify=_FirstImageCheck(model, file, chosen),
-        assumed=""
-        if stated is None
-        else f"rgb range {stated[1]}, which the graph normalises itself",
+        # From the file, onnxruntime reads weights that lie beside it.
+        verify=_FirstImageCheck(model.SerializeToString() if is_part else str(file), file),
     )
+
+
+def _pruned(model: Any, output: str, path: Path) -> bool:
+    """True if not all of the model was needed: in it stay that output and the nodes that it needs.
+
+    Each node comes after those it reads. The order is that of the file if possible; files converted
+    to half precision are not in order. ModelError if a node reads a value that nothing gives, or
+    nodes read each other in a circle.
+    """
+    graph = model.graph
+    nodes, outputs = list(graph.node), [o for o in graph.output if o.name == output]
+    known = {*(t.name for t in graph.initializer), *(i.name for i in graph.input)}
+    producer = {name: n for n, proto in enumerate(nodes) for name in proto.output if name}
+    reads: dict[int, set[int]] = {}
+    pending = [producer[output]] if output in producer else []
+    while pending:
+        n = pending.pop()
+        if n in reads:
+            continue
+        inputs = {name for name in nodes[n].input if name and name not in known}
+        absent = sorted(inputs - producer.keys())
+        if absent:
+            raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
+        reads[n] = {producer[name] for name in inputs}
+        pending += reads[n]
+    order = sorted(reads)
+    if any(before >= n for n, befores in reads.items() for before in befores):
+        try:
+            by_number = dict(sorted(reads.items()))
+            order = [*graphlib.TopologicalSorter(by_number).static_order()]
+        except graphlib.CycleError:
+            raise ModelError(f"ONNX file {path}: its nodes read each other in a circle") from None
+    pruned = len(order) < len(nodes) or len(outputs) < len(graph.output)
+    kept = type(graph)()
+    kept.node.extend(nodes[n] for n in order)
+    kept.output.extend(outputs)
+    graph.ClearField("node")
+    graph.ClearField("output")
+    graph.MergeFrom(kept)
+    return pruned
 
 
 def _as_input(rgb: Tensor | None, channels_last: bool) -> Tensor:
@@ -166,10 +205,15 @@ def _patch_size(model: Any) -> int | None:
 
 
 class _FirstImageCheck:
-    """Compares the network with onnxruntime on the first image."""
+    """Compares the network with onnxruntime on the first image.
 
-    def __init__(self, model: Any, file: Path, output: str) -> None:
-        self._model, self._file, self._output, self._note = model, file, output, ""
+    Args:
+        source: What onnxruntime reads: a file, or the content of one.
+        file: The network's file, for messages.
+    """
+
+    def __init__(self, source: str | bytes, file: Path) -> None:
+        self._source, self._file, self._note = source, file, ""
 
     def __call__(self, module: nn.Module, arguments: Sequence[Tensor]) -> str:
         """Returns how well they agree; compares only once. ModelError if they differ."""
@@ -180,9 +224,8 @@ class _FirstImageCheck:
         with torch.no_grad():
             actual = module(*arguments).cpu()  # first, since it allocates no more than it should
         expected = self._expected(inputs)
-        limit = _HALF_MISMATCH if _is_half(self._model) else MISMATCH
         deviation = _deviation(actual, expected)
-        if not deviation <= limit:
+        if not deviation <= (_HALF_MISMATCH if module.is_half else MISMATCH):
             raise ModelError(
                 f"ONNX file {self._file}: its reading by torch differs from onnxruntime's by"
                 f" {deviation:.2g} of the output's range"
@@ -199,51 +242,24 @@ class _FirstImageCheck:
         options.intra_op_num_threads = torch.get_num_threads()
         try:
             session = onnxruntime.InferenceSession(
-                self._needed_graph(), options, providers=["CPUExecutionProvider"]
+                self._source, options, providers=["CPUExecutionProvider"]
             )
             halves = {i.name for i in session.get_inputs() if i.type == "tensor(float16)"}
             feed = {
                 name: value.half().numpy() if name in halves else value.numpy()
                 for name, value in inputs.items()
             }
-            return torch.from_numpy(session.run([self._output], feed)[0]).float()
+            return torch.from_numpy(session.run(None, feed)[0]).float()
         except Exception as error:  # onnxruntime has a type for each of its status codes
             raise ModelError(
                 f"ONNX file {self._file} does not run in onnxruntime: {describe(error)}"
             ) from None
 
-    def _needed_graph(self) -> str | bytes:
-        """The file if it is needed whole, else a model of the nodes that the output needs.
-
-        onnxruntime would run every node; a small file may hold one that needs much memory. From the
-        file, it reads weights that lie beside it.
-        """
-        import onnx
-
-        graph = self._model.graph
-        known = {*(t.name for t in graph.initializer), *(i.name for i in graph.input)}
-        needed = order_of_nodes(graph.node, known, [self._output], self._file)
-        if len(needed) == len(graph.node):
-            return str(self._file)
-        part = onnx.ModelProto()
-        part.CopyFrom(self._model)
-        del part.graph.node[:], part.graph.output[:]
-        part.graph.node.extend(graph.node[n] for n in needed)
-        part.graph.output.extend(o for o in graph.output if o.name == self._output)
-        content: bytes = part.SerializeToString()
-        return content
-
-
-def _is_half(model: Any) -> bool:
-    from onnx import TensorProto
-
-    return any(t.data_type == TensorProto.FLOAT16 for t in model.graph.initializer)
-
 
 def _deviation(actual: Tensor, expected: Tensor) -> float:
     """The largest difference relative to the largest expected value."""
     if actual.shape != expected.shape:
-        return float("inf")
+        return math.inf
     if not expected.numel():
         return 0.0
     largest = float(expected.abs().max())

@@ -1,4 +1,8 @@
-"""The table of ONNX operators; each function registers itself with `@operator`."""
+"""The table of the ONNX operators that depth networks use, each as the standard defines it.
+
+The functions register themselves with `@operator` (https://onnx.ai/onnx/operators). Every version
+of an operator is covered: an attribute that later became an input is read as either.
+"""
 
 from __future__ import annotations
 
@@ -63,3 +67,11 @@ def optional(inputs: Inputs, index: int) -> Tensor | None:
 def whole_numbers(values: Tensor) -> list[int]:
     """Returns the elements of an integer tensor as Python numbers."""
     return [int(v) for v in values.reshape(-1).tolist()]
+
+
+def stated(node: Node, name: str, inputs: Inputs, index: int) -> list[int] | None:
+    """Returns the numbers of an attribute, or of the input that later took its place."""
+    if name not in node.attributes and optional(inputs, index) is not None:
+        return whole_numbers(inputs[index])
+    numbers: list[int] | None = node.get(name)
+    return numbers

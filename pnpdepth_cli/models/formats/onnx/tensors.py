@@ -8,13 +8,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.formats.onnx.operators.table import (
+from pnpdepth_cli.models.formats.onnx.table import (
     Inputs,
     Node,
     Unsupported,
     operator,
     optional,
     register,
+    stated,
     whole_numbers,
 )
 
@@ -23,13 +24,6 @@ TYPES = {
     7: torch.int64, 9: torch.bool, 10: torch.float32, 11: torch.float64, 16: torch.float32,
 }  # fmt: skip
 """TensorProto.DataType; half precision is computed in float32."""
-
-
-def _axes(node: Node, inputs: Inputs) -> list[int] | None:
-    axes = node.get("axes")
-    if axes is None and optional(inputs, 1) is not None:
-        axes = whole_numbers(inputs[1])
-    return None if axes is None else list(axes)
 
 
 register(
@@ -51,7 +45,7 @@ register(
 register(
     {
         "Tile": lambda _, i: i[0].repeat(whole_numbers(i[1])),
-        "Squeeze": lambda node, i: i[0].squeeze(_axes(node, i) or [*range(i[0].ndim)]),
+        "Squeeze": lambda node, i: i[0].squeeze(stated(node, "axes", i, 1) or [*range(i[0].ndim)]),
         "Trilu": lambda node, i: (torch.triu if node.get("upper", 1) else torch.tril)(
             i[0], 0 if optional(i, 1) is None else whole_numbers(i[1])[0]
         ),
@@ -62,8 +56,8 @@ register(
 
 @operator("Reshape", host=(1,))
 def reshape(node: Node, inputs: Inputs) -> Tensor:
-    x = inputs[0]
-    wanted = node.get("shape") if len(inputs) < 2 else whole_numbers(inputs[1])
+    x, wanted = inputs[0], stated(node, "shape", inputs, 1)
+    assert wanted is not None
     if not node.get("allowzero", 0):
         wanted = [x.shape[i] if n == 0 else n for i, n in enumerate(wanted)]
     return x.reshape(wanted)
@@ -71,7 +65,7 @@ def reshape(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("Unsqueeze", host=(1,))
 def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
-    x, axes = inputs[0], _axes(node, inputs)
+    x, axes = inputs[0], stated(node, "axes", inputs, 1)
     assert axes is not None
     rank = x.ndim + len(axes)
     for axis in sorted(a % rank for a in axes):
@@ -81,20 +75,16 @@ def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("Expand", host=(1,))
 def expand(node: Node, inputs: Inputs) -> Tensor:
-    x = inputs[0]
-    wanted = whole_numbers(inputs[1])
-    rank = max(x.ndim, len(wanted))
-    own = [1] * (rank - x.ndim) + list(x.shape)
-    wanted = [1] * (rank - len(wanted)) + wanted
+    x, wanted = inputs[0], whole_numbers(inputs[1])
+    wanted = [1] * (x.ndim - len(wanted)) + wanted
+    own = [1] * (len(wanted) - x.ndim) + list(x.shape)
     return x.expand([n if w == 1 else w for n, w in zip(own, wanted, strict=True)])
 
 
 @operator("Split", host=(1,))
 def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     x, axis = inputs[0], node.get("axis", 0)
-    sizes = node.get("split")
-    if sizes is None and optional(inputs, 1) is not None:
-        sizes = whole_numbers(inputs[1])
+    sizes = stated(node, "split", inputs, 1)
     if sizes is None:
         parts, total = node.get("num_outputs", node.outputs), x.shape[axis]
         each = math.ceil(total / parts)
@@ -104,15 +94,11 @@ def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
 
 @operator("Pad", host=(1, 2, 3))
 def pad(node: Node, inputs: Inputs) -> Tensor:
-    x = inputs[0]
-    mode = node.get("mode", "constant")
-    flat = node.get("pads", node.get("paddings"))
-    value = node.get("value", 0.0)
-    if flat is None:
-        flat = whole_numbers(inputs[1])
-        value = 0.0 if optional(inputs, 2) is None else inputs[2].item()
-    axes = whole_numbers(inputs[3]) if optional(inputs, 3) is not None else list(range(x.ndim))
-    pairs = list(zip(flat[: len(axes)], flat[len(axes) :], strict=True))
+    x, mode = inputs[0], node.get("mode", "constant")
+    flat = stated(node, "pads", inputs, 1) or node.get("paddings")
+    value = node.get("value", 0.0) if optional(inputs, 2) is None else inputs[2].item()
+    axes = whole_numbers(inputs[3]) if optional(inputs, 3) is not None else [*range(x.ndim)]
+    pairs = zip(flat[: len(axes)], flat[len(axes) :], strict=True)
     sides = dict(zip((a % x.ndim for a in axes), pairs, strict=True))
     if mode == "constant":
         each = [sides.get(axis, (0, 0)) for axis in reversed(range(x.ndim))]
@@ -188,29 +174,22 @@ def number_range(node: Node, inputs: Inputs) -> Tensor:
 @operator("Slice", host=(1, 2, 3, 4))
 def slice_(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
-    stated: list[list[int] | None] = [node.get(name) for name in ("starts", "ends", "axes")]
-    if len(inputs) > 1:
-        stated = [
-            None if (one := optional(inputs, n)) is None else whole_numbers(one)
-            for n in (1, 2, 3, 4)
-        ]
-    starts, ends, axes, steps = (*stated, None)[:4]
+    starts, ends, axes, steps = (
+        stated(node, name, inputs, n)
+        for n, name in enumerate(("starts", "ends", "axes", "steps"), 1)
+    )
     assert starts is not None
     assert ends is not None
     axes, steps = axes or [*range(len(starts))], steps or [1] * len(starts)
     for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
         size = x.shape[axis]
-        kept = range(*slice(start, _backwards_end(end, size, step), step).indices(size))
+        # With a negative step, an end before the first element includes that element.
+        kept = range(*slice(start, None if step < 0 and end < -size else end, step).indices(size))
         if step > 0:
             x = x[(slice(None),) * (axis % x.ndim) + (slice(kept.start, kept.stop, step),)]
         else:
             x = x.index_select(axis, torch.tensor(list(kept), dtype=torch.long, device=x.device))
     return x
-
-
-def _backwards_end(end: int, size: int, step: int) -> int | None:
-    """With a negative step, an end before the first element includes that element."""
-    return None if step < 0 and end < -size else end
 
 
 @operator("Gather")
@@ -251,7 +230,7 @@ def scatter_elements(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("TopK", host=(1,))
 def top_k(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
-    k = node.get("k") if len(inputs) < 2 else whole_numbers(inputs[1])[0]
+    k = node.get("k") if "k" in node.attributes else whole_numbers(inputs[1])[0]
     largest = inputs[0].topk(
         k, node.get("axis", -1), bool(node.get("largest", 1)), bool(node.get("sorted", 1))
     )

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.formats.onnx.operators.table import (
+from pnpdepth_cli.models.formats.onnx.table import (
     Inputs,
     Node,
     Unsupported,
@@ -24,86 +24,58 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
 )
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """How output coordinates map to the input, and how values are interpolated there."""
-
-    mode: str
-    coordinates: str
-    nearest: str
-    a: float = -0.75
-    exclude_outside: bool = False
-    antialias: bool = False
-
-
-@operator("Upsample", host=(1,))
-def upsample(node: Node, inputs: Inputs) -> Tensor:
-    x = inputs[0]
-    scales = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
-    if scales is None:  # the first version had two attributes
-        scales = [1.0, 1.0, node.get("height_scale"), node.get("width_scale")]
-    mode = {"bilinear": "linear"}.get(node.get("mode", "nearest"), node.get("mode", "nearest"))
-    return _resized(x, _Plan(mode=mode, coordinates="asymmetric", nearest="simple"), scales, None)
-
-
-@operator("Resize", host=(1, 2, 3))
+@operator("Upsample", "Resize", host=(1, 2, 3))
 def resize(node: Node, inputs: Inputs) -> Tensor:
-    x = inputs[0]
-    if node.opset < 11:
-        plan = _Plan(node.get("mode", "nearest"), "asymmetric", "simple")
-        return _resized(x, plan, inputs[1].tolist(), None)
-    plan = _Plan(
-        mode=node.get("mode", "nearest"),
-        coordinates=node.get("coordinate_transformation_mode", "half_pixel"),
-        nearest=node.get("nearest_mode", "round_prefer_floor"),
-        a=node.get("cubic_coeff_a", -0.75),
-        exclude_outside=bool(node.get("exclude_outside", 0)),
-        antialias=bool(node.get("antialias", 0)),
-    )
-    if plan.coordinates == "tf_crop_and_resize":
-        raise Unsupported("coordinate_transformation_mode tf_crop_and_resize")
-    given_scales, given_sizes = optional(inputs, 2), optional(inputs, 3)
+    x, scales, sizes = inputs[0], optional(inputs, 2), optional(inputs, 3)
+    if node.op == "Upsample" or node.opset < 11:
+        mode = {"bilinear": "linear"}.get(node.get("mode"), node.get("mode", "nearest"))
+        more = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "simple"}
+        factors = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
+        if factors is None:  # the first version had two attributes
+            factors = [1.0, 1.0, node.get("height_scale"), node.get("width_scale")]
+        return _resized(x, replace(node, attributes={"mode": mode, **more}), factors, None)
     axes = [a % x.ndim for a in node.get("axes", range(x.ndim))]
-    if given_sizes is not None and given_sizes.numel():
-        sizes = dict(zip(axes, whole_numbers(given_sizes), strict=True))
+    if sizes is not None and sizes.numel():
+        wanted = dict(zip(axes, whole_numbers(sizes), strict=True))
         policy = node.get("keep_aspect_ratio_policy", "stretch")
-        factors = {a: n / x.shape[a] for a, n in sizes.items()}
+        by_axis = {a: n / x.shape[a] for a, n in wanted.items()}
         if policy != "stretch":
-            ratio = (min if policy == "not_larger" else max)(factors.values())
-            sizes = {a: math.floor(ratio * x.shape[a] + 0.5) for a in axes}
-            factors = dict.fromkeys(axes, ratio)
-        wanted = [sizes.get(a, x.shape[a]) for a in range(x.ndim)]
-        return _resized(x, plan, [factors.get(a, 1.0) for a in range(x.ndim)], wanted)
-    if given_scales is None:
+            ratio = (min if policy == "not_larger" else max)(by_axis.values())
+            wanted = {a: math.floor(ratio * x.shape[a] + 0.5) for a in axes}
+            by_axis = dict.fromkeys(axes, ratio)
+        out = [wanted.get(a, x.shape[a]) for a in range(x.ndim)]
+        return _resized(x, node, [by_axis.get(a, 1.0) for a in range(x.ndim)], out)
+    if scales is None:
         raise Unsupported("neither scales nor sizes")
-    factors = dict(zip(axes, given_scales.tolist(), strict=True))
-    return _resized(x, plan, [factors.get(a, 1.0) for a in range(x.ndim)], None)
+    by_axis = dict(zip(axes, scales.tolist(), strict=True))
+    return _resized(x, node, [by_axis.get(a, 1.0) for a in range(x.ndim)], None)
 
 
-def _resized(x: Tensor, plan: _Plan, factors: list[float], sizes: list[int] | None) -> Tensor:
+def _resized(x: Tensor, node: Node, factors: list[float], sizes: list[int] | None) -> Tensor:
     sizes = sizes or [math.floor(n * s) for n, s in zip(x.shape, factors, strict=True)]
-    fast = _by_torch(x, plan, factors, sizes)
+    fast = _by_torch(x, node, factors, sizes)
     if fast is not None:
         return fast
     for axis, (size, factor) in enumerate(zip(sizes, factors, strict=True)):
         if size != x.shape[axis] or factor != 1:
-            x = _along(x, axis, *_taps(plan, x.shape[axis], size, factor))
+            x = _along(x, axis, *_taps(node, x.shape[axis], size, factor))
     return x
 
 
-def _by_torch(x: Tensor, plan: _Plan, factors: list[float], sizes: list[int]) -> Tensor | None:
+def _by_torch(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> Tensor | None:
     """The result of torch's own resize if it computes the same; else None."""
     exact = all(n * f == s for n, f, s in zip(x.shape, factors, sizes, strict=True))
     is_image = x.ndim == 4 and tuple(x.shape[:2]) == tuple(sizes[:2]) and exact
-    if not is_image or plan.antialias or not x.is_floating_point():
+    if not is_image or node.get("antialias") or not x.is_floating_point():
         return None
-    size = (sizes[2], sizes[3])
+    size, mode = (sizes[2], sizes[3]), node.get("mode", "nearest")
+    coordinates = node.get("coordinate_transformation_mode", "half_pixel")
     whole = all(f >= 1 and f == int(f) for f in factors)
-    if plan.mode == "nearest" and whole and plan.nearest in ("simple", "floor"):
-        return F.interpolate(x, size) if plan.coordinates == "asymmetric" else None
-    corners = plan.coordinates == "align_corners"
-    half = plan.coordinates in ("half_pixel", "pytorch_half_pixel") and min(size) > 1
-    if plan.mode == "linear" and (half or corners):
+    if mode == "nearest" and whole and node.get("nearest_mode") in ("simple", "floor"):
+        return F.interpolate(x, size) if coordinates == "asymmetric" else None
+    corners = coordinates == "align_corners"
+    half = coordinates in ("half_pixel", "pytorch_half_pixel") and min(size) > 1
+    if mode == "linear" and (half or corners):
         return F.interpolate(x, size, mode="bilinear", align_corners=corners)
     return None
 
@@ -120,26 +92,29 @@ def _along(x: Tensor, axis: int, index: Tensor, weight: Tensor) -> Tensor:
     return torch.stack(parts).sum(dim=0) if len(parts) > 2 else parts[0] + parts[1]
 
 
-def _taps(plan: _Plan, size: int, out: int, factor: float) -> tuple[Tensor, Tensor]:
+def _taps(node: Node, size: int, out: int, factor: float) -> tuple[Tensor, Tensor]:
     """Indices and weights (out, k) along one axis."""
-    position = _coordinates(plan.coordinates, size, out, factor)
-    if plan.mode == "nearest":
-        index = _ROUNDING[plan.nearest](position, factor).long().clamp(0, size - 1)
+    mode, antialias = node.get("mode", "nearest"), node.get("antialias", 0)
+    coordinates = node.get("coordinate_transformation_mode", "half_pixel")
+    position = _coordinates(coordinates, size, out, factor)
+    if mode == "nearest":
+        rounding = _ROUNDING[node.get("nearest_mode", "round_prefer_floor")]
+        index = rounding(position, factor).long().clamp(0, size - 1)
         return index[:, None], torch.ones(out, 1)
-    if plan.mode not in ("linear", "cubic"):
-        raise Unsupported(f"mode {plan.mode}")
-    linear = plan.mode == "linear"
-    if linear and not plan.antialias:
+    if mode not in ("linear", "cubic"):
+        raise Unsupported(f"mode {mode}")
+    linear = mode == "linear"
+    if linear and not antialias:
         position = position.clamp(0, size - 1)
-    shrink = min(1.0, factor) if plan.antialias else 1.0
+    shrink = min(1.0, factor) if antialias else 1.0
     reach = math.ceil((1 if linear else 2) / shrink)
     index = position.floor().long()[:, None] + torch.arange(1 - reach, reach + 1)
     distance = (index - position[:, None]) * shrink
-    weight = (1 - distance.abs()).clamp_min(0) if linear else _cubic(distance, plan.a)
-    outside = (index < 0) | (index > size - 1)
-    if plan.exclude_outside:
-        weight = weight.masked_fill(outside, 0)
-    if plan.exclude_outside or plan.antialias:
+    a = node.get("cubic_coeff_a", -0.75)
+    weight = (1 - distance.abs()).clamp_min(0) if linear else _cubic(distance, a)
+    if node.get("exclude_outside", 0):
+        weight = weight.masked_fill((index < 0) | (index > size - 1), 0)
+    if node.get("exclude_outside", 0) or antialias:
         weight = weight / weight.sum(dim=1, keepdim=True)
     return index.clamp(0, size - 1), weight
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.formats.onnx.operators.table import (
+from pnpdepth_cli.models.formats.onnx.table import (
     Inputs,
     Node,
     Operator,
@@ -19,6 +18,7 @@ from pnpdepth_cli.models.formats.onnx.operators.table import (
     operator,
     optional,
     register,
+    stated,
     whole_numbers,
 )
 
@@ -29,10 +29,17 @@ _UNARY = (
 )
 """Named as in torch, but for capitals."""
 
+
+def _divided(a: Tensor, b: Tensor) -> Tensor:
+    whole = not a.is_floating_point() and not b.is_floating_point()
+    return torch.div(a, b, rounding_mode="trunc") if whole else a / b
+
+
 _BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Equal": torch.eq, "Greater": torch.gt,
     "Less": torch.lt, "GreaterOrEqual": torch.ge, "LessOrEqual": torch.le,
-    "And": torch.logical_and, "Or": torch.logical_or, "Xor": torch.logical_xor,
+    "And": torch.logical_and, "Or": torch.logical_or, "Xor": torch.logical_xor, "Div": _divided,
+    "Pow": lambda base, exponent: torch.pow(base, exponent).to(base.dtype),
 }  # fmt: skip
 
 _FOLDED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
@@ -90,19 +97,6 @@ def _broadcast_as_before_7(node: Node, a: Tensor, b: Tensor) -> Tensor:
         return b
     axis %= a.ndim
     return b.reshape(*b.shape, *[1] * (a.ndim - axis - b.ndim))
-
-
-@operator("Div")
-def div(node: Node, inputs: Inputs) -> Tensor:
-    a, b = inputs[0], _broadcast_as_before_7(node, inputs[0], inputs[1])
-    whole = not a.is_floating_point() and not b.is_floating_point()
-    return torch.div(a, b, rounding_mode="trunc") if whole else a / b
-
-
-@operator("Pow")
-def power(node: Node, inputs: Inputs) -> Tensor:
-    base, exponent = inputs[0], _broadcast_as_before_7(node, inputs[0], inputs[1])
-    return torch.pow(base, exponent).to(base.dtype)
 
 
 @operator("IsInf")
@@ -170,21 +164,17 @@ _REDUCTIONS: dict[str, Callable[[Tensor, list[int], bool], Tensor]] = {
     "ReduceSumSquare": lambda x, axes, keep: x.square().sum(axes, keepdim=keep),
     "ReduceLogSum": lambda x, axes, keep: x.sum(axes, keepdim=keep).log(),
     "ReduceLogSumExp": lambda x, axes, keep: x.logsumexp(axes, keepdim=keep),
-    "ReduceProd": lambda x, axes, keep: _product(x, axes, keep),
+    "ReduceProd": lambda x, axes, keep: functools.reduce(
+        lambda y, axis: y.prod(axis, keepdim=keep, dtype=x.dtype),
+        sorted((a % x.ndim for a in axes), reverse=True),
+        x,
+    ),
 }
-
-
-def _product(x: Tensor, axes: list[int], keep: bool) -> Tensor:
-    for axis in sorted((a % x.ndim for a in axes), reverse=True):
-        x = x.prod(axis, keepdim=keep, dtype=x.dtype)
-    return x
 
 
 @operator(*_REDUCTIONS, host=(1,))
 def reduce(node: Node, inputs: Inputs) -> Tensor:
-    axes: Any = node.get("axes")
-    if axes is None and optional(inputs, 1) is not None:
-        axes = whole_numbers(inputs[1])
+    axes = stated(node, "axes", inputs, 1)
     if not axes:
         if node.get("noop_with_empty_axes", 0):
             # Nothing is summed, but the function of each element is still applied.

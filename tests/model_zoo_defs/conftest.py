@@ -1,0 +1,17 @@
+"""Weights that do not fit are compared with few known networks, since building all takes long."""
+
+from __future__ import annotations
+
+import pytest
+
+from pnpdepth_cli.models import registry
+
+KNOWN = [
+    *("eigen-kitti", "latefusion-tiny", "sparseconv-nomask"),
+    *("sparse2dense-r18-upconv-d", "sparse2dense-r18-upconv-d-kitti"),
+]
+
+
+@pytest.fixture(autouse=True)
+def few_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "names", lambda: KNOWN)
