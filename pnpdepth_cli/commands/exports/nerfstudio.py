@@ -20,7 +20,7 @@ from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.io.formats.png import LARGEST_CODE
+from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.record import write_json
 
 _CODES_PER_UNIT = 1000.0
