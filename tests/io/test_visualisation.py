@@ -19,7 +19,7 @@ from pnpdepth_cli.io.colours import (
     UNKNOWN,
     DepthScale,
     depth_scale,
-    paint_gain,
+    paint_signed,
     round_steps,
 )
 from pnpdepth_cli.io.figure import draw_discs, figure_content, magnification
@@ -310,7 +310,9 @@ def test_a_few_wild_depths_do_not_stretch_the_scale() -> None:
 
 
 def test_stronger_change_is_stronger_colour() -> None:
-    colours = paint_gain(np.array([0, 0.3, 1, 7, -0.3, -1]), np.full(6, 0.9)).astype(int)
+    colours = paint_signed(
+        np.array([0, 0.3, 1, 7, -0.3, -1]), np.full(6, 0.9), "blue-orange"
+    ).astype(int)
     assert colours[2].tolist() == colours[3].tolist() == BLUE
     assert colours[5].tolist() == ORANGE
     spread = np.ptp(colours, axis=1)

@@ -20,7 +20,7 @@ LONGEST_HEADER = 1 << 14
 _DTYPE = re.compile(r"['\"]descr['\"]\s*:\s*['\"]([^'\"]{1,20})['\"]")
 _FORTRAN = re.compile(r"['\"]fortran_order['\"]\s*:\s*(True|False)\b")
 _SHAPE = re.compile(r"['\"]shape['\"]\s*:\s*\(\s*((?:\d{1,18}\s*,\s*)*(?:\d{1,18}\s*)?)\)")
-"""The fields of a header. NumPy evaluates it as Python, and threads of CPython 3.11 that evaluate at
+"""The fields of a header. NumPy evaluates it as Python, and threads of CPython 3.11 that do so at
 once raise SystemError for a good file."""
 
 
