@@ -20,8 +20,8 @@ _SIGNED = {
     "error": ((220, 105, 0), (25, 90, 190)),
     "change": ((1, 102, 94), (118, 42, 131)),
 }
-"""Colours of 1 and -1: better and worse (`choices.COLORS`), too far and too near, farther and nearer.
-Blue and orange are told apart by colour-blind eyes."""
+"""Colours of 1 and -1: better and worse (`choices.COLORS`), too far and too near, farther and
+nearer. Blue and orange are told apart by colour-blind eyes."""
 
 LOGARITHMIC_FROM = 8.0
 """Ratio of far to near from which the scale is logarithmic.

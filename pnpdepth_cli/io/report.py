@@ -74,8 +74,8 @@ class Head:
     tables: Sequence[Any] = ()
     """Each has caption, header and rows of text, as `commands.tables.Table`."""
     charts: Sequence[Mapping[str, Any]] = ()
-    """Each has caption, x_title, y_title and lines over fractions from 0 to 1: (x, y) by the name of
-    the line, of which the last is dashed."""
+    """Each has caption, x_title, y_title and lines over fractions from 0 to 1, the last one dashed:
+    (x, y) by the name of the line."""
     without_title: str = ""
     without: Sequence[tuple[str, str]] = ()
     """Name and reason of each frame that has no result."""
