@@ -12,21 +12,13 @@ from pathlib import Path
 
 from pnpdepth_cli.errors import UsageError
 
-_MOST_PIXELS = 64_000_000
-"""Pixels of the largest common cameras."""
-
+_MOST_PIXELS = 64_000_000  # of the largest common cameras
 _MOST_FILE_BYTES = 1 << 30
-_DECODED_BYTES_PER_PIXEL = 8
-"""Of an image as its file stores it: four channels of 16 bits, so 64 megapixels take 512 MB."""
-
-_BYTES_PER_PIXEL = 64
-"""Memory that reading and drawing one pixel takes at most; fewer pixels than memory / 64 fit."""
-
 _FILE_BYTES_PER_PIXEL = 4
-_MEMORY_FRACTION = 0.5
+_DECODED_BYTES_PER_PIXEL = 8  # of four channels of 16 bits
+_BYTES_PER_PIXEL = 64  # of memory that reading and drawing takes at most
 _UNBACKED_VALUES = 1 << 25
-_VALUES_PER_BYTE = 1032
-"""The highest compression ratio of deflate; no codec of the formats read here is far above it."""
+_VALUES_PER_BYTE = 1032  # the highest ratio of deflate; no codec read here is far above it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,15 +49,20 @@ class Budget:
 
 def budget() -> Budget:
     """The limits in force."""
-    return _chosen or _of_this_machine()
+    memory = _memory_bytes()
+    pixels = _chosen or min(_MOST_PIXELS, memory // _BYTES_PER_PIXEL)
+    least = 1 << 20 if _chosen else _MOST_FILE_BYTES
+    return Budget(
+        max_pixels=pixels,
+        max_file_bytes=max(least, _FILE_BYTES_PER_PIXEL * pixels),
+        max_decoded_bytes=memory // 2,
+    )
 
 
 def size_problem(path: Path, most: int | None = None) -> str | None:
-    """Returns why an existing file is too large to be read, or None.
+    """Returns why an existing file of a network or its weights is too large to be read, or None.
 
-    Args:
-        path: A file of a network or its weights.
-        most: Bytes that are allowed. None: `max_decoded_bytes`.
+    Allowed are `most` bytes; without a number, `max_decoded_bytes`.
     """
     most = budget().max_decoded_bytes if most is None else most
     size = path.stat().st_size
@@ -81,34 +78,21 @@ def set_max_pixels(max_pixels: int | None) -> None:
         UsageError: The number is below 1.
     """
     global _chosen
-    if max_pixels is None:
-        _chosen = None
-        return
-    if max_pixels < 1:
+    if max_pixels is not None and max_pixels < 1:
         raise UsageError(f"--max-pixels is {max_pixels}; give a number of pixels above 0")
-    _chosen = Budget(
-        max_pixels=max_pixels,
-        max_file_bytes=max(_FILE_BYTES_PER_PIXEL * max_pixels, 1 << 20),
-        max_decoded_bytes=_of_this_machine().max_decoded_bytes,
-    )
+    _chosen = max_pixels
 
 
 def chosen_max_pixels() -> int | None:
     """What `set_max_pixels` was given; None for the default."""
-    return None if _chosen is None else _chosen.max_pixels
+    return _chosen
 
 
-_chosen: Budget | None = None
+_chosen: int | None = None
 
 
 @functools.cache
-def _of_this_machine() -> Budget:
+def _memory_bytes() -> int:
     import psutil  # 20 ms that `--help` does not pay
 
-    memory = int(psutil.virtual_memory().total)
-    max_pixels = min(_MOST_PIXELS, memory // _BYTES_PER_PIXEL)
-    return Budget(
-        max_pixels=max_pixels,
-        max_file_bytes=max(_MOST_FILE_BYTES, _FILE_BYTES_PER_PIXEL * max_pixels),
-        max_decoded_bytes=int(_MEMORY_FRACTION * memory),
-    )
+    return int(psutil.virtual_memory().total)

@@ -22,8 +22,7 @@ from pnpdepth_cli.commands.refinement.frame_camera import (
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.cloud_files import CLOUD_SUFFIXES, write_cloud
-from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.cloud_files import check_cloud_suffix, write_cloud
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.io.rgb import read_rgb
@@ -41,7 +40,7 @@ class CloudRequest:
     depth: Path
     """A depth file, or a folder with files NAME_depth.SUFFIX, as `refine` and `batch` write."""
     output: Path
-    """The file to write; its suffix is one of `CLOUD_SUFFIXES`."""
+    """The file to write: .ply, .glb or .laz."""
     image: Path | None = None
     """The colours. None: the image that the record NAME.json beside the depth names, if any."""
     calib: Path | None = None
@@ -114,10 +113,7 @@ def record_path(output: Path) -> Path:
 
 
 def _check(request: CloudRequest) -> None:
-    if request.output.suffix.lower() not in CLOUD_SUFFIXES:
-        raise OutputError(
-            f"{request.output}: a cloud is written as one of {', '.join(CLOUD_SUFFIXES)}"
-        )
+    check_cloud_suffix(request.output)
     for path in (request.output, record_path(request.output)):
         if path.exists() and not request.overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
@@ -196,28 +192,17 @@ def _depth_and_camera(
     request: CloudRequest, frame: ResultFrame
 ) -> tuple[NDArray[np.float32], FrameCamera]:
     """The depth of a frame, 0 where it is excluded, and its camera."""
-    depth = read_depth(frame.depth, scale=request.depth_scale).values
-    keep = depth <= request.max_depth
-    if frame.valid is not None:
-        keep &= _of_size(frame, frame.valid, read_rgb(frame.valid).values[..., 0], depth) > 0
+    depth, keep = frame.read(request.depth_scale)
+    keep &= depth <= request.max_depth
     if request.max_sigma is not None:
         if frame.sigma is None:
             raise InputError(
                 f"{frame.depth} has no standard deviation beside it; --max-sigma needs the file"
                 " that `pnpdepth refine --uncertainty` writes"
             )
-        sigma = _of_size(frame, frame.sigma, read_depth(frame.sigma).values, depth)
-        keep &= sigma <= request.max_sigma * depth
+        keep &= frame.of_size(frame.sigma, depth) <= request.max_sigma * depth
     size = (depth.shape[0], depth.shape[1])
     return np.where(keep, depth, np.float32(0)), _camera(request, frame, size)
-
-
-def _of_size(
-    frame: ResultFrame, path: Path, values: NDArray[np.float32], depth: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    if values.shape != depth.shape:
-        raise SizeError(f"{path} is not of the size of {frame.depth}")
-    return values
 
 
 def _colours(

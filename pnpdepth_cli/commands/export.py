@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import functools
 import operator
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pnpdepth_cli import __version__
 from pnpdepth_cli.choices import EXPORTS
-from pnpdepth_cli.commands.exports import Depth, Export, ExportFrame
+from pnpdepth_cli.commands.exports import Export, ExportFrame
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
-from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.record import write_json
-from pnpdepth_cli.io.rgb import read_rgb, sizes_of
+from pnpdepth_cli.io.rgb import sizes_of
 
 _LONGEST_NAME = 200
 """Bytes of a name of a record that becomes a path."""
@@ -50,7 +44,9 @@ def export_results(request: ExportRequest) -> dict[str, Any]:
     if request.output.exists() and not request.output.is_dir():
         raise OutputError(f"{request.output} is a file; name a folder")
     frames = [_frame(result, export) for result in result_frames(request.results)]
-    _check_one_unit(frames)
+    units = sorted({f"{f.result.unit} (unit-scale {f.unit_scale:g})" for f in frames})
+    if len(units) > 1:
+        raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
     written = [*export.files(request.output, frames), request.output / f"export_{request.to}.json"]
     if len(set(written)) < len(written):
         raise InputError(f"{request.results}: two frames have one image name; refine them again")
@@ -64,7 +60,7 @@ def export_results(request: ExportRequest) -> dict[str, Any]:
         "to": request.to,
         "results": str(request.results),
         "frames": len(frames),
-        "unit": frames[0].unit,
+        "unit": frames[0].result.unit,
     }
     with all_or_none(written):
         record["notes"] = export.write(request.output, frames)
@@ -102,14 +98,13 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
             " (--protocol whole)"
         )
     return ExportFrame(
+        result=result,
         image=image,
         image_name=name,
         size=(height, width),
         camera=camera,
-        unit=result.unit,
         unit_scale=numbers[1],
         farthest=numbers[0],
-        read=functools.partial(_read, result),
     )
 
 
@@ -119,20 +114,3 @@ def _is_fit(name: Any) -> bool:
     inside = path.parts and not path.is_absolute() and ".." not in path.parts
     long = len(name.encode("utf-8", "surrogateescape")) > _LONGEST_NAME
     return bool(inside) and name.isprintable() and "\\" not in name and not long
-
-
-def _check_one_unit(frames: Sequence[ExportFrame]) -> None:
-    units = sorted({f"{frame.unit} (unit-scale {frame.unit_scale:g})" for frame in frames})
-    if len(units) > 1:
-        raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
-
-
-def _read(result: ResultFrame) -> tuple[Depth, NDArray[np.bool_]]:
-    depth = read_depth(result.depth).values
-    known = depth > 0
-    if result.valid is None:
-        return depth, known
-    valid = read_rgb(result.valid).values[..., 0] > 0
-    if valid.shape != depth.shape:
-        raise SizeError(f"{result.valid} is not of the size of {result.depth}")
-    return depth, known & valid

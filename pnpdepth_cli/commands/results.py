@@ -7,12 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.commands.sparse.options import METRES
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
 from pnpdepth_cli.io.dataset.find_files import find_files
+from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.record import read_json
+from pnpdepth_cli.io.rgb import read_rgb
 
 DEPTH_ENDING = "_depth"
 """End of the stem of a depth file."""
@@ -54,6 +59,23 @@ class ResultFrame:
             raise FileFormatError(
                 f"{self.depth}: the camera in the record beside it is damaged; refine it again"
             ) from error
+
+    def read(self, scale: float | None = None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Returns the (H, W) depth, 0 = unknown, and where it is known and valid.
+
+        Integer depth files hold metres × `scale`; None: their own scale.
+        """
+        depth = read_depth(self.depth, scale=scale).values
+        if self.valid is None:
+            return depth, depth > 0
+        return depth, (depth > 0) & (self.of_size(self.valid, depth) > 0)
+
+    def of_size(self, path: Path, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Returns the mask or standard deviation in a file. Raises SizeError if it is another."""
+        values = read_rgb(path).values[..., 0] if path == self.valid else read_depth(path).values
+        if values.shape != depth.shape:
+            raise SizeError(f"{path} is not of the size of {self.depth}")
+        return values
 
 
 def result_frames(root: Path) -> list[ResultFrame]:

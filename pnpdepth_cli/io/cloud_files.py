@@ -19,11 +19,17 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 
-CLOUD_SUFFIXES = (".ply", ".glb", ".laz")
+_SUFFIXES = (".ply", ".glb", ".laz")
 _LAZ_STEP = 1e-4  # metres between two coordinates that LAZ can tell apart
 
 Part = tuple[NDArray[np.float32], NDArray[np.float32], "NDArray[np.uint8] | None"]
 """(N, 3) points; (N, 3) unit normals, 0 where unknown; (N, 3) colours 0…255, or None."""
+
+
+def check_cloud_suffix(path: Path) -> None:
+    """Raises OutputError if no format of clouds has the suffix."""
+    if path.suffix.lower() not in _SUFFIXES:
+        raise OutputError(f"{path}: a cloud is written as one of {', '.join(_SUFFIXES)}")
 
 
 def write_cloud(path: Path, parts: Iterable[Part]) -> int:
@@ -37,12 +43,11 @@ def write_cloud(path: Path, parts: Iterable[Part]) -> int:
         The number of points.
 
     Raises:
-        OutputError: The suffix is none of `CLOUD_SUFFIXES`, or the file cannot be written.
+        OutputError: The suffix is unknown, or the file cannot be written.
         UsageError: The format needs a package that is not installed.
     """
+    check_cloud_suffix(path)
     suffix = path.suffix.lower()
-    if suffix not in CLOUD_SUFFIXES:
-        raise OutputError(f"{path}: a cloud is written as one of {', '.join(CLOUD_SUFFIXES)}")
     with atomic_path(path) as temporary:
         if suffix == ".ply":
             return _write_ply(temporary, iter(parts))

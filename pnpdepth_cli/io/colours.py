@@ -14,14 +14,14 @@ Pixels = NDArray[np.uint8]
 UNKNOWN = 70
 """The grey of a pixel without depth: turbo has no such colour."""
 
-_RED = np.array([214, 26, 30], dtype=np.float32)
-_GREEN = np.array([16, 140, 52], dtype=np.float32)
-_BLUE = np.array([25, 90, 190], dtype=np.float32)
-_ORANGE = np.array([220, 105, 0], dtype=np.float32)
-_PURPLE = np.array([118, 42, 131], dtype=np.float32)
-_TEAL = np.array([1, 102, 94], dtype=np.float32)
-_GAIN_COLOURS = {"blue-orange": (_BLUE, _ORANGE), "paper": (_RED, _GREEN)}
-"""(better, worse) by the names of `choices.COLORS`."""
+_SIGNED = {
+    "blue-orange": ((25, 90, 190), (220, 105, 0)),
+    "paper": ((214, 26, 30), (16, 140, 52)),
+    "error": ((220, 105, 0), (25, 90, 190)),
+    "change": ((1, 102, 94), (118, 42, 131)),
+}
+"""Colours of 1 and -1: better and worse (`choices.COLORS`), too far and too near, farther and
+nearer. Blue and orange are told apart by colour-blind eyes."""
 
 LOGARITHMIC_FROM = 8.0
 """Ratio of far to near from which the scale is logarithmic.
@@ -32,12 +32,10 @@ On a linear scale, nearly all of a street would have the colour of its far end.
 
 @dataclass(frozen=True, kw_only=True)
 class DepthScale:
-    """The colour of each depth: turbo from near (warm) to far (cold)."""
+    """The colour of each depth: turbo from `low_m`, near and warm, to `high_m`, far and cold."""
 
     low_m: float
-    """Near end, metres."""
     high_m: float
-    """Far end, metres."""
     warm_is_far: bool = False
     """Whether the warm end is the far one, as for a standard deviation."""
 
@@ -107,41 +105,26 @@ def dimmed(grey: NDArray[np.float32]) -> Pixels:
     return np.repeat(levels[:, :, None], 3, axis=2)
 
 
-def paint_gain(
-    strength: NDArray[np.floating], light: NDArray[np.floating], colors: str = "blue-orange"
+def paint_signed(
+    strength: NDArray[np.floating], light: NDArray[np.floating], colors: str
 ) -> Pixels:
-    """Returns (..., 3) colours of a gain: better at 1, worse at -1, the grey `light` 0..1 at 0.
-
-    Blue and orange are told apart by colour-blind eyes.
-    """
-    return _between(strength, light, *_GAIN_COLOURS[colors])
-
-
-def paint_change(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:
-    """Returns (..., 3) colours: teal at 1 (farther), purple at -1 (nearer), `light` at 0."""
-    return _between(strength, light, _TEAL, _PURPLE)
-
-
-def paint_error(strength: NDArray[np.floating], light: NDArray[np.floating]) -> Pixels:
-    """Returns (..., 3) colours: orange at 1 (too far), blue at -1 (too near), `light` at 0."""
-    return _between(strength, light, _ORANGE, _BLUE)
-
-
-def swatches(colours: Pixels) -> list[str]:
-    """Returns (N, 3) colours as #rrggbb."""
-    return [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in colours.tolist()]
-
-
-def _between(
-    strength: NDArray[np.floating],
-    light: NDArray[np.floating],
-    above: NDArray[np.float32],
-    below: NDArray[np.float32],
-) -> Pixels:
-    amount = np.clip(np.abs(np.asarray(strength, dtype=np.float32)), 0, 1)[..., None]
-    hue = np.where(np.asarray(strength)[..., None] > 0, above, below)
+    """Returns (..., 3) colours of `_SIGNED` from -1 to 1, around the grey `light` 0..1 at 0."""
+    above, below = _SIGNED[colors]
+    signed = np.asarray(strength, dtype=np.float32)[..., None]
+    amount = np.clip(np.abs(signed), 0, 1)
     base = 255 * np.asarray(light, dtype=np.float32)[..., None]
+    hue = np.where(signed > 0, np.float32(above), np.float32(below))
     return np.asarray(np.rint((1 - amount) * base + amount * hue), dtype=np.uint8)
+
+
+def signed_bar(colors: str, length: int) -> Pixels:
+    """Returns (length, 3) colours of a legend of `paint_signed`."""
+    return paint_signed(np.linspace(-1, 1, length), np.full(length, 0.88), colors)
+
+
+def hex_colours(colours: Pixels) -> list[str]:
+    """Returns (N, 3) colours as #rrggbb."""
+    return [f"#{bytes(colour).hex()}" for colour in colours]
 
 
 def _turbo(position: NDArray[np.float64]) -> Pixels:

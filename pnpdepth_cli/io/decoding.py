@@ -13,7 +13,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -208,18 +208,13 @@ class _OthersOnly:
 
 @contextmanager
 def _without_standard_error() -> Iterator[None]:
-    try:
-        kept = os.dup(2) if threading.active_count() == 1 else None
-    except OSError:  # it is closed
-        kept = None
-    if kept is None:
+    with ExitStack() as after:
+        if threading.active_count() == 1:
+            with suppress(OSError):  # it is closed
+                kept = os.dup(2)
+                after.callback(os.close, kept)
+                after.callback(os.dup2, kept, 2)
+                nothing = os.open(os.devnull, os.O_WRONLY)
+                after.callback(os.close, nothing)
+                os.dup2(nothing, 2)
         yield
-        return
-    nothing = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nothing, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nothing)

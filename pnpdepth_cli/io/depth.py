@@ -10,22 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.choices import FORMATS
 from pnpdepth_cli.errors import FileFormatError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import check_pixel_count, read_bytes
 from pnpdepth_cli.io.formats import (
     DEPTH_SUFFIXES,
     KITTI_SCALE,
+    LARGEST_CODE,
     SATURATED_CODE,
+    SCALE_KEY,
     StoredArray,
-    WriteOptions,
     check_scale,
-    depth_formats,
+    eight_bits,
     format_of_content,
     format_of_suffix,
     kind_of,
 )
-from pnpdepth_cli.io.formats.png import eight_bits
 
 _SHORTEST_M, _LONGEST_M = 0.02, 1000.0
 _COMMON_M = (0.2, 200.0)
@@ -84,7 +85,7 @@ def load_stored(path: Path, channel: str | None) -> StoredArray:
     kind = kind_of(data)
     if kind is not None:
         raise eight_bits(path, kind)
-    names = [each.name for each in depth_formats() if each.name != "PNG"]
+    names = [kind.name for kind in FORMATS.values() if kind.name != "PNG"]
     raise FileFormatError(
         f"{path} is not a depth file; give a 16-bit PNG, {', '.join(names[:-1])} or {names[-1]}"
     )
@@ -166,10 +167,30 @@ def write_depth(
         )
     if depth.ndim != 2 or 0 in depth.shape:
         raise SizeError(f"{path}: depth of shape {depth.shape} is no image; give (H, W)")
-    metres = known_metres(depth)
+    values: NDArray[Any] = known_metres(depth)
+    if depth_format.integer:
+        values = _codes(path, values, scale)
+        text = {SCALE_KEY: repr(float(scale)).removesuffix(".0"), **(text or {})}
     with atomic_path(path) as temporary:
-        options = WriteOptions(path=path, scale=scale, text=text or {})
-        depth_format.write(temporary, metres, options)
+        depth_format.write(temporary, values, text or {})
+
+
+def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.uint16]:
+    check_scale(scale)
+    codes = np.rint(metres.astype(np.float64) * scale)
+    if codes.max() > LARGEST_CODE:
+        raise OutputError(
+            f"{path}: the largest depth, {metres.max():.6g} m, does not fit a 16-bit PNG with "
+            f"{scale:g} codes per metre (at most {LARGEST_CODE / scale:.6g} m); "
+            "write .exr, .npy or .tiff"
+        )
+    lost = (metres > 0) & (codes == 0)
+    if lost.any():
+        raise OutputError(
+            f"{path}: {int(lost.sum()):,} depths down to {metres[lost].min():.3g} m would become "
+            f"0 (unknown) in a 16-bit PNG with {scale:g} codes per metre; write .exr, .npy or .tiff"
+        )
+    return codes.astype(np.uint16)
 
 
 def describe_range(

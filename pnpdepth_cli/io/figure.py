@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.colours import DepthScale, Pixels, paint_gain
+from pnpdepth_cli.io.colours import DepthScale, Pixels, dimmed, signed_bar
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -46,14 +46,12 @@ _CONTENT_KEY = "pnpdepth"  # of the PNG text that describes the figure
 
 @dataclass(frozen=True, kw_only=True)
 class Panel:
-    """An image with a title above it."""
+    """An image with a title and a fainter remark above it."""
 
     title: str
     pixels: Pixels
     """(H, W, 3)."""
-
     remark: str = ""
-    """Beside the title, in fainter ink."""
 
 
 def magnification(shape: tuple[int, ...], *, columns: int, legend: bool) -> float:
@@ -91,39 +89,35 @@ def hatched(pixels: Pixels, valid: NDArray[np.bool_] | None) -> Pixels:
 
 
 def draw_discs(
-    pixels: Pixels,
+    grey: NDArray[np.float32],
     xy: NDArray[np.floating],
     colours: Pixels,
     factor: float,
     order: NDArray[np.intp],
 ) -> Pixels:
-    """Returns a copy of an image, enlarged by `factor`, with a disc at each of N points.
+    """Returns the dimmed grey image (H, W), enlarged by `factor`, with a disc at each of N points.
 
-    Pixel coordinates (N, 2) are those of the original image; `order` has the topmost point last.
+    Pixel coordinates (N, 2) are those of the image; `order` has the topmost point last.
     """
-    canvas = np.ascontiguousarray(pixels).copy()
-    if len(xy) == 0:
-        return canvas
-    spacing = math.sqrt(canvas.shape[0] * canvas.shape[1] / len(xy))
+    canvas = np.ascontiguousarray(resized(dimmed(grey), factor, smooth=True))
+    spacing = math.sqrt(canvas.shape[0] * canvas.shape[1] / max(len(xy), 1))
     radius = min(max(0.24 * spacing, 1.4), 6.0)
     centres = (np.asarray(xy, dtype=np.float64) + 0.5) * factor - 0.5
     fraction = 4  # OpenCV takes coordinates in sixteenths of a pixel
     sixteenths = np.rint(centres * (1 << fraction)).astype(int)
     rim = radius + 1.2 if radius >= 3 else 0.0
     for index in order:
-        centre = (int(sixteenths[index, 0]), int(sixteenths[index, 1]))
-        red, green, blue = (int(level) for level in colours[index])
-        for size, ink in ((rim, (15, 15, 15)), (radius, (red, green, blue))):
+        for size, ink in ((rim, (15, 15, 15)), (radius, colours[index].tolist())):
             if size:
-                sixteenth = round(size * (1 << fraction))
+                sixteenth, centre = round(size * (1 << fraction)), sixteenths[index].tolist()
                 cv2.circle(canvas, centre, sixteenth, ink, -1, cv2.LINE_AA, fraction)
     return canvas
 
 
-def depth_figure(
-    panels: list[Panel], columns: int, scale: DepthScale, unit: str = "m"
-) -> PIL.Image.Image:
-    """Returns a figure of panels, `columns` to a row, beside a bar of depth colours."""
+def save_depth_figure(
+    path: Path, panels: list[Panel], scale: DepthScale, unit: str = "m", *, columns: int = 1
+) -> None:
+    """Writes a PNG of panels, `columns` to a row, beside a bar of depth colours."""
     figure, draw = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
     figure.info[_CONTENT_KEY] |= {"low_m": scale.low_m, "high_m": scale.high_m}
     left = figure.width - MARGIN - _LEGEND_WIDTH + GAP
@@ -132,12 +126,9 @@ def depth_figure(
         (left, MARGIN + 5), "metres" if unit == "m" else unit, font=_font(_FONT_SIZE), fill=_INK
     )
     # Far at the top, as on an axis.
-    depths = np.linspace(1, 0, bottom - top)
-    if scale.logarithmic:
-        metres = scale.low_m * (scale.high_m / scale.low_m) ** depths
-    else:
-        metres = scale.low_m + (scale.high_m - scale.low_m) * depths
-    bar = np.repeat(scale.paint(metres)[:, None], _BAR_WIDTH, axis=1)
+    spaced = np.geomspace if scale.logarithmic else np.linspace
+    depths = spaced(scale.high_m, scale.low_m, bottom - top)
+    bar = np.repeat(scale.paint(depths)[:, None], _BAR_WIDTH, axis=1)
     _paste(figure, bar, left, top)
     draw.rectangle((left - 1, top - 1, left + _BAR_WIDTH, bottom), outline=_LINE)
     for tick, label in _labels(scale.ticks()):
@@ -145,13 +136,20 @@ def depth_figure(
         right = left + _BAR_WIDTH
         draw.line((right, y, right + 6, y), fill=_INK, width=1)
         draw.text((right + 11, y), label, font=_font(_SMALL_FONT_SIZE), fill=_INK, anchor="lm")
-    return figure
+    _save(figure, path)
 
 
-def gain_figure(
-    panel: Panel, gain: NDArray[np.float64], amount: str, noun: str, colors: str, unknown: str
-) -> PIL.Image.Image:
-    """Returns a figure of one map of N gains with a colour bar, and how many are above 0 or below.
+def save_gain_figure(
+    path: Path,
+    panel: Panel,
+    gain: NDArray[np.float64],
+    *,
+    amount: str,
+    noun: str,
+    colors: str,
+    unknown: str = "",
+) -> None:
+    """Writes a PNG of one map of N gains with a colour bar, and how many are above 0 or below.
 
     `amount` is the gain of full colour, with its unit; `noun` what is counted; `unknown` what the
     dark pixels are, "" where there are none.
@@ -161,7 +159,7 @@ def gain_figure(
     footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {100 * worse:.1f} % worse"
     ends = (f"worse by {amount} or more", f"better by {amount} or more")
     figure.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown or None, "footer": footer}
-    bar = np.repeat(paint_gain(np.linspace(-1, 1, 220), np.full(220, 0.88), colors)[None], 18, 0)
+    bar = np.repeat(signed_bar(colors, 220)[None], 18, axis=0)
     font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
     x, y = float(MARGIN), figure.height - MARGIN - 56
     draw.text((x, y), ends[0], font=small, fill=_INK, anchor="lm")
@@ -174,15 +172,10 @@ def gain_figure(
         draw.rectangle((x, y - 9, x + 18, y + 9), fill=_UNKNOWN_GAIN)
         draw.text((x + 28, y), unknown, font=small, fill=_INK, anchor="lm")
     draw.text((MARGIN, y + 40), footer, font=font, fill=_INK, anchor="lm")
-    return figure
+    _save(figure, path)
 
 
-def save_figure(figure: PIL.Image.Image, path: Path) -> None:
-    """Writes the figure as a PNG, whatever the suffix, of which `figure_content` reads the panels.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+def _save(figure: PIL.Image.Image, path: Path) -> None:
     from PIL.PngImagePlugin import PngInfo
 
     text = PngInfo()
@@ -192,7 +185,7 @@ def save_figure(figure: PIL.Image.Image, path: Path) -> None:
 
 
 def figure_content(path: Path) -> dict[str, Any]:
-    """Returns what a file of `save_figure` shows; only its first bytes are read.
+    """Returns what a figure shows; only the first bytes of its file are read.
 
     `size` is (width, height), `panels` have title and box (left, top, width, height). A figure of
     depth has low_m and high_m of its colours, one of gains ends, unknown and footer.

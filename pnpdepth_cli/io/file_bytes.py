@@ -16,31 +16,19 @@ def read_bytes(path: Path) -> bytes:
         InputError: There is no such file, or it is a folder, a device or a pipe.
         FileFormatError: It is empty, or larger than the budget.
     """
-    check_size(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise cannot_read(path, error) from error
-    if not data:
-        raise _empty(path)
-    return data
-
-
-def check_size(path: Path) -> None:
-    """Raises the errors of `read_bytes` that show without reading the file."""
-    size = size_of_regular_file(path)
-    limit = budget().max_file_bytes
+    size, limit = size_of_regular_file(path), budget().max_file_bytes
     if size > limit:
         raise FileFormatError(
             f"{path} has {size:,} bytes, more than {limit:,}; make it smaller, or allow more with"
             " --max-pixels"
         )
-    if not size:
-        raise _empty(path)
-
-
-def _empty(path: Path) -> FileFormatError:
-    return FileFormatError(f"{path} is empty (0 bytes); copy or create it again")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise cannot_read(path, error) from error
+    if not data:
+        raise FileFormatError(f"{path} is empty (0 bytes); copy or create it again")
+    return data
 
 
 def size_of_regular_file(path: Path) -> int:
@@ -95,30 +83,29 @@ def check_pixel_count(
     """
     if width < 1 or height < 1:
         raise FileFormatError(f"{path} has no pixels ({width}x{height}); create it again")
-    pixels = width * height
-    _check_claim(path, pixels, channels, value_bytes, file_bytes, f"{width}x{height} pixels")
+    what, pixel_bytes = f"{width}x{height} pixels", channels * value_bytes
+    check_value_count(path, width * height, file_bytes, value_bytes=pixel_bytes, what=what)
 
 
 def check_value_count(
-    path: Path, count: int, file_bytes: int | None = None, *, value_bytes: int = 1
+    path: Path,
+    count: int,
+    file_bytes: int | None = None,
+    *,
+    value_bytes: int = 1,
+    what: str | None = None,
 ) -> None:
     """Raises FileFormatError for an array of more values than the budget."""
-    _check_claim(path, count, 1, value_bytes, file_bytes, f"{count:,} values")
-
-
-def _check_claim(
-    path: Path, count: int, channels: int, value_bytes: int, file_bytes: int | None, what: str
-) -> None:
+    what = what or f"{count:,} values"
     allow = "make it smaller, or allow more with --max-pixels"
-    if count > budget().max_pixels:
-        raise FileFormatError(f"{path} has {what}, more than {budget().max_pixels:,}; {allow}")
-    decoded = count * channels * value_bytes
-    if decoded > budget().max_image_bytes:
+    limits, decoded = budget(), count * value_bytes
+    if count > limits.max_pixels:
+        raise FileFormatError(f"{path} has {what}, more than {limits.max_pixels:,}; {allow}")
+    if decoded > limits.max_image_bytes:
         raise FileFormatError(
-            f"{path} has {what} in {decoded:,} bytes, more than {budget().max_image_bytes:,};"
-            f" {allow}"
+            f"{path} has {what} in {decoded:,} bytes, more than {limits.max_image_bytes:,}; {allow}"
         )
-    if file_bytes is not None and count > budget().max_values_from(file_bytes):
+    if file_bytes is not None and count > limits.max_values_from(file_bytes):
         raise FileFormatError(
             f"{path} claims {what} in {file_bytes:,} bytes, which cannot be true; create it again"
         )

@@ -8,7 +8,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.resources import files
@@ -28,7 +28,7 @@ from pnpdepth_cli.io.atomic import (
     make_folder,
     remove_leftovers,
 )
-from pnpdepth_cli.io.colours import LOGARITHMIC_FROM, DepthScale, Pixels, swatches
+from pnpdepth_cli.io.colours import LOGARITHMIC_FROM, DepthScale, Pixels, hex_colours
 from pnpdepth_cli.io.figure import resized
 from pnpdepth_cli.io.record import plain, read_json, write_json
 
@@ -36,7 +36,7 @@ PAGE = "index.html"
 IMAGES = "images"
 VIEWER = "viewer.js"
 _MADE_OF = "report.json"
-_IMAGE = re.compile(r"([0-9a-f]{20})_[a-z_]+\.(?:jpg|png|js)")
+_IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.(?:jpg|png|js)")
 _INVISIBLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _VIEW_SIZE = 960  # of the longer side, at most
 _SMALL = 480  # smaller views are enlarged by a whole number, so that their pixels stay square
@@ -48,39 +48,17 @@ class Column:
     """A value of each frame, and how the page shows it."""
 
     key: str
-    """Unique name."""
     title: str
     unit: str = ""
     """Unit of value × factor."""
     decimals: int = 4
     factor: float = 1.0
     percent: bool = False
-    """True to show the value in per cent."""
     higher_is_better: bool = False
     signed: bool = False
     """True if values above 0 are better and below 0 worse."""
     listed: bool = True
     """True to show it in the list of frames, not only in a frame's own view."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """A table of text; the first cell of each row is its title."""
-
-    caption: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Chart:
-    """Lines over fractions from 0 to 1."""
-
-    caption: str
-    x_title: str
-    y_title: str
-    lines: Mapping[str, Sequence[tuple[float, float]]]
-    """(x, y) by the name of the line; the last line is dashed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +71,11 @@ class Head:
     """Label, value and remark of the figures that are shown large."""
     facts: Sequence[tuple[str, str]] = ()
     notes: Sequence[str] = ()
-    tables: Sequence[Table] = ()
-    charts: Sequence[Chart] = ()
+    tables: Sequence[Any] = ()
+    """Each has caption, header and rows of text, as `commands.tables.Table`."""
+    charts: Sequence[Mapping[str, Any]] = ()
+    """Each has caption, x_title, y_title and lines over fractions from 0 to 1, the last one dashed:
+    (x, y) by the name of the line."""
     without_title: str = ""
     without: Sequence[tuple[str, str]] = ()
     """Name and reason of each frame that has no result."""
@@ -155,14 +136,13 @@ def whole_report(folder: Path) -> Iterator[Path]:
     with atomic_folder(folder) as temporary:
         yield temporary
         images = {path.name for path in (temporary / IMAGES).iterdir()}
-        viewer = (temporary / VIEWER).exists()
-    _remove_unused(folder, lambda name, key: name not in images, viewer=viewer)
+    _remove_unused(folder, images)
 
 
 def remove_report_leftovers(folder: Path) -> int:
     """Removes what killed writers left, while nobody writes; returns how many there were."""
     try:
-        return sum(remove_leftovers(each) for each in (folder, folder / IMAGES) if each.is_dir())
+        return sum(remove_leftovers(path) for path in (folder, folder / IMAGES) if path.is_dir())
     except OSError as error:
         raise cannot_write(folder, error) from error
 
@@ -189,11 +169,12 @@ def write_report(
             its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
     """
-    keys: set[str] = set()
+    used = {VIEWER} if viewer else set[str]()
 
     def shown() -> Iterator[Any]:
         for frame in frames:
-            keys.add(frame["key"])
+            used.update(Path(view["src"]).name for view in frame.get("views", {}).values())
+            used.update([f"{frame['key']}_view.js"] if frame.get("view_mb") else [])
             yield plain(frame)
 
     style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
@@ -204,7 +185,7 @@ def write_report(
         "thumb": head.thumb,
         "unit": head.unit,
         "map_colours": head.map_colours,
-        "depth_colours": swatches(DepthScale(low_m=1.0, high_m=2.0).paint(np.linspace(1, 2, 17))),
+        "depth_colours": hex_colours(DepthScale(low_m=1, high_m=2).paint(np.linspace(1, 2, 17))),
         "logarithmic_from": LOGARITHMIC_FROM,
     }
     page = folder / PAGE
@@ -218,9 +199,8 @@ def write_report(
     ):
         file.writelines(parts)
     if viewer:
-        text = "\n".join(_source(name) for name in ("../three/three.min.js", VIEWER))
-        _write_text(folder / VIEWER, text)
-    _remove_unused(folder, lambda name, key: key not in keys, viewer=viewer)
+        _write_text(folder / VIEWER, _source("../three/three.min.js") + "\n" + _source(VIEWER))
+    _remove_unused(folder, used)
     return page.stat().st_size
 
 
@@ -276,14 +256,11 @@ def _write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
-def _remove_unused(folder: Path, unused: Callable[[str, str], bool], *, viewer: bool) -> None:
-    """Removes images of a report, and no other file, by their names and keys."""
+def _remove_unused(folder: Path, used: set[str]) -> None:
+    """Removes images and views of a report that are not in use, and no other file."""
     try:
-        if not viewer:
-            (folder / VIEWER).unlink(missing_ok=True)
-        for path in (folder / IMAGES).iterdir():
-            name = _IMAGE.fullmatch(path.name)
-            if name and (unused(path.name, name[1]) or (path.suffix == ".js" and not viewer)):
+        for path in (folder / VIEWER, *(folder / IMAGES).iterdir()):
+            if path.name not in used and (path.name == VIEWER or _IMAGE.fullmatch(path.name)):
                 path.unlink(missing_ok=True)
     except OSError as error:
         raise cannot_write(folder, error) from error
@@ -304,7 +281,7 @@ def _environment() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda each: visible(each) if type(each) is str else each,
+        finalize=lambda value: visible(value) if type(value) is str else value,
     )
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment
@@ -319,11 +296,11 @@ def _policy(style: str, script: str, *, viewer: bool) -> Markup:
 
     A report with 3D views may also run the scripts beside it.
     """
-    style, script = (
-        base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+    of_style, of_script = (
+        base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         for text in (style, script)
     )
     return Markup(
-        "default-src 'none'; img-src 'self' file: data:;"
-        f" style-src 'sha256-{style}'; script-src 'sha256-{script}'{' file:' if viewer else ''}"
+        f"default-src 'none'; img-src 'self' file: data:; style-src 'sha256-{of_style}';"
+        f" script-src 'sha256-{of_script}'{' file:' if viewer else ''}"
     )

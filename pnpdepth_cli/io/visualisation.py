@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +18,16 @@ from pnpdepth_cli.io.colours import (
     depth_scale,
     dimmed,
     grey_of,
-    paint_change,
-    paint_error,
-    paint_gain,
+    paint_signed,
 )
 from pnpdepth_cli.io.figure import (
     Panel,
-    depth_figure,
     draw_discs,
-    gain_figure,
     hatched,
     magnification,
     resized,
-    save_figure,
+    save_depth_figure,
+    save_gain_figure,
 )
 
 Depth = NDArray[np.float32]
@@ -98,15 +92,11 @@ def preview(
         ),
         _points_panel(grey, sparse_xy, sparse_depth, scale, factor),
         Panel(title="Depth before", pixels=resized(scale.paint(before), factor)),
-        Panel(
-            title="Depth after",
-            pixels=hatched(resized(scale.paint(after), factor), valid),
-            remark="" if valid is None or valid.all() else "hatched: not valid",
-        ),
+        _depth_panel("Depth after", after, valid, scale, factor),
         _change_panel(before, after, grey, factor, zoom),
         _zoom_panel(depths, scale, zoom, resized(before, factor).shape),
     ]
-    save_figure(depth_figure(panels, columns, scale, unit), path)
+    save_depth_figure(path, panels, scale, unit, columns=columns)
 
 
 def overlay(
@@ -119,7 +109,7 @@ def overlay(
     scale = depth_scale(depth)
     factor = magnification(rgb.shape, columns=1, legend=True)
     panel = _points_panel(grey_of(rgb), xy, depth, scale, factor)
-    save_figure(depth_figure([panel], 1, scale), path)
+    save_depth_figure(path, [panel], scale)
 
 
 def sigma_preview(
@@ -128,12 +118,8 @@ def sigma_preview(
     """Writes a PNG of a standard deviation (H, W) in `unit`, hatched where depth is not valid."""
     scale = replace(depth_scale(sigma), warm_is_far=True)
     factor = magnification(sigma.shape, columns=1, legend=True)
-    panel = Panel(
-        title="Standard deviation",
-        pixels=hatched(resized(scale.paint(sigma), factor), valid),
-        remark="of the depth" if valid is None or valid.all() else "hatched: not valid",
-    )
-    save_figure(depth_figure([panel], 1, scale, unit), path)
+    panel = _depth_panel("Standard deviation", sigma, valid, scale, factor)
+    save_depth_figure(path, [panel], scale, unit)
 
 
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
@@ -159,20 +145,28 @@ def error_map(
     """
     both = (prediction > 0) & (ground_truth > 0)
     error = prediction[both].astype(np.float64) - ground_truth[both]
-    return _painted(error, both, grey, paint_error)
+    return _painted(error, both, grey, "error")
 
 
 def _painted(
     values: NDArray[np.float64],
     where: NDArray[np.bool_],
     grey: NDArray[np.float32] | None,
-    paint: Callable[[NDArray[np.float64], NDArray[np.float32]], Pixels],
+    colors: str,
 ) -> tuple[Pixels, float]:
     """A map with the colours of signed values on the dark grey image, and that of full colour."""
     ground = np.full(where.shape, 0.3, np.float32) if grey is None else grey
     pixels, strongest = dimmed(np.asarray(0.6 * ground, np.float32)), _strongest(values)
-    pixels[where] = paint(values / strongest, 0.66 + 0.3 * ground[where])
+    pixels[where] = paint_signed(values / strongest, 0.66 + 0.3 * ground[where], colors)
     return pixels, strongest
+
+
+def _depth_panel(
+    title: str, depth: Depth, valid: NDArray[np.bool_] | None, scale: DepthScale, factor: float
+) -> Panel:
+    pixels = hatched(resized(scale.paint(depth), factor), valid)
+    remark = "" if valid is None or valid.all() else "hatched: not valid"
+    return Panel(title=title, pixels=pixels, remark=remark)
 
 
 def _points_panel(
@@ -183,9 +177,8 @@ def _points_panel(
     factor: float,
 ) -> Panel:
     """The points in the colours of their depth on the grey image, nearest on top."""
-    ground = resized(dimmed(grey), factor, smooth=True)
     far_first = np.argsort(-depth, kind="stable")
-    discs = draw_discs(ground, xy, scale.paint(depth), factor, far_first)
+    discs = draw_discs(grey, xy, scale.paint(depth), factor, far_first)
     count = f"{len(depth):,} point{'' if len(depth) == 1 else 's'}"
     return Panel(title="Sparse depth", pixels=discs, remark=count)
 
@@ -199,8 +192,8 @@ def _change_panel(
 ) -> Panel:
     """The signed change in metres, with a frame around the zoom."""
     both = _both_known(before, after)
-    pixels, strongest = _painted((after[both] - before[both]).astype(np.float64), both, grey,
-                                 paint_change)  # fmt: skip
+    change = (after[both] - before[both]).astype(np.float64)
+    pixels, strongest = _painted(change, both, grey, "change")
     shown = resized(pixels, factor)
     top, left, height, width = zoom
     low = (round(left * factor), round(top * factor))
@@ -226,8 +219,7 @@ def _zoom_panel(
     for start, depth in zip(starts, depths.values(), strict=True) if part else ():
         shown = cv2.resize(scale.paint(depth[area]), (part, rows), interpolation=cv2.INTER_NEAREST)
         pixels[:, start : start + part] = shown
-    for left, right in pairwise(starts):
-        pixels[:, max(left + part - 1, 0) : right + 1] = 255
+        pixels[:, start - 1 : start + 1] = 255  # a line to the depth before; none at the first
     most = "where most changed" if "linear" not in depths else "where after differs most"
     return Panel(title="Zoom", pixels=pixels, remark=f"{' | '.join(depths)}, {most} (frame)")
 
@@ -263,9 +255,8 @@ def _zoom(depths: dict[str, Depth], of_points: tuple[slice, slice]) -> tuple[int
     inside = np.zeros_like(relative)
     inside[of_points] = np.minimum(relative, _strongest(relative[of_points]))[of_points]
     total = cv2.integral(inside)
-    window = (total[height:, width:] - total[:-height, width:] - total[height:, :-width]) + total[
-        :-height, :-width
-    ]
+    rows_of = total[height:] - total[:-height]
+    window = rows_of[:, width:] - rows_of[:, :-width]
     top, left = np.unravel_index(int(window.argmax()), window.shape)
     return int(top), int(left), height, width
 
@@ -297,13 +288,14 @@ def improvement(
     if not known.any():
         raise InputError("the ground truth has no pixel with known depth; give another file")
     gain = _gain(before[known], after[known], gt[known])
-    paint = functools.partial(paint_gain, colors=colors)
-    pixels, strongest = _painted(gain, known, None if rgb is None else grey_of(rgb), paint)
+    pixels, strongest = _painted(gain, known, None if rgb is None else grey_of(rgb), colors)
     factor = magnification(gt.shape, columns=1, legend=False)
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
     unknown = "" if known.all() else "no ground truth"
-    figure = gain_figure(panel, gain, f"{strongest:.3g} m", "pixels", colors, unknown)
-    save_figure(figure, path)
+    amount = f"{strongest:.3g} m"
+    save_gain_figure(
+        path, panel, gain, amount=amount, noun="pixels", colors=colors, unknown=unknown
+    )
     return float((gain > 0).mean())
 
 
@@ -340,14 +332,14 @@ def improvement_at_points(
     strongest = _strongest(gain)
     grey = grey_of(rgb_or_grey)
     factor = magnification(grey.shape, columns=1, legend=False)
-    ground = resized(dimmed(0.8 * grey), factor, smooth=True)
-    colours = paint_gain(gain / strongest, np.full(len(gain), 0.92), colors)
+    colours = paint_signed(gain / strongest, np.full(len(gain), 0.92), colors)
     weakest_first = np.argsort(np.abs(gain), kind="stable")
-    discs = draw_discs(ground, xy, colours, factor, weakest_first)
+    discs = draw_discs(0.8 * grey, xy, colours, factor, weakest_first)
     noun = "held-out points" if held_out else "points used"
     remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
     panel = Panel(title="Change of error", pixels=discs, remark=remark)
-    save_figure(gain_figure(panel, gain, f"{strongest:.3g} {unit}", noun, colors, ""), path)
+    amount = f"{strongest:.3g} {unit}"
+    save_gain_figure(path, panel, gain, amount=amount, noun=noun, colors=colors)
     return float((gain > 0).mean())
 
 

@@ -102,7 +102,8 @@ def test_images_of_no_frame_are_removed_and_nothing_else(tmp_path: Path) -> None
     kept, stale = image_key("a"), image_key("b")
     for name in (f"{kept}_map.jpg", f"{stale}_map.jpg", "mine.jpg", f"{stale}.txt"):
         (images / name).write_bytes(b"x")
-    write_report(tmp_path, HEAD, [frame("a", kept), frame("without")])
+    shown = frame("a", kept) | {"views": {"map": {"src": f"images/{kept}_map.jpg"}}}
+    write_report(tmp_path, HEAD, [shown, frame("without")])
     left = {path.name for path in images.iterdir()}
     assert left == {f"{kept}_map.jpg", "mine.jpg", f"{stale}.txt"}
 

@@ -6,7 +6,8 @@ holds an `Export` called `EXPORT`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -14,38 +15,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
-
-Depth = NDArray[np.float32]
+from pnpdepth_cli.commands.results import ResultFrame
+from pnpdepth_cli.io.atomic import atomic_path, make_folder
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportFrame:
     """A refined frame."""
 
+    result: ResultFrame
     image: Path
     image_name: str
     """Its path below the folder of the images, as COLMAP names it, with slashes."""
     size: tuple[int, int]
     """(H, W)."""
     camera: FrameCamera
-    """The camera; its pose is in `unit`."""
-    unit: str
-    """Of depth and pose, as in the record."""
+    """Its pose is in the unit of the result."""
     unit_scale: float
     """Units of the depth per unit of the COLMAP model; 1 without a model."""
     farthest: float
     """Depth of the farthest sparse point."""
-    read: Callable[[], tuple[Depth, NDArray[np.bool_]]]
-    """Reads the (H, W) depth, 0 = unknown, and where it is known and valid."""
 
     @property
     def stem(self) -> str:
         """The image name without its suffix."""
         return PurePosixPath(self.image_name).with_suffix("").as_posix()
 
-    def valid_depth(self) -> Depth:
+    def valid_depth(self) -> NDArray[np.float32]:
         """Returns the (H, W) depth, 0 where it is unknown or not valid."""
-        depth, valid = self.read()
+        depth, valid = self.result.read()
         return np.where(valid, depth, np.float32(0))
 
 
@@ -60,6 +58,14 @@ class Export:
     """The files that `write` writes into a folder."""
     write: Callable[[Path, Sequence[ExportFrame]], list[str]]
     """Writes them and returns notes. Raises PnpDepthError."""
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Yields a temporary file that becomes the path, whose folder is created."""
+    make_folder(path.parent)
+    with atomic_path(path) as temporary:
+        yield temporary
 
 
 def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note
-from pnpdepth_cli.io.atomic import atomic_path, make_folder
+from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note, new_file
 from pnpdepth_cli.sensors.cloud import depth_normals
 
 
@@ -21,13 +20,10 @@ def _map(folder: Path, frame: ExportFrame, kind: str) -> Path:
     return folder / "stereo" / f"{kind}_maps" / f"{frame.image_name}.geometric.bin"
 
 
-def _images_to_fuse(folder: Path) -> Path:
-    return folder / "stereo" / "fusion.cfg"
-
-
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
     maps = [_map(folder, frame, kind) for frame in frames for kind in ("depth", "normal")]
-    return maps if _images_to_fuse(folder).exists() else [*maps, _images_to_fuse(folder)]
+    listed = folder / "stereo" / "fusion.cfg"  # image_undistorter may have written it already
+    return maps if listed.exists() else [*maps, listed]
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
@@ -35,9 +31,8 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
         depth = frame.valid_depth()
         _write_map(_map(folder, frame, "normal"), depth_normals(depth, frame.camera.camera))
         _write_map(_map(folder, frame, "depth"), depth[..., None] / frame.unit_scale)
-    listed = _images_to_fuse(folder)
-    if not listed.exists():  # image_undistorter has written it already
-        with atomic_path(listed) as temporary:
+    for listed in _files(folder, frames)[2 * len(frames) :]:
+        with new_file(listed) as temporary:
             text = "".join(f"{frame.image_name}\n" for frame in frames)
             temporary.write_text(text, encoding="utf-8", newline="\n")
     return distortion_note(frames, "COLMAP's fusion")
@@ -46,8 +41,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
 def _write_map(path: Path, values: NDArray[np.floating]) -> None:
     """Writes an (H, W, C) map."""
     height, width, channels = values.shape
-    make_folder(path.parent)
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with new_file(path) as temporary, temporary.open("wb") as file:
         file.write(f"{width}&{height}&{channels}&".encode())
         file.write(np.ascontiguousarray(values.transpose(2, 0, 1)).astype("<f4").tobytes())
 

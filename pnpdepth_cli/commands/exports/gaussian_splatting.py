@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note
+from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note, new_file
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.atomic import atomic_path, make_folder
+from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.record import write_json
 
 _CODES = 2**16
@@ -71,7 +71,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
 
 def _inverse(frame: ExportFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """(H, W) inverse depth in units of the model, and where the depth is known and valid."""
-    depth, valid = frame.read()
+    depth, valid = frame.result.read()
     known = depth > 0
     if not known.any():
         return np.zeros(depth.shape), valid
@@ -84,8 +84,7 @@ def _inverse(frame: ExportFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]
 def _save(path: Path, pixels: NDArray[np.uint16] | NDArray[np.uint8]) -> None:
     from PIL import Image
 
-    make_folder(path.parent)
-    with atomic_path(path) as temporary:
+    with new_file(path) as temporary:
         Image.fromarray(pixels).save(temporary, "PNG")
 
 

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame
+from pnpdepth_cli.commands.exports import Export, ExportFrame, new_file
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.atomic import atomic_path, make_folder
+from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.io.formats.png import LARGEST_CODE
+from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.record import write_json
 
 _CODES_PER_UNIT = 1000.0
@@ -66,8 +66,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
         write_depth(path, np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
         copy = _image(folder, frame)
         if copy != frame.image:
-            make_folder(copy.parent)
-            with atomic_path(copy) as temporary:
+            with new_file(copy) as temporary:
                 shutil.copyfile(frame.image, temporary)
     content = {
         "camera_model": _MODELS[lenses[0]],
@@ -79,7 +78,9 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
     notes = []
     if clipped:
         limit = LARGEST_CODE / _CODES_PER_UNIT / factor
-        notes.append(f"depth: {clipped:,} pixels beyond {limit:.4g} {frames[0].unit} are unknown")
+        notes.append(
+            f"depth: {clipped:,} pixels beyond {limit:.4g} {frames[0].result.unit} are unknown"
+        )
     if factor != 1:
         notes.append(f"unit: poses and depth are × {factor:g}, so that depth fits 16 bits")
     return notes
@@ -87,7 +88,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
 
 def _factor(frames: Sequence[ExportFrame]) -> float:
     """What poses and depths in model units are multiplied by, a power of two; 1 for metres."""
-    if all(frame.unit == METRES for frame in frames):
+    if all(frame.result.unit == METRES for frame in frames):
         return 1.0
     farthest = _BEYOND_POINTS * max(frame.farthest for frame in frames)
     return float(2.0 ** math.floor(math.log2(LARGEST_CODE / _CODES_PER_UNIT / farthest)))

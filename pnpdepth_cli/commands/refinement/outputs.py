@@ -18,8 +18,7 @@ from pnpdepth_cli.frames.frame import Refined, is_dense
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.depth import metres, write_depth
-from pnpdepth_cli.io.formats import format_of_suffix
-from pnpdepth_cli.io.formats.png import LARGEST_CODE
+from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
 from pnpdepth_cli.io.visualisation import (
     improvement,
     improvement_at_points,

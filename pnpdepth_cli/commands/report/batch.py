@@ -13,19 +13,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pnpdepth_cli.commands.report.evaluation import column_of, frames_text
-from pnpdepth_cli.commands.tables import column_title, format_value
+from pnpdepth_cli.commands.tables import Table, column_title, format_value
 from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import InputError, OutputError
-from pnpdepth_cli.io.colours import paint_gain, swatches
+from pnpdepth_cli.io.colours import hex_colours, signed_bar
 from pnpdepth_cli.io.figure import figure_content
 from pnpdepth_cli.io.report import (
     IMAGES,
     Column,
     Head,
-    Table,
     begin_report,
     check_report_folder,
     image_key,
@@ -229,7 +226,7 @@ def _head(
         sort_by="rmse_gain" if measured else "rmse_after",
         labels=_LABELS,
         thumb="second",
-        map_colours=swatches(paint_gain(np.linspace(-1, 1, 9), np.full(9, 0.88), colors)),
+        map_colours=hex_colours(signed_bar(colors, 9)),
         unit=unit,
     )
 
@@ -244,13 +241,10 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     tiles = [("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
     for basis in (_GT, _HELD_OUT):
         mean = summary["mean"][basis]
-        for key, measure in _ERRORS.items() if mean else ():
-            before, after = (mean[stage].get(key) for stage in ("before", "after"))
-            change = f"{format_value(measure, before)} → {format_value(measure, after)}"
-            gain = _gain(before, after)
-            gain_text = "" if gain is None else f"gain {_signed(100 * gain, 1, '%')} "
+        for measure in _ERRORS.values() if mean else ():
+            before, after, gain = _changed(measure, mean)
             label = f"{measure.title} [{summary['unit']}]"
-            tiles.append((label, change, f"{gain_text}{_BASES[basis]}"))
+            tiles.append((label, f"{before} → {after}", f"gain {gain} {_BASES[basis]}"))
     return tiles
 
 
@@ -282,22 +276,29 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str
 
 def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
     measures: Iterable[Measure] = MEASURES if basis == _GT else _ERRORS.values()
-    rows = []
-    for measure in measures:
-        before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
-        values = [format_value(measure, before), format_value(measure, after)]
-        change = _gain_text(measure, before, after)
-        rows.append([column_title(in_unit(measure, unit)), *values, change])
+    rows = [[column_title(in_unit(each, unit)), *_changed(each, mean)] for each in measures]
     if basis == _GT:
         coverage = [mean[stage].get("coverage") for stage in ("before", "after")]
-        shares = ["–" if value is None else f"{value:.2%}" for value in coverage]
-        rows.append(["coverage", *shares, ""])
+        rows.append(["coverage", *("–" if c is None else f"{c:.2%}" for c in coverage), ""])
     shown = 3 if basis == _USED else 4  # a gain at the points used means nothing
     return Table(
         caption=f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}",
         header=["", "before", "after", "gain"][:shown],
         rows=[row[:shown] for row in rows],
     )
+
+
+def _changed(measure: Measure, mean: Mapping[str, Any]) -> tuple[str, str, str]:
+    """The mean before and after, and its gain; a gain without sign is rounded to zero."""
+    before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
+    gain, decimals, unit = _gain(before, after), 1, "%"
+    if measure.percent and before is not None and after is not None:
+        gain, decimals, unit = after - before, 2, " pt"
+    text = "–"
+    if gain is not None:
+        size = f"{100 * abs(gain):.{decimals}f}"
+        text = f"{'' if float(size) == 0 else '+' if gain > 0 else '−'}{size}{unit}"
+    return format_value(measure, before), format_value(measure, after), text
 
 
 def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[Table]:
@@ -316,19 +317,3 @@ def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[
 def in_unit(measure: Measure, unit: str) -> Measure:
     """Returns the measure of depths whose unit is not the metre, such as a model's."""
     return replace(measure, unit=unit) if measure.unit == "m" else measure
-
-
-def _gain_text(measure: Measure, before: float | None, after: float | None) -> str:
-    if before is None or after is None:
-        return "–"
-    if measure.percent:
-        return _signed(100 * (after - before), 2, " pt")
-    gain = _gain(before, after)
-    return "–" if gain is None else _signed(100 * gain, 1, "%")
-
-
-def _signed(value: float, decimals: int, unit: str) -> str:
-    """The value with its sign; without one if it is rounded to zero."""
-    text = f"{abs(value):.{decimals}f}"
-    sign = "" if float(text) == 0 else "+" if value > 0 else "−"
-    return f"{sign}{text}{unit}"

@@ -16,12 +16,10 @@ from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.tables import format_value, unit_of
 from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import InputError, PnpDepthError
-from pnpdepth_cli.io.colours import depth_scale, grey_of, paint_error, swatches
+from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
-    Chart,
     Column,
     Head,
-    Table,
     begin_report,
     check_report_folder,
     image_key,
@@ -119,10 +117,7 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
             ("Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"),
         ],
         notes=evaluation.notes,
-        tables=[
-            Table(caption=table.caption, header=table.header, rows=table.rows)
-            for table in (means_by_measure(evaluation), *calibration_tables(evaluation))
-        ],
+        tables=[means_by_measure(evaluation), *calibration_tables(evaluation)],
         charts=_charts(evaluation),
         without_title=f"Not scored: {len(without):,}",
         without=without,
@@ -132,7 +127,7 @@ def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
             "first": f"Prediction{fill}", "second": "Ground truth", "map": "Error",
             "image": "Image",
         },
-        map_colours=swatches(paint_error(np.linspace(-1, 1, 9), np.full(9, 0.88))),
+        map_colours=hex_colours(signed_bar("error", 9)),
     )  # fmt: skip
 
 
@@ -154,36 +149,30 @@ def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
     ]
 
 
-def _charts(evaluation: Evaluation) -> list[Chart]:
+def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
     """The calibration plot and the sparsification curve of the predicted standard deviation."""
     found = evaluation.uncertainty
     if found is None:
         return []
     frames = frames_text(found.frames)
-    charts = [
-        Chart(
-            caption=f"Calibration, {frames}",
-            x_title="errors within the interval if normal",
-            y_title="observed",
-            lines={
-                "observed": list(zip(found.expected, found.observed, strict=True)),
-                "normal": [(0, 0), (1, 1)],
-            },
-        )
-    ]
+    observed = list(zip(found.expected, found.observed, strict=True))
+    charts: list[dict[str, Any]] = [{
+        "caption": f"Calibration, {frames}",
+        "x_title": "errors within the interval if normal",
+        "y_title": "observed",
+        "lines": {"observed": observed, "normal": [(0, 0), (1, 1)]},
+    }]  # fmt: skip
     if whole := found.sparsification[0]:
         by_sigma, by_error = (
             [(part, mae / whole) for part, mae in zip(found.removed, curve, strict=True)]
             for curve in (found.sparsification, found.oracle)
         )
-        charts.append(
-            Chart(
-                caption=f"Sparsification, {frames}: AUSE {found.ause:.4f}",
-                x_title="pixels removed",
-                y_title="MAE of the others",
-                lines={"by σ": by_sigma, "by error (oracle)": by_error},
-            )
-        )
+        charts.append({
+            "caption": f"Sparsification, {frames}: AUSE {found.ause:.4f}",
+            "x_title": "pixels removed",
+            "y_title": "MAE of the others",
+            "lines": {"by σ": by_sigma, "by error (oracle)": by_error},
+        })  # fmt: skip
     return charts
 
 
@@ -194,8 +183,7 @@ def _entry(
     notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
     if frame.leaked:
         notes.append(f"{frame.leaked:,} of them were given to the network as sparse depth.")
-    notes.append(f"Prediction: {frame.pair.prediction}")
-    notes.append(f"Ground truth: {frame.pair.frame.gt}")
+    notes += [f"Prediction: {frame.pair.prediction}", f"Ground truth: {frame.pair.frame.gt}"]
     try:
         drawn = _drawn(frame, evaluation, images)
     except InputError as error:  # the file has changed since it was scored

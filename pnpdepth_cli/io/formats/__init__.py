@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import FORMATS
@@ -27,6 +26,9 @@ SCALE_KEY = "pnpdepth:scale"
 
 SATURATED_CODE = 65535
 """The largest 16-bit code: what a sensor gives beyond its range, so never a measurement."""
+
+LARGEST_CODE = SATURATED_CODE - 1
+"""The largest code that is written."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,18 +46,6 @@ class StoredArray:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WriteOptions:
-    """How a depth image is written."""
-
-    path: Path
-    """The output file that the user named; messages name it."""
-    scale: float
-    """Codes per metre of a format of integers."""
-    text: Mapping[str, str]
-    """Texts by key that the file carries, where the format has room for them."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class DepthFormat:
     """One file format of depth images."""
 
@@ -67,25 +57,21 @@ class DepthFormat:
     """What the content begins with; files are recognised by content, never by suffix."""
     read: Callable[[Path, bytes, str | None], StoredArray]
     """From path (for messages), content and `--channel`. Raises FileFormatError."""
-    write: Callable[[Path, NDArray[np.float32], WriteOptions], None]
-    """(H, W) metres, 0 where unknown, into an existing empty file. Raises OutputError."""
+    write: Callable[[Path, NDArray[Any], Mapping[str, str]], None]
+    """(H, W) float32 metres or uint16 codes, 0 where unknown, into an existing empty file, with
+    texts by key where the format has room for them."""
     integer: bool = False
     """Whether files hold 16-bit integer codes, not float32 metres."""
 
 
-def depth_formats() -> list[DepthFormat]:
-    """All formats, in the order of `choices.FORMATS`."""
-    return list(FORMATS.values())
-
-
 def format_of_content(data: bytes) -> DepthFormat | None:
     """The format whose magic the content begins with; None for another kind of file."""
-    return next((each for each in depth_formats() if data.startswith(each.magic)), None)
+    return next((kind for kind in FORMATS.values() if data.startswith(kind.magic)), None)
 
 
 def format_of_suffix(suffix: str) -> DepthFormat | None:
     """The format that is written for a suffix in any case; None for an unknown one."""
-    return next((each for each in depth_formats() if suffix.lower() in each.suffixes), None)
+    return next((kind for kind in FORMATS.values() if suffix.lower() in kind.suffixes), None)
 
 
 def kind_of(data: bytes) -> str | None:
@@ -100,6 +86,14 @@ def kind_of(data: bytes) -> str | None:
         return "WEBP"
     depth_format = format_of_content(data)
     return None if depth_format is None else depth_format.name
+
+
+def eight_bits(path: Path, kind: str) -> FileFormatError:
+    """Returns the error for an 8-bit image given as depth."""
+    return FileFormatError(
+        f"{path} is an 8-bit {kind}; 8 bits cannot hold depth and it is probably an image of a "
+        "depth map, give the 16-bit PNG, EXR or NPY"
+    )
 
 
 def check_scale(scale: float | None) -> None:
@@ -118,15 +112,13 @@ def scale_in_text(path: Path, text: str) -> float | None:
     if match is None:
         return None
     try:
-        scale = float(match[1])
-    except ValueError:
-        scale = math.nan
-    if not (math.isfinite(scale) and scale > 0):
+        check_scale(scale := float(match[1]))
+    except (ValueError, UsageError) as error:
         raise FileFormatError(
             f"{path} says {SCALE_KEY}={match[1][:40]}, which is no scale; write the file again"
-        )
+        ) from error
     return scale
 
 
-DEPTH_SUFFIXES: tuple[str, ...] = tuple(s for each in depth_formats() for s in each.suffixes)
+DEPTH_SUFFIXES: tuple[str, ...] = tuple(s for kind in FORMATS.values() for s in kind.suffixes)
 """The suffixes that depth can be written to; PNG holds integer codes, the others float32 metres."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.decoding import silence
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
-from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray
 
 _DEPTH_NAMES = frozenset({"z", "depth"})
 
@@ -55,7 +56,7 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
     return channels
 
 
-def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
+def _write(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
     """One float32 channel Z, ZIP compressed."""
     import OpenEXR
 
@@ -90,16 +91,15 @@ def _part_channels(part: Any) -> dict[str, NDArray[Any]]:
     channels = {name: np.asarray(channel.pixels) for name, channel in part.channels.items()}
     if np.array_equal(data, display):
         return channels
-    width, height = display[1] - display[0] + 1
-    left, top = np.maximum(data[0], display[0])
-    right, bottom = np.maximum(np.minimum(data[1], display[1]) + 1, (left, top))
-    inside, there = (
-        np.s_[top - y : bottom - y, left - x : right - x] for x, y in (data[0], display[0])
-    )
-    placed = {name: np.zeros((height, width), of.dtype) for name, of in channels.items()}
+    size = display[1] - display[0] + 1
+    low, high = ((end - display[0]).clip(0, size) for end in (data[0], data[1] + 1))
+    shift = display[0] - data[0]  # of a pixel of the display window
+    placed = {}
     for name, pixels in channels.items():
-        if left < right and top < bottom:
-            placed[name][there] = pixels[inside]
+        whole = placed[name] = np.zeros(size[::-1], pixels.dtype)
+        inside = pixels[max(shift[1], 0) :, max(shift[0], 0) :]
+        there = whole[low[1] : high[1], low[0] : high[0]]
+        there[:] = inside[: there.shape[0], : there.shape[1]]
     return placed
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import math
 import re
 import struct
-import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +14,14 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_value_count, damaged
-from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray
 
 LONGEST_HEADER = 1 << 14
 _DTYPE = re.compile(r"['\"]descr['\"]\s*:\s*['\"]([^'\"]{1,20})['\"]")
 _FORTRAN = re.compile(r"['\"]fortran_order['\"]\s*:\s*(True|False)\b")
 _SHAPE = re.compile(r"['\"]shape['\"]\s*:\s*\(\s*((?:\d{1,18}\s*,\s*)*(?:\d{1,18}\s*)?)\)")
-"""The fields of a header. NumPy evaluates it as Python, which raises many kinds on damaged ones."""
-
-HEADER_LOCK = threading.Lock()
-"""To be held while NumPy parses a header: CPython 3.11 mixes up the recursion depths of threads
-that evaluate at once, and raises SystemError for a good file."""
+"""The fields of a header. NumPy evaluates it as Python, and threads of CPython 3.11 that do so at
+once raise SystemError for a good file."""
 
 
 def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[Any]:
@@ -71,21 +67,15 @@ def read_npy_header(
     return shape, "F" if fortran[1] == "True" else "C", dtype, end
 
 
-def npy_bytes(array: NDArray[Any]) -> bytes:
-    """Returns an NPY file of the array."""
-    buffer = io.BytesIO()
-    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
-    return buffer.getvalue()
-
-
 def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
     array = parse_npy(path, data)
     check_value_count(path, array.size)
     return StoredArray(values=array, description=f"{array.dtype} NPY", is_image=False)
 
 
-def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
-    file.write_bytes(npy_bytes(metres))
+def _write(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+    with file.open("wb") as stream:
+        np.save(stream, metres)
 
 
 FORMAT = DepthFormat(

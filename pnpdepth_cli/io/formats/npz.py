@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -13,11 +14,9 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import check_value_count, damaged, one_line
-from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
-from pnpdepth_cli.io.formats.npy import LONGEST_HEADER, npy_bytes, parse_npy, read_npy_header
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray
+from pnpdepth_cli.io.formats.npy import LONGEST_HEADER, parse_npy, read_npy_header
 
-# A fixed time in the archive: the same depth gives the same bytes.
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Those that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
 
@@ -80,11 +79,9 @@ def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
     return StoredArray(values=array, description=f"{array.dtype} NPZ array {name}", is_image=False)
 
 
-def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
-    member = zipfile.ZipInfo("depth.npy", date_time=_EPOCH)
-    member.compress_type = zipfile.ZIP_DEFLATED
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(member, npy_bytes(metres))
+def _write(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+    with file.open("wb") as stream:
+        np.savez_compressed(stream, depth=metres)  # all members have the time 1980-01-01
 
 
 FORMAT = DepthFormat(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
-from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray
 
 _HEADER = re.compile(rb"(Pf|PF)\s+(\d{1,9})\s+(\d{1,9})\s+([-+0-9.eE]{1,40})[ \t]*\r?\n")
 
@@ -45,21 +46,16 @@ def parse_pfm(path: Path, data: bytes) -> tuple[NDArray[np.float32], float]:
     return np.ascontiguousarray(values[::-1], dtype=np.float32), abs(factor)
 
 
-def pfm_bytes(depth: NDArray[np.float32]) -> bytes:
-    """Returns a little-endian PFM of the (H, W) values."""
-    height, width = depth.shape
-    body = np.ascontiguousarray(depth[::-1], dtype="<f4").tobytes()
-    return f"Pf\n{width} {height}\n-1.0\n".encode() + body
-
-
 def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
     values, factor = parse_pfm(path, data)
     unused = "" if factor == 1 else f", scale factor {factor:g} of its header not applied"
     return StoredArray(values=values, description=f"PFM{unused}")
 
 
-def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
-    file.write_bytes(pfm_bytes(metres))
+def _write(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+    height, width = metres.shape
+    header = f"Pf\n{width} {height}\n-1.0\n".encode()  # little-endian
+    file.write_bytes(header + metres[::-1].astype("<f4").tobytes())
 
 
 FORMAT = DepthFormat(name="PFM", suffixes=(".pfm",), magic=(b"Pf", b"PF"), read=_read, write=_write)

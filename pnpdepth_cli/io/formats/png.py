@@ -8,30 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, OutputError
+from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.decoding import decode_with_opencv, opened_image, raw_mode
 from pnpdepth_cli.io.formats import (
-    SATURATED_CODE,
     SCALE_KEY,
     DepthFormat,
     StoredArray,
-    WriteOptions,
-    check_scale,
+    eight_bits,
     scale_in_text,
 )
 
-LARGEST_CODE = SATURATED_CODE - 1
-"""The largest code that is written."""
-
 _COMPRESSION_LEVEL = 4  # of zlib: a third of the time of its default 6, files 4 per cent larger
-
-
-def eight_bits(path: Path, kind: str) -> FileFormatError:
-    """The error for an 8-bit image given as depth."""
-    return FileFormatError(
-        f"{path} is an 8-bit {kind}; 8 bits cannot hold depth and it is probably an image of a "
-        "depth map, give the 16-bit PNG, EXR or NPY"
-    )
 
 
 def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
@@ -60,30 +47,7 @@ def _not_grey(path: Path, colours: str) -> FileFormatError:
     )
 
 
-def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
-    scale = repr(float(options.scale)).removesuffix(".0")
-    _save(file, _codes(options.path, metres, options.scale), {SCALE_KEY: scale, **options.text})
-
-
-def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.uint16]:
-    check_scale(scale)
-    codes = np.rint(metres.astype(np.float64) * scale)
-    if codes.max() > LARGEST_CODE:
-        raise OutputError(
-            f"{path}: the largest depth, {metres.max():.6g} m, does not fit a 16-bit PNG with "
-            f"{scale:g} codes per metre (at most {LARGEST_CODE / scale:.6g} m); "
-            "write .exr, .npy or .tiff"
-        )
-    lost = (metres > 0) & (codes == 0)
-    if lost.any():
-        raise OutputError(
-            f"{path}: {int(lost.sum()):,} depths down to {metres[lost].min():.3g} m would become "
-            f"0 (unknown) in a 16-bit PNG with {scale:g} codes per metre; write .exr, .npy or .tiff"
-        )
-    return codes.astype(np.uint16)
-
-
-def _save(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) -> None:
+def _write(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) -> None:
     from PIL import Image, PngImagePlugin
 
     chunks = PngImagePlugin.PngInfo()

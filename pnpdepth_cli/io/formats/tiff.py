@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,8 +13,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.decoding import check_tags, decode_with_opencv, silence
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
-from pnpdepth_cli.io.formats import DepthFormat, StoredArray, WriteOptions, scale_in_text
-from pnpdepth_cli.io.formats.png import eight_bits
+from pnpdepth_cli.io.formats import DepthFormat, StoredArray, eight_bits, scale_in_text
 
 _WIDTH, _HEIGHT, _BITS, _DESCRIPTION, _SAMPLES, _FORMAT = 256, 257, 258, 270, 277, 339
 _BLOCK_TAGS = ((273, 279), (324, 325))  # offsets and byte counts, of strips or of tiles
@@ -86,7 +86,7 @@ def _read(path: Path, data: bytes, channel: str | None) -> StoredArray:
     return StoredArray(values=values, description=description, scale=scale)
 
 
-def _write(file: Path, metres: NDArray[np.float32], options: WriteOptions) -> None:
+def _write(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
     from PIL import Image
 
     Image.fromarray(metres).save(file, "TIFF", compression="tiff_adobe_deflate")

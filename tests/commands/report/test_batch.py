@@ -15,7 +15,7 @@ from pnpdepth_cli.commands.batch.batch import plan_batch
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.report import batch as report_batch
 from pnpdepth_cli.errors import OutputError, StorageError
-from pnpdepth_cli.io.colours import paint_gain
+from pnpdepth_cli.io.colours import paint_signed
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.figure import figure_content
 from pnpdepth_cli.io.report import link_image
@@ -302,6 +302,6 @@ def test_the_legend_has_the_colours_of_the_improvement_maps(
     root: Path, report: Path, colors: str
 ) -> None:
     batch(root, html=report, refine={"colors": colors})
-    worse, better = (paint_gain(np.array(s), np.array(0.88), colors) for s in (-1.0, 1.0))
+    worse, better = (paint_signed(np.array(s), np.array(0.88), colors) for s in (-1.0, 1.0))
     shown = page_data(report)["map_colours"]
     assert [shown[0], shown[-1]] == ["#" + bytes(each).hex() for each in (worse, better)]

@@ -135,9 +135,9 @@ def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
     assert result.uncertainty is not None
     assert len(page_data(root / "report")["charts"]) == 2
     calibration, sparsification = _charts(result)
-    observed = calibration.lines["observed"]
+    observed = calibration["lines"]["observed"]
     assert observed == [(x, pytest.approx(x, abs=0.02)) for x, _ in observed]
-    by_sigma, by_error = map(dict, sparsification.lines.values())
+    by_sigma, by_error = map(dict, sparsification["lines"].values())
     assert by_sigma[0] == by_error[0] == 1
     assert 1 > by_sigma[0.5] > by_error[0.5] > 0
     area = np.trapezoid([by_sigma[x] - by_error[x] for x in by_sigma], list(by_sigma))
