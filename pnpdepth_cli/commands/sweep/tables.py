@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.evaluation.dependence import find_clusters, groups_by_name
-from pnpdepth_cli.commands.evaluation.resampling import (
+from pnpdepth_cli.commands.evaluation.statistics import (
     Floats,
     FrameTable,
+    find_clusters,
     gain,
-    gain_interval,
-    mean_interval,
+    groups_by_name,
+    interval,
 )
 from pnpdepth_cli.commands.tables import Table, write_text
 from pnpdepth_cli.core.metrics import MEASURES
@@ -104,9 +104,12 @@ def _mean_and_interval(
     """(5, measures) each, of a table (frames, methods, measures): means and gains, their ends."""
     plain, linear, refined = (FrameTable.of_frames(table[:, method]) for method in range(3))
     clusters = find_clusters(groups_by_name(names), table.reshape(len(table), -1))
-    drawing = clusters.ids, resamples, 0
-    ends = [mean_interval(each, *drawing) for each in (plain, linear, refined)]
-    ends += [gain_interval(each, refined, _BETTER, *drawing) for each in (plain, linear)]
+    drawing = clusters, resamples, 0
+    ends = [interval(lambda means: means, [each], *drawing) for each in (plain, linear, refined)]
+    ends += [
+        interval(lambda a, b: gain(a, b, _BETTER), [each, refined], *drawing)
+        for each in (plain, linear)
+    ]
     means = table.mean(axis=0)
     mean = np.concatenate([means, [gain(each, means[2], _BETTER) for each in means[:2]]])
     low, high = np.stack(ends, axis=1)
