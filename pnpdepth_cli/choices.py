@@ -277,7 +277,7 @@ MISSING = ("skip", "min", "max", "fail")
 """Empty predictions are not scored, scored as the lower or the upper bound, or refused."""
 
 SCALINGS = ("none", "median", "affine", "affine-disparity", "log")
-"""How the prediction of an image is scaled to its ground truth: `commands.evaluation.scaling`."""
+"""How the prediction of an image is scaled to its ground truth: `commands.evaluation.frames`."""
 
 PREDICTION_KINDS = ("depth", "disparity")
 """What the files of a prediction hold."""

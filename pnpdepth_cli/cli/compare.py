@@ -75,21 +75,18 @@ def compare(
     (Holm); it is exact for few groups, else with N random permutations.
     """
     from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
-    from pnpdepth_cli.commands.evaluation.compare import CompareRequest
     from pnpdepth_cli.commands.evaluation.compare import compare as compare_runs
     from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
 
     files = TableFiles(**table_files)
     files.check([Path(run) for run in runs])
     comparison = compare_runs(
-        CompareRequest(
-            paths=runs,
-            resamples=resamples,
-            seed=seed,
-            grouped=not no_groups,
-            all_measures=all_measures,
-            columns=columns,
-        )
+        runs,
+        resamples=resamples,
+        seed=seed,
+        grouped=not no_groups,
+        all_measures=all_measures,
+        columns=columns,
     )
     print_notes(comparison.notes)
     table = comparison_table(comparison)

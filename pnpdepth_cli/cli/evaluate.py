@@ -208,7 +208,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     from pnpdepth_cli.commands.evaluation import tables
     from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest
     from pnpdepth_cli.commands.evaluation.evaluate import evaluate as run_evaluation
-    from pnpdepth_cli.commands.evaluation.frame_reading import Scales
+    from pnpdepth_cli.commands.evaluation.frames import Scales
     from pnpdepth_cli.commands.evaluation.protocols import choose_protocol
     from pnpdepth_cli.commands.report import evaluation as report_eval
     from pnpdepth_cli.commands.tables import chosen_measures

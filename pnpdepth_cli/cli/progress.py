@@ -57,6 +57,7 @@ class BatchProgress:
     def __init__(self, name: str = "batch", unit: str = "frame") -> None:
         self._name, self._unit = name, unit
         self.done = self.to_do = self.failed = 0
+        self._said: set[str] = set()
         self._bar: tqdm[Any] | None = None
 
     def __enter__(self) -> BatchProgress:
@@ -82,15 +83,13 @@ class BatchProgress:
             self._bar = open_bar(self._name, self._unit, total=to_do)
 
     def frame(self, row: Mapping[str, Any]) -> None:
-        """Counts a frame, and prints why it failed if it did."""
-        if row["status"] != "done":
-            self.say(f"{row['status']}: {row['name']}: {row['message']}")
-        self.advance(failed=row["status"] == "failed")
-
-    def advance(self, *, failed: bool) -> None:
-        """Counts one more."""
+        """Counts a frame, and prints why it failed if it did; what was said of it is not again."""
+        line = f"{row['status']}: {row['name']}: {row['message']}"
+        if row["status"] != "done" and line not in self._said:
+            self._said.add(line)
+            self.say(line)
         self.done += 1
-        self.failed += failed
+        self.failed += row["status"] == "failed"
         if self._bar is not None:
             self._bar.update()
             if self.failed:

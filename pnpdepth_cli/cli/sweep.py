@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import Any
 
 import click
@@ -122,8 +121,11 @@ def sweep(
     per table (extra pnpdepth[plot]), and sweep.jsonl (the journal). Run again, also with other
     values, only missing values are computed.
     """
+    from pnpdepth_cli.cli.tables import print_table
     from pnpdepth_cli.commands.sweep.axes import PARAMETERS, read_axis, studies_of, values_of
+    from pnpdepth_cli.commands.sweep.outputs import study_table
     from pnpdepth_cli.commands.sweep.points import read_sampling
+    from pnpdepth_cli.commands.sweep.running import RESULTS
     from pnpdepth_cli.commands.sweep.sweep import SweepRequest, run_sweep
 
     fixed = dict(text.partition("=")[::2] for text in settings)
@@ -137,7 +139,7 @@ def sweep(
         points={name: text for name, text in fixed.items() if PARAMETERS[name].of_points},
         refine=options.request_of(values).with_fields(**method),
     )
-    with _Progress() as progress:
+    with BatchProgress("sweep", "run") as progress:
         try:
             record = run_sweep(request, progress)
         except StorageError as error:
@@ -148,65 +150,13 @@ def sweep(
     if as_json:
         click.echo(json.dumps(record, indent=2))
     else:
-        _print(record)
+        for study in record["studies"]:
+            print_table(study_table(study, record))
+        plots = [study["plot"] for study in record["studies"] if study["plot"]]
+        written = "  ".join(f"{record['output']}/{name}" for name in (*RESULTS, *plots))
+        click.echo(f"wrote {written}", err=True)
     if progress.failed:
         raise FramesFailedError(
             f"{progress.failed:,} of {progress.to_do:,} runs failed; {request.output}/sweep.csv"
             " counts the frames missing from each mean; run the same command to retry them"
         )
-
-
-class _Progress(BatchProgress):
-    """Progress of a sweep; the same message about the same frame is printed once."""
-
-    def __init__(self) -> None:
-        super().__init__("sweep", "run")
-        self._printed: set[tuple[str, str]] = set()
-
-    def frame(self, row: Mapping[str, Any]) -> None:
-        """Counts a run that is done or has failed."""
-        self.advance(failed=row["status"] == "failed")
-        if row["message"] and (row["name"], row["message"]) not in self._printed:
-            self._printed.add((row["name"], row["message"]))
-            self.say(f"{row['status']}: {row['name']}: {row['message']}")
-
-
-def _print(record: Mapping[str, Any]) -> None:
-    """Prints a table per study on stdout, and the names of the files on stderr."""
-    from pnpdepth_cli.cli.tables import print_rows
-
-    for study in record["studies"]:
-        names = list(study["parameters"])
-        cost = ["time [s]"] * any("time_s" in cell for cell in study["cells"])
-        print_rows(
-            f"{' × '.join(names)}: means over frames, MAE in metres, gains over plain in %",
-            [*names, "points used", "frames", "linear", "plain", "refined", "±", "gain", "95 %",
-             "RMSE gain", "MRE gain", "δ1 gain", *cost],
-            [[*cell["parameters"].values(), *_cells(cell)] for cell in study["cells"]],
-        )  # fmt: skip
-    plots = [study["plot"] for study in record["studies"] if study["plot"]]
-    names = ["sweep.csv", "sweep.json", "sweep.tex", "sweep_frames.csv", *plots]
-    click.echo("wrote " + "  ".join(f"{record['output']}/{name}" for name in names), err=True)
-
-
-def _cells(cell: Mapping[str, Any]) -> list[str]:
-    time = [_text(cell["time_s"], ".3g")] if "time_s" in cell else []
-    if cell["measures"] is None:
-        return ["–", "0", *["–"] * 9, *time]
-    mae, diverged = cell["measures"]["mae"], cell["diverged"]
-    low, high = mae["refined_low"], mae["refined_high"]
-    ends = (_text(mae[name], "+.1f") for name in ("gain_low", "gain_high"))
-    return [
-        f"{cell['points']:,.0f}",
-        f"{cell['frames']:,}" + (f", {diverged:,} diverged" if diverged else ""),
-        *(_text(mae[name], ".4f") for name in ("linear", "plain", "refined")),
-        _text(None if low is None else (high - low) / 2, ".4f"),
-        _text(mae["gain"], "+.1f"),
-        "–" if low is None else " … ".join(ends),
-        *(_text(cell["measures"][key]["gain"], "+.1f") for key in ("rmse", "mre", "delta1")),
-        *time,
-    ]
-
-
-def _text(value: float | None, form: str) -> str:
-    return "–" if value is None else f"{value:{form}}"

@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
@@ -45,16 +45,17 @@ class Cell(str):
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Rows of text; the first column is left-aligned, the others, of numbers, right-aligned."""
+    """Rows; the first column is left-aligned, the others, of numbers, right-aligned."""
 
     header: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[Any]]
+    """Texts; for CSV, also numbers and None."""
     caption: str = ""
 
     def csv(self) -> str:
         """Returns the table as `write_csv` writes it."""
         buffer = io.StringIO()
-        write_csv(buffer, self.header, [[str(cell) for cell in row] for row in self.rows])
+        write_csv(buffer, self.header, self.rows)
         return buffer.getvalue()
 
     def markdown(self) -> str:

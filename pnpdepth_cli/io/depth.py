@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import FORMATS
-from pnpdepth_cli.errors import FileFormatError, OutputError, SizeError
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import check_pixel_count, read_bytes
 from pnpdepth_cli.io.formats import (
@@ -36,6 +37,22 @@ _FARTHEST_INDOORS_M = 40.0
 _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
 
 
+# Quotients of these, which a wrong one gives, within a tenth.
+_SCALE_QUOTIENTS = (1000.0, 256.0, 100.0, 10.0, 1000.0 / 256.0, 5.0, 5000.0 / 256.0, 5000.0)
+_QUOTIENT_TOLERANCE = math.log(1.1)
+
+
+class DepthKind(NamedTuple):
+    """What kind of depth file was read."""
+
+    source: str
+    """In words, such as `16-bit PNG ÷ 256`."""
+    scale: float | None
+    """Codes per metre; None for floats."""
+    assumed: bool
+    """True if neither the file nor the user nor the data set states the scale."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class DepthImage:
     """A depth image as read from a file."""
@@ -48,6 +65,11 @@ class DepthImage:
     """True if neither the file nor the user gave the scale."""
     scale: float | None = None
     """Codes per metre that integers were divided by; None for a float file."""
+
+    @property
+    def kind(self) -> DepthKind:
+        """What was read."""
+        return DepthKind(self.source, self.scale, self.assumed_scale)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -246,6 +268,40 @@ def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
         f"{fact}: --depth-scale {better:g} (now {scale:g}) "
         f"would make it {metres(median * scale / better)} m"
     )
+
+
+def scale_warning(what: str, ratio: float, kinds: Mapping[str, DepthKind | None]) -> str | None:
+    """Returns a warning if depths are a multiple of the ground truth that a wrong scale explains.
+
+    Args:
+        what: The depths, in the plural.
+        ratio: Median of depth / ground truth; NaN if nothing can be compared.
+        kinds: The file of the depths, then that of the ground truth, by the option of its scale.
+
+    Raises:
+        InputError: If the scale of one of them was assumed.
+    """
+    quotients = (*_SCALE_QUOTIENTS, *(1 / factor for factor in _SCALE_QUOTIENTS))
+    log_ratio = math.log(ratio) if ratio > 0 else math.nan
+    near = (q for q in quotients if abs(log_ratio - math.log(q)) < _QUOTIENT_TOLERANCE)
+    factor = next(near, None)
+    if factor is None:
+        return None
+    sides = zip(kinds.items(), (factor, 1 / factor), strict=True)
+    integer = [(option, kind, by) for (option, kind), by in sides if kind and kind.scale]
+    unstated = [side for side in integer if "(from the file)" not in side[1].source]
+    advice = " or ".join(
+        f"{option} {(kind.scale or 1) * by:.6g} (now {kind.scale:g})"
+        for option, kind, by in unstated or integer
+    )
+    about = f"{factor:.4g}" if factor >= 1 else f"1/{1 / factor:.4g}"
+    fact = (
+        f"{what} are {ratio:.4g} times the ground truth (median), about {about}: a scale is"
+        f" probably wrong; {f'{advice} would remove it' if advice else 'float files hold metres'}"
+    )
+    if assumed := [f"{option} {kind.scale:g}" for option, kind, _ in integer if kind.assumed]:
+        raise InputError(f"{fact}, {' '.join(assumed)} keeps it")
+    return f"warning: {fact}"
 
 
 def metres(value: float) -> str:

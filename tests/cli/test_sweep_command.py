@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
@@ -31,7 +32,7 @@ def test_a_sweep_prints_a_table_per_study_and_the_files_it_wrote(
     assert [title.split(":")[0] for title in titles] == ["points", "loss"]
     assert re.search(r"^ 20 +20 +2 +0\.\d{4}", out, re.MULTILINE)
     assert "points: the frames' own; --sample to change" in err
-    assert "2 frames, 22 runs: 0 done already, 22 to do" in err
+    assert "2 frames, 12 runs: 0 done already, 12 to do" in err
     last = err.splitlines()[-1]
     assert last.startswith("wrote out/sweep.csv")
     for written in last.removeprefix("wrote ").split():
@@ -39,7 +40,7 @@ def test_a_sweep_prints_a_table_per_study_and_the_files_it_wrote(
     assert code_of(arguments(*vary)) == 0
     again, err = capsys.readouterr()
     assert again == out
-    assert "22 done already, 0 to do" in err
+    assert "12 done already, 0 to do" in err
 
 
 def test_json_prints_what_is_in_the_file_and_the_csv_has_the_same_cells(
@@ -83,7 +84,7 @@ EXITS: list[tuple[list[str], int, str]] = [
     (["--vary", "points=a"], 2, "neither a number"),
     (["--vary", "points=500"], 7, "runs failed"),
     (["--vary", "points=9", "--set", "colour=red"], 2, "no parameter 'colour'"),
-    (["--vary", "points=9", "--set", "lr"], 2, "is not a step size"),
+    (["--vary", "points=9", "--set", "lr"], 2, "a step size above 0"),
     (["--vary", "lr=1", "--vary", "loss=l1", "--vary", "points=9"], 2, "--one-by-one"),
     (["--vary", "lr=1", "--sample", "many"], 2, "no sensor 'many'"),
     (["--vary", "lr=1", "--seeds", "0"], 2, "--seeds must be >= 1"),
@@ -136,20 +137,20 @@ def test_ctrl_c_prints_how_to_continue_and_exits_130(
 ) -> None:
     from pnpdepth_cli.commands.sweep import running as sweep_running
 
-    own, calls = sweep_running.refined, []
+    own, calls = sweep_running.refine_frame, []
 
-    def interrupted(*request: object) -> object:
+    def interrupted(*request: Any, **options: Any) -> object:
         calls.append(request)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return own(*request)  # type: ignore[arg-type]
+        return own(*request, **options)
 
-    monkeypatch.setattr(sweep_running, "refined", interrupted)
+    monkeypatch.setattr(sweep_running, "refine_frame", interrupted)
     vary = ("--vary", "lr=1%,3%", "--plots", "none")
     assert code_of(arguments(*vary)) == 130
     assert "stopped; run the same command to continue" in capsys.readouterr().err
     assert code_of(arguments(*vary)) == 0
-    assert "6 runs: 2 done already, 4 to do" in capsys.readouterr().err
+    assert "4 runs: 1 done already, 3 to do" in capsys.readouterr().err
 
 
 def test_the_help_names_all_that_can_be_varied() -> None:

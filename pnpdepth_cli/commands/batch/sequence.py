@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.evaluation.dependence import groups_by_name
+from pnpdepth_cli.commands.evaluation.statistics import groups_by_name
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset.frame import Frame, Neighbour

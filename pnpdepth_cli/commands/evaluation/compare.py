@@ -3,36 +3,80 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.evaluation.dependence import MIN_CLUSTERS, Clusters, find_clusters
+from pnpdepth_cli.choices import MEASURE_GROUPS
 from pnpdepth_cli.commands.evaluation.pairing import some_names
-from pnpdepth_cli.commands.evaluation.resampling import (
+from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS
+from pnpdepth_cli.commands.evaluation.statistics import (
     LEVEL,
+    MIN_CLUSTERS,
+    Clusters,
     FrameTable,
+    find_clusters,
     gain,
-    gain_interval,
+    groups_by_name,
     holm,
+    interval,
     swap_p_values,
 )
-from pnpdepth_cli.commands.evaluation.runs import Run, read_run
 from pnpdepth_cli.commands.tables import chosen_measures
-from pnpdepth_cli.core.metrics import Measure
-from pnpdepth_cli.errors import InputError, UsageError
-from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.core.metrics import MEASURES, Measure
+from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.io.record import plain, read_json
 
 ALPHA = 0.05
 MAIN_MEASURES = ("rmse", "mae", "mre", "delta1", "inverse_rmse", "inverse_mae")
 """Keys of the measures that are compared by default; the last two are the kit's."""
+_STAGES = ("before", "after")
 
 
 @dataclass(frozen=True, kw_only=True)
+class RunFrame:
+    """The saved scores of one frame."""
+
+    values: dict[str, float]
+    """Measures by their key; NaN for null."""
+    pixels: int
+    """Scored pixels."""
+    group: str
+    """The sequence the frame belongs to."""
+    known: int | None = None
+    """Pixels with ground truth; None where the file does not say."""
+    sums: tuple[float, ...] = ()
+    """Of a pooled run: over the pixels, in the order of core.metrics.SUMS."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """The scored frames of one saved run, by name."""
+
+    label: str
+    """The file's name without its folder."""
+    path: str
+    """As the user gave it."""
+    measures: tuple[Measure, ...]
+    """Those of all frames."""
+    scoring: dict[str, Any]
+    """The rules that decide the figures."""
+    frames: dict[str, RunFrame]
+
+    def coverage(self, names: Sequence[str]) -> float | None:
+        """Returns the fraction of the ground truth that is scored; None where files do not say."""
+        known = [self.frames[name].known or 0 for name in names]
+        if not all(known):
+            return None
+        return sum(self.frames[name].pixels for name in names) / sum(known)
+
+
+@dataclass(frozen=True)
 class Gain:
     """How much better a run is than the first one; positive is better for every measure.
 
@@ -40,9 +84,8 @@ class Gain:
     """
 
     percent: float
-    """Of the first run's mean."""
+    """Of the first run's mean; with the ends of its 95 % interval."""
     low_percent: float
-    """Lower end of its 95 % interval, a studentised bootstrap over the clusters of frames."""
     high_percent: float
     difference: float
     """This run's mean minus the first run's, in the measure's unit."""
@@ -60,7 +103,6 @@ class RunMean:
     path: str
     mean: dict[str, float]
     coverage: float | None
-    """Fraction of the ground truth's pixels that is scored; None where files do not say."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,44 +135,49 @@ class Comparison:
         return result
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompareRequest:
-    """Which runs to compare, and how their differences are tested."""
-
-    paths: Sequence[str]
-    """Files as `read_run` takes them; the first is the reference."""
-    resamples: int = 10_000
-    """Bootstrap samples, and the most swaps of the permutation test."""
-    seed: int = 0
-    grouped: bool = True
-    """False if every frame counts as independent."""
-    all_measures: bool = False
-    """True to compare by every measure that all runs have, not only by MAIN_MEASURES."""
-    columns: Sequence[str] | None = None
-    """Keys of the measures to compare by, instead."""
-
-
-def compare(request: CompareRequest) -> Comparison:
+def compare(
+    paths: Sequence[str],
+    *,
+    resamples: int = 10_000,
+    seed: int = 0,
+    grouped: bool = True,
+    all_measures: bool = False,
+    columns: Sequence[str] | None = None,
+) -> Comparison:
     """Returns the runs on the frames that all of them scored, compared with the first.
 
     A measure that a frame lacks in one of the runs is averaged and tested over the other frames.
+
+    Args:
+        paths: Files as `read_run` takes them; the first is the reference.
+        resamples: Bootstrap samples, and the most swaps of the permutation test.
+        seed: Of both.
+        grouped: False if every frame counts as independent.
+        all_measures: Whether every measure that all runs have is compared, not MAIN_MEASURES.
+        columns: Keys of the measures to compare by, instead.
 
     Raises:
         UsageError: For fewer than two runs.
         InputError: If they were scored by different rules, or have no frame in common.
     """
-    if len(request.paths) < 2:
+    if len(paths) < 2:
         raise UsageError("two runs at least are needed to compare")
-    if request.resamples < 1:
-        raise UsageError(f"--bootstrap must be >= 1, got {request.resamples}")
-    runs = [read_run(path) for path in request.paths]
+    if resamples < 1:
+        raise UsageError(f"--bootstrap must be >= 1, got {resamples}")
+    runs = [read_run(path) for path in paths]
     for run in runs[1:]:
         _check_rules(runs[0], run)
     names = tuple(name for name in runs[0].frames if all(name in run.frames for run in runs))
     if not names:
         first, other = (some_names(run.frames) or "none" for run in (runs[0], runs[-1]))
         raise InputError(f"the runs have no scored frame in common: {first}; and {other}")
-    measures = _measures(runs, request)
+    shared = set.intersection(*({m.key for m in run.measures} for run in runs))
+    measures = tuple(measure for measure in runs[0].measures if measure.key in shared)
+    main = tuple(measure for measure in measures if measure.key in MAIN_MEASURES)
+    if columns is not None or all_measures or not main:
+        measures = chosen_measures(measures, columns)
+    else:
+        measures = main
     keys = [measure.key for measure in measures]
     values = np.array(
         [[[run.frames[n].values.get(k, math.nan) for k in keys] for n in names] for run in runs]
@@ -138,16 +185,22 @@ def compare(request: CompareRequest) -> Comparison:
     known = np.isfinite(values).all(axis=0)
     differences = np.concatenate(list(values[1:] - values[0]), axis=1)
     groups = [runs[0].frames[name].group for name in names]
-    clusters = find_clusters(groups, differences, grouped=request.grouped)
-    if runs[0].pooled:
+    clusters = find_clusters(groups, differences, grouped=grouped)
+    pooled = runs[0].scoring.get("average") == "pooled"
+    if pooled:
         sums = (np.array([run.frames[name].sums for name in names]) for run in runs)
         tables = [FrameTable.of_pixels(of_run, keys) for of_run in sums]
     else:
         tables = [FrameTable.of_frames(np.where(known, of_run, math.nan)) for of_run in values]
-    gains, exact = [], True
-    for table in tables[1:]:
-        rows, exact = _gains(tables[0], table, measures, clusters, request)
-        gains.append(dict(zip(keys, rows, strict=True)))
+    better = np.array([1.0 if m.higher_is_better else -1.0 for m in measures])
+    means, gains, exact = [table.mean() for table in tables], [], True
+    for table, mean in zip(tables[1:], means[1:], strict=True):
+        both, drawing = (tables[0], table), (clusters, resamples, seed)
+        low, high = interval(lambda a, b: gain(a, b, better), both, *drawing)
+        p_values, exact = swap_p_values(*both, *drawing)
+        percent, difference = gain(means[0], mean, better), mean - means[0]
+        rows = np.stack([percent, low, high, difference, p_values, holm(p_values)], axis=1)
+        gains.append({key: Gain(*row) for key, row in zip(keys, rows.tolist(), strict=True)})
     return Comparison(
         frames=names,
         measures=measures,
@@ -156,29 +209,28 @@ def compare(request: CompareRequest) -> Comparison:
             RunMean(
                 label=label,
                 path=run.path,
-                mean=dict(zip(keys, table.mean().tolist(), strict=True)),
-                coverage=_coverage(run, names),
+                mean=dict(zip(keys, mean.tolist(), strict=True)),
+                coverage=run.coverage(names),
             )
-            for label, run, table in zip(_labels(runs), runs, tables, strict=True)
+            for label, run, mean in zip(_labels(runs), runs, means, strict=True)
         ),
         gains=tuple(gains),
         clusters=clusters,
         exact_p_values=exact,
-        resamples=request.resamples,
-        seed=request.seed,
+        resamples=resamples,
+        seed=seed,
         notes=(
             *_notes(runs, names),
-            *([] if runs[0].pooled else _lacking(names, measures, known)),
+            *([] if pooled else _lacking(names, measures, known)),
             *_cluster_notes(clusters, len(names), len(measures)),
         ),
     )
 
 
 def _check_rules(first: Run, other: Run) -> None:
-    rules = sorted({*first.scoring, *other.scoring})
     differing = [
         f"{rule} {first.scoring.get(rule)} and {other.scoring.get(rule)}"
-        for rule in rules
+        for rule in sorted({*first.scoring, *other.scoring})
         if first.scoring.get(rule) != other.scoring.get(rule)
     ]
     if differing:
@@ -186,60 +238,6 @@ def _check_rules(first: Run, other: Run) -> None:
             f"{first.path} and {other.path} were scored by different rules"
             f" ({'; '.join(differing)}); score both by one protocol"
         )
-
-
-def _measures(runs: Sequence[Run], request: CompareRequest) -> tuple[Measure, ...]:
-    """Those of all runs that the user chose, or the main ones."""
-    shared = set.intersection(*({m.key for m in run.measures} for run in runs))
-    common = [measure for measure in runs[0].measures if measure.key in shared]
-    main = tuple(measure for measure in common if measure.key in MAIN_MEASURES)
-    if request.columns is None and main and not request.all_measures:
-        return main
-    return chosen_measures(common, request.columns)
-
-
-def _gains(
-    first: FrameTable,
-    other: FrameTable,
-    measures: Sequence[Measure],
-    clusters: Clusters,
-    request: CompareRequest,
-) -> tuple[list[Gain], bool]:
-    """The gain of a run in each measure, and whether their p-values are exact."""
-    better = np.array([1.0 if m.higher_is_better else -1.0 for m in measures])
-    drawing = clusters.ids, request.resamples, request.seed
-    low, high = gain_interval(first, other, better, *drawing)
-    p_values, exact = swap_p_values(first, other, *drawing)
-    before, after = first.mean(), other.mean()
-    rows = (gain(before, after, better), low, high, after - before, p_values, holm(p_values))
-    names = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
-    return [
-        Gain(**dict(zip(names, row, strict=True))) for row in np.stack(rows, axis=1).tolist()
-    ], exact
-
-
-def _lacking(
-    names: Sequence[str], measures: Sequence[Measure], known: NDArray[np.bool_]
-) -> list[str]:
-    """A line for each set of measures that some frames lack."""
-    titles: dict[tuple[str, ...], list[str]] = {}
-    for measure, has in zip(measures, known.T, strict=True):
-        lacking = tuple(name for name, known_in in zip(names, has, strict=True) if not known_in)
-        titles.setdefault(lacking, []).append(measure.title)
-    return [
-        f"{', '.join(of)}: over {len(names) - len(lacking):,} frames; {len(lacking):,} lack it in"
-        f" a run: {some_names(lacking)}"
-        for lacking, of in titles.items()
-        if lacking
-    ]
-
-
-def _coverage(run: Run, names: Sequence[str]) -> float | None:
-    frames = [run.frames[name] for name in names]
-    known = [frame.known for frame in frames if frame.known is not None]
-    if len(known) < len(frames) or not sum(known):
-        return None
-    return sum(frame.pixels for frame in frames) / sum(known)
 
 
 def _labels(runs: Sequence[Run]) -> list[str]:
@@ -256,8 +254,7 @@ def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
     """Warnings of frames and pixels that not all runs scored."""
     lines = []
     for run in runs:
-        unshared = [name for name in run.frames if name not in set(names)]
-        if unshared:
+        if unshared := [name for name in run.frames if name not in set(names)]:
             lines.append(
                 f"warning: {len(unshared):,} frames of {run.path} are not scored in all runs and"
                 f" left out: {some_names(unshared)}"
@@ -270,19 +267,32 @@ def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
             f" in another run, so the runs were not scored on the same: {some_names(other_truth)}"
         )
     elif any(len({frame.pixels for frame in of}) > 1 for of in frames.values()):
-        shares = (
-            (_coverage(run, names), sum(run.frames[name].pixels for name in names), run.path)
-            for run in runs
-        )
-        listed = ", ".join(
-            f"{f'{pixels:,} pixels' if share is None else f'{share:.2%}'} in {path}"
-            for share, pixels, path in shares
-        )
+        shares = []
+        for run in runs:
+            share, pixels = run.coverage(names), sum(run.frames[n].pixels for n in names)
+            text = f"{pixels:,} pixels" if share is None else f"{share:.2%}"
+            shares.append(f"{text} in {run.path}")
         lines.append(
-            f"warning: coverage differs ({listed}), and a run that leaves hard pixels empty looks"
-            " better; this is no ranking. Score with --missing max, or with one --mask"
+            f"warning: coverage differs ({', '.join(shares)}), and a run that leaves hard pixels"
+            " empty looks better; this is no ranking. Score with --missing max, or with one --mask"
         )
     return lines
+
+
+def _lacking(
+    names: Sequence[str], measures: Sequence[Measure], known: NDArray[np.bool_]
+) -> list[str]:
+    """A line for each set of measures that some frames lack."""
+    titles: dict[tuple[str, ...], list[str]] = {}
+    for measure, has in zip(measures, known.T, strict=True):
+        lacking = tuple(np.array(names, object)[~has])
+        titles.setdefault(lacking, []).append(measure.title)
+    return [
+        f"{', '.join(of)}: over {len(names) - len(lacking):,} frames; {len(lacking):,} lack it in"
+        f" a run: {some_names(lacking)}"
+        for lacking, of in titles.items()
+        if lacking
+    ]
 
 
 def _cluster_notes(clusters: Clusters, frames: int, measures: int) -> list[str]:
@@ -296,3 +306,95 @@ def _cluster_notes(clusters: Clusters, frames: int, measures: int) -> list[str]:
         f" {measures} measures: the smallest possible p is {smallest:.2g}, adjusted {adjusted:.2g}"
         + ("" if clusters.count >= MIN_CLUSTERS else f"; there is no interval below {MIN_CLUSTERS}")
     ]
+
+
+def read_run(text: str) -> Run:
+    """Returns the run in a file, or in the summary of a batch's folder.
+
+    A run is the output of `pnpdepth eval --json`, a batch's summary, or a refinement's record.
+
+    Args:
+        text: The path; `FILE:before` means the prediction that a refinement started from, without
+            it its result is meant.
+
+    Raises:
+        FileFormatError: For a file without scores.
+        UsageError: For `:before` of an evaluation.
+    """
+    path, stage = Path(text), "after"
+    start, colon, end = text.rpartition(":")
+    if colon and end in _STAGES and not path.exists():
+        path, stage = Path(start), end
+    if path.is_dir():
+        path = path / "summary.json"
+    record = read_json(path)
+    if record.get("command") == "eval" and stage == "before":
+        raise UsageError(f"{path} is of eval, which has no before; leave out :before")
+    try:
+        read = (
+            _evaluated(record) if record.get("command") == "eval" else _refined(record, path, stage)
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        fact = one_line(repr(error))
+        raise FileFormatError(
+            f"{path} does not hold scores as pnpdepth writes them ({fact}); create it again"
+        ) from error
+    label = f"{path.stem}:before" if stage == "before" else path.stem
+    return Run(label=label, path=text, **read)
+
+
+def _evaluated(record: Mapping[str, Any]) -> dict[str, Any]:
+    """What `eval --json` printed; measures that are unknown here are left out."""
+    groups = (group.measures for group in MEASURE_GROUPS.values())
+    known = {measure.key: measure for measures in groups for measure in measures}
+    protocol = record["protocol"]
+    known |= {measure.key: measure for measure in PROTOCOLS[protocol["name"]].measures}
+    keys = [each["key"] for each in record["measures"]]
+    return {
+        "measures": tuple(known[key] for key in keys if key in known),
+        "scoring": dict(protocol["scoring"]),
+        "frames": {
+            str(frame["name"]): RunFrame(
+                values=_numbers(frame["values"]),
+                pixels=int(frame["pixels"]),
+                group=str(frame["group"]),
+                known=None if frame["known"] is None else int(frame["known"]),
+                sums=tuple(float(each) for each in frame.get("sums", ())),
+            )
+            for frame in record["frames"]
+            if frame["error"] is None
+        },
+    }
+
+
+def _refined(record: Mapping[str, Any], path: Path, stage: str) -> dict[str, Any]:
+    """The scores in a batch's summary, or of the one frame of a record."""
+    if isinstance(record.get("frames"), list):
+        scores = {entry["name"]: entry.get("scores") for entry in record["frames"]}
+    else:
+        scores = {path.stem: record.get("scores")}
+    values = {name: _numbers(each[stage]) for name, each in scores.items() if each is not None}
+    if not values:
+        raise FileFormatError(
+            f"{path} holds no scores; give what eval --json printed, or the summary of a batch or"
+            " the record of a refinement with ground truth"
+        )
+    return {
+        "measures": tuple(m for m in MEASURES if all(m.key in each for each in values.values())),
+        "scoring": PROTOCOLS["paper"].scoring(),
+        "frames": {
+            name: RunFrame(
+                values=each,
+                pixels=round(each["pixels"]),
+                group=group,
+                known=round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
+            )
+            for (name, each), group in zip(
+                values.items(), groups_by_name(list(values)), strict=True
+            )
+        },
+    }
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    return {key: math.nan if value is None else float(value) for key, value in values.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -10,19 +11,34 @@ from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.evaluation.dependence import MIN_CLUSTERS, Clusters, find_clusters
-from pnpdepth_cli.commands.evaluation.diagnostics import kind_notes, warnings_of
-from pnpdepth_cli.commands.evaluation.frame_reading import Scales
-from pnpdepth_cli.commands.evaluation.frame_scoring import FrameScores, score_pair
+from pnpdepth_cli.commands.evaluation.frames import Scales
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
-from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames
+from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, choose_protocol
-from pnpdepth_cli.commands.evaluation.resampling import LEVEL, Floats, FrameTable, mean_interval
-from pnpdepth_cli.commands.evaluation.uncertainty import Uncertainty, summarise_uncertainty
+from pnpdepth_cli.commands.evaluation.scoring import (
+    FrameScores,
+    Uncertainty,
+    score_pair,
+    summarise_uncertainty,
+)
+from pnpdepth_cli.commands.evaluation.statistics import (
+    LEVEL,
+    MIN_CLUSTERS,
+    Clusters,
+    FrameTable,
+    find_clusters,
+    interval,
+)
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.depth import DepthKind, scale_warning
+from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import plain
+
+_LEAK_WARNING_FRACTION = 0.01
+_LISTED = 3
+_OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale", "sparse": "--sparse-scale"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,25 +52,31 @@ class EvalRequest:
     sparse: Path | None = None
     """The networks' sparse input: a file, or a folder of them."""
     protocol: str = "paper"
-    calib: Path | None = None
-    """Calibration of all frames, for measures that need the intrinsics; None for the data set's."""
-    layout_protocol: str | None = None
-    """How frames of a data set are cut, one of FRAME_PROTOCOLS; None for the layout's own."""
     changes: dict[str, Any] = field(default_factory=dict)
     """Fields of the protocol that the user sets otherwise."""
+    calib: Path | None = None
+    layout_protocol: str | None = None
     scales: Scales = field(default_factory=Scales)
     resamples: int = 2000
     """Bootstrap samples behind the intervals; 0 computes none."""
     seed: int = 0
-    """Of the bootstrap."""
     grouped: bool = True
     """False if every frame counts as independent."""
     workers: int = 2
     """Frames read at once."""
 
-
-Interval = dict[str, tuple[float, float]]
-"""The ends of the 95 % interval of each measure's mean by its key; NaN where there is none."""
+    def __post_init__(self) -> None:
+        for option, scale in (
+            ("--pred-scale", self.scales.prediction),
+            ("--gt-scale", self.scales.truth),
+            ("--sparse-scale", self.scales.sparse),
+        ):
+            if scale is not None and not (math.isfinite(scale) and scale > 0):
+                raise UsageError(f"{option} must be a finite number above 0, got {scale:g}")
+        if self.workers < 1:
+            raise UsageError(f"--workers must be >= 1, got {self.workers}")
+        if self.resamples < 0:
+            raise UsageError(f"--bootstrap must be >= 0, got {self.resamples}; 0 leaves it out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,8 +90,8 @@ class Evaluation:
     """A row for each frame of the ground truth, in its order."""
     mean: dict[str, float]
     """Over the scored frames, by the measure's key."""
-    interval: Interval | None
-    """None with too few independent frames."""
+    interval: dict[str, tuple[float, float]] | None
+    """The ends of the 95 % interval of each mean; None with too few independent frames."""
     clusters: Clusters
     """What the bootstrap resamples as a whole."""
     uncertainty: Uncertainty | None
@@ -112,9 +134,10 @@ class Evaluation:
     def as_record(self) -> dict[str, Any]:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
         request, protocol = self.request, self.protocol
-        interval = None
+        of_request = {name: getattr(request, name) for name in ("sparse", "calib")}
+        bounds = None
         if self.interval is not None:
-            interval = {
+            bounds = {
                 "level": LEVEL,
                 "resamples": request.resamples,
                 "seed": request.seed,
@@ -123,17 +146,15 @@ class Evaluation:
                 "low": {key: low for key, (low, _) in self.interval.items()},
                 "high": {key: high for key, (_, high) in self.interval.items()},
             }
-        pooled = protocol.average == "pooled"
         record = {
             "command": "eval",
             "versions": versions(),
             "inputs": {
                 "prediction": request.prediction,
                 "truth": request.ground_truth,
-                "sparse": request.sparse,
-                "calib": request.calib,
+                **of_request,
                 "layout_protocol": request.layout_protocol,
-                "scales": asdict(request.scales),
+                "scales": request.scales,
             },
             "protocol": {
                 "name": protocol.name,
@@ -151,13 +172,13 @@ class Evaluation:
                 "coverage": self.coverage,
             },
             "mean": self.mean,
-            "interval": interval,
-            "uncertainty": None if self.uncertainty is None else asdict(self.uncertainty),
+            "interval": bounds,
+            "uncertainty": self.uncertainty,
             "frames": [
-                frame_record(frame) | ({"sums": frame.sums} if pooled else {})
+                frame_record(frame) | ({"sums": frame.sums} if protocol.average == "pooled" else {})
                 for frame in self.frames
             ],
-            "notes": list(self.notes),
+            "notes": self.notes,
         }
         result: dict[str, Any] = plain(record)
         return result
@@ -200,8 +221,7 @@ def evaluate(
             concerns all frames.
     """
     protocol = choose_protocol(request.protocol, **request.changes)
-    _check(request)
-    pairs = pair_frames(
+    pairs, notes = pair_frames(
         request.prediction,
         request.ground_truth,
         sparse=request.sparse,
@@ -209,22 +229,23 @@ def evaluate(
         layout_protocol=request.layout_protocol,
         calib=request.calib,
     )
+    single = request.prediction.is_file() and len(pairs) == 1
 
     def score(pair: FramePair) -> FrameScores:
         try:
             row = score_pair(pair, protocol, request.scales)
         except PnpDepthError as error:
-            if pairs.single:
+            if single:
                 raise
             return FrameScores(pair=pair, error=str(error))
-        if pairs.single and row.error is not None:
+        if single and row.error is not None:
             raise InputError(row.error)
         return row
 
     rows: list[FrameScores] = []
-    for row in in_order(score, pairs.frames, request.workers):
+    for row in in_order(score, pairs, request.workers):
         rows.append(row)
-        on_frame(len(rows), len(pairs.frames))
+        on_frame(len(rows), len(pairs))
     scored = [row for row in rows if row.scored]
     if not scored:
         raise InputError(f"no frame could be scored; the first: {rows[0].error}")
@@ -232,72 +253,121 @@ def evaluate(
     values = np.array([[row.values[key] for key in keys] for row in scored])
     groups = [row.pair.group for row in scored]
     clusters = find_clusters(groups, values, grouped=request.grouped)
-    mean, interval = _mean_and_interval(scored, values, clusters, protocol, request)
+    if protocol.average == "pooled":
+        table = FrameTable.of_pixels(np.array([row.sums for row in scored]), keys)
+    else:  # a measure that a frame lacks is averaged over the other frames
+        table = FrameTable.of_frames(values)
+    mean = devkit_mean(values) if protocol.is_devkit else table.mean()
+    bounds, no_interval = None, []
+    if request.resamples and clusters.count >= MIN_CLUSTERS:
+        ends = interval(lambda means: means, [table], clusters, request.resamples, request.seed)
+        highest = [1.0 if measure.percent else math.inf for measure in protocol.measures]
+        low, high = (np.where(np.isnan(mean), math.nan, end) for end in ends)
+        inside = np.maximum(low, 0.0).tolist(), np.minimum(high, highest).tolist()
+        bounds = dict(zip(keys, zip(*inside, strict=True), strict=True))
+    elif request.resamples and len(scored) > 1:
+        no_interval.append(
+            f"no interval: {clusters.describe()} are too few to tell how sure the means are;"
+            f" {MIN_CLUSTERS} are needed"
+        )
     uncertainties = [row.uncertainty for row in scored if row.uncertainty is not None]
     return Evaluation(
         request=request,
         protocol=protocol,
         frames=tuple(rows),
         mean=dict(zip(keys, mean.tolist(), strict=True)),
-        interval=interval,
+        interval=bounds,
         clusters=clusters,
         uncertainty=summarise_uncertainty(uncertainties),
-        notes=(
-            *pairs.notes,
-            *kind_notes(rows),
-            *warnings_of(rows, protocol),
-            *_interval_notes(clusters, len(scored), request),
-        ),
+        notes=(*notes, *_kind_notes(rows), *_warnings(rows, protocol), *no_interval),
     )
 
 
-def _check(request: EvalRequest) -> None:
-    scales = request.scales
-    for option, scale in (
-        ("--pred-scale", scales.prediction),
-        ("--gt-scale", scales.truth),
-        ("--sparse-scale", scales.sparse),
-    ):
-        if scale is not None and not (math.isfinite(scale) and scale > 0):
-            raise UsageError(f"{option} must be a finite number above 0, got {scale:g}")
-    if request.workers < 1:
-        raise UsageError(f"--workers must be >= 1, got {request.workers}")
-    if request.resamples < 0:
-        raise UsageError(f"--bootstrap must be >= 0, got {request.resamples}; 0 leaves it out")
+def kinds_of(rows: Sequence[FrameScores]) -> dict[str, list[tuple[DepthKind, int]]]:
+    """Returns the kinds of files of "prediction", "gt" and "sparse" with counts, frequent first."""
+    return {
+        side: Counter(row.kinds[side] for row in rows if side in row.kinds).most_common()
+        for side in _OPTIONS
+    }
 
 
-def _mean_and_interval(
-    rows: Sequence[FrameScores],
-    values: Floats,
-    clusters: Clusters,
-    protocol: EvalProtocol,
-    request: EvalRequest,
-) -> tuple[Floats, Interval | None]:
-    """(M,) the means of (N, M) values, and their intervals inside the range of each measure.
+def _kind_notes(rows: Sequence[FrameScores]) -> list[str]:
+    """A line for the predictions, and one for the ground truth."""
+    lines = []
+    for side, kinds in kinds_of(rows).items():
+        texts = [
+            kind.source
+            + (f"; {_OPTIONS[side]} to change" if kind.assumed else "")
+            + (f" ({count:,} files)" if len(kinds) > 1 else "")
+            for kind, count in kinds[:_LISTED]
+        ]
+        more = len(kinds) - _LISTED
+        if texts and side != "sparse":
+            lines.append(f"{side}: {', '.join(texts)}{f', {more} more kinds' * (more > 0)}")
+    return lines
 
-    A measure that a frame lacks is averaged over the other frames.
+
+def _warnings(rows: Sequence[FrameScores], protocol: EvalProtocol) -> list[str]:
+    """The warnings of an evaluation, each one line.
+
+    Raises:
+        InputError: If a scale that was assumed is wrong by a factor between those in use.
     """
-    measures = protocol.measures
-    if protocol.average == "pooled":
-        table = FrameTable.of_pixels(
-            np.array([row.sums for row in rows]), [m.key for m in measures]
+    scored = [row for row in rows if row.scored]
+    lines = []
+    if missing := [row.name for row in rows if row.missing]:
+        lines.append(
+            f"warning: {len(missing):,} of {len(rows):,} frames have no prediction:"
+            f" {some_names(missing)}"
         )
-    else:
-        table = FrameTable.of_frames(values)
-    mean = devkit_mean(values) if protocol.is_devkit else table.mean()
-    if clusters.count < MIN_CLUSTERS or not request.resamples:
-        return mean, None
-    low, high = mean_interval(table, clusters.ids, request.resamples, request.seed)
-    low, high = (np.where(np.isnan(mean), math.nan, end) for end in (low, high))
-    highest = [1.0 if measure.percent else math.inf for measure in measures]
-    ends = np.stack([np.maximum(low, 0.0), np.minimum(high, highest)], axis=-1).tolist()
-    return mean, {m.key: (a, b) for m, (a, b) in zip(measures, ends, strict=True)}
-
-
-def _interval_notes(clusters: Clusters, frames: int, request: EvalRequest) -> list[str]:
-    if frames == 1 or clusters.count >= MIN_CLUSTERS or not request.resamples:
-        return []
-    return [
-        f"no interval: {clusters.describe()} are too few to tell how sure the means are;"
-        f" {MIN_CLUSTERS} are needed"
+    failed = [row for row in rows if not row.scored and not row.missing]
+    lines += [
+        f"warning: frame {one_line(row.name)} was not scored: {row.error}"
+        for row in failed[:_LISTED]
     ]
+    if (more := len(failed) - _LISTED) > 0:
+        lines.append(f"warning: {more:,} more frames were not scored")
+    known = sum(row.known for row in scored)
+    if empty := known - sum(row.predicted for row in scored):
+        treatment = {
+            "skip": "lowers the coverage and is in no error",
+            "min": f"is scored as {protocol.min_depth:g} m",
+            "max": f"is scored as {protocol.max_depth or 0:g} m",
+        }.get(protocol.missing, "")
+        if protocol.is_devkit:
+            treatment = "was filled in from its neighbours before scoring"
+        lines.append(
+            f"warning: {empty:,} pixels ({empty / known:.2%}) of the ground truth have no"
+            f" prediction; what is missing {treatment}"
+        )
+    if holes := [row.name for row in scored if math.isnan(row.values.get("log_mae", 0.0))]:
+        lines.append(
+            f"warning: {len(holes):,} predictions have empty rows between filled ones, which the"
+            f" development kit sets to −1 m and scores (its logarithmic errors are then NaN):"
+            f" {some_names(holes)}"
+        )
+    if factors := [row.fit.factor for row in scored if row.fit is not None]:
+        median = float(np.median(factors))
+        spread = float(np.std(np.array(factors) / median)) if median else math.nan
+        lines.append(
+            f"scale-by {protocol.scale_by}: factor {median:.4g} (median of {len(factors):,}"
+            f" images), standard deviation / median {spread:.3f}"
+        )
+    kinds = {side: found[0][0] for side, found in kinds_of(rows).items() if found}
+    for side, what, ratios in (
+        ("prediction", "predictions", [row.ratio for row in scored]),
+        ("sparse", "sparse points", [row.sparse_ratio for row in scored]),
+    ):
+        compared = [ratio for ratio in ratios if math.isfinite(ratio)] or [math.nan]
+        by_option = {_OPTIONS[name]: kinds.get(name) for name in (side, "gt")}
+        lines += filter(None, [scale_warning(what, float(np.median(compared)), by_option)])
+    leaked = sum(row.leaked or 0 for row in scored)
+    if leaked and not protocol.exclude_sparse:
+        fraction = leaked / sum(row.pixels for row in scored if row.leaked is not None)
+        sign = "warning: " if fraction >= _LEAK_WARNING_FRACTION else ""
+        lines.append(
+            f"{sign}{leaked:,} of the scored pixels ({fraction:.2%}) have a point of the sparse"
+            " input as ground truth, which the prediction could copy; --exclude-sparse leaves them"
+            " out"
+        )
+    return lines

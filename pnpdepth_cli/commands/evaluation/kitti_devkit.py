@@ -20,18 +20,13 @@ from numpy.typing import NDArray
 from pnpdepth_cli.core.metrics import Measure
 
 DEVKIT_MEASURES = tuple(
-    Measure(key=key, title=title, unit=unit, decimals=6)
-    for key, title, unit in (
-        ("mae", "MAE", "m"),
-        ("rmse", "RMSE", "m"),
-        ("inverse_mae", "inverse MAE", "1/m"),
-        ("inverse_rmse", "inverse RMSE", "1/m"),
-        ("log_mae", "log MAE", ""),
-        ("log_rmse", "log RMSE", ""),
-        ("scale_invariant_log", "scale invariant log", ""),
-        ("abs_relative", "abs relative", ""),
-        ("squared_relative", "squared relative", ""),
+    Measure(key=title.lower().replace(" ", "_"), title=title, unit=unit, decimals=6)
+    for unit, *titles in (
+        ("m", "MAE", "RMSE"),
+        ("1/m", "inverse MAE", "inverse RMSE"),
+        ("", "log MAE", "log RMSE", "scale invariant log", "abs relative", "squared relative"),
     )
+    for title in titles
 )
 """In the kit's order and with its six decimals. Its squared relative is (p − g)²/g²."""
 

@@ -1,31 +1,41 @@
-"""Finds the prediction of each frame of the ground truth: files and folders matched by name."""
+"""Finds the prediction of each frame of the ground truth: files matched by name, or stacked."""
 
 from __future__ import annotations
 
-import os
+import contextlib
+import functools
+import io
+import pickle
 import re
+import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from pnpdepth_cli.commands.evaluation.dependence import groups_by_name
-from pnpdepth_cli.commands.evaluation.stacks import stack_size
-from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.commands.evaluation.statistics import groups_by_name
+from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.dataset.find_files import find_files
 from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, file_of
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray
 from pnpdepth_cli.io.layouts import Frame, Source, find_layout, find_protocol, list_frames
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.remote.address import RemotePath
 
-_POINTS = (*DEPTH_SUFFIXES, ".csv", ".txt")
 _DEPTH_MARKS = ("_depth", ".depth")
 _COMPANIONS = ("_preview", "_improvement", "_sigma", "_valid")
-_SIGMA_SUFFIXES = (".exr", ".npy")
 # KITTI's selection names the kind of file in the middle.
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5
+_ARRAY_PARTS = {
+    *((f"numpy.{core}.multiarray", part) for core in ("core", "_core")
+      for part in ("_reconstruct", "scalar")),
+    *(("numpy", part) for part in ("ndarray", "dtype")),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,18 +64,7 @@ class FramePair:
     sampled: int = 0
     """Points of the ground truth that were the sparse input, by the run's record."""
     image: Source | None = None
-    """The image, if the record or the data set names it."""
     mask: Path | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pairs:
-    """All frames of the ground truth, in its order."""
-
-    frames: tuple[FramePair, ...]
-    notes: tuple[str, ...]
-    single: bool = False
-    """True for two files rather than two folders."""
 
 
 def pair_frames(
@@ -76,8 +75,8 @@ def pair_frames(
     mask: Path | None = None,
     layout_protocol: str | None = None,
     calib: Path | None = None,
-) -> Pairs:
-    """Returns the frames of two files, or of two folders by name, each with the one before.
+) -> tuple[list[FramePair], list[str]]:
+    """Returns the frames of the ground truth in its order, each with the one before; and notes.
 
     Args:
         prediction: A depth file, or a folder of them.
@@ -92,53 +91,69 @@ def pair_frames(
         UsageError: For a file and a folder, or a layout protocol without a data set.
         InputError: For a missing path, or folders without a common name.
     """
-    for path in (prediction, ground_truth, *(p for p in (sparse, mask, calib) if p)):
+    for path in filter(None, (prediction, ground_truth, sparse, mask, calib)):
         _check_local(path)
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
-    layout = _layout_of(ground_truth)
-    if layout is None:
-        if layout_protocol is not None:
-            raise UsageError(
-                f"--layout-protocol {layout_protocol} is for data sets, and {ground_truth} is in no"
-                " known layout; leave it out"
-            )
-        if prediction.is_dir() != ground_truth.is_dir():
-            raise UsageError(
-                f"give two files or two folders, not one of each: {prediction}, {ground_truth}"
-            )
-    elif prediction.is_file():
+    try:
+        layout = find_layout(ground_truth)
+    except (InputError, OSError):  # files and folders of files
+        layout = None
+    if layout is None and layout_protocol is not None:
+        raise UsageError(
+            f"--layout-protocol {layout_protocol} is for data sets, and {ground_truth} is in no"
+            " known layout; leave it out"
+        )
+    if layout is None and prediction.is_dir() != ground_truth.is_dir():
+        raise UsageError(
+            f"give two files or two folders, not one of each: {prediction}, {ground_truth}"
+        )
+    if layout is not None and prediction.is_file():
         raise UsageError(f"{ground_truth} is a data set but {prediction} one file; give a folder")
     notes: list[str] = []
-    if prediction.is_file():
-        if (count := stack_size(prediction)) is not None:
-            return _stacked_pairs(prediction, ground_truth, count)
-        name = frame_name(prediction.stem)
-        frames, predictions = [Frame(name=name, gt=ground_truth)], {name: prediction}
-    else:
+    if prediction.is_dir():
         predictions, notes = depth_files(prediction)
         frames, more_notes = _true_frames(ground_truth, layout, layout_protocol)
         notes += more_notes
+    elif (count := stack_size(prediction)) is not None:
+        return _stacked_pairs(prediction, ground_truth, count)
+    else:
+        name = frame_name(prediction.stem)
+        frames, predictions = [Frame(name=name, gt=ground_truth)], {name: prediction}
     for frame in frames:
-        for part in (frame.image, frame.sparse, frame.gt):
-            if part is not None:
-                _check_local(file_of(part))
+        for part in filter(None, (frame.image, frame.sparse, frame.gt)):
+            _check_local(file_of(part))
     if calib is not None:
         frames = [replace(frame, calib=calib) for frame in frames]
-    return _pairs(frames, predictions, sparse, mask, notes, single=prediction.is_file())
+    names = {frame.name for frame in frames}
+    if names.isdisjoint(predictions):
+        raise InputError(
+            "no prediction has the name of a ground truth file: predictions are"
+            f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}"
+        )
+    if extra := sorted(set(predictions) - names):
+        notes.append(
+            f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
+            f" and are not scored: {some_names(extra)}"
+        )
+    points = _by_frame(sparse, (*DEPTH_SUFFIXES, ".csv", ".txt"), names)
+    masks = _by_frame(mask, (*DEPTH_SUFFIXES, *IMAGE_SUFFIXES), names)
+    pairs: list[FramePair] = []
+    last: dict[str, FramePair] = {}
+    for frame, group in zip(frames, groups_by_name([f.name for f in frames]), strict=True):
+        pair = replace(
+            _pair(frame, predictions.get(frame.name), points.get(frame.name)),
+            group=group if frame.group is None else frame.group,
+            mask=masks.get(frame.name),
+        )
+        pairs.append(replace(pair, previous=last.get(pair.group)))
+        last[pair.group] = pair
+    return pairs, notes
 
 
 def _check_local(path: Path) -> None:
     if isinstance(path, RemotePath):
         raise UsageError(f"{path}: eval reads local files; copy the frames from the store first")
-
-
-def _layout_of(ground_truth: Path) -> str | None:
-    """The layout that the ground truth is a data set of; None for files and folders of files."""
-    try:
-        return find_layout(ground_truth)
-    except (InputError, OSError):
-        return None
 
 
 def _true_frames(
@@ -161,62 +176,13 @@ def _true_frames(
     ]
 
 
-def _stacked_pairs(prediction: Path, ground_truth: Path, count: int) -> Pairs:
-    """A frame for each map of two files of several frames."""
-    others = stack_size(ground_truth)
-    if others != count:
-        stored = "a single map" if others is None else f"{others:,} frames"
-        raise InputError(f"{prediction} holds {count:,} frames but {ground_truth} {stored}")
-    frames = (Frame(name=f"{index:04}", gt=ground_truth) for index in range(count))
-    return Pairs(
-        frames=tuple(
-            FramePair(name=frame.name, prediction=prediction, frame=frame, index=index)
-            for index, frame in enumerate(frames)
-        ),
-        notes=(f"{count:,} frames in each of the two files",),
-    )
-
-
-def _pairs(
-    frames: Sequence[Frame],
-    predictions: Mapping[str, Path],
-    sparse: Path | None,
-    mask: Path | None,
-    notes: list[str],
-    *,
-    single: bool,
-) -> Pairs:
-    names = {frame.name for frame in frames}
-    if names.isdisjoint(predictions):
-        raise InputError(
-            "no prediction has the name of a ground truth file: predictions are"
-            f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}"
-        )
-    if extra := sorted(set(predictions) - names):
-        notes.append(
-            f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
-            f" and are not scored: {some_names(extra)}"
-        )
-    points = _by_frame(sparse, _POINTS, names)
-    masks = _by_frame(mask, (*DEPTH_SUFFIXES, *IMAGE_SUFFIXES), names)
-    pairs: list[FramePair] = []
-    last: dict[str, FramePair] = {}
-    for frame, group in zip(frames, groups_by_name([f.name for f in frames]), strict=True):
-        pair = replace(
-            _pair(frame, predictions.get(frame.name), points.get(frame.name)),
-            group=group if frame.group is None else frame.group,
-            mask=masks.get(frame.name),
-        )
-        pairs.append(replace(pair, previous=last.get(pair.group)))
-        last[pair.group] = pair
-    return Pairs(frames=tuple(pairs), notes=tuple(notes), single=single)
-
-
-def _by_frame(path: Path | None, suffixes: Sequence[str], names: Iterable[str]) -> dict[str, Path]:
+def _by_frame(
+    path: Path | None, suffixes: tuple[str, ...], names: Iterable[str]
+) -> dict[str, Path]:
     """The file of each frame: the one for all, or those of the folder."""
     if path is None:
         return {}
-    return _depth_files(path, suffixes)[0] if path.is_dir() else dict.fromkeys(names, path)
+    return _files(path, suffixes)[0] if path.is_dir() else dict.fromkeys(names, path)
 
 
 def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePair:
@@ -224,12 +190,12 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
     record, sigma = {}, None
     if prediction is not None:
         name = _base(prediction.stem, _DEPTH_MARKS) or prediction.stem
-        record = _record(prediction.with_name(f"{name}.json"))
-        sigmas = (prediction.with_name(f"{name}_sigma{suffix}") for suffix in _SIGMA_SUFFIXES)
+        sigmas = (prediction.with_name(f"{name}_sigma{suffix}") for suffix in (".exr", ".npy"))
         sigma = next((file for file in sigmas if file.is_file()), None)
+        with contextlib.suppress(PnpDepthError):
+            record = read_json(prediction.with_name(f"{name}.json"))
     inputs = _dict(record.get("inputs"))
-    used = _dict(record.get("points")).get("used")
-    sampling = _dict(inputs.get("sparse"))
+    used, sampling = _dict(record.get("points")).get("used"), _dict(inputs.get("sparse"))
     is_sampled = "sampled_from" in sampling
     known = frame.sparse
     if known is not None and known.suffix.lower() not in DEPTH_SUFFIXES:
@@ -245,13 +211,6 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
         sampled=used if is_sampled and isinstance(used, int) else 0,
         image=_input(inputs, "image") or frame.image,
     )
-
-
-def _record(path: Path) -> dict[str, Any]:
-    try:
-        return read_json(path) if path.is_file() else {}
-    except PnpDepthError:
-        return {}
 
 
 def _input(inputs: Mapping[str, Any], part: str) -> Path | None:
@@ -279,42 +238,35 @@ def frame_name(stem: str) -> str:
 def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     """Returns the depth files below a folder by frame name, sorted, and notes on them.
 
-    A frame in a subfolder has it in its name.
+    A frame in a subfolder has it in its name. Where `x_depth.png` exists, `x.png` is not depth, and
+    `x_preview.png` and the like belong to it.
 
     Raises:
-        InputError: If there is none.
+        InputError: If there is none, or two are one frame.
     """
-    files, notes = _depth_files(folder, DEPTH_SUFFIXES)
+    files, notes = _files(folder, DEPTH_SUFFIXES)
     if not files:
         suffixes = " ".join(DEPTH_SUFFIXES)
         raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
     return files, notes
 
 
-def _depth_files(folder: Path, suffixes: Sequence[str]) -> tuple[dict[str, Path], list[str]]:
-    """(one depth file per frame name, warnings) of all depth files below the folder.
-
-    Where `x_depth.png` exists, `x.png` is not depth, and `x_preview.png` and the like belong to it.
-    """
-    unreadable: list[OSError] = []
+def _files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path], list[str]]:
+    found, problems = find_files(folder, suffixes)
+    for problem in problems:
+        if problem.path.is_file():
+            raise InputError(str(problem))
+    marked = {_base(stem, _DEPTH_MARKS) for stem in found} - {None}  # stems with a _depth file
     by_frame: dict[str, Path] = {}
-    ignored: list[str] = []
-    for top, folders, files in os.walk(folder, onerror=unreadable.append):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        paths = [Path(top, name) for name in sorted(files) if not name.startswith(".")]
-        depths = [p for p in paths if p.suffix.lower() in suffixes and p.is_file()]
-        marked = {_base(p.stem, _DEPTH_MARKS) for p in depths} - {None}  # stems with a _depth file
-        inside = Path(top).relative_to(folder)
-        for path in depths:
-            name = (inside / frame_name(path.stem)).as_posix()
-            if path.stem in marked:
-                ignored.append(path.name)
-            elif name in by_frame:
-                raise InputError(f"{path} and {by_frame[name].name} are one frame; keep one")
-            elif _base(path.stem, _COMPANIONS) not in marked:
-                by_frame[name] = path
-    notes = [f"warning: {e.filename} cannot be read ({e.strerror})" for e in unreadable]
-    if ignored:
+    for stem, path in found.items():
+        name = frame_name(stem)
+        if stem in marked or _base(stem, _COMPANIONS) in marked:
+            continue
+        if name in by_frame:
+            raise InputError(f"{path} and {by_frame[name].name} are one frame; keep one")
+        by_frame[name] = path
+    notes = [f"warning: {problem}" for problem in problems]
+    if ignored := [found[stem].name for stem in sorted(marked & found.keys())]:
         notes.append(f"{folder}: ignored, as there is a _depth of each: {some_names(ignored)}")
     return dict(sorted(by_frame.items())), notes
 
@@ -330,3 +282,77 @@ def some_names(names: Iterable[str]) -> str:
     text = ", ".join(one_line(name) for name in listed[:_LISTED])
     more = len(listed) - _LISTED
     return f"{text} and {more:,} more" if more > 0 else text
+
+
+def _stacked_pairs(
+    prediction: Path, ground_truth: Path, count: int
+) -> tuple[list[FramePair], list[str]]:
+    """A frame for each map of two files of several frames."""
+    others = stack_size(ground_truth)
+    if others != count:
+        stored = "a single map" if others is None else f"{others:,} frames"
+        raise InputError(f"{prediction} holds {count:,} frames but {ground_truth} {stored}")
+    frames = (Frame(name=f"{index:04}", gt=ground_truth) for index in range(count))
+    return [
+        FramePair(name=frame.name, prediction=prediction, frame=frame, index=index)
+        for index, frame in enumerate(frames)
+    ], [f"{count:,} frames in each of the two files"]
+
+
+def stack_size(path: Path) -> int | None:
+    """Returns how many frames a file stacks; None for a single depth map or an unreadable file.
+
+    Stacks are `(N, H, W)` NPY, or NPZ as monodepth2's `gt_depths`.
+    """
+    if path.suffix.lower() not in (".npy", ".npz"):
+        return None
+    stack = _stack(path)
+    return None if stack is None else len(stack)
+
+
+def load_stacked(path: Path, index: int) -> StoredArray:
+    """Returns frame `index` of a stack as it is stored."""
+    stack = _stack(path)
+    assert stack is not None
+    values = np.asarray(stack[index])
+    if values.ndim != 2:
+        raise FileFormatError(f"{path}: frame {index} is of shape {values.shape}, not (H, W)")
+    kind = path.suffix.removeprefix(".").upper()
+    return StoredArray(values=values, description=f"{values.dtype} {kind} of {len(stack):,} frames")
+
+
+@functools.lru_cache(maxsize=4)
+def _stack(path: Path) -> Sequence[NDArray[Any]] | NDArray[Any] | None:
+    """The stack in a file; None for anything else, which the reader of single maps reports."""
+    try:
+        if path.suffix.lower() == ".npy":
+            with path.open("rb") as file:
+                array = _array_in(file)
+        else:
+            with zipfile.ZipFile(path) as archive:
+                (name,) = archive.namelist()
+                array = _array_in(io.BytesIO(archive.read(name)))
+    except Exception:  # NumPy evaluates the header, which raises many kinds where it is damaged
+        return None
+    if array.dtype == object:
+        return [np.asarray(each) for each in array.ravel()]
+    return array if array.ndim == 3 and 1 not in (array.shape[0], array.shape[2]) else None
+
+
+def _array_in(file: IO[bytes]) -> NDArray[Any]:
+    """The array of an NPY; monodepth2 stores images of different sizes as objects, a pickle."""
+    header = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
+    _, _, dtype = header[np.lib.format.read_magic(file)[0]](file)
+    if dtype.hasobject:
+        return np.asarray(_ArrayUnpickler(file).load())
+    file.seek(0)
+    return np.asarray(np.load(file, allow_pickle=False))
+
+
+class _ArrayUnpickler(pickle.Unpickler):
+    """Creates NumPy arrays of numbers; refuses every other class and function."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ARRAY_PARTS:
+            raise pickle.UnpicklingError(f"{module}.{name} is not part of an array")
+        return super().find_class(module, name)

@@ -24,27 +24,23 @@ _CROP_FRACTIONS = {
 }
 # Eigen et al. 2014 for NYU Depth v2: rows 45 to 470, columns 41 to 600 of 480x640 pixels.
 _NYU_SIZE = (480, 640)
-_NYU_WINDOW = (45, 471, 41, 601)
+_NYU_WINDOW = (41, 45, 560, 426)
 # What networks for KITTI's benchmark see of a frame: 352x1216 pixels at the bottom, centred (BTS,
 # Lee et al. 2019, `do_kb_crop`).
 _KB_SIZE = (352, 1216)
 _CROPS = ("none", "nyu", *_CROP_FRACTIONS)
 
-Window = tuple[int, int, int, int]
-"""(top, bottom, left, right) in pixels; bottom and right are just outside."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class EvalProtocol:
-    """How predictions are scored."""
+    """How predictions are scored; depths in metres."""
 
     name: str
     scale: float = 256.0
     """Codes per metre of integer files that neither the file nor the user states."""
     min_depth: float = 0.0
-    """Ground truth is scored above it, metres."""
+    """Ground truth is scored above it, and below `max_depth`."""
     max_depth: float | None = None
-    """Ground truth is scored below it, metres; None for no bound."""
     clip: bool = False
     """Whether predictions are clipped to these bounds."""
     crop: str = "none"
@@ -52,17 +48,11 @@ class EvalProtocol:
     mask: Path | None = None
     """An image, or a folder of one per frame, whose pixels above 0 are scored."""
     average: str = "per-image"
-    """One of choices.AVERAGES."""
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
-    """Of δ1, δ2 and δ3."""
     exclude_sparse: bool = False
-    """Whether pixels with a sparse point are left out."""
     missing: str = "skip"
-    """What becomes of empty predictions, one of choices.MISSING."""
     prediction_kind: str = "depth"
-    """One of choices.PREDICTION_KINDS."""
     scale_by: str = "none"
-    """How the prediction of each image is scaled to its ground truth, one of choices.SCALINGS."""
     prediction_crop: str | None = None
     """Part of the ground truth's frame that predictions show: "kb", or X,Y,WIDTH,HEIGHT; None for
     all of it. The rest counts as empty."""
@@ -89,22 +79,6 @@ class EvalProtocol:
         """The groups of additional measures."""
         return tuple(MEASURE_GROUPS[name] for name in self.groups)
 
-    def window(self, size: tuple[int, int]) -> Window:
-        """Returns the rows and columns that are scored of a frame of `size` (H, W) pixels.
-
-        Raises:
-            SizeError: If the crop does not fit the frame.
-        """
-        return _window(self.crop, size, "crop")
-
-    def prediction_window(self, size: tuple[int, int]) -> Window:
-        """Returns the rows and columns of a frame of `size` (H, W) pixels that predictions show.
-
-        Raises:
-            SizeError: If the crop does not fit the frame.
-        """
-        return _window(self.prediction_crop or "none", size, "--pred-crop")
-
     def scoring(self) -> dict[str, Any]:
         """Returns what decides the figures; equal for two evaluations that can be compared."""
         rules = {name: value for name, value in asdict(self).items() if name not in _OF_READING}
@@ -118,23 +92,21 @@ class EvalProtocol:
         """Returns one line, such as `eigen: ground truth in 0.001–80 m, crop eigen, …`."""
         kept = (*_OF_READING, "exclude_sparse")
         own = replace(PROTOCOLS[self.name], **{name: getattr(self, name) for name in kept})
-        if self.max_depth is None:
-            bounds = f" above {self.min_depth:g} m" if self.min_depth else ""
-        else:
+        bounds = f" above {self.min_depth:g} m" if self.min_depth else ""
+        if self.max_depth is not None:
             bounds = f" in {self.min_depth:g}–{self.max_depth:g} m"
-        disparity, scaled = self.prediction_kind == "disparity", self.scale_by != "none"
         limits = ", ".join(f"{limit:.6g}" for limit in self.thresholds)
         averaged = "the images" if self.average == "per-image" else "all pixels together"
         parts = {
             f"{self.name}{'' if self == own else ' (changed)'}: all known ground truth{bounds}": 1,
-            f"crop {self.crop}" if self.crop != "none" else "no crop": True,
+            "no crop" if self.crop == "none" else f"crop {self.crop}": True,
             "predictions clipped to the same range": self.clip,
             f"mask {self.mask}": self.mask,
             "without the pixels of sparse points": self.exclude_sparse,
             f"predictions resized ({self.resize})": self.resize,
             f"predictions of crop {self.prediction_crop}": self.prediction_crop,
-            "predictions are disparity": disparity,
-            f"each image scaled by {self.scale_by}": scaled,
+            "predictions are disparity": self.prediction_kind == "disparity",
+            f"each image scaled by {self.scale_by}": self.scale_by != "none",
             _MISSING_TEXTS[self.missing]: self.missing != "skip",
             "missing predictions filled in, errors as its program prints them": self.is_devkit,
             f"δ below {limits}": not self.is_devkit,
@@ -189,9 +161,7 @@ _NOT_OF_DEVKIT = {
 def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
     """Returns the protocol of this name with the fields that the user changes.
 
-    Args:
-        name: One of PROTOCOLS.
-        **changes: Fields of EvalProtocol; None leaves a field as it is.
+    None leaves a field as it is.
 
     Raises:
         UsageError: For an unknown name or a setting out of its range.
@@ -209,20 +179,15 @@ def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
     if changed.get("min_depth") == 0 and published.missing == "min":
         changed.setdefault("missing", "skip")  # there is no bound to score empty predictions as
     protocol = replace(published, **changed)
-    _check(protocol)
-    return protocol
-
-
-def _check(protocol: EvalProtocol) -> None:
     low, high = protocol.min_depth, protocol.max_depth
+    for name in protocol.groups:
+        _ = MEASURE_GROUPS[name]
     if not (math.isfinite(low) and low >= 0):
         raise UsageError(f"--min-depth must be metres >= 0, got {low:g}")
     if high is not None and not (math.isfinite(high) and high > low):
         raise UsageError(f"--max-depth must be metres above --min-depth {low:g}, got {high:g}")
     if not all(math.isfinite(limit) and limit > 1 for limit in protocol.thresholds):
         raise UsageError("--delta must be above 1: δ counts ratios below it")
-    for name in protocol.groups:
-        _ = MEASURE_GROUPS[name]
     if protocol.groups and protocol.average == "pooled":
         raise UsageError("--measures are of each image; --average pooled does not apply to them")
     if protocol.missing == "min" and low == 0:
@@ -233,30 +198,39 @@ def _check(protocol: EvalProtocol) -> None:
         _rectangle(protocol.crop, names=_CROPS)
     if protocol.prediction_crop not in (None, "kb"):
         _rectangle(protocol.prediction_crop or "", names=("kb",))
+    return protocol
 
 
-def _window(crop: str, size: tuple[int, int], called: str) -> Window:
+def crop_window(crop: str, size: tuple[int, ...], called: str = "crop") -> tuple[slice, slice]:
+    """Returns the rows and columns of a frame of `size` (H, W) pixels that lie in a crop.
+
+    Raises:
+        SizeError: If the crop does not fit the frame.
+    """
     height, width = size
-    if crop == "none":
-        return 0, height, 0, width
     if crop in _CROP_FRACTIONS:
         top, bottom, left, right = _CROP_FRACTIONS[crop]
-        return int(top * height), int(bottom * height), int(left * width), int(right * width)
-    if crop == "nyu":
-        if size != _NYU_SIZE:
-            raise SizeError(
-                f"crop nyu is for frames of 640×480 but this one is {width}×{height};"
-                " --crop none, or give X,Y,WIDTH,HEIGHT"
-            )
-        return _NYU_WINDOW
-    if crop == "kb":
-        h, w = _KB_SIZE
-        x, y = (width - w) // 2, height - h
+        rows, columns = (
+            (int(top * height), int(bottom * height)),
+            (int(left * width), int(right * width)),
+        )
+        return slice(*rows), slice(*columns)
+    if crop == "nyu" and size != _NYU_SIZE:
+        raise SizeError(
+            f"crop nyu is for frames of 640×480 but this one is {width}×{height};"
+            " --crop none, or give X,Y,WIDTH,HEIGHT"
+        )
+    if crop in ("none", "nyu", "kb"):
+        x, y, w, h = {
+            "none": (0, 0, width, height),
+            "nyu": _NYU_WINDOW,
+            "kb": ((width - _KB_SIZE[1]) // 2, height - _KB_SIZE[0], *_KB_SIZE[::-1]),
+        }[crop]
     else:
         x, y, w, h = _rectangle(crop)
     if min(x, y) < 0 or x + w > width or y + h > height:
         raise SizeError(f"{called} {crop} does not lie in a frame of {width}×{height}")
-    return y, y + h, x, x + w
+    return slice(y, y + h), slice(x, x + w)
 
 
 def _rectangle(text: str, names: tuple[str, ...] = ()) -> tuple[int, int, int, int]:

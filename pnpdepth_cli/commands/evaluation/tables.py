@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 
 from pnpdepth_cli.commands.evaluation.compare import ALPHA, Comparison
-from pnpdepth_cli.commands.evaluation.diagnostics import kinds_of
-from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, frame_record
-from pnpdepth_cli.commands.evaluation.frame_scoring import FrameScores
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, frame_record, kinds_of
+from pnpdepth_cli.commands.evaluation.scoring import FrameScores
 from pnpdepth_cli.commands.tables import (
     Cell,
     Table,
@@ -148,19 +147,17 @@ def comparison_table(comparison: Comparison) -> Table:
         title, mean = column_title(measure), format_value(measure, base.mean[measure.key])
         rows.append([title, base.label, mean, *["–"] * 4])
         for run, gains in zip(others, comparison.gains, strict=True):
-            gain = gains[measure.key]
-            significant = gain.p_adjusted < ALPHA
-            percent = Cell(
-                _signed(gain.percent),
-                ("good" if gain.percent > 0 else "bad") if significant else "dim",
+            found = gains[measure.key]
+            style = (
+                "dim" if not found.p_adjusted < ALPHA else "good" if found.percent > 0 else "bad"
             )
             rows.append([
                 title,
                 run.label,
                 format_value(measure, run.mean[measure.key]),
-                percent,
-                *(_signed(end) for end in (gain.low_percent, gain.high_percent)),
-                "–" if math.isnan(gain.p_adjusted) else f"{gain.p_adjusted:.4f}",
+                Cell(_signed(found.percent), style),
+                *(_signed(end) for end in (found.low_percent, found.high_percent)),
+                "–" if math.isnan(found.p_adjusted) else f"{found.p_adjusted:.4f}",
             ])  # fmt: skip
     swaps = "all" if comparison.exact_p_values else f"{comparison.resamples:,} random"
     return Table(
@@ -196,8 +193,12 @@ def methods_table(comparison: Comparison) -> Table:
         p_values = [1.0, *(gains[measure.key].p_adjusted for gains in comparison.gains)]
         for row, mean, p in zip(rows, means, p_values, strict=True):
             text, stars = format_value(measure, mean), "*" * sum(p < limit for limit in _STARS)
-            is_best = best is not None and text == format_value(measure, best)
-            row.append(Cell(text + stars, "bold" if is_best else ""))
+            row.append(
+                Cell(
+                    text + stars,
+                    "bold" if not math.isnan(mean) and text == format_value(measure, best) else "",
+                )
+            )
     return Table(
         header=["", *map(column_title, comparison.measures)],
         rows=rows,

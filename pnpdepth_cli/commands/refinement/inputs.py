@@ -23,7 +23,15 @@ from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import METRES, Frame, Register, registration_to_make, tensor_of
 from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source
 from pnpdepth_cli.io.dataset.reading import check_same_view, depth_of, masked, moved_to, rgb_of
-from pnpdepth_cli.io.depth import DepthImage, describe_range, implausible, metres, read_depth
+from pnpdepth_cli.io.depth import (
+    DepthImage,
+    DepthKind,
+    describe_range,
+    implausible,
+    metres,
+    read_depth,
+    scale_warning,
+)
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import read_sparse
@@ -82,8 +90,8 @@ class _Part:
     """(H, W) before the protocol's crop."""
     record: dict[str, Any]
     notes: tuple[str, ...] = ()
-    scale: float | None = None
-    """Integers per metre of its file."""
+    kind: DepthKind | None = None
+    """Of the file of a depth map."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +106,8 @@ class _Sparse:
     unit: str = METRES
     camera: FrameCamera | None = None
     """The camera of the whole image, where it came with the points."""
+    kind: DepthKind | None = None
+    """Of a depth map."""
 
 
 def read_inputs(request: RefineRequest) -> Inputs:
@@ -134,7 +144,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     notes = [note for part in parts.values() if part is not None for note in part.notes]
     if ground_truth is not None and files.sparse is not None:
         notes += _leak_warning(sparse.points, ground_truth.values)
-        notes += _scale_warning(sparse.points, ground_truth.values)
+        notes += _scale_warning(sparse, ground_truth)
     notes += (*(() if camera is None else camera.notes), *neighbours.notes)
     points = used
     if neighbours.scans and camera is not None:
@@ -229,17 +239,23 @@ def _without_far_points(sparse: _Sparse) -> _Sparse:
     return replace(sparse, points=sparse.points.select(~far), notes=(*sparse.notes, note))
 
 
-def _scale_warning(points: SparsePoints, gt: ImageArray) -> list[str]:
-    """A warning if ground truth and sparse depth differ by a factor where both are known."""
-    depth = points.scatter()[0, 0].numpy()
+def _scale_warning(sparse: _Sparse, ground_truth: _Part) -> list[str]:
+    """A warning if ground truth and sparse depth differ by a factor where both are known.
+
+    Raises:
+        InputError: A scale that was assumed explains it.
+    """
+    depth, gt = sparse.points.scatter()[0, 0].numpy(), ground_truth.values
     both = (depth > 0) & (gt > 0)
     if int(both.sum()) < _MIN_COMPARED:
         return []
     ratio = float(np.median(gt[both] / depth[both]))
     if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
         return []
+    kinds = {"--depth-scale": sparse.kind, "--gt-scale": ground_truth.kind}
     return [
-        f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
+        scale_warning("sparse points", 1 / ratio, kinds)
+        or f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
         f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give --gt-scale"
         " or --depth-scale"
     ]
@@ -310,7 +326,7 @@ def _read_ground_truth(
         whole=(values.shape[0], values.shape[1]),
         record=_file_record(source) | {"read_as": ground_truth.source},
         notes=(f"gt: {described}",),
-        scale=ground_truth.scale,
+        kind=ground_truth.kind,
     )
 
 
@@ -335,7 +351,7 @@ def _sampled(
     source = f"{files.sample.kind} of the ground truth, seed {seed}"
     return _Sparse(
         points=points.tensors(),
-        scale=ground_truth.scale,
+        scale=ground_truth.kind.scale if ground_truth.kind else None,
         record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": seed},
         notes=(f"sparse: {describe_range(points.depth, source)}",),
     )
@@ -399,6 +415,7 @@ def _read_points(
         scale=sparse.scale,
         record=_file_record(path) | {"read_as": sparse.source} | record,
         notes=tuple(notes),
+        kind=DepthKind(sparse.source, sparse.scale, sparse.assumed_scale),
     )
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
-from pnpdepth_cli.commands.evaluation.frame_reading import image_of, load_frame
-from pnpdepth_cli.commands.evaluation.frame_scoring import FrameScores, filled
+from pnpdepth_cli.commands.evaluation.frames import image_of, load_frame
+from pnpdepth_cli.commands.evaluation.scoring import FrameScores, filled
 from pnpdepth_cli.commands.evaluation.tables import calibration_tables, means_by_measure
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.tables import format_value, unit_of

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
 from pnpdepth_cli.commands.refinement.request import count_or_fraction
-from pnpdepth_cli.commands.sweep.points import read_sampling
-from pnpdepth_cli.core.update_rules import step_size
+from pnpdepth_cli.commands.sweep.points import Sampling, read_sampling
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.sensors import SamplePattern
 from pnpdepth_cli.settings import LARGEST_SEED, OptionField, Settings, options_of
 from pnpdepth_cli.settings import Axis as Shown
 
@@ -28,7 +25,7 @@ class Parameter:
     shown: Shown
     """Titles of its axis."""
     value: Callable[[str], Any]
-    """Parses a text; raises ValueError or UsageError."""
+    """Parses a text; raises UsageError."""
     of_points: bool = False
     """Whether it decides the points."""
 
@@ -93,7 +90,7 @@ def read_value(name: str, text: str) -> Any:
         raise UsageError(f"no parameter {name!r} to vary; there are {', '.join(PARAMETERS)}")
     try:
         return PARAMETERS[name].value(text)
-    except (ValueError, UsageError) as error:
+    except UsageError as error:
         raise UsageError(f"{name}={text}: {error}") from None
 
 
@@ -110,10 +107,8 @@ def studies_of(axes: Sequence[Axis], *, one_by_one: bool) -> list[Study]:
     """Returns a study for each axis, or one of all of them.
 
     Raises:
-        UsageError: Without an axis, with one twice, or for a grid of more than two.
+        UsageError: With an axis twice, or for a grid of more than two.
     """
-    if not axes:
-        raise UsageError("nothing to vary; say what with --vary, such as --vary points=20,100,500")
     if len({axis.name for axis in axes}) < len(axes):
         raise UsageError("a parameter comes in two --vary; give all its values in one")
     if one_by_one:
@@ -126,55 +121,43 @@ def studies_of(axes: Sequence[Axis], *, one_by_one: bool) -> list[Study]:
     return [Study(axes=tuple(axes))]
 
 
-def _number(kind: type[int | float], most: float = math.inf) -> Callable[[str], float]:
-    def value(text: str) -> float:
+def _valid(owner: Callable[..., Any], field: str, kind: type) -> Callable[[str], Any]:
+    """Returns a parser of texts that a field of the owner takes."""
+
+    def value(text: str) -> Any:
+        if kind is bool and text not in ("on", "off"):
+            raise UsageError(f"{text!r} is neither on nor off")
         try:
-            number = kind(text)
+            parsed = text == "on" if kind is bool else kind(text)
         except ValueError:
             whole = "whole " if kind is int else ""
-            raise ValueError(f"{text!r} is not a {whole}number") from None
-        if not 0 <= number <= most or math.isinf(number):
-            limit = "" if math.isinf(most) else f" and <= {most:g}"
-            raise ValueError(f"must be finite, >= 0{limit}, got {text}")
-        return number
+            raise UsageError(f"{text!r} is not a {whole}number") from None
+        return getattr(owner(**{field: parsed}), field)
 
     return value
-
-
-def _one_of(names: Sequence[Any]) -> Callable[[str], str]:
-    def value(text: str) -> str:
-        if text not in names:
-            raise ValueError(f"{text!r} is not one of {', '.join(names)}")
-        return text
-
-    return value
-
-
-def _switch(text: str) -> bool:
-    return _one_of(("on", "off"))(text) == "on"
 
 
 def _points(text: str) -> str:
     count, fraction = count_or_fraction(text)
-    if (count is not None and count < 1) or (fraction is not None and not 0 < fraction <= 1):
-        raise ValueError("give at least one point, or a fraction above 0 and at most 100 %")
+    SamplePattern(count=count, fraction=fraction)
     return text
 
 
-def _step(text: str) -> str:
-    step_size(text, torch.zeros(1))
-    return text
+def _seed(text: str) -> int:
+    seed = int(_valid(Settings, "seed", int)(text))
+    if seed > LARGEST_SEED:
+        raise UsageError(f"the largest seed is {LARGEST_SEED}")
+    return seed
 
 
 def _of_method(field: OptionField) -> Parameter:
     """The parameter of an option of the method."""
-    kinds: Mapping[str, Callable[[str], Any]]
-    kinds = {"int": _number(int), "float": _number(float), "bool": _switch, "str": str}
-    choices = field.option.choices
-    value = kinds[field.type] if choices is None else _one_of(tuple(choices))
+    kind = {"int": int, "float": float, "bool": bool, "str": str}[field.type]
+    if field.name == "lr":
+        kind = str
     return Parameter(
         shown=field.option.axis or Shown(title=field.name.replace("_", " ")),
-        value=_step if field.name == "lr" else value,
+        value=_valid(Settings, field.name, kind),
     )
 
 
@@ -188,15 +171,20 @@ _OF_THOSE = "sparse points (% of those there are)"
 PARAMETERS: Mapping[str, Parameter] = {
     "points": _of_points("sparse points", _points, title_percent=_OF_THOSE, log=True),
     "sensor": _of_points("sensor", read_sampling),
-    "noise": _of_points("noise of the points (m)", _number(float)),
-    "relative-noise": _of_points("noise of the points (fraction of depth)", _number(float)),
-    "outliers": _of_points("outliers among the points (fraction)", _number(float, 1)),
-    "jitter": _of_points("jitter of the points (px)", _number(float)),
-    "rotation-noise": _of_points("rotation noise of the scanner (°)", _number(float, 360)),
+    **{
+        name: _of_points(title, _valid(Sampling, name.replace("-", "_"), float))
+        for name, title in {
+            "noise": "noise of the points (m)",
+            "relative-noise": "noise of the points (fraction of depth)",
+            "outliers": "outliers among the points (fraction)",
+            "jitter": "jitter of the points (px)",
+            "rotation-noise": "rotation noise of the scanner (°)",
+        }.items()
+    },
     **{
         each.name_within: _of_method(each) for each in options_of(Settings) if each.name not in _OWN
     },
     "model": Parameter(shown=Shown(title="network"), value=str),
-    "seed": Parameter(shown=Shown(title="seed of the points"), value=_number(int, LARGEST_SEED)),
+    "seed": Parameter(shown=Shown(title="seed of the points"), value=_seed),
 }
 """All parameters that can be varied, in the order of the help."""

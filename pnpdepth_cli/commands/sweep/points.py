@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 
 from pnpdepth_cli.commands.refinement.inputs import Inputs
-from pnpdepth_cli.commands.refinement.request import RefineRequest, count_or_fraction
+from pnpdepth_cli.commands.refinement.request import (
+    RefineRequest,
+    count_or_fraction,
+    sample_pattern,
+)
 from pnpdepth_cli.commands.sparse.make import find_sensor
 from pnpdepth_cli.commands.sparse.scans import camera_of, check_size
 from pnpdepth_cli.errors import InputError, UsageError
@@ -55,6 +59,11 @@ class Sampling:
     rotation_noise: float = 0.0
     """Of the scanner, degrees."""
 
+    def __post_init__(self) -> None:
+        _ = self.sample_noise  # refuses what is out of range
+        if not 0 <= self.rotation_noise <= 360:
+            raise UsageError(f"must be from 0 to 360 degrees, got {self.rotation_noise:g}")
+
     @property
     def is_pattern(self) -> bool:
         """True for a pattern of `pnpdepth sample`."""
@@ -68,9 +77,11 @@ class Sampling:
     @property
     def sample_noise(self) -> SampleNoise:
         """The noise of each point."""
-        absolute, relative = self.noise, self.relative_noise
         return SampleNoise(
-            metres=absolute, relative=relative, outliers=self.outliers, jitter_px=self.jitter
+            metres=self.noise,
+            relative=self.relative_noise,
+            outliers=self.outliers,
+            jitter_px=self.jitter,
         )
 
     @property
@@ -86,8 +97,7 @@ class Sampling:
                 f"sensor {self.sensor!r} needs a number of points: {self.sensor}:500, or --sample"
                 " 500, or --vary points=100,500"
             )
-        count, fraction = count_or_fraction(self.points)
-        return SamplePattern(kind=self.sensor, count=count, fraction=fraction)
+        return sample_pattern(self.sensor, *count_or_fraction(self.points))
 
     def record(self) -> dict[str, Any]:
         """Returns all that decides the points except the frame and the seed."""
@@ -154,10 +164,11 @@ def frame_points(
     try:
         if sampling.is_pattern:
             pattern = sampling.pattern()
-            drawn = sample_points(inputs.gt, pattern, seed, image=inputs.image, noise=noise)
-            return drawn.tensors()
+            return sample_points(
+                inputs.gt, pattern, seed, image=inputs.image, noise=noise
+            ).tensors()
         if sampling.lidar is not None:
-            points = _scanned(sampling, sampling.lidar, seed, inputs, request, frame)
+            points = _scanned(sampling, sampling.lidar, seed, inputs.gt, request, frame)
         elif request.files.sparse is None:
             raise InputError(
                 "there is no sparse depth; --sample 500 draws points from the ground truth"
@@ -171,12 +182,7 @@ def frame_points(
 
 
 def _scanned(
-    sampling: Sampling,
-    lidar: Lidar,
-    seed: int,
-    inputs: Inputs,
-    request: RefineRequest,
-    frame: Frame,
+    sampling: Sampling, lidar: Lidar, seed: int, gt: Any, request: RefineRequest, frame: Frame
 ) -> Points:
     """The points of a LiDAR at the camera's position, simulated in the frame's ground truth."""
     sensor, protocol = f"sensor {sampling.sensor!r} needs", request.files.protocol
@@ -188,11 +194,11 @@ def _scanned(
             " it; --protocol whole does not"
         )
     calibration = read_calibration(frame.calib, frame.camera)
-    check_size(frame.calib, calibration, inputs.size)
+    check_size(frame.calib, calibration, gt.shape)
     here = replace(camera_of(calibration), rotation=FORWARD_LEFT_UP, translation=np.zeros(3))
-    lidar = replace(lidar, rotation_noise_deg=sampling.rotation_noise)
-    assert inputs.gt is not None
-    return simulate_lidar(inputs.gt, here, lidar, seed)
+    return simulate_lidar(
+        gt, here, replace(lidar, rotation_noise_deg=sampling.rotation_noise), seed
+    )
 
 
 def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Points:
@@ -200,12 +206,10 @@ def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Po
     if wanted is None:
         return points
     available = len(points.depth)
-    count, fraction = count_or_fraction(wanted)
-    number = max(1, round(fraction * available)) if fraction is not None else count or 0
+    number = sample_pattern("uniform", *count_or_fraction(wanted)).wanted(available)
     if number > available:
         raise InputError(
             f"{number:,} points of {available:,}; ask for fewer, or draw them from the ground truth"
             f" with --sample {wanted}"
         )
-    kept = np.sort(rng.choice(available, number, replace=False))
-    return replace(points, xy=points.xy[kept], depth=points.depth[kept])
+    return points.select(np.sort(rng.choice(available, number, replace=False)))

@@ -3,37 +3,48 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.commands.batch.batch import Listener
 from pnpdepth_cli.commands.batch.frames import Task, find_frames, task_of
+from pnpdepth_cli.commands.batch.records import model_identity, settings_of
 from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.running import read_frame, reference_frames
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.refinement.record import model_record
 from pnpdepth_cli.commands.refinement.refine import load_refiner
+from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.sweep.axes import Cell, Study, values_of
-from pnpdepth_cli.commands.sweep.journal import Journal
-from pnpdepth_cli.commands.sweep.plan import Plan, Runs
-from pnpdepth_cli.commands.sweep.plots import draw_study, need_matplotlib
+from pnpdepth_cli.commands.sweep.outputs import (
+    draw_study,
+    need_matplotlib,
+    row_of,
+    summarise,
+    write_sweep,
+)
 from pnpdepth_cli.commands.sweep.points import OWN, Sampling, frame_points
-from pnpdepth_cli.commands.sweep.running import results
-from pnpdepth_cli.commands.sweep.tables import row_of, summarise, write_sweep
+from pnpdepth_cli.commands.sweep.running import Journal, Run, results
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.lock import locked_folder
+from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote.store import status_of
+from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.sensors import SamplePattern
+from pnpdepth_cli.settings import Settings
 
 Model = tuple[str, "Path | None"]
 """A network and its weights, as the user names them."""
+Frames = Sequence[tuple[Task, Frame]]
 
 _RESOLVE_POINTS = 500
 """Points of the ground truth that the definition is resolved on; the paper uses 500 indoors."""
@@ -63,18 +74,91 @@ class SweepRequest(FrameSelection):
         if self.seeds < 1:
             raise UsageError(f"--seeds must be >= 1, got {self.seeds}")
 
+    @property
+    def cells(self) -> list[Cell]:
+        """The cells of all studies."""
+        return [cell for study in self.studies for cell in study.cells()]
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Network:
-    """A network of the sweep and its runs."""
+    """A network of the sweep, and how its cells are computed."""
 
     spec: str
     """What the user called it."""
     refiner: Refiner
-    plan: Plan
-    base: dict[str, Any]
-    """The settings that are not varied."""
-    runs: Runs
+    definition: ModelDefinition
+    base: RefineRequest
+    """How a frame is refined where nothing is varied."""
+    sampling: Sampling
+    """The points where nothing is varied."""
+    seeds: int
+
+    def settings(self, cell: Cell) -> Settings:
+        """Returns how a cell refines. Raises UsageError if parameters contradict each other."""
+        varied = values_of(cell, of_points=False)
+        varied = {name: value for name, value in varied.items() if name not in ("model", "seed")}
+        options = replace(self.base.method, **varied).with_preset()
+        settings = resolve_settings(self.definition, options)
+        return replace(settings, propagate=options.propagate or "none", preset=None)
+
+    def draws(self, cell: Cell) -> tuple[Sampling, Sequence[int]]:
+        """Returns where a cell's points come from, and the seeds of their draws."""
+        sampling = self.sampling.with_values(values_of(cell, of_points=True))
+        if "seed" in cell:
+            return sampling, (int(cell["seed"]),)
+        own = self.base.method.seed
+        return sampling, range(own, own + (self.seeds if sampling.is_random else 1))
+
+    def runs(self, cells: Sequence[Cell], frames: Frames) -> dict[Any, Run]:
+        """Returns the runs of the cells by frame, seed, points and settings.
+
+        A run is computed once, however many cells use it. Those of a frame follow each other, and
+        among these those with the same points.
+        """
+        identity, states = model_identity(self.base), dict[Path, Any]()
+        wanted: dict[tuple[Sampling, int], dict[Settings, None]] = {}
+        for cell in cells:
+            sampling, seeds = self.draws(cell)
+            for seed in seeds:
+                wanted.setdefault((sampling, seed), {})[self.settings(cell)] = None
+        runs = {}
+        for task, frame in frames:
+            read = settings_of(task.request, identity, "files", "network") | {"frame": frame.name}
+            del read["sample"]  # `sampling` says it
+            for (sampling, seed), several in wanted.items():
+                paths = dict(_files(task, frame, sampling))
+                states |= {path: _state(path) for path in paths.values() if path not in states}
+                files = {name: states[path] for name, path in paths.items()}
+                drawn = {"seed": seed, "sampling": sampling.record(), "files": files}
+                for settings in several:
+                    decides = plain(read | drawn | {"settings": settings})
+                    text = json.dumps(decides, sort_keys=True)
+                    runs[frame.name, seed, sampling, settings] = Run(
+                        task=task, frame=frame, seed=seed, sampling=sampling, settings=settings,
+                        key=hashlib.sha256(text.encode()).hexdigest(),
+                    )  # fmt: skip
+        return runs
+
+
+def _files(task: Task, frame: Frame, sampling: Sampling) -> Iterator[tuple[str, Path]]:
+    """The files that decide the result with these points."""
+    own = sampling.sensor == OWN
+    yield from ((n, path) for n, path in task.inputs.items() if own or n in ("image", "gt"))
+    if sampling.lidar is not None and frame.calib is not None:
+        yield "calib", frame.calib
+
+
+def _state(path: Path) -> tuple[int, int | str] | None:
+    """What changes with a file's content: size and time, or the version that a store states."""
+    if isinstance(path, RemotePath):
+        stored = status_of(path)
+        return None if stored is None else (stored.size, stored.version)
+    try:
+        status = path.stat()
+    except OSError:  # the run will say so
+        return None
+    return status.st_size, status.st_mtime_ns
 
 
 def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
@@ -91,45 +175,47 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         raise UsageError(f"{output}: sweep writes to a local folder; name one with -o")
     if request.plots != "none":
         need_matplotlib()
-    sampling, tasks = _frames(request, listener)
+    sampling, frames = _frames(request, listener)
     make_folder(output)
     with locked_folder(output, None, lambda: None):
         remove_leftovers(output)
         journal = Journal(output)
-        for note in journal.notes:
-            listener.say(note)
         cells: dict[Model, list[Cell]] = {}
-        for study in request.studies:
-            for cell in study.cells():
-                cells.setdefault(_model_of(cell, request), []).append(cell)
-        networks = {
-            model: _network(model, of, request, sampling, tasks, listener)
-            for model, of in cells.items()
-        }
+        for cell in request.cells:
+            cells.setdefault(_model_of(cell, request), []).append(cell)
+        networks, runs = {}, {}
+        for model, of_model in cells.items():
+            network = networks[model] = _network(
+                model, of_model, request, sampling, frames, listener
+            )
+            runs[model] = network.runs(of_model, frames)
+            for layer in dict.fromkeys(run.settings.layer for run in runs[model].values()):
+                if layer is not None:
+                    with network.refiner.network.cut_at(layer):
+                        pass  # reports an unknown layer before anything is computed
         to_do = {
-            model: [run for run in each.runs.values() if not journal.is_done(run)]
-            for model, each in networks.items()
+            model: [run for run in of.values() if run.key not in journal.results]
+            for model, of in runs.items()
         }
-        count = sum(len(each.runs) for each in networks.values())
-        left = sum(map(len, to_do.values()))
+        count, left = (sum(map(len, of.values())) for of in (runs, to_do))
         listener.say(
-            f"{len(tasks):,} frames, {count:,} runs: {count - left:,} done already, {left:,} to do"
+            f"{len(frames):,} frames, {count:,} runs: {count - left:,} done already, {left:,} to do"
         )
         listener.begin(left)
-        for model, each in networks.items():
-            for run, result in results(to_do[model], each.refiner.network):
+        for model, network in networks.items():
+            for run, result in results(to_do[model], network.refiner.network):
                 row = {"name": run.frame.name, "status": "done", "message": None}
                 if isinstance(result, PnpDepthError):  # it is tried again next time
                     row |= {"status": "failed", "message": str(result)}
                 else:
                     journal.add(run, result)
-                    if result.get("diverged"):
+                    if result["diverged"]:
                         row |= {"status": "diverged", "message": result["diverged"]}
                 listener.frame(row)
-        return _write(request, sampling, networks, [task.name for task, _ in tasks], journal)
+        return _write(request, networks, runs, [task.name for task, _ in frames], journal)
 
 
-def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[tuple[Task, Frame]]]:
+def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, Frames]:
     """Where points come from unless that is varied, and the frames with ground truth."""
     batch = BatchRequest(
         source=request.source,
@@ -158,8 +244,7 @@ def _frames(request: SweepRequest, listener: Listener) -> tuple[Sampling, list[t
         listener.say(f"points: {origin}; --sample to change")
     if request.points:
         sampling = sampling.with_values(values_of(request.points, of_points=True))
-    cells = [cell for study in request.studies for cell in study.cells()]
-    samplings = [sampling.with_values(values_of(cell, of_points=True)) for cell in cells]
+    samplings = [sampling.with_values(values_of(cell, of_points=True)) for cell in request.cells]
     scan = request.refine.files.scan
     if any(each.lidar for each in samplings):
         # the calibration is then of the camera, not of a scan
@@ -191,78 +276,75 @@ def _network(
     cells: Sequence[Cell],
     request: SweepRequest,
     sampling: Sampling,
-    tasks: Sequence[tuple[Task, Frame]],
+    frames: Frames,
     listener: Listener,
 ) -> _Network:
-    """The network, loaded, and the runs of its cells."""
-    named = {"model": model[0], "checkpoint": model[1]}
-    refine = request.refine.with_fields(**named)
-    tasks = [
-        (replace(task, request=task.request.with_fields(**named)), frame) for task, frame in tasks
-    ]
-    layer = next((cell["layer"] for cell in cells if "layer" in cell), refine.method.layer)
-    refiner = _resolved(layer, refine.method.seed, tasks, listener)
-    definition = refiner.network.definition
-    if layer is None or definition.default_layer is None:  # where `refine` cuts the first frame
-        defaults = replace(definition.defaults, layer=refiner.layer)
-        definition = replace(definition, defaults=defaults)
-    plan = Plan(definition=definition, base=refine, sampling=sampling, seeds=request.seeds)
-    settings, method = resolve_settings(definition, refine.method.with_preset()), plan.method({})[0]
-    base = asdict(settings) | {"layer": method.layer, "propagate": method.propagate}
-    listener.say(
-        f"network: {definition.name}; where not varied: cut at {base['layer']},"
-        f" {base['iterations']} updates of z ({base['update']}, {base['loss']}, step {base['lr']})"
-    )
-    runs = plan.runs(cells, tasks)
-    for each in dict.fromkeys(run.method.layer for run in runs.values() if run.method):
-        with refiner.network.cut_at(each):
-            pass  # reports an unknown layer before anything is computed
-    return _Network(spec=model[0], refiner=refiner, plan=plan, base=base, runs=runs)
-
-
-def _resolved(
-    layer: str | None, seed: int, tasks: Sequence[tuple[Task, Frame]], listener: Listener
-) -> Refiner:
-    """The network, its definition resolved on the first frame that can be read.
+    """The network, loaded, its definition resolved on the first frame that can be read.
 
     A layer to cut at is named, as the network may have no default.
     """
+    named = {"model": model[0], "checkpoint": model[1]}
+    base = request.refine.with_fields(**named)
+    layer = next((cell["layer"] for cell in cells if "layer" in cell), base.method.layer)
+    tasks = [(replace(t, request=t.request.with_fields(**named)), frame) for t, frame in frames]
 
     def read(task: Task, frame: Frame) -> Inputs:
         """The frame with points of its ground truth, so as not to depend on what is varied."""
         inputs = read_frame(task)
         known = 0 if inputs.gt is None else int((inputs.gt > 0).sum())
         some = Sampling(sensor="uniform", points=str(min(_RESOLVE_POINTS, known)))
-        return replace(inputs, points=frame_points(some, seed, inputs, task.request, frame))
+        return replace(
+            inputs, points=frame_points(some, base.method.seed, inputs, task.request, frame)
+        )
 
-    def others(number: int) -> Iterator[Inputs]:
-        """Further frames, which decide the input range as well; errors are reported later."""
-        for other in reference_frames(tasks, number):
-            with contextlib.suppress(PnpDepthError):
-                yield read(*other)
-
-    errors = []
-    for number, (task, frame) in enumerate(tasks):
+    errors: list[InputError] = []
+    for task, frame in tasks:
         try:
             inputs = read(task, frame)
+            break
         except InputError as error:
             errors.append(error)
-            continue
-        further = partial(lambda first: list(others(first)), number)
-        refiner = load_refiner(task.request.with_fields(layer=layer), inputs, further)
-        for note in inputs.notes:
-            if task.request.files.sample is None or not note.startswith("sparse"):
-                listener.say(f"{task.name}: {note}")
-        for note in refiner.network.notes:
-            listener.say(note)
-        return refiner
-    raise errors[0]
+    else:
+        raise errors[0]
+
+    def others(_: Inputs) -> list[Inputs]:
+        """Further frames, which decide the input range as well; errors are reported later."""
+        found = []
+        for other in reference_frames(tasks, len(errors)):
+            with contextlib.suppress(PnpDepthError):
+                found.append(read(*other))
+        return found
+
+    refiner = load_refiner(task.request.with_fields(layer=layer), inputs, others)
+    for note in inputs.notes:
+        if task.request.files.sample is None or not note.startswith("sparse"):
+            listener.say(f"{task.name}: {note}")
+    for note in refiner.network.notes:
+        listener.say(note)
+    definition = refiner.network.definition
+    if layer is None or definition.default_layer is None:  # where `refine` cuts the first frame
+        defaults = replace(definition.defaults, layer=refiner.layer)
+        definition = replace(definition, defaults=defaults)
+    network = _Network(
+        spec=model[0],
+        refiner=refiner,
+        definition=definition,
+        base=base,
+        sampling=sampling,
+        seeds=request.seeds,
+    )
+    own = network.settings({})
+    listener.say(
+        f"network: {definition.name}; where not varied: cut at {own.layer},"
+        f" {own.iterations} updates of z ({own.update}, {own.loss}, step {own.lr})"
+    )
+    return network
 
 
 def _write(
     request: SweepRequest,
-    sampling: Sampling,
     networks: Mapping[Model, _Network],
+    runs: Mapping[Model, Mapping[Any, Run]],
     names: Sequence[str],
     journal: Journal,
 ) -> dict[str, Any]:
@@ -272,13 +354,17 @@ def _write(
     for study in request.studies:
         cells = []
         for cell in study.cells():
-            network = networks[_model_of(cell, request)]
-            of_cell = _rows(study, cell, network, names, journal)
-            summary = summarise(of_cell, request.resamples)
-            for each in (summary, *of_cell):
-                if not request.cost:
-                    each.pop("time_s", None)
-            cells.append({"parameters": dict(cell), **summary})
+            model = _model_of(cell, request)
+            settings = networks[model].settings(cell)
+            sampling, seeds = networks[model].draws(cell)
+            of_cell = []
+            for name in names:
+                for seed in seeds:
+                    run = runs[model][name, seed, sampling, settings]
+                    scores = row_of(journal.results.get(run.key), timed=request.cost)
+                    row = {"study": study.name, **cell, "frame": name, "seed": seed, **scores}
+                    of_cell.append(row)
+            cells.append({"parameters": dict(cell), **summarise(of_cell, request.resamples)})
             rows += of_cell
         plot = None if request.plots == "none" else f"sweep_{study.name}.{request.plots}"
         if plot is not None:
@@ -290,32 +376,13 @@ def _write(
         "command": "sweep",
         "source": str(request.source),
         "output": str(request.output),
-        "model": _record_of(first),
-        **({"more_models": [_record_of(each) for each in others]} if others else {}),
+        "model": model_record(first.refiner.network, first.spec),
+        **({"more_models": [model_record(n.refiner.network, n.spec) for n in others]}
+           if others else {}),
         "frames": list(names),
         "seeds": request.seeds,
-        "base": first.base | asdict(sampling),
+        "base": asdict(first.settings({})) | asdict(first.sampling),
         "studies": studies,
-    }
+    }  # fmt: skip
     write_sweep(request.output, record, rows)
     return record
-
-
-def _record_of(network: _Network) -> dict[str, Any]:
-    return model_record(network.refiner.network, network.spec)
-
-
-def _rows(
-    study: Study, cell: Cell, network: _Network, names: Sequence[str], journal: Journal
-) -> list[dict[str, Any]]:
-    """A row for each frame of a cell and each draw of its points."""
-    sampling, seeds = network.plan.draws(cell)
-    (method, iterations), rows = network.plan.method(cell), []
-    for name in names:
-        for seed in seeds:
-            linear, refined = (
-                journal.result(network.runs[name, seed, sampling, each]) for each in (None, method)
-            )
-            scores = row_of(iterations, linear, refined)
-            rows.append({"study": study.name, **cell, "frame": name, "seed": seed, **scores})
-    return rows

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.compare import CompareRequest, Comparison
+from pnpdepth_cli.commands.evaluation.compare import Comparison
 from pnpdepth_cli.commands.evaluation.compare import compare as compare_runs
 from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, evaluate
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
@@ -18,7 +18,7 @@ from pnpdepth_cli.io.record import write_json
 
 
 def compare(paths: list[str], **settings: Any) -> Comparison:
-    return compare_runs(CompareRequest(paths=paths, **settings))
+    return compare_runs(paths, **settings)
 
 
 def run(root: Path, name: str, errors: dict[str, list[float]], **frames: Any) -> str:

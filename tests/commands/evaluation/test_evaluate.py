@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, Evaluation, evaluate
-from pnpdepth_cli.commands.evaluation.frame_reading import Scales
+from pnpdepth_cli.commands.evaluation.frames import Scales
 from pnpdepth_cli.commands.evaluation.tables import worst
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.depth import write_depth

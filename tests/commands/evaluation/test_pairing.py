@@ -1,37 +1,43 @@
-"""Predictions and truths matched by name."""
+"""Predictions and truths matched by name, and files of several frames."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.pairing import Pairs, frame_name, pair_frames
+from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, evaluate
+from pnpdepth_cli.commands.evaluation.pairing import (
+    FramePair,
+    frame_name,
+    load_stacked,
+    pair_frames,
+    stack_size,
+)
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
-
-DEPTH = np.full((3, 4), 2, np.float32)
 
 
 def depth_at(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_depth(path, DEPTH)
+    write_depth(path, np.full((3, 4), 2, np.float32))
     return path
 
 
 def folders(root: Path, predictions: list[str], truths: list[str]) -> tuple[Path, Path]:
-    for name in predictions:
-        depth_at(root / "out" / name)
-    for name in truths:
-        depth_at(root / "gt" / name)
+    for folder, names in (("out", predictions), ("gt", truths)):
+        (root / folder).mkdir()
+        for name in names:
+            depth_at(root / folder / name)
     return root / "out", root / "gt"
 
 
-def matched(pairs: Pairs) -> dict[str, str | None]:
-    return {f.name: f.prediction.name if f.prediction else None for f in pairs.frames}
+def matched(pairs: list[FramePair]) -> dict[str, str | None]:
+    return {f.name: f.prediction.name if f.prediction else None for f in pairs}
 
 
 NAMES = [
@@ -51,107 +57,94 @@ def test_a_stem_names_its_frame(stem: str, name: str) -> None:
     assert frame_name(stem) == name
 
 
-def test_the_files_of_a_refinement_are_paired_with_ground_truth_without_images(
-    tmp_path: Path,
-) -> None:
-    out, gt = folders(
-        tmp_path,
+MATCHED = [
+    (  # the files of a refinement, and ground truth without images
         ["b_depth.png", "b_preview.png", "b_improvement.png", "ä ö_depth.exr", "b.png"],
         ["b.png", "ä ö.npy"],
-    )
-    pairs = pair_frames(out, gt)
-    assert matched(pairs) == {"b": "b_depth.png", "ä ö": "ä ö_depth.exr"}
-    assert not pairs.single
-    assert pairs.notes == (f"{out}: ignored, as there is a _depth of each: b.png",)
+        {"b": "b_depth.png", "ä ö": "ä ö_depth.exr"},
+        ["out: ignored, as there is a _depth of each: b.png"],
+    ),
+    (  # frames in folders of their own
+        ["one/1_depth.png", "two/1_depth.png"],
+        ["one/1.png", "two/1.png", "two/2.png"],
+        {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None},
+        [],
+    ),
+    (
+        ["a.png", "x.png", "y.png", ".b.png", ".hidden/c.png"],
+        ["a.png", "b.png"],
+        {"a": "a.png", "b": None},
+        ["warning: 2 of 3 predictions have no ground truth and are not scored: x, y"],
+    ),
+]
 
 
-def test_frames_in_folders_of_their_own_are_matched_with_the_folder(tmp_path: Path) -> None:
-    out, gt = folders(
-        tmp_path, ["one/1_depth.png", "two/1_depth.png"], ["one/1.png", "two/1.png", "two/2.png"]
-    )
-    pairs = pair_frames(out, gt)
-    assert matched(pairs) == {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None}
-
-
-def test_missing_predictions_are_listed_and_extra_predictions_reported(
+@pytest.mark.parametrize(("predictions", "truths", "expected", "notes"), MATCHED)
+def test_files_are_matched_by_name_and_what_is_left_is_reported(
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    predictions: list[str],
+    truths: list[str],
+    expected: dict[str, str | None],
+    notes: list[str],
 ) -> None:
-    out, gt = folders(tmp_path, ["a.png", "x.png", "y.png"], ["a.png", "b.png"])
-    pairs = pair_frames(out, gt)
-    assert matched(pairs) == {"a": "a.png", "b": None}
-    assert pairs.notes == (
-        "warning: 2 of 3 predictions have no ground truth and are not scored: x, y",
-    )
+    monkeypatch.chdir(tmp_path)
+    pairs, own_notes = pair_frames(*folders(Path(), predictions, truths))
+    assert (matched(pairs), own_notes) == (expected, notes)
 
 
-def test_hidden_files_links_in_circles_and_unreadable_folders_do_no_harm(tmp_path: Path) -> None:
-    out, gt = folders(tmp_path, ["a.png", ".b.png", ".hidden/c.png"], ["a.png"])
+def test_links_in_circles_do_no_harm_and_an_unreadable_folder_is_reported(tmp_path: Path) -> None:
+    out, gt = folders(tmp_path, ["a.png", "closed/b.png"], ["a.png"])
     (out / "circle").symlink_to(out, target_is_directory=True)
     (out / "self.png").symlink_to(out / "self.png")
-    assert matched(pair_frames(out, gt)) == {"a": "a.png"}
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root can read every folder")
-def test_an_unreadable_folder_is_reported(tmp_path: Path) -> None:
-    out, gt = folders(tmp_path, ["a.png", "closed/b.png"], ["a.png"])
     (out / "closed").chmod(0)
     try:
-        (note,) = pair_frames(out, gt).notes
+        pairs, notes = pair_frames(out, gt)
     finally:
         (out / "closed").chmod(0o700)
-    assert "closed cannot be read" in note
+    assert matched(pairs) == {"a": "a.png"}
+    if os.geteuid():  # root can read every folder
+        assert "closed cannot be read" in notes[0]
 
 
-def test_two_files_of_one_frame_are_refused(tmp_path: Path) -> None:
-    out, gt = folders(tmp_path, ["a.npy", "a.png"], ["a.png"])
-    with pytest.raises(InputError, match=r"a\.png and a\.npy are one frame"):
-        pair_frames(out, gt)
+REFUSED = [
+    (["a.npy", "a.png"], ["a.png"], "out", "gt", InputError, "are one frame; keep one"),
+    (["a.png"], [], "out", "gt", InputError, "gt holds no depth file"),
+    (["1.png"], ["0001.png"], "out", "gt", InputError,
+     "file: predictions are 1; ground truth is 0001"),
+    (["a.png"], ["a.png"], "out/a.png", "gt", UsageError, "two files or two folders"),
+    (["a.png"], ["a.png"], "out", "gt/a.png", UsageError, "two files or two folders"),
+    (["a.png"], ["a.png"], "out", "nothing", InputError, "no such file or folder"),
+]  # fmt: skip
 
 
-def test_an_empty_folder_and_one_without_depth_are_refused(tmp_path: Path) -> None:
-    out, gt = folders(tmp_path, ["a.png"], ["a.png"])
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "empty" / "a.jpg").write_bytes(b"x")
-    with pytest.raises(InputError, match="holds no depth file"):
-        pair_frames(tmp_path / "empty", gt)
-    with pytest.raises(InputError, match="holds no depth file"):
-        pair_frames(out, tmp_path / "empty")
-
-
-def test_folders_without_a_common_name_are_refused_with_both_kinds_of_names(tmp_path: Path) -> None:
-    out, gt = folders(tmp_path, ["1.png"], ["0001.png"])
-    with pytest.raises(InputError) as error:
-        pair_frames(out, gt)
-    assert str(error.value) == (
-        "no prediction has the name of a ground truth file: predictions are 1; ground truth is 0001"
-    )
+@pytest.mark.parametrize(("predictions", "truths", "first", "second", "error", "message"), REFUSED)
+def test_what_cannot_be_matched_is_refused(
+    tmp_path: Path,
+    predictions: list[str],
+    truths: list[str],
+    first: str,
+    second: str,
+    error: type[Exception],
+    message: str,
+) -> None:
+    folders(tmp_path, predictions, truths)
+    with pytest.raises(error, match=message):
+        pair_frames(tmp_path / first, tmp_path / second)
 
 
 def test_two_files_are_one_frame_whatever_they_are_called(tmp_path: Path) -> None:
-    pairs = pair_frames(depth_at(tmp_path / "p_depth.png"), depth_at(tmp_path / "g.npy"))
-    assert pairs.single
-    assert matched(pairs) == {"p": "p_depth.png"}
-    assert pairs.frames[0].frame.gt == tmp_path / "g.npy"
-
-
-def test_a_file_and_a_folder_or_nothing_at_all_are_refused(tmp_path: Path) -> None:
-    out, gt = folders(tmp_path, ["a.png"], ["a.png"])
-    with pytest.raises(UsageError, match="two files or two folders"):
-        pair_frames(out / "a.png", gt)
-    with pytest.raises(UsageError, match="two files or two folders"):
-        pair_frames(out, gt / "a.png")
-    with pytest.raises(InputError, match="no such file or folder"):
-        pair_frames(out, tmp_path / "nothing")
+    (pair,), _ = pair_frames(depth_at(tmp_path / "p_depth.png"), depth_at(tmp_path / "g.npy"))
+    assert (pair.name, pair.frame.gt) == ("p", tmp_path / "g.npy")
 
 
 def test_sparse_depth_and_masks_are_one_for_all_or_one_for_each(tmp_path: Path) -> None:
     out, gt = folders(tmp_path, ["a.png", "b.png"], ["a.png", "b.png"])
-    one = depth_at(tmp_path / "one.png")
-    depth_at(tmp_path / "each" / "b.png")
-    pairs = pair_frames(out, gt, sparse=one, mask=tmp_path / "each")
-    assert [f.sparse for f in pairs.frames] == [one, one]
-    assert [f.mask for f in pairs.frames] == [None, tmp_path / "each" / "b.png"]
-    assert all(f.sparse_named for f in pairs.frames)
+    one, each = depth_at(tmp_path / "one.png"), depth_at(tmp_path / "each" / "b.png")
+    pairs, _ = pair_frames(out, gt, sparse=one, mask=tmp_path / "each")
+    assert [(f.sparse, f.sparse_named, f.mask) for f in pairs] == [
+        (one, True, None), (one, True, each),
+    ]  # fmt: skip
 
 
 def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -> None:
@@ -163,7 +156,7 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     scan = {"sparse": {"path": str(sparse), "calibration": "calib.txt"}}
     (out / "b.json").write_text(json.dumps({"inputs": scan}))
     (out / "c.json").write_text("not JSON at all")
-    frames = pair_frames(out, gt).frames
+    frames, _ = pair_frames(out, gt)
     assert [(f.sparse, f.image) for f in frames] == [(sparse, image), (None, None), (None, None)]
     assert not frames[0].sparse_named
 
@@ -173,7 +166,70 @@ def test_the_ground_truth_can_be_a_data_set_of_a_known_layout(tmp_path: Path) ->
     data = tmp_path / "data"
     for name in ("rgb/a.png", "rgb/b.png", "sparse/a.png", "sparse/b.png", "gt/a.png"):
         depth_at(data / name)
-    pairs = pair_frames(out, data)
+    pairs, notes = pair_frames(out, data)
     assert matched(pairs) == {"a": "a_depth.png"}
-    assert pairs.notes[0] == "gt: layout pairs; frames with ground truth: 1"
-    assert pairs.frames[0].sparse == data / "sparse" / "a.png"
+    assert notes[0] == "gt: layout pairs; frames with ground truth: 1"
+    assert pairs[0].sparse == data / "sparse" / "a.png"
+
+
+def test_stacked_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    gt = rng.uniform(1, 70, (6, 30, 40)).astype(np.float32)
+    gt[rng.random(gt.shape) < 0.5] = 0
+    disparity = (1 / (np.where(gt > 0, gt, 5) * rng.lognormal(0, 0.2, gt.shape))).astype("f4") / 30
+    np.save(tmp_path / "disps.npy", disparity)
+    np.savez_compressed(tmp_path / "gt_depths.npz", data=gt)
+    request = EvalRequest(
+        prediction=tmp_path / "disps.npy",
+        ground_truth=tmp_path / "gt_depths.npz",
+        protocol="garg",
+        changes={"prediction_kind": "disparity", "scale_by": "median"},
+    )
+    result = evaluate(request)
+    errors, ratios = [], []
+    for d, g in zip(disparity, gt, strict=True):  # monodepth2's evaluate_depth.py
+        mask = np.zeros(g.shape, bool)
+        mask[int(0.40810811 * 30) : int(0.99189189 * 30), int(0.03594771 * 40) : 38] = True
+        mask &= (g > 1e-3) & (g < 80)
+        p, t = (1 / d)[mask], g[mask]
+        ratios.append(np.median(t) / np.median(p))
+        p = np.clip(p * ratios[-1], 1e-3, 80)
+        errors.append((np.mean(np.abs(t - p) / t), np.sqrt(np.mean((t - p) ** 2))))
+    assert [frame.name for frame in result.frames] == [f"{n:04}" for n in range(6)]
+    assert (result.mean["mre"], result.mean["rmse"]) == pytest.approx(np.mean(errors, axis=0))
+    median = np.median(ratios)
+    spread = f"standard deviation / median {np.std(np.array(ratios) / median):.3f}"
+    factor = f"scale-by median: factor {median:.4g}"
+    assert any(note.startswith(factor) and note.endswith(spread) for note in result.notes)
+
+
+class _Attack:
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, ("true",)
+
+
+def test_images_of_different_sizes_are_objects_and_anything_else_is_not_executed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = np.empty(2, object)
+    maps[0], maps[1] = np.ones((2, 3), np.float32), np.full((4, 5), 2, np.float32)
+    np.savez(tmp_path / "gt_depths.npz", data=maps)
+    assert stack_size(tmp_path / "gt_depths.npz") == 2
+    assert load_stacked(tmp_path / "gt_depths.npz", 1).values.tolist() == maps[1].tolist()
+    calls: list[str] = []
+    monkeypatch.setattr(os, "system", calls.append)
+    maps[0] = _Attack()
+    np.save(tmp_path / "attack.npy", maps, allow_pickle=True)
+    assert stack_size(tmp_path / "attack.npy") is None
+    assert calls == []
+
+
+def test_single_maps_are_no_stack_and_numbers_of_frames_must_agree(tmp_path: Path) -> None:
+    sizes = {}
+    for name, shape in (("map", (4, 5)), ("channel", (1, 4, 5)), ("three", (3, 4, 5)),
+                        ("two", (2, 4, 5))):  # fmt: skip
+        np.save(tmp_path / f"{name}.npy", np.ones(shape, np.float32))
+        sizes[name] = stack_size(tmp_path / f"{name}.npy")
+    assert sizes == {"map": None, "channel": None, "three": 3, "two": 2}
+    with pytest.raises(InputError, match=r"holds 3 frames but .* 2 frames"):
+        pair_frames(tmp_path / "three.npy", tmp_path / "two.npy")

@@ -8,7 +8,11 @@ from typing import Any
 
 import pytest
 
-from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS, choose_protocol
+from pnpdepth_cli.commands.evaluation.protocols import (
+    PROTOCOLS,
+    choose_protocol,
+    crop_window,
+)
 from pnpdepth_cli.errors import SizeError, UsageError
 
 # (protocol, frame, (top, bottom, left, right)) as the published evaluations cut them
@@ -27,7 +31,9 @@ WINDOWS = [
 def test_a_protocol_scores_the_window_that_was_published(
     name: str, size: tuple[int, int], window: tuple[int, int, int, int]
 ) -> None:
-    assert PROTOCOLS[name].window(size) == window
+    top, bottom, left, right = window
+    crop = PROTOCOLS[name].crop
+    assert crop_window(crop, size) == (slice(top, bottom), slice(left, right))
 
 
 def test_the_bounds_are_the_published_ones() -> None:
@@ -43,16 +49,12 @@ def test_the_bounds_are_the_published_ones() -> None:
     assert {p.average for p in PROTOCOLS.values()} == {"per-image"}
 
 
-def test_a_rectangle_is_cut_where_it_is_and_refused_where_it_is_not_inside() -> None:
-    protocol = choose_protocol("paper", crop="10,20,30,40")
-    assert protocol.window((60, 40)) == (20, 60, 10, 40)
-    with pytest.raises(SizeError, match="39×60"):
-        protocol.window((60, 39))
-
-
-def test_the_nyu_crop_is_of_640_by_480_only() -> None:
+def test_a_crop_that_does_not_fit_the_frame_is_refused() -> None:
+    assert crop_window("10,20,30,40", (60, 40)) == (slice(20, 60), slice(10, 40))
+    with pytest.raises(SizeError, match=r"--pred-crop 10,20,30,40 does not lie in .* 39×60"):
+        crop_window("10,20,30,40", (60, 39), "--pred-crop")
     with pytest.raises(SizeError, match=r"640×480 but this one is 304×228; --crop none"):
-        PROTOCOLS["nyu-eigen"].window((228, 304))
+        crop_window("nyu", (228, 304))
 
 
 REFUSED: list[tuple[str, dict[str, Any], str]] = [

@@ -192,9 +192,7 @@ def test_further_frames_are_not_watched_and_hold_no_more_memory() -> None:
             assert torch.equal(split.rear(split.front(x)), whole)
             assert split._replay is not None
             held.append([_bytes(saved.value) for saved in split._replay.outputs if saved])
-            recorder = mock.patch(
-                "pnpdepth_cli.core.split.Recorder", side_effect=AssertionError
-            )
+            recorder = mock.patch("pnpdepth_cli.core.split.Recorder", side_effect=AssertionError)
             stack.enter_context(recorder)
     assert held[0] == held[1]
     assert sum(held[0]) > 0

@@ -1,27 +1,49 @@
-"""Scores one frame: its measures, sums over pixels that can be added up, and facts for warnings."""
+"""Scores one frame: measures, sums over pixels that can be added up, and facts for warnings.
+
+Whether a predicted standard deviation is right is measured by calibration, the fraction of errors
+within k standard deviations against that of a normal distribution; and by sparsification, the mean
+absolute error of the pixels that remain when the most uncertain ones are removed, against removing
+those with the largest error (Ilg et al., ECCV 2018).
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.stats import norm
 
-from pnpdepth_cli.commands.evaluation.frame_reading import (
-    DepthKind,
-    LoadedFrame,
-    Scales,
-    load_frame,
-)
+from pnpdepth_cli.commands.evaluation.frames import Fit, LoadedFrame, Scales, load_frame
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
-from pnpdepth_cli.commands.evaluation.measures import Depth
+from pnpdepth_cli.commands.evaluation.measures import Depth, Floats
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol
-from pnpdepth_cli.commands.evaluation.scaling import Fit
-from pnpdepth_cli.commands.evaluation.uncertainty import FrameUncertainty, frame_uncertainty
 from pnpdepth_cli.core.metrics import MEASURES, error_sums, measures_of
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.depth import DepthKind
+
+ONE_SIGMA, TWO_SIGMA = (float(2 * norm.cdf(k) - 1) for k in (1, 2))
+LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, ONE_SIGMA, 0.8, 0.9, TWO_SIGMA, 0.99)
+"""Probabilities of intervals."""
+REMOVED = tuple(n / 20 for n in range(20))
+"""Fractions of the pixels."""
+
+
+class FrameUncertainty(NamedTuple):
+    """What one frame contributes, over pixels with prediction, ground truth and deviation."""
+
+    pixels: int
+    within: Floats
+    """(LEVELS,) how many errors lie within the interval of each probability."""
+    sparsification: Floats
+    """(REMOVED,) mean absolute error, metres, without the most uncertain pixels."""
+    oracle: Floats
+    """(REMOVED,) the same without the pixels of largest error."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +62,6 @@ class FrameScores:
     predicted: int = 0
     """Pixels of these with a prediction in the file; the others are empty."""
     fit: Fit | None = None
-    """How the prediction was scaled to the ground truth, if it was."""
     ratio: float = math.nan
     """Median of prediction / ground truth."""
     sparse_ratio: float = math.nan
@@ -101,25 +122,27 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Frame
     )
     if protocol.is_devkit:
         values = devkit_errors(depth, gt)
-    elif not (depth > 0).any():
-        return replace(row, error=f"{pair.prediction} holds no valid depth")
     elif not pixels:
-        return replace(row, error=f"{pair.prediction} has no depth where the ground truth is known")
+        where = " where the ground truth is known" if (depth > 0).any() else ""
+        return replace(row, error=f"{pair.prediction} holds no valid depth{where}")
     else:
         keys = (measure.key for measure in MEASURES)
         values = dict(zip(keys, measures_of(sums).tolist(), strict=True))
         values |= _additional(frame, pair, protocol, scales)
-    leaked = min(pair.sampled, pixels) or None
-    row = replace(row, values=values, ratio=_median_ratio(depth, gt))
-    if frame.sigma is not None:
-        row = replace(row, uncertainty=frame_uncertainty(depth, gt, frame.sigma))
+    leaked, sparse_ratio = min(pair.sampled, pixels) or None, math.nan
     if frame.sparse is not None:
-        given = both & (frame.sparse > 0)
         equal = np.abs(frame.sparse - gt) <= frame.tolerance + 1e-6 * gt
-        leaked = int(np.count_nonzero(given & equal))
+        leaked = int(np.count_nonzero(both & (frame.sparse > 0) & equal))
         if pair.sparse_named:
-            row = replace(row, sparse_ratio=_median_ratio(frame.sparse, gt))
-    return replace(row, leaked=leaked)
+            sparse_ratio = _median_ratio(frame.sparse, gt)
+    return replace(
+        row,
+        values=values,
+        ratio=_median_ratio(depth, gt),
+        sparse_ratio=sparse_ratio,
+        leaked=leaked,
+        uncertainty=None if frame.sigma is None else frame_uncertainty(depth, gt, frame.sigma),
+    )
 
 
 def _median_ratio(depth: Depth, gt: Depth) -> float:
@@ -152,3 +175,74 @@ def _additional(
 def filled(depth: Depth) -> Depth:
     """Returns the depth with what the development kit fills in, without its −1."""
     return np.maximum(fill_background(depth), np.float32(0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uncertainty:
+    """Calibration over the pixels of all frames, and the mean sparsification of the frames."""
+
+    frames: int
+    pixels: int
+    within_1_sigma: float
+    """Fraction of errors within one standard deviation; 0.683 if calibrated."""
+    within_2_sigma: float
+    """Within two; 0.954 if calibrated."""
+    ause: float
+    """Area between sparsification and oracle, in units of the error of all pixels; 0 is best."""
+    expected: tuple[float, ...]
+    """LEVELS, the calibration curve's."""
+    observed: tuple[float, ...]
+    """Fraction of errors within the interval of each."""
+    removed: tuple[float, ...]
+    """REMOVED, the sparsification curve's."""
+    sparsification: tuple[float, ...]
+    oracle: tuple[float, ...]
+
+
+def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty | None:
+    """Returns what a frame contributes; None if no pixel has all three.
+
+    Args:
+        depth: (H, W) predictions in metres, 0 where unknown.
+        gt: (H, W) ground truth in metres, 0 where not scored.
+        sigma: (H, W) standard deviations in metres, 0 where unknown.
+    """
+    known = (gt > 0) & (depth > 0) & (sigma > 0)
+    if not known.any():
+        return None
+    error = np.abs(depth[known].astype(np.float64) - gt[known])
+    deviation = sigma[known].astype(np.float64)
+    limits = norm.ppf((1 + np.array(LEVELS)) / 2)
+    kept = np.maximum(1, np.round((1 - np.array(REMOVED)) * len(error))).astype(int)
+
+    def curve(order: NDArray[np.intp]) -> Floats:
+        return np.asarray(np.cumsum(error[order])[kept - 1] / kept)
+
+    return FrameUncertainty(
+        pixels=len(error),
+        within=np.searchsorted(np.sort(error / deviation), limits, side="right").astype(np.float64),
+        sparsification=curve(np.argsort(deviation, kind="stable")),
+        oracle=curve(np.argsort(error)),
+    )
+
+
+def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> Uncertainty | None:
+    """Returns the calibration and sparsification of all frames; None without any."""
+    if not frames:
+        return None
+    pixels, within, by_sigma, by_error = zip(*frames, strict=True)
+    observed = np.sum(within, axis=0) / sum(pixels)
+    sparsification, oracle = np.mean(by_sigma, axis=0), np.mean(by_error, axis=0)
+    area = float(np.trapezoid(sparsification - oracle, REMOVED))
+    return Uncertainty(
+        frames=len(frames),
+        pixels=sum(pixels),
+        within_1_sigma=float(observed[LEVELS.index(ONE_SIGMA)]),
+        within_2_sigma=float(observed[LEVELS.index(TWO_SIGMA)]),
+        ause=area / float(sparsification[0]) if sparsification[0] else 0.0,
+        expected=LEVELS,
+        observed=tuple(observed.tolist()),
+        removed=REMOVED,
+        sparsification=tuple(sparsification.tolist()),
+        oracle=tuple(oracle.tolist()),
+    )

@@ -1,4 +1,7 @@
-"""Reads the depths of one frame, checks their sizes, and masks what the protocol does not score."""
+"""Reads the depths of one frame, checks their sizes, and masks what the protocol does not score.
+
+Predictions of relative networks are scaled to the ground truth of each image (`scaled`).
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,18 @@ import cv2
 import numpy as np
 
 from pnpdepth_cli.commands.evaluation.measures import Depth, Floats, Mask, MeasuredFrame
-from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol
-from pnpdepth_cli.commands.evaluation.scaling import Fit, scaled
-from pnpdepth_cli.commands.evaluation.stacks import load_stacked
+from pnpdepth_cli.commands.evaluation.pairing import FramePair, load_stacked
+from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, crop_window
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_mask, rgb_of
-from pnpdepth_cli.io.depth import DepthImage, depth_from_stored, known_metres, load_stored
+from pnpdepth_cli.io.depth import (
+    DepthImage,
+    DepthKind,
+    depth_from_stored,
+    known_metres,
+    load_stored,
+)
 from pnpdepth_cli.io.layouts import Hdf5Array
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import read_sparse
@@ -25,7 +32,8 @@ from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors import SamplePattern, sample_points
 from pnpdepth_cli.sensors.sparse import as_depth_image
 
-Size = tuple[int, int]
+Size = tuple[int, ...]
+Window = tuple[slice, slice]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,15 +48,11 @@ class Scales:
     """Which EXR channel or NPZ array holds the depth."""
 
 
-class DepthKind(NamedTuple):
-    """What kind of depth file was read."""
+class Fit(NamedTuple):
+    """depth = factor · predicted + shift, or the same in disparity (1/m)."""
 
-    source: str
-    """In words, such as `16-bit PNG ÷ 256`."""
-    scale: float | None
-    """Codes per metre; None for floats."""
-    assumed: bool
-    """True if neither the file nor the user nor the data set states the scale."""
+    factor: float
+    shift: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,11 +82,17 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
         InputError: For a file that cannot be read.
         SizeError: Where sizes differ.
     """
-    whole = _read_ground_truth(pair, protocol, scales)
-    gt = np.ascontiguousarray(pair.frame.protocol.apply(whole.values))
-    size = (gt.shape[0], gt.shape[1])
-    kinds = {"gt": _kind(whole)}
-    sparse, kind = _known_sparse(pair, protocol, scales, size)
+    frame = pair.frame
+    if isinstance(frame.gt, Hdf5Array):
+        source = f"{frame.gt.path.suffix} array"
+        whole = DepthImage(values=depth_of(frame.gt), source=source, assumed_scale=False)
+    else:
+        assert frame.gt is not None
+        scale = scales.truth if scales.truth is not None else frame.gt_scale
+        whole = _read(frame.gt, scale, scales.channel, protocol, pair.index)
+    gt = np.ascontiguousarray(frame.protocol.apply(masked(whole.values, frame.masks)))
+    kinds = {"gt": whole.kind}
+    sparse, kind = _known_sparse(pair, protocol, scales, gt.shape)
     if kind is not None:
         kinds["sparse"] = kind
     mask = _scored_mask(pair, gt, protocol)
@@ -94,14 +104,14 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
                 f"frame {pair.name} has no sparse depth file to exclude; give it with --sparse"
             )
         mask &= sparse == 0
-    frame = LoadedFrame(
+    loaded = LoadedFrame(
         depth=np.zeros_like(gt),
         gt=np.where(mask, gt, np.float32(0)),
         sparse=sparse,
         intrinsics=_intrinsics(pair, protocol, (whole.values.shape[0], whole.values.shape[1])),
         kinds=kinds,
     )
-    return frame if pair.prediction is None else _with_prediction(frame, pair, protocol, scales)
+    return loaded if pair.prediction is None else _with_prediction(loaded, pair, protocol, scales)
 
 
 def _with_prediction(
@@ -109,9 +119,10 @@ def _with_prediction(
 ) -> LoadedFrame:
     """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
     assert pair.prediction is not None
-    size = (frame.gt.shape[0], frame.gt.shape[1])
+    size = frame.gt.shape
     image = _read(pair.prediction, scales.prediction, scales.channel, protocol, pair.index)
-    values = _to_size(pair, image.values, size, protocol)
+    window = crop_window(protocol.prediction_crop or "none", size, "--pred-crop")
+    values = _to_size(pair, image.values, size, window, protocol.resize)
     depth, fit = scaled(values, frame.gt, protocol.prediction_kind, protocol.scale_by)
     if protocol.clip:
         clipped = np.clip(depth, protocol.min_depth, protocol.max_depth)
@@ -129,14 +140,14 @@ def _with_prediction(
     return replace(
         frame,
         depth=depth,
-        kinds={"prediction": _kind(image), **frame.kinds},
+        kinds={"prediction": image.kind, **frame.kinds},
         predicted=values > 0,
         fit=fit,
-        sigma=_read_sigma(pair.sigma, size, protocol) if has_sigma else None,
+        sigma=_read_sigma(pair.sigma, size, window) if has_sigma else None,
     )
 
 
-def _read_sigma(path: Path | None, size: Size, protocol: EvalProtocol) -> Depth | None:
+def _read_sigma(path: Path | None, size: Size, window: Window) -> Depth | None:
     """(H, W) the standard deviation in metres, 0 where unknown; None where it is not known."""
     if path is None:
         return None
@@ -145,42 +156,21 @@ def _read_sigma(path: Path | None, size: Size, protocol: EvalProtocol) -> Depth 
     except InputError:
         return None
     placed = np.zeros(size, np.float32)
-    top, bottom, left, right = protocol.prediction_window(size)
-    shown = placed[top:bottom, left:right]
-    if values.shape != shown.shape:
+    if placed[window].shape != values.shape:
         return None
-    shown[:] = values
+    placed[window] = values
     return placed
 
 
-def _kind(image: DepthImage) -> DepthKind:
-    return DepthKind(image.source, image.scale, image.assumed_scale)
-
-
-def _read_ground_truth(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> DepthImage:
-    """The ground truth before the data set's crop."""
-    frame = pair.frame
-    if isinstance(frame.gt, Hdf5Array):
-        values, source = masked(depth_of(frame.gt), frame.masks), f"{frame.gt.path.suffix} array"
-        return DepthImage(values=values, source=source, assumed_scale=False)
-    if frame.gt is None:
-        raise InputError(f"frame {pair.name} has no ground truth")
-    scale = scales.truth if scales.truth is not None else frame.gt_scale
-    image = _read(frame.gt, scale, scales.channel, protocol, pair.index)
-    return replace(image, values=masked(image.values, frame.masks))
-
-
-def _intrinsics(pair: FramePair, protocol: EvalProtocol, size: Size) -> Floats | None:
+def _intrinsics(pair: FramePair, protocol: EvalProtocol, size: tuple[int, int]) -> Floats | None:
     """(3, 3) of the frame as the data set cuts it, if a measure needs them and they are known."""
-    frame = pair.frame
+    frame, calibration = pair.frame, pair.frame.calibration
     if all(group.needs != "intrinsics" for group in protocol.measure_groups):
         return None
-    if frame.calib is None and frame.calibration is None:
-        return None
-    calibration = frame.calibration
     if frame.calib is not None:
         calibration = read_calibration(frame.calib, frame.camera)
-    assert calibration is not None
+    if calibration is None:
+        return None
     return frame.protocol.intrinsics_in_crop(calibration.intrinsics, size)
 
 
@@ -190,8 +180,7 @@ def _read(
     """The depth image; codes are metres × the scale, else the file's own, else the protocol's."""
     stored = load_stored(path, channel) if index is None else load_stacked(path, index)
     assumed = scale is None and stored.scale is None and stored.values.dtype.kind != "f"
-    scale = protocol.scale if assumed else scale
-    image = depth_from_stored(path, stored, scale)
+    image = depth_from_stored(path, stored, protocol.scale if assumed else scale)
     if protocol.is_devkit and image.scale is not None and stored.values.ndim == 2:
         # the development kit reads every code but 0 as a depth, the largest too
         image = replace(image, values=known_metres(stored.values / image.scale))
@@ -207,12 +196,13 @@ def _known_sparse(
     """
     if pair.sparse is None:
         return None, None
+    height, width = size
     try:
         scale = scales.sparse if scales.sparse is not None else pair.frame.sparse_scale
-        sparse = read_sparse(pair.sparse, size=size, scale=scale)
+        sparse = read_sparse(pair.sparse, size=(height, width), scale=scale)
         assumed = sparse.assumed_scale
         if assumed and protocol.scale != sparse.scale:
-            sparse = read_sparse(pair.sparse, size=size, scale=protocol.scale)
+            sparse = read_sparse(pair.sparse, size=(height, width), scale=protocol.scale)
         xy, source_size = sparse.points.xy, sparse.points.size
         if source_size != size:
             xy = pair.frame.protocol.in_crop(xy, source_size)
@@ -222,8 +212,9 @@ def _known_sparse(
         if pair.sparse_named or protocol.exclude_sparse:
             raise
         return None, None
-    inside = in_frame(xy, size)
-    points = SparsePoints(xy=xy[inside], depth=sparse.points.depth[inside], size=size)
+    inside = in_frame(xy, (height, width))
+    depth = sparse.points.depth[inside]
+    points = SparsePoints(xy=xy[inside], depth=depth, size=(height, width))
     return as_depth_image(points), DepthKind(sparse.source, sparse.scale, assumed)
 
 
@@ -249,7 +240,7 @@ def _sampled_again(pair: FramePair, sampling: dict[str, Any], ground_truth: Dept
     return as_depth_image(points)
 
 
-def image_of(pair: FramePair, size: tuple[int, ...]) -> Depth | None:
+def image_of(pair: FramePair, size: Size) -> Depth | None:
     """Returns (H, W, 3) in 0…1, the frame's image; None unless one is known and of that size.
 
     Raises:
@@ -265,9 +256,8 @@ def image_of(pair: FramePair, size: tuple[int, ...]) -> Depth | None:
 
 def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -> Mask:
     """(H, W) true where the protocol scores known ground truth."""
-    top, bottom, left, right = protocol.window((ground_truth.shape[0], ground_truth.shape[1]))
     scored = np.zeros(ground_truth.shape, bool)
-    scored[top:bottom, left:right] = True
+    scored[crop_window(protocol.crop, ground_truth.shape)] = True
     scored &= ground_truth > protocol.min_depth
     if protocol.max_depth is not None:
         scored &= ground_truth < protocol.max_depth
@@ -281,26 +271,23 @@ def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -
     return scored
 
 
-def _to_size(pair: FramePair, depth: Depth, size: Size, protocol: EvalProtocol) -> Depth:
+def _to_size(
+    pair: FramePair, depth: Depth, size: Size, window: Window, resize: str | None
+) -> Depth:
     """The depth map at the ground truth's size: as it is, in its crop, or resized if allowed."""
-    top, bottom, left, right = protocol.prediction_window(size)
-    view = (bottom - top, right - left)
-    if depth.shape != view:
-        if protocol.resize is None:
-            raise _different(
-                pair, "prediction", pair.prediction, depth.shape, view,
-                advice="; --resize nearest or bilinear scales predictions if both show the same"
-                " view, --pred-crop kb puts those of KITTI's benchmark crop in their place",
-            )  # fmt: skip
-        depth = _resized(depth, view, protocol.resize)
-    if view == size:
-        return depth
     placed = np.zeros(size, np.float32)
-    placed[top:bottom, left:right] = depth
+    view = placed[window].shape
+    if depth.shape != view and resize is None:
+        raise _different(
+            pair, "prediction", pair.prediction, depth.shape, view,
+            advice="; --resize nearest or bilinear scales predictions if both show the same"
+            " view, --pred-crop kb puts those of KITTI's benchmark crop in their place",
+        )  # fmt: skip
+    placed[window] = depth if depth.shape == view else _resized(depth, view, resize)
     return placed
 
 
-def _resized(depth: Depth, size: Size, method: str) -> Depth:
+def _resized(depth: Depth, size: Size, method: str | None) -> Depth:
     target = size[1], size[0]
     if method == "nearest":
         return cv2.resize(depth, target, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
@@ -311,15 +298,55 @@ def _resized(depth: Depth, size: Size, method: str) -> Depth:
 
 
 def _different(
-    pair: FramePair,
-    what: str,
-    path: Path | None,
-    shape: tuple[int, ...],
-    size: tuple[int, ...],
-    *,
-    advice: str = "",
+    pair: FramePair, what: str, path: Path | None, shape: Size, size: Size, *, advice: str = ""
 ) -> SizeError:
     return SizeError(
         f"{what} {path} is {shape[1]}×{shape[0]} but the ground truth {pair.frame.gt} is"
         f" {size[1]}×{size[0]}{advice}"
     )
+
+
+def scaled(values: Depth, gt: Depth, kind: str, scale_by: str) -> tuple[Depth, Fit | None]:
+    """Returns the prediction in metres, fitted to the ground truth of its image, and the fit.
+
+    By the median: Zhou et al. 2017, monodepth2; affine: least squares in depth, Marigold (Ke et al.
+    2024); affine-disparity: least squares in 1/m, MiDaS (Ranftl et al. 2020); log: the mean of the
+    logarithm, Eigen et al. 2014. A fitted value that is not above 0 becomes unknown (0).
+
+    Args:
+        values: (H, W) predictions of the kind, 0 where unknown.
+        gt: (H, W) ground truth in metres, 0 where it is not scored.
+        kind: One of choices.PREDICTION_KINDS.
+        scale_by: One of choices.SCALINGS.
+
+    Raises:
+        InputError: If fewer than two pixels have both, or the prediction is constant.
+    """
+    depth = _inverse(values) if kind == "disparity" else values
+    if scale_by == "none":
+        return depth, None
+    both = (gt > 0) & (depth > 0)
+    if np.count_nonzero(both) < 2:
+        raise InputError(f"--scale-by {scale_by} needs 2 pixels with ground truth and prediction")
+    in_disparity = scale_by == "affine-disparity"
+    if in_disparity:
+        depth = values if kind == "disparity" else _inverse(depth)
+    p, g = depth[both].astype(np.float64), gt[both].astype(np.float64)
+    if scale_by == "median":
+        fit = Fit(float(np.median(g) / np.median(p)))
+    elif scale_by == "log":
+        fit = Fit(float(np.exp((np.log(g) - np.log(p)).mean())))
+    elif not (variance := float(p.var())):
+        raise InputError("the prediction is constant, so that no scale and shift can be fitted")
+    else:
+        target = 1 / g if in_disparity else g
+        factor = float(((p - p.mean()) * (target - target.mean())).mean()) / variance
+        fit = Fit(factor, float(target.mean() - factor * p.mean()))
+    fitted = depth * np.float64(fit.factor) + fit.shift
+    result = np.where((depth > 0) & (fitted > 0), fitted, 0).astype(np.float32)
+    return _inverse(result) if in_disparity else result, fit
+
+
+def _inverse(values: Depth) -> Depth:
+    known = values > 0
+    return np.where(known, 1 / np.where(known, values, 1).astype(np.float64), 0).astype(np.float32)

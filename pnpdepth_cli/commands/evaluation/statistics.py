@@ -1,0 +1,282 @@
+"""How sure means over frames are: independent clusters, bootstrap, permutations, Holm's correction.
+
+Errors of neighbouring frames of a video are alike, so whole clusters of frames are resampled. The
+bootstrap is studentised, which few values of skewed errors need (coverage in
+docs/guides/evaluation.md) and scipy.stats does not have.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+
+from pnpdepth_cli.core.metrics import MEASURES, measures_of
+
+Floats = NDArray[np.float64]
+
+LEVEL = 0.95
+MIN_CLUSTERS = 5
+"""Fewer give no interval: with lognormal errors (σ 0.5) even a studentised one misses too often."""
+BLOCK_BIAS = 0.1
+"""Fraction of the variance of a mean that blocks of a single sequence may miss."""
+MAX_BLOCKS = 10
+"""Most blocks of a single sequence. Few long blocks stay independent also where the correlation is
+not that of a first-order autoregression, at a small loss of power (Ibragimov and Müller 2010)."""
+
+_FRAME_NUMBER = re.compile(r"(?:^|[_\-/])\d+(?:_image_\d+)?$")
+_STEP = 1e-5
+"""Of the numerical derivative, relative to the sums; its error is near 1e-10."""
+_CELLS = 1 << 21
+"""Numbers held at once, so that memory stays bounded for any number of clusters."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clusters:
+    """A partition of the frames into clusters that count as independent."""
+
+    ids: NDArray[np.int64]
+    """(N,) the cluster of each frame, from 0 to count − 1."""
+    unit: str
+    """What a cluster is, in the plural."""
+
+    @property
+    def count(self) -> int:
+        """How many clusters there are."""
+        return int(self.ids.max()) + 1
+
+    def describe(self) -> str:
+        """Returns text such as `12 groups of frames`."""
+        return f"{self.count:,} {self.unit}"
+
+
+def groups_by_name(names: Sequence[str]) -> list[str]:
+    """Returns the sequence of each frame: its name before the frame number, or else its folder.
+
+    `drive_0002_sync_0000000008_image_02` is of `drive_0002_sync`, and `office/0012` of `office`.
+    Unless all names end in a number, only folders make groups.
+    """
+    stems = [_FRAME_NUMBER.sub("", name) for name in names]
+    if all(stem != name for stem, name in zip(stems, names, strict=True)):
+        return stems
+    return [name.rpartition("/")[0] for name in names]
+
+
+def find_clusters(groups: Sequence[str], series: Floats, *, grouped: bool = True) -> Clusters:
+    """Returns the groups; for a single group with correlated errors, blocks of it.
+
+    Args:
+        groups: The sequence of each of N frames.
+        series: (N, M) what is averaged, in the order of the frames.
+        grouped: False makes every frame a cluster.
+    """
+    names, frames = list(dict.fromkeys(groups)), len(groups)
+    if grouped and 1 < len(names) < frames:
+        ids = np.array([names.index(group) for group in groups])
+        return Clusters(ids=ids, unit="groups of frames")
+    length = block_length(series) if grouped and len(names) == 1 else 1
+    if length == 1:
+        return Clusters(ids=np.arange(frames), unit="frames")
+    blocks = max(1, min(MAX_BLOCKS, frames // length))
+    return Clusters(
+        ids=np.arange(frames) * blocks // frames,
+        unit=f"blocks of about {round(frames / blocks):,} consecutive frames of one sequence,"
+        " as their errors are correlated",
+    )
+
+
+def block_length(series: Floats) -> int:
+    """Returns the length of blocks whose means are nearly independent; 1 if frames already are.
+
+    Blocks of length L of a first-order autoregression with lag-1 correlation ρ understate the
+    variance of the mean by the fraction 2ρ/(1 − ρ²)/L for large L, which is kept at BLOCK_BIAS.
+    ρ is the median over the columns without NaN, corrected for its bias (Kendall 1954); a
+    correlation below its standard error counts as none.
+
+    Args:
+        series: (N, M) in order of time.
+    """
+    frames = len(series)
+    if frames < MIN_CLUSTERS:
+        return 1
+    centred = series - series.mean(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        lag_one = (centred[1:] * centred[:-1]).sum(axis=0) / (centred**2).sum(axis=0)
+        correlation = float(np.nanmedian(lag_one))
+    if math.isnan(correlation) or correlation <= 1 / math.sqrt(frames):
+        return 1
+    correlation = min(correlation + (1 + 3 * correlation) / frames, 0.99)
+    return min(frames, math.ceil(2 * correlation / (1 - correlation**2) / BLOCK_BIAS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameTable:
+    """The scores of N frames as sums, from which the means of any weighting of them follow."""
+
+    sums: Floats
+    """(N, S)"""
+    mean_of: Callable[[Floats], Floats]
+    """From sums (…, S) to means (…, M); unchanged where the sums are multiplied."""
+
+    @classmethod
+    def of_frames(cls, values: Floats) -> FrameTable:
+        """Every frame counts alike; (N, M) with NaN where a frame lacks a measure."""
+
+        def mean_of(sums: Floats) -> Floats:
+            total, count = np.split(sums, 2, axis=-1)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                return np.asarray(total / count)
+
+        known = np.isfinite(values)
+        return cls(sums=np.hstack([np.where(known, values, 0.0), known]), mean_of=mean_of)
+
+    @classmethod
+    def of_pixels(cls, sums: Floats, keys: Sequence[str]) -> FrameTable:
+        """Every pixel counts alike; (N, len(SUMS)), and the measures of MEASURES that are meant."""
+        kept = [number for number, measure in enumerate(MEASURES) if measure.key in keys]
+        return cls(sums=sums, mean_of=lambda s: measures_of(torch.from_numpy(s)).numpy()[..., kept])
+
+    def mean(self) -> Floats:
+        """Returns (M,) the means over all frames; NaN for a measure that none has."""
+        return self.mean_of(self.sums.sum(axis=0))
+
+    def totals(self, clusters: Clusters) -> Floats:
+        """Returns (G, S) the sums of each cluster."""
+        totals = np.zeros((clusters.count, self.sums.shape[1]))
+        np.add.at(totals, clusters.ids, self.sums)
+        return totals
+
+
+def gain(before: Floats, after: Floats, better: Floats) -> Floats:
+    """Returns (…, M) the change in per cent of `before`; NaN where that is no number.
+
+    Args:
+        before: (…, M)
+        after: (…, M)
+        better: (M,) 1 for measures of which higher is better, else −1.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        change = np.where(before == after, 0.0, 100 * better * (after - before) / np.abs(before))
+    return np.where(np.isfinite(change), change, math.nan)
+
+
+def interval(
+    statistic: Callable[..., Floats],
+    tables: Sequence[FrameTable],
+    clusters: Clusters,
+    resamples: int,
+    seed: int,
+) -> tuple[Floats, Floats]:
+    """Returns (M,), (M,): the ends of the 95 % interval of statistic(*means of the tables).
+
+    Each end is that of the bootstrap-t (Efron and Tibshirani 1993, section 12.5) or of Student's t,
+    whichever is farther out: the first follows the skewness of the errors, the second the error of
+    a standard error from few clusters. Standard errors are linearised in the sums (infinitesimal
+    jackknife). NaN for a measure that fewer than MIN_CLUSTERS clusters have.
+
+    Args:
+        statistic: From means (…, M) of each table to (…, M); differentiable.
+        tables: Of the same frames and measures; clusters are resampled whole.
+        clusters: Of the frames.
+        resamples: How many bootstrap samples are drawn.
+        seed: Of the drawing.
+    """
+    totals = np.hstack([table.totals(clusters) for table in tables])  # (G, S)
+    ends = np.cumsum([table.sums.shape[1] for table in tables])[:-1]
+
+    def means(sums: Floats) -> list[Floats]:
+        parts = np.split(sums, ends, axis=-1)
+        return [table.mean_of(part) for table, part in zip(tables, parts, strict=True)]
+
+    held = np.isfinite(means(totals)).all(axis=0).sum(axis=0)
+    steps = np.maximum(_STEP * np.abs(totals).sum(axis=0), 1e-300)
+
+    def linearised(counts: Floats) -> tuple[Floats, Floats]:
+        """(B, M) the statistic where clusters count as (B, G), and (B, M) its standard errors."""
+        sums = counts @ totals
+        ahead, behind = (
+            statistic(*means(sums[:, None] + sign * np.diag(steps))) for sign in (1, -1)
+        )
+        slopes = (ahead - behind) / (2 * steps[:, None])  # (B, S, M)
+        with np.errstate(invalid="ignore"):
+            variance = np.einsum("bg,bgm->bm", counts, (totals @ slopes) ** 2)
+        return statistic(*means(sums)), np.sqrt(variance)
+
+    size = len(totals)
+    value, error = (row[0] for row in linearised(np.ones((1, size))))
+    error = np.where(error > 1e-8 * np.maximum(np.abs(value), 1.0), error, 0.0)
+    generator, ratios = np.random.default_rng(seed), []
+    batch = max(1, _CELLS // (max(size, len(steps)) * len(steps)))
+    for start in range(0, resamples, batch):
+        count = min(batch, resamples - start)
+        drawn = generator.multinomial(size, np.full(size, 1 / size), count).astype(np.float64)
+        values, errors = linearised(drawn)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # a resample without variance says nothing of the ratio's distribution
+            ratios.append(np.where(errors > 1e-6 * error, (values - value) / errors, math.nan))
+    all_ratios = np.concatenate(ratios)
+    all_ratios[:, np.isnan(all_ratios).all(axis=0)] = 0.0
+    tail = (1 - LEVEL) / 2
+    low, high = np.nanquantile(all_ratios, [tail, 1 - tail], axis=0)
+    dof = np.maximum(held - 1, 1)
+    student = stats.t.ppf(1 - tail, dof) * np.sqrt((dof + 1) / dof)
+    error = np.where(held >= MIN_CLUSTERS, error, math.nan)
+    return value - np.maximum(high, student) * error, value - np.minimum(low, -student) * error
+
+
+def swap_p_values(
+    first: FrameTable, other: FrameTable, clusters: Clusters, resamples: int, seed: int
+) -> tuple[Floats, bool]:
+    """Returns (M,) two-sided p-values of paired runs, and whether they are exact.
+
+    The p-value is the fraction of swaps of the two runs, cluster by cluster, after which the means
+    differ at least as much as observed (Good 2005, chapter 3). All 2^G swaps are tried if they are
+    at most `resamples`; else so many random ones, with the observed one counted in.
+    """
+    a, b = first.totals(clusters), other.totals(clusters)
+    count = len(a)
+
+    def difference(swapped: Floats) -> Floats:
+        """(B, M) the differences of means with the clusters swapped where (B, G) is 1."""
+        moved = swapped @ (b - a)
+        return np.abs(other.mean_of(b.sum(axis=0) - moved) - first.mean_of(a.sum(axis=0) + moved))
+
+    observed = difference(np.zeros((1, count)))[0]
+
+    def differs_as_much(swapped: Floats, _: Floats, axis: int) -> Floats:
+        # rounding must not make an equal difference look smaller than the observed one
+        return np.asarray(difference(np.atleast_2d(swapped)) >= observed * (1 - 1e-9), np.float64)
+
+    exact = count < 60 and 2**count <= resamples
+    if count < 2:
+        return np.full(len(observed), math.nan), exact
+    result = stats.permutation_test(
+        (np.zeros(count), np.ones(count)),
+        differs_as_much,
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=np.inf if exact else resamples,
+        batch=max(1, _CELLS // count),
+        alternative="greater",
+        axis=-1,
+        random_state=np.random.default_rng(seed),
+    )
+    return np.where(np.isfinite(observed), np.ravel(result.pvalue), math.nan), exact
+
+
+def holm(p_values: Floats) -> Floats:
+    """Returns (M,) p-values adjusted for testing M hypotheses (Holm 1979); NaN stays NaN."""
+    order = np.argsort(p_values)
+    order = order[np.isfinite(p_values[order])]
+    adjusted = np.full(len(p_values), math.nan)
+    steps = p_values[order] * np.arange(len(order), 0, -1)
+    adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return adjusted

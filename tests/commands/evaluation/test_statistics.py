@@ -1,0 +1,226 @@
+"""Clusters, intervals and p-values against textbooks, scipy.stats and brute force; Holm by hand."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.signal import lfilter
+
+from pnpdepth_cli.commands.evaluation import statistics
+from pnpdepth_cli.commands.evaluation.statistics import (
+    Clusters,
+    FrameTable,
+    block_length,
+    find_clusters,
+    gain,
+    groups_by_name,
+    holm,
+    swap_p_values,
+)
+from pnpdepth_cli.core.metrics import SUMS, error_sums, score
+
+
+def clusters_of(ids: list[int] | np.ndarray) -> Clusters:
+    return Clusters(ids=np.asarray(ids), unit="frames")
+
+
+def interval(table: FrameTable, resamples: int, seed: int = 0, ids: object = None) -> np.ndarray:
+    """(2, M) the ends of the interval of the means."""
+    clusters = clusters_of(np.arange(len(table.sums)) if ids is None else ids)
+    return np.stack(statistics.interval(lambda mean: mean, [table], clusters, resamples, seed))
+
+
+def of_frames(*rows: list[float]) -> FrameTable:
+    return FrameTable.of_frames(np.array(rows, float))
+
+
+def test_a_mean_counts_frames_alike_or_pixels_alike_and_skips_what_is_lacking() -> None:
+    table = of_frames([1, 10, np.nan], [3, np.nan, np.nan])
+    assert table.mean() == pytest.approx([2, 10, np.nan], nan_ok=True)
+    totals = of_frames([1], [3], [6]).totals(clusters_of([1, 0, 1]))
+    assert totals.tolist() == [[3, 1], [7, 2]]
+    generator = torch.Generator().manual_seed(0)
+    frames = [torch.rand(2, n, generator=generator) + 1 for n in (3, 50)]
+    sums = np.array([error_sums(p, g)[0].tolist() for p, g in frames])
+    expected = score(*torch.cat(frames, dim=1))
+    mean = FrameTable.of_pixels(sums, ["rmse", "delta1"]).mean()
+    assert mean == pytest.approx([expected.rmse, expected.delta1], rel=1e-12)
+
+
+def test_each_end_is_the_farther_one_of_bootstrap_t_and_students_t() -> None:
+    values = np.random.default_rng(2).lognormal(0, 0.5, 9)
+    counts = np.random.default_rng(7).multinomial(9, np.full(9, 1 / 9), 3000)
+    drawn = np.array([np.repeat(values, count) for count in counts])
+    kept = drawn[drawn.std(axis=1) > 1e-6]
+    ratios = (kept.mean(axis=1) - values.mean()) / (kept.std(axis=1) / 3)
+    low, high = np.quantile(ratios, [0.025, 0.975])
+    own = values.std() / 3
+    bootstrap = (values.mean() - high * own, values.mean() - low * own)
+    student = stats.t.interval(0.95, 8, loc=values.mean(), scale=stats.sem(values))
+    expected = (min(bootstrap[0], student[0]), max(bootstrap[1], student[1]))
+    assert expected == pytest.approx((student[0], bootstrap[1]))  # the errors are skewed
+    bounds = interval(of_frames(*values[:, None]), 3000, seed=7)
+    assert np.ravel(bounds) == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_standard_error_of_a_pooled_measure_is_the_delta_methods() -> None:
+    sums = np.random.default_rng(3).uniform(1, 2, (300, len(SUMS)))
+    low, high = interval(FrameTable.of_pixels(sums, ["rmse"]), 4000)
+    squared, pixels = sums[:, SUMS.index("squared")], sums[:, SUMS.index("pixels")]
+    mean = squared.sum() / pixels.sum()
+    error = np.sqrt(((squared - mean * pixels) ** 2).sum()) / pixels.sum() / (2 * np.sqrt(mean))
+    assert (high[0] - low[0]) / 2 == pytest.approx(1.96 * error, rel=0.05)
+
+
+def test_clusters_of_equal_frames_are_as_sure_as_one_frame_each() -> None:
+    values = np.random.default_rng(2).lognormal(0, 0.5, (9, 1))
+    repeated = of_frames(*np.repeat(values, 20, axis=0))
+    bounds = interval(repeated, 500, ids=np.repeat(np.arange(9), 20))
+    assert bounds == pytest.approx(interval(of_frames(*values), 500))
+    assert interval(of_frames(*[[2.5]] * 6), 50).tolist() == [[2.5], [2.5]]
+
+
+def test_lognormal_errors_of_eight_frames_are_covered() -> None:
+    draws = np.random.default_rng(0).lognormal(-0.125, 0.5, (30, 8, 20))  # of mean 1, σ 0.5
+    ends = [interval(of_frames(*rows), 500, seed=trial) for trial, rows in enumerate(draws)]
+    covered = float(np.mean([(low <= 1) & (high >= 1) for low, high in ends]))
+    assert covered >= 0.93 - 3 * np.sqrt(0.93 * 0.07 / 600)
+
+
+def test_the_interval_is_of_the_seed_and_the_same_in_any_batches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    table = FrameTable.of_frames(np.random.default_rng(1).random((7, 2)))
+    once = interval(table, 100, seed=3)
+    assert not np.array_equal(once, interval(table, 100, seed=4))
+    monkeypatch.setattr(statistics, "_CELLS", 30)
+    assert interval(table, 100, seed=3) == pytest.approx(once, rel=1e-12)
+
+
+def test_the_gain_is_in_per_cent_of_the_first_and_its_interval_narrows_with_equal_gains() -> None:
+    before = np.random.default_rng(0).lognormal(0, 1, (9, 2))
+    noise = np.random.default_rng(1).uniform(0.3, 0.7, before.shape)
+    first, half, noisy = (FrameTable.of_frames(before * by) for by in (1, 0.5, noise))
+    better, clusters = np.array([-1.0, 1.0]), clusters_of(np.arange(9))
+
+    def gains(other: FrameTable) -> np.ndarray:
+        """(3, 2) the gain and the ends of its interval."""
+        between = statistics.interval(
+            lambda a, b: gain(a, b, better), [first, other], clusters, 500, 0
+        )
+        return np.stack([gain(first.mean(), other.mean(), better), *between])
+
+    assert gains(half) == pytest.approx(np.array([[50, -50]] * 3), abs=1e-6)
+    value, low, high = gains(noisy)
+    assert (low < value - 1).all()
+    assert (value + 1 < high).all()
+    assert np.isnan(gain(np.zeros(2), np.array([1.0, np.nan]), better)).all()
+
+
+def p_value_of(changes: np.ndarray, resamples: int) -> tuple[float, bool]:
+    """Of runs whose frames differ by these."""
+    tables = (FrameTable.of_frames(rows[:, None]) for rows in (np.zeros_like(changes), changes))
+    clusters = clusters_of(np.arange(len(changes)))
+    (p_value,), exact = swap_p_values(*tables, clusters, resamples, seed=0)
+    return p_value, exact
+
+
+@given(st.lists(st.integers(-5, 5), min_size=2, max_size=7))
+def test_the_exact_p_value_is_the_fraction_of_all_swaps_that_differ_as_much(
+    changes: list[int],
+) -> None:
+    values = np.array(changes, float)
+    swaps = [abs(np.dot(signs, values)) for signs in product((1, -1), repeat=len(values))]
+    expected = np.mean([swap >= abs(values.sum()) - 1e-9 for swap in swaps])
+    assert p_value_of(values, 1000) == (expected, True)
+
+
+def test_the_sampled_p_value_is_near_the_exact_one_and_never_zero() -> None:
+    values = np.random.default_rng(0).normal(0.4, 1, 12)
+    (exact_p, exact), (sampled_p, sampled) = (p_value_of(values, n) for n in (4096, 4095))
+    assert (exact, sampled) == (True, False)
+    assert sampled_p == pytest.approx(exact_p, abs=0.03)
+    assert p_value_of(np.ones(100), 999) == (1 / 1000, False)
+
+
+def test_a_measure_that_some_frames_lack_has_the_interval_of_the_others() -> None:
+    rows = np.random.default_rng(0).lognormal(0, 0.5, (12, 3))
+    rows[:4, 1] = np.nan
+    rows[:8, 2] = np.nan  # four frames are too few
+    low, high = interval(FrameTable.of_frames(rows), 4000, seed=2)
+    for column, frames in ((0, rows[:, :1]), (1, rows[4:, 1:2])):
+        alone = np.ravel(interval(FrameTable.of_frames(frames), 4000, seed=2))
+        width = alone[1] - alone[0]
+        assert [low[column], high[column]] == pytest.approx(
+            alone, abs=(0.2 if column else 1e-9) * width
+        )
+        assert low[column] < frames.mean() - width / 10
+        assert high[column] > frames.mean() + width / 10
+    assert np.isnan([low[2], high[2]]).all()
+    first, worse = (FrameTable.of_frames(rows * by) for by in (1, 1.5))
+    p_values, exact = swap_p_values(first, worse, clusters_of(np.arange(12)), 4096, 0)
+    assert exact
+    assert p_values == pytest.approx([2 / 2**12, 2 / 2**8, 2 / 2**4])
+    nothing = FrameTable.of_frames(np.full((5, 1), np.nan))
+    assert np.isnan(swap_p_values(nothing, nothing, clusters_of(np.arange(5)), 50, 0)[0]).all()
+
+
+def test_holm_multiplies_the_smallest_most_and_keeps_the_order() -> None:
+    adjusted = holm(np.array([0.01, 0.04, np.nan, 0.03]))
+    assert adjusted == pytest.approx([0.03, 0.06, np.nan, 0.06], nan_ok=True)
+    assert holm(np.array([0.9, 0.8])).tolist() == [1.0, 1.0]
+
+
+NAMES = [
+    (["2011_09_26_drive_0002_sync_0000000008_image_02"], ["2011_09_26_drive_0002_sync"]),
+    (["seq-01_000012", "office/0012", "office/frame_0012"], ["seq-01", "office", "office/frame"]),
+    (["0012", "1305031102.175304"], ["", ""]),
+    (["left", "run/left"], ["", "run"]),
+    (["a", "b_1", "office/c_2"], ["", "", "office"]),  # one has no number
+]
+
+
+@pytest.mark.parametrize(("names", "groups"), NAMES)
+def test_the_group_of_a_frame_is_its_name_before_the_frame_number(
+    names: list[str], groups: list[str]
+) -> None:
+    assert groups_by_name(names) == groups
+
+
+def autoregression(correlation: float, frames: int, seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(size=(frames + 200, 1))
+    return np.asarray(lfilter([1.0], [1.0, -correlation], noise, axis=0)[200:])
+
+
+def test_groups_are_clusters_in_the_order_of_the_frames() -> None:
+    clusters = find_clusters(["b", "a", "b", "c"], np.zeros((4, 1)))
+    assert clusters.ids.tolist() == [0, 1, 0, 2]
+    assert clusters.describe() == "3 groups of frames"
+    assert find_clusters(["b", "a"], np.zeros((2, 1))).describe() == "2 frames"
+
+
+def test_one_sequence_of_independent_frames_has_a_cluster_for_each() -> None:
+    lengths = [block_length(autoregression(0.0, 100, seed)) for seed in range(40)]
+    assert np.mean([length == 1 for length in lengths]) >= 0.7  # 84 % in the long run
+    assert find_clusters([""] * 6, np.arange(6.0)[:, None] % 2).describe() == "6 frames"
+
+
+def test_one_correlated_sequence_is_cut_into_a_few_long_blocks() -> None:
+    series = autoregression(0.5, 1000, 0)
+    # 2ρ/(1 − ρ²)/L of the variance is missing: 1.33/L, a tenth at 13.3
+    length = block_length(series)
+    assert length == pytest.approx(14, abs=3)
+    clusters = find_clusters(["drive"] * 1000, series)
+    assert (np.diff(clusters.ids) >= 0).all()
+    assert np.bincount(clusters.ids).tolist() == [100] * 10
+    assert "blocks of about 100 consecutive frames" in clusters.describe()
+    short = autoregression(0.5, 60, 0)
+    assert find_clusters(["drive"] * 60, short).count == 60 // block_length(short) < 6
+    assert block_length(np.column_stack([series, np.full(1000, np.nan)])) == length
+    assert block_length(np.full((200, 1), np.nan)) == block_length(np.ones((200, 1))) == 1
