@@ -91,13 +91,6 @@ def test_a_failed_frame_is_reported_and_the_others_are_scored(
     assert "1 with a faulty file" in (result.unscored() or "")
 
 
-def test_where_nothing_can_be_scored_the_first_reason_is_the_error(two: Path) -> None:
-    for name in ("a_depth.npy", "ü b_depth.npy"):
-        depth_file(two / "out" / name, [[0, 0]])
-    with pytest.raises(InputError, match=r"no frame could be scored; the first: .*a_depth\.npy"):
-        scored(two)
-
-
 def test_two_single_files_raise_their_error(two: Path) -> None:
     prediction, gt = two / "out" / "a_depth.npy", two / "gt" / "a.npy"
     result = evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
@@ -201,20 +194,6 @@ def test_missing_pixels_are_skipped_clamped_or_refused(two: Path) -> None:
     refused = scored(two, missing="fail", **bounds)
     assert [frame.name for frame in refused.failed] == ["ü b"]
     assert "--missing fail refuses" in (refused.frames[1].error or "")
-
-
-def test_protocols_of_papers_score_empty_predictions_as_the_lower_bound(tmp_path: Path) -> None:
-    gt = np.full((20, 20), 4, np.float32)
-    prediction = gt.copy()
-    prediction[:, ::2] = 0
-    depth_file(tmp_path / "out" / "a.npy", prediction)
-    depth_file(tmp_path / "gt" / "a.npy", gt)
-    # BTS: pred[pred < min_depth] = min_depth, and all masked ground truth is scored
-    garg = scored(tmp_path, protocol="garg")
-    assert garg.mean["mre"] == pytest.approx(0.5 * (4 - 1e-3) / 4, rel=0.12)
-    assert garg.frames[0].pixels == garg.frames[0].known
-    assert scored(tmp_path, protocol="garg", missing="skip").mean["mre"] == 0
-    assert scored(tmp_path, protocol="garg", min_depth=0.0).mean["mre"] == 0
 
 
 def test_few_groups_of_frames_have_no_interval_but_a_note(tmp_path: Path) -> None:
@@ -438,6 +417,9 @@ REFUSED = [
     ({"scales": Scales(truth=0.0)}, "--gt-scale"),
     ({"scales": Scales(prediction=math.nan)}, "--pred-scale"),
     ({"workers": 0}, "--workers"),
+    ({"groups": ("edge",)}, "unknown group of measures 'edge'; did you mean 'edges'"),
+    ({"groups": ("area",), "average": "pooled"}, "--average pooled does not apply"),
+    ({"groups": ("area",), "protocol": "kitti-devkit"}, "--measures does not apply to kitti-"),
     ({"resamples": -1}, "--bootstrap"),
 ]
 
@@ -489,15 +471,6 @@ def test_measures_of_the_scene_need_intrinsics(sequences: Path) -> None:
     assert 0 < result.mean["normal_angle"] < 90
     with pytest.raises(InputError, match="--measures distance needs the sparse depth of frame"):
         scored(sequences, groups=("distance",))
-
-
-def test_unknown_and_unfitting_measures_are_refused(two: Path) -> None:
-    with pytest.raises(UsageError, match="unknown group of measures 'edge'; did you mean 'edges'"):
-        scored(two, groups=("edge",))
-    with pytest.raises(UsageError, match="--average pooled does not apply"):
-        scored(two, groups=("area",), average="pooled")
-    with pytest.raises(UsageError, match="--measures does not apply to kitti-devkit"):
-        scored(two, groups=("area",), protocol="kitti-devkit")
 
 
 def test_points_sampled_from_the_ground_truth_are_excluded_as_they_were_drawn(
