@@ -26,14 +26,6 @@ from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
-_SCALE_OPTIONS = {
-    "prediction": "pred_scale",
-    "truth": "gt_scale",
-    "sparse": "sparse_scale",
-    "channel": "channel",
-}
-"""Options by the field of `Scales` that they set."""
-
 
 def _thresholds(text: str) -> tuple[float, float, float]:
     """Returns the thresholds of δ1…δ3 from one number, which is raised to powers, or from three."""
@@ -52,54 +44,57 @@ def _choice(flag: str, names: Sequence[str], text: str) -> Callable[[Any], Any]:
     return click.option(flag, field, type=click.Choice(names), help=text)
 
 
+def _option(flags: str, metavar: str | None, text: str, **details: Any) -> Callable[[Any], Any]:
+    return click.option(*flags.split(), metavar=metavar, help=text, **details)
+
+
+_FLAGS_OF_INPUT = (
+    *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--pred-crop"),
+    *("--mask", "--calib", "--layout-protocol", "--sparse", "--sparse-scale", "--workers"),
+)
+_FLAGS_OF_PROTOCOL = (
+    *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average", "--delta"),
+    *("--exclude-sparse", "--missing", "--scale-by", "--bootstrap", "--no-groups", "--seed"),
+    "--measures",
+)
+_FLAGS_OF_OUTPUT = (
+    *("--csv", "--markdown", "--latex", "--columns", "--html", "--overwrite", "--json"),
+)
+_COMMON = (
+    *("--protocol", "--min-depth", "--max-depth", "--crop", "--average", "--gt-scale"),
+    *("--pred-scale", "--sparse", "--resize", *_FLAGS_OF_OUTPUT),
+)
+
+
 @click.command(
     name="eval",
     short_help="Score depth files against ground truth.",
     cls=grouped_help.GroupedCommand,
-    common=frozenset(
-        (
-            *("--protocol", "--min-depth", "--max-depth", "--crop", "--average", "--gt-scale"),
-            *("--pred-scale", "--sparse", "--csv", "--markdown", "--latex", "--html", "--json"),
-            *("--overwrite", "--resize"),
-        )
-    ),
-    groups={
-        "Input": (
-            *("--pred-scale", "--gt-scale", "--pred-kind", "--channel", "--resize", "--pred-crop"),
-            *("--mask", "--calib", "--layout-protocol", "--sparse", "--sparse-scale", "--workers"),
-        ),
-        "Protocol": (
-            *("--protocol", "--min-depth", "--max-depth", "--clip", "--crop", "--average"),
-            *("--delta", "--exclude-sparse", "--missing", "--scale-by", "--bootstrap"),
-            *("--no-groups", "--seed", "--measures"),
-        ),
-        "Output": (
-            *("--csv", "--markdown", "--latex", "--columns", "--html", "--overwrite", "--json"),
-        ),
-    },
+    common=frozenset(_COMMON) - {"--columns"},
+    groups={"Input": _FLAGS_OF_INPUT, "Protocol": _FLAGS_OF_PROTOCOL, "Output": _FLAGS_OF_OUTPUT},
 )
 @click.argument("prediction", type=options.FILE, metavar="PRED")
 @click.argument("ground_truth", type=options.FILE, metavar="GT")
-@click.option(
+@_option(
     "--protocol",
+    None,
+    "Preset of the options below.",
     type=click.Choice(EVAL_PROTOCOLS),
     default="paper",
     show_default=True,
-    help="Preset of the options below.",
 )
-@click.option("--min-depth", type=float, metavar="M", help="Score ground truth above M metres.")
-@click.option("--max-depth", type=float, metavar="M", help="Score ground truth below M metres.")
-@click.option("--clip/--no-clip", default=None, help="Clip predictions to these bounds.")
-@click.option("--crop", metavar="NAME|X,Y,W,H", help="none, nyu, eigen, garg, or a rectangle.")
-@click.option("--mask", type=options.FILE, help="Mask image, or folder with a mask per frame.")
+@_option("--min-depth", "M", "Score ground truth above M metres.", type=float)
+@_option("--max-depth", "M", "Score ground truth below M metres.", type=float)
+@_option("--clip/--no-clip", None, "Clip predictions to these bounds.", default=None)
+@_option("--crop", "NAME|X,Y,W,H", "none, nyu, eigen, garg, or a rectangle.")
+@_option("--mask", None, "Mask image, or folder with a mask per frame.", type=options.FILE)
 @_choice("--average", AVERAGES, "Mean over images, or over all pixels of all images.")
-@click.option(
-    "--delta",
-    "thresholds",
-    type=_thresholds,
-    metavar="D|D1,D2,D3",
-    help="Thresholds of δ1…δ3: D, D², D³, or D1, D2, D3. The paper's KITTI rows use 1.01."
+@_option(
+    "--delta thresholds",
+    "D|D1,D2,D3",
+    "Thresholds of δ1…δ3: D, D², D³, or D1, D2, D3. The paper's KITTI rows use 1.01."
     "  [default: 1.25]",
+    type=_thresholds,
 )
 @_choice(
     "--missing",
@@ -113,64 +108,52 @@ def _choice(flag: str, names: Sequence[str], text: str) -> Callable[[Any], Any]:
     "Scale each image to its ground truth, for relative predictions.  [default: none]",
 )
 @_choice("--pred-kind", PREDICTION_KINDS, "What predictions are.  [default: depth]")
-@click.option(
-    "--measures",
-    "groups",
+@_option(
+    "--measures groups",
+    "GROUP,…",
+    f"Additional measures: {', '.join(MEASURE_GROUPS)}.",
     type=names_in,
-    metavar="GROUP,…",
-    help=f"Additional measures: {', '.join(MEASURE_GROUPS)}.",
 )
-@click.option(
+@_option(
     "--calib",
+    None,
+    "Calibration or K of all frames, for --measures normals and cloud.  [default: the data set's]",
     type=options.FILE,
-    help="Calibration or K of all frames, for --measures normals and cloud.  [default: the data"
-    " set's]",
 )
-@click.option("--pred-scale", type=float, metavar="S", help="Integer predictions hold metres × S.")
-@click.option("--gt-scale", type=float, metavar="S", help="Integer ground truth holds metres × S.")
+@_option("--pred-scale", "S", "Integer predictions hold metres × S.", type=float)
+@_option("--gt-scale", "S", "Integer ground truth holds metres × S.", type=float)
 @options.channel
 @_choice("--resize", RESIZES, "Resize predictions to the size of the ground truth.")
-@click.option(
-    "--pred-crop",
-    "prediction_crop",
-    metavar="kb|X,Y,W,H",
-    help="Part of the frame that predictions show, such as the 1216×352 of KITTI's benchmark.",
+@_option(
+    "--pred-crop prediction_crop",
+    "kb|X,Y,W,H",
+    "Part of the frame that predictions show, such as the 1216×352 of KITTI's benchmark.",
 )
 @_choice(
     "--layout-protocol",
     FRAME_PROTOCOLS,
     "Crop of the frames of a data set GT, as in batch.  [default: the layout's own]",
 )
-@click.option(
+@_option(
     "--sparse",
+    "FILE|FOLDER",
+    "Sparse depth the networks had: points that are part of the ground truth are reported.",
     type=options.FILE,
-    metavar="FILE|FOLDER",
-    help="Sparse depth the networks had: points that are part of the ground truth are reported.",
 )
-@click.option(
-    "--sparse-scale", type=float, metavar="S", help="Integer --sparse files hold metres × S."
+@_option("--sparse-scale", "S", "Integer --sparse files hold metres × S.", type=float)
+@_option(
+    "--exclude-sparse", None, "Leave out pixels with a sparse point.", is_flag=True, default=None
 )
-@click.option(
-    "--exclude-sparse", is_flag=True, default=None, help="Leave out pixels with a sparse point."
-)
-@click.option(
-    "--bootstrap",
-    "resamples",
+@_option(
+    "--bootstrap resamples",
+    "N",
+    "Number of bootstrap resamples for the intervals; 0 prints none.",
     type=int,
     default=2000,
     show_default=True,
-    metavar="N",
-    help="Number of bootstrap resamples for the intervals; 0 prints none.",
 )
 @options.bootstrap_seed
-@click.option(
-    "--workers",
-    type=int,
-    default=2,
-    show_default=True,
-    metavar="N",
-    help="Number of frames read at once.",
-)
+@_option("--workers", "N", "Number of frames read at once.", type=int, default=2, show_default=True)
 @options.no_groups
 @options.table_files(
     csv="Write a row per frame.",
@@ -178,12 +161,11 @@ def _choice(flag: str, names: Sequence[str], text: str) -> Callable[[Any], Any]:
     latex="Write a tabular of the means.",
 )
 @columns
-@click.option(
-    "--html",
+@_option(
+    "--html", "FOLDER",
+    "Write an HTML report: every frame beside its ground truth, the worst first.",
     type=options.FILE,
-    metavar="FOLDER",
-    help="Write an HTML report: every frame beside its ground truth, the worst first.",
-)
+)  # fmt: skip
 def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: Any) -> None:
     """Score the depth in PRED against the ground truth in GT: two files, or two folders.
 
@@ -221,12 +203,16 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
         report_eval.check_eval_report(
             html, [path for path in inputs if path is not None], overwrite=files.overwrite
         )
-    scales = {field: values.pop(name) for field, name in _SCALE_OPTIONS.items()}
     request = EvalRequest(
         prediction=prediction,
         ground_truth=ground_truth,
         grouped=not values.pop("no_groups"),
-        scales=Scales(**scales),
+        scales=Scales(
+            prediction=values.pop("pred_scale"),
+            truth=values.pop("gt_scale"),
+            sparse=values.pop("sparse_scale"),
+            channel=values.pop("channel"),
+        ),
         **{each.name: values.pop(each.name) for each in fields(EvalRequest) if each.name in values},
         changes=values,
     )

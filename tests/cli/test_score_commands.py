@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import json
@@ -61,30 +60,34 @@ def test_the_table_is_data_and_what_was_assumed_is_talk(
     assert "float32 NPY" in err
 
 
-def test_json_is_the_whole_result_and_nothing_else_on_stdout(
+def test_json_is_the_whole_result_with_every_option_and_the_same_with_more_workers(
     frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of("eval", "out", "gt", "--json", "--protocol", "garg", "--max-depth", "5") == 0
-    record = json.loads(capsys.readouterr().out)
-    assert [frame["name"] for frame in record["frames"]] == ["a", "b ü_1", "c\nd", "e", "f", "g"]
-    assert record["protocol"]["name"] == "garg"
-    assert record["protocol"]["scoring"]["max_depth"] == 5
-    assert "garg (changed)" in record["protocol"]["described"]
-    assert record["mean"]["mre"] == pytest.approx(np.mean(
-        [frame["values"]["mre"] for frame in record["frames"]]
-    ))  # fmt: skip
-    assert record["interval"]["level"] == 0.95
-    assert record["counts"]["scored"] == 6
-
-
-def test_the_same_command_gives_the_same_bytes(
-    frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    options = (
+        "--protocol",
+        "garg",
+        "--max-depth",
+        "10",
+        "--scale-by",
+        "median",
+        "--missing",
+        "max",
+    )
     texts = []
     for workers in ("1", "3"):
-        assert code_of("eval", "out", "gt", "--json", "--workers", workers) == 0
+        more = ("--delta", "1.06", "--workers", workers, "--json")
+        assert code_of("eval", "out", "gt", *options, *more) == 0
         texts.append(capsys.readouterr().out)
     assert texts[0] == texts[1]
+    record = json.loads(texts[0])
+    assert [frame["name"] for frame in record["frames"]] == ["a", "b ü_1", "c\nd", "e", "f", "g"]
+    scoring = record["protocol"]["scoring"]
+    assert (scoring["max_depth"], scoring["missing"]) == (10, "max")
+    assert scoring["thresholds"] == [1.06, 1.06**2, 1.06**3]
+    assert "garg (changed)" in record["protocol"]["described"]
+    assert record["mean"]["mre"] == pytest.approx(0, abs=1e-6)  # predictions are 1.1 × too far
+    assert record["frames"][0]["factor"] == pytest.approx(1 / 1.1)
+    assert record["interval"]["level"] == 0.95
 
 
 def test_csv_has_a_line_for_each_frame_also_those_without_score(
@@ -155,13 +158,6 @@ def test_tables_carry_a_scale_that_was_assumed(
     assert "; gt: 16-bit PNG ÷ 256, assumed" in capsys.readouterr().out.splitlines()[0]
 
 
-def test_only_one_thing_goes_to_stdout(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert code_of("eval", "out", "gt", "--json", "--csv", "-") == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert code_of("eval", "out", "gt", "--csv", "-") == 0
-    assert capsys.readouterr().out.startswith("name,group,prediction,truth,")
-
-
 def test_files_are_not_overwritten_unasked_and_inputs_never(
     frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -180,6 +176,8 @@ EXITS = [
     (["eval", "out", "gt", "--protocol", "kiti"], 2, "kitti"),
     (["eval", "out", "gt", "--delta", "1,2"], 2, "--delta"),
     (["eval", "out", "gt", "--delta", "fast"], 2, "--delta"),
+    (["eval", "out", "gt", "--missing", "max"], 2, "scores empty predictions as --max-depth"),
+    (["eval", "out", "gt", "--json", "--csv", "-"], 2, "can go to stdout"),
     (["eval", "out", "gt/a.npy"], 2, "two files or two folders"),
     (["eval", "out", "nowhere"], 3, "nowhere"),
     (["eval", "out", "gt", "--protocol", "nyu-eigen"], 3, "640×480"),
@@ -202,15 +200,6 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
     assert out == ""
     assert message in err
     assert "Traceback" not in err
-
-
-def test_the_base_of_delta_is_raised_to_powers(
-    frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of("eval", "out", "gt", "--delta", "1.06", "--json") == 0
-    record = json.loads(capsys.readouterr().out)
-    assert record["protocol"]["scoring"]["thresholds"] == [1.06, 1.06**2, 1.06**3]
-    assert (record["mean"]["delta1"], record["mean"]["delta2"]) == (0, 1)
 
 
 def test_runs_are_compared_as_a_table_as_json_and_as_files(
@@ -249,13 +238,12 @@ def test_four_runs_fit_into_120_columns(frames: Path, capsys: pytest.CaptureFixt
     runs = [f"{kind} run of a network with a long name at K = 20.json" for kind in "abcd"]
     for name in runs:
         Path(name).write_text(text)
-    for options in ([], ["--all"]):
-        assert code_of("compare", *runs, *options) == 0
-        out = capsys.readouterr().out
-        rows = [line for line in out.splitlines() if "↓" in line or "↑" in line]
-        assert len(rows) == 4 * (12 if options else 4)
-        assert max(map(len, out.splitlines())) <= 120
-        assert all("…" in row and "long name at K = 20" in row for row in rows)
+    assert code_of("compare", *runs, "--all") == 0
+    out = capsys.readouterr().out
+    rows = [line for line in out.splitlines() if "↓" in line or "↑" in line]
+    assert len(rows) == 4 * 12
+    assert max(map(len, out.splitlines())) <= 120
+    assert all("…" in row and "long name at K = 20" in row for row in rows)
 
 
 def test_a_refinement_scores_the_same_when_its_files_are_evaluated(
@@ -298,63 +286,3 @@ def test_a_name_that_is_no_utf_8_is_scored_and_printed(
 
 def test_the_help_names_every_protocol() -> None:
     assert tuple(PROTOCOLS) == EVAL_PROTOCOLS
-
-
-def test_relative_predictions_and_missing_pixels_are_options_of_eval(
-    frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ("--scale-by", "median", "--missing", "max", "--max-depth", "10", "--json")
-    assert code_of("eval", "out", "gt", *arguments) == 0
-    out, err = capsys.readouterr()
-    record = json.loads(out)
-    assert record["mean"]["mre"] == pytest.approx(0, abs=1e-6)  # predictions are 1.1 × too far
-    assert record["frames"][0]["factor"] == pytest.approx(1 / 1.1)
-    assert "scale-by median: factor 0.9091" in err
-    assert record["protocol"]["scoring"]["missing"] == "max"
-    assert code_of("eval", "out", "gt", "--missing", "max") == 2
-    assert "--missing max scores empty predictions as --max-depth" in capsys.readouterr().err
-
-
-def test_a_formula_as_a_name_is_text_in_every_table(frames: Path) -> None:
-    for folder in ("out", "gt"):
-        Path(folder, "a.npy").rename(Path(folder, "=1+1.npy"))
-    assert code_of("eval", "out", "gt", "--csv", "scores.csv", "--markdown", "scores.md") == 0
-    rows = list(csv.DictReader(io.StringIO(Path("scores.csv").read_text())))
-    assert "'=1+1" in [row["name"] for row in rows]
-    with contextlib.redirect_stdout(io.StringIO()) as text:
-        assert code_of("eval", "out", "gt", "--json") == 0
-    for name in ("@run.json", "=run.json"):
-        Path(name).write_text(text.getvalue())
-    assert code_of("compare", "@run.json", "=run.json", "--csv", "c.csv") == 0
-    rows = list(csv.DictReader(io.StringIO(Path("c.csv").read_text())))
-    assert {row["run"] for row in rows} == {"'@run", "'=run"}
-    assert {row["gain [%]"] for row in rows} == {"–", "+0.00"}
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("pixels", "x"),
-        ("pixels", -1),
-        ("pixels", 10**400),
-        ("known", 2.5),
-        ("sums", ["x"]),
-        ("values", {"rmse": []}),
-        ("values", {"rmse": 10**400}),
-        ("measures", [{"key": []}]),
-        ("protocol", {"name": "other"}),
-    ],
-    ids=lambda value: str(value)[:20],
-)
-def test_a_run_whose_fields_are_of_another_kind_is_refused_in_one_line(
-    field: str, value: object, frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of("eval", "out", "gt", "--json") == 0
-    record = json.loads(capsys.readouterr().out)
-    (record if field in record else record["frames"][2])[field] = value
-    for name in ("a.json", "b.json"):
-        Path(name).write_text(json.dumps(record))
-    assert code_of("compare", "a.json", "b.json") == 3
-    err = capsys.readouterr().err
-    assert err.startswith("pnpdepth: a.json does not hold scores")
-    assert err.count("\n") == 1

@@ -195,9 +195,9 @@ def compare(
     better = np.array([1.0 if m.higher_is_better else -1.0 for m in measures])
     means, gains, exact = [table.mean() for table in tables], [], True
     for table, mean in zip(tables[1:], means[1:], strict=True):
-        both, drawing = (tables[0], table), (clusters, resamples, seed)
-        low, high = interval(lambda a, b: gain(a, b, better), both, *drawing)
-        p_values, exact = swap_p_values(*both, *drawing)
+        drawing = clusters, resamples, seed
+        low, high = interval(lambda a, b: gain(a, b, better), (tables[0], table), *drawing)
+        p_values, exact = swap_p_values(tables[0], table, *drawing)
         percent, difference = gain(means[0], mean, better), mean - means[0]
         rows = np.stack([percent, low, high, difference, p_values, holm(p_values)], axis=1)
         gains.append({key: Gain(*row) for key, row in zip(keys, rows.tolist(), strict=True)})

@@ -121,8 +121,9 @@ def pair_frames(
         name = frame_name(prediction.stem)
         frames, predictions = [Frame(name=name, gt=ground_truth)], {name: prediction}
     for frame in frames:
-        for part in filter(None, (frame.image, frame.sparse, frame.gt)):
-            _check_local(file_of(part))
+        for part in (frame.image, frame.sparse, frame.gt):
+            if part is not None:
+                _check_local(file_of(part))
     if calib is not None:
         frames = [replace(frame, calib=calib) for frame in frames]
     names = {frame.name for frame in frames}
@@ -256,7 +257,8 @@ def _files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path], li
     for problem in problems:
         if problem.path.is_file():
             raise InputError(str(problem))
-    marked = {_base(stem, _DEPTH_MARKS) for stem in found} - {None}  # stems with a _depth file
+    bases = (_base(stem, _DEPTH_MARKS) for stem in found)
+    marked = {base for base in bases if base is not None}  # stems with a _depth file
     by_frame: dict[str, Path] = {}
     for stem, path in found.items():
         name = frame_name(stem)

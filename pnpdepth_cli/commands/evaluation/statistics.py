@@ -122,35 +122,39 @@ class FrameTable:
     """The scores of N frames as sums, from which the means of any weighting of them follow."""
 
     sums: Floats
-    """(N, S)"""
+    """(N, K, M): K summands of each of M measures; (N, K, 1) if all measures share them."""
     mean_of: Callable[[Floats], Floats]
-    """From sums (…, S) to means (…, M); unchanged where the sums are multiplied."""
+    """From sums (…, K, M or 1) to means (…, M); unchanged where the sums are multiplied."""
 
     @classmethod
     def of_frames(cls, values: Floats) -> FrameTable:
         """Every frame counts alike; (N, M) with NaN where a frame lacks a measure."""
 
         def mean_of(sums: Floats) -> Floats:
-            total, count = np.split(sums, 2, axis=-1)
             with np.errstate(divide="ignore", invalid="ignore"):
-                return np.asarray(total / count)
+                return np.asarray(sums[..., 0, :] / sums[..., 1, :])
 
         known = np.isfinite(values)
-        return cls(sums=np.hstack([np.where(known, values, 0.0), known]), mean_of=mean_of)
+        sums = np.stack([np.where(known, values, 0.0), known.astype(np.float64)], axis=1)
+        return cls(sums=sums, mean_of=mean_of)
 
     @classmethod
     def of_pixels(cls, sums: Floats, keys: Sequence[str]) -> FrameTable:
         """Every pixel counts alike; (N, len(SUMS)), and the measures of MEASURES that are meant."""
         kept = [number for number, measure in enumerate(MEASURES) if measure.key in keys]
-        return cls(sums=sums, mean_of=lambda s: measures_of(torch.from_numpy(s)).numpy()[..., kept])
+
+        def mean_of(sums: Floats) -> Floats:
+            return np.asarray(measures_of(torch.from_numpy(sums[..., 0])).numpy()[..., kept])
+
+        return cls(sums=sums[..., None], mean_of=mean_of)
 
     def mean(self) -> Floats:
         """Returns (M,) the means over all frames; NaN for a measure that none has."""
         return self.mean_of(self.sums.sum(axis=0))
 
     def totals(self, clusters: Clusters) -> Floats:
-        """Returns (G, S) the sums of each cluster."""
-        totals = np.zeros((clusters.count, self.sums.shape[1]))
+        """Returns (G, K, M or 1) the sums of each cluster."""
+        totals = np.zeros((clusters.count, *self.sums.shape[1:]))
         np.add.at(totals, clusters.ids, self.sums)
         return totals
 
@@ -189,32 +193,32 @@ def interval(
         resamples: How many bootstrap samples are drawn.
         seed: Of the drawing.
     """
-    totals = np.hstack([table.totals(clusters) for table in tables])  # (G, S)
+    totals = np.concatenate([table.totals(clusters) for table in tables], axis=1)  # (G, K, M)
     ends = np.cumsum([table.sums.shape[1] for table in tables])[:-1]
 
     def means(sums: Floats) -> list[Floats]:
-        parts = np.split(sums, ends, axis=-1)
+        parts = np.split(sums, ends, axis=-2)
         return [table.mean_of(part) for table, part in zip(tables, parts, strict=True)]
 
     held = np.isfinite(means(totals)).all(axis=0).sum(axis=0)
     steps = np.maximum(_STEP * np.abs(totals).sum(axis=0), 1e-300)
+    one_each = np.eye(len(steps))[..., None] * steps  # (K, K, M)
 
     def linearised(counts: Floats) -> tuple[Floats, Floats]:
         """(B, M) the statistic where clusters count as (B, G), and (B, M) its standard errors."""
-        sums = counts @ totals
-        ahead, behind = (
-            statistic(*means(sums[:, None] + sign * np.diag(steps))) for sign in (1, -1)
-        )
-        slopes = (ahead - behind) / (2 * steps[:, None])  # (B, S, M)
+        sums = np.tensordot(counts, totals, axes=1)
+        ahead, behind = (statistic(*means(sums[:, None] + sign * one_each)) for sign in (1, -1))
+        slopes = (ahead - behind) / (2 * steps)  # (B, K, M)
         with np.errstate(invalid="ignore"):
-            variance = np.einsum("bg,bgm->bm", counts, (totals @ slopes) ** 2)
+            influence = sum(totals[:, k] * slopes[:, None, k] for k in range(len(steps)))
+            variance = np.einsum("bg,bgm->bm", counts, np.square(influence))
         return statistic(*means(sums)), np.sqrt(variance)
 
     size = len(totals)
     value, error = (row[0] for row in linearised(np.ones((1, size))))
     error = np.where(error > 1e-8 * np.maximum(np.abs(value), 1.0), error, 0.0)
     generator, ratios = np.random.default_rng(seed), []
-    batch = max(1, _CELLS // (max(size, len(steps)) * len(steps)))
+    batch = max(1, _CELLS // (max(size, len(steps) ** 2) * len(held)))
     for start in range(0, resamples, batch):
         count = min(batch, resamples - start)
         drawn = generator.multinomial(size, np.full(size, 1 / size), count).astype(np.float64)
@@ -246,7 +250,7 @@ def swap_p_values(
 
     def difference(swapped: Floats) -> Floats:
         """(B, M) the differences of means with the clusters swapped where (B, G) is 1."""
-        moved = swapped @ (b - a)
+        moved = np.tensordot(swapped, b - a, axes=1)
         return np.abs(other.mean_of(b.sum(axis=0) - moved) - first.mean_of(a.sum(axis=0) + moved))
 
     observed = difference(np.zeros((1, count)))[0]

@@ -16,6 +16,7 @@ from pnpdepth_cli.commands.tables import (
     format_value,
 )
 from pnpdepth_cli.core.metrics import Measure
+from pnpdepth_cli.io.record import plain
 
 _FRAMES_SHOWN = 12
 _FRAME_COLUMNS = 6
@@ -77,20 +78,13 @@ def _interval(evaluation: Evaluation, measure: Measure) -> str:
 def frames_csv(evaluation: Evaluation) -> Table:
     """Returns a row for each frame: its files, its counts, and its measures as stored."""
     keys = [measure.key for measure in evaluation.protocol.measures]
-    records = [frame_record(frame) for frame in evaluation.frames]
+    records = [plain(frame_record(frame)) for frame in evaluation.frames]
     columns = [name for name in records[0] if name not in ("values", "error")]
     rows = [
         [*(r[name] for name in columns), *(r["values"].get(key) for key in keys), r["error"]]
         for r in records
     ]
-    return Table(
-        header=[*columns, *keys, "error"],
-        rows=[["" if _is_nothing(each) else str(each) for each in row] for row in rows],
-    )
-
-
-def _is_nothing(value: object) -> bool:
-    return value is None or (isinstance(value, float) and math.isnan(value))
+    return Table(header=[*columns, *keys, "error"], rows=rows)
 
 
 def frames_table(evaluation: Evaluation, columns: Sequence[str] | None) -> Table:

@@ -253,9 +253,9 @@ def _scale_warning(sparse: _Sparse, ground_truth: _Part) -> list[str]:
     if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
         return []
     kinds = {"--depth-scale": sparse.kind, "--gt-scale": ground_truth.kind}
+    scale_warning("sparse points", 1 / ratio, kinds)
     return [
-        scale_warning("sparse points", 1 / ratio, kinds)
-        or f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
+        f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
         f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give --gt-scale"
         " or --depth-scale"
     ]

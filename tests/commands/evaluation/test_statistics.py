@@ -44,7 +44,7 @@ def test_a_mean_counts_frames_alike_or_pixels_alike_and_skips_what_is_lacking() 
     table = of_frames([1, 10, np.nan], [3, np.nan, np.nan])
     assert table.mean() == pytest.approx([2, 10, np.nan], nan_ok=True)
     totals = of_frames([1], [3], [6]).totals(clusters_of([1, 0, 1]))
-    assert totals.tolist() == [[3, 1], [7, 2]]
+    assert totals.tolist() == [[[3], [1]], [[7], [2]]]
     generator = torch.Generator().manual_seed(0)
     frames = [torch.rand(2, n, generator=generator) + 1 for n in (3, 50)]
     sums = np.array([error_sums(p, g)[0].tolist() for p, g in frames])

@@ -1,0 +1,123 @@
+"""Scaling of relative predictions by the papers' reference codes, and standard deviations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, evaluate
+from pnpdepth_cli.commands.evaluation.frames import scaled
+from pnpdepth_cli.commands.evaluation.scoring import (
+    FrameUncertainty,
+    frame_uncertainty,
+    summarise_uncertainty,
+)
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.depth import write_depth
+
+RNG = np.random.default_rng(0)
+GT = RNG.uniform(1, 9, (40, 50)).astype(np.float32)
+WHERE = RNG.random(GT.shape) < 0.7
+"""Where the ground truth is known."""
+
+
+def test_without_scaling_disparity_becomes_depth_and_nothing_else() -> None:
+    disparity = (1 / GT).astype(np.float32)
+    disparity[0, 0] = 0
+    depth, fit = scaled(disparity, GT, "disparity", "none")
+    assert fit is None
+    assert depth[0, 0] == 0
+    assert depth[1:] == pytest.approx(GT[1:], rel=1e-6)
+
+
+def test_median_is_that_of_monodepth2_and_empty_predictions_stay_empty() -> None:
+    predicted = (GT * RNG.uniform(0.2, 0.4, GT.shape)).astype(np.float32)
+    predicted[:, :10] = 0
+    both = WHERE & (predicted > 0)
+    # evaluate_depth.py: ratio = np.median(gt_depth) / np.median(pred_depth), both masked
+    ratio = np.median(GT[both]) / np.median(predicted[both])
+    depth, fit = scaled(predicted, np.where(WHERE, GT, 0), "depth", "median")
+    assert fit is not None
+    assert fit.factor == pytest.approx(ratio, rel=1e-6)
+    assert depth == pytest.approx(predicted * ratio, rel=1e-6)
+
+
+@pytest.mark.parametrize("scale_by", ["affine", "affine-disparity"])
+def test_affine_is_the_least_squares_fit_of_marigold_and_midas(scale_by: str) -> None:
+    """In depth or in disparity: np.linalg.lstsq of [pred, 1] to the ground truth."""
+    in_depth = scale_by == "affine"
+    target = GT if in_depth else 1 / GT
+    predicted = ((target + 0.5) / 3 + RNG.normal(0, 0.01, GT.shape)).astype(np.float32)
+    a = np.stack([predicted[WHERE], np.ones(WHERE.sum())], axis=1).astype(np.float64)
+    (s, t), *_ = np.linalg.lstsq(a, target[WHERE].astype(np.float64), rcond=None)
+    kind = "depth" if in_depth else "disparity"
+    depth, fit = scaled(predicted, np.where(WHERE, GT, 0), kind, scale_by)
+    assert fit is not None
+    assert (fit.factor, fit.shift) == pytest.approx((s, t), rel=1e-5)
+    fitted = np.maximum(s * predicted + t, 0)
+    assert depth == pytest.approx(fitted if in_depth else 1 / fitted, rel=1e-4, abs=1e-6)
+
+
+def test_log_leaves_no_mean_error_of_the_logarithm() -> None:
+    predicted = (GT * RNG.lognormal(1, 0.2, GT.shape)).astype(np.float32)
+    depth, _ = scaled(predicted, np.where(WHERE, GT, 0), "depth", "log")
+    assert np.mean(np.log(depth[WHERE]) - np.log(GT[WHERE])) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_constant_prediction_and_too_few_pixels_are_refused() -> None:
+    with pytest.raises(InputError, match="constant"):
+        scaled(np.ones_like(GT), GT, "depth", "affine")
+    with pytest.raises(InputError, match="needs 2 pixels"):
+        scaled(GT, np.zeros_like(GT), "depth", "median")
+
+
+def uncertain(factor: float) -> FrameUncertainty:
+    """A frame whose standard deviation is off by a factor."""
+    gt = RNG.uniform(2, 6, (200, 200)).astype(np.float32)
+    sigma = RNG.uniform(0.02, 0.2, gt.shape).astype(np.float32)
+    depth = (gt + sigma * RNG.normal(size=gt.shape)).astype(np.float32)
+    result = frame_uncertainty(depth, gt, sigma * np.float32(factor))
+    assert result is not None
+    return result
+
+
+def test_a_right_deviation_is_calibrated_and_one_of_half_the_size_is_not() -> None:
+    right = summarise_uncertainty([uncertain(1.0) for _ in range(3)])
+    half = summarise_uncertainty([uncertain(0.5)])
+    assert right is not None
+    assert half is not None
+    assert (right.frames, right.pixels) == (3, 3 * 200 * 200)
+    within = right.within_1_sigma, right.within_2_sigma, half.within_1_sigma
+    assert within == pytest.approx((0.683, 0.954, 0.383), abs=0.01)
+    assert right.observed == pytest.approx(right.expected, abs=0.01)
+
+
+def test_sparsification_is_by_definition() -> None:
+    gt = np.full((1, 20), 10, np.float32)
+    error = np.arange(1, 21)[None].astype(np.float32)
+    worst = frame_uncertainty(gt + error, gt, error[:, ::-1].copy())
+    best = frame_uncertainty(gt + error, gt, error)
+    assert worst is not None
+    assert best is not None
+    kept = [error[0, : 20 - n].mean() for n in range(20)]
+    assert best.oracle.tolist() == best.sparsification.tolist() == pytest.approx(kept)
+    assert worst.sparsification.tolist() == pytest.approx([error[0, n:].mean() for n in range(20)])
+    total, none = summarise_uncertainty([worst]), summarise_uncertainty([best])
+    assert total is not None
+    assert none is not None
+    area = np.trapezoid(worst.sparsification - worst.oracle, np.arange(20) / 20)
+    assert (total.ause, none.ause) == pytest.approx((area / error.mean(), 0))
+
+
+def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
+    for folder in ("out", "gt"):
+        (tmp_path / folder).mkdir()
+    write_depth(tmp_path / "gt" / "a.npy", GT)
+    write_depth(tmp_path / "out" / "a_depth.npy", (GT + RNG.normal(0, 0.1, GT.shape)).astype("f4"))
+    write_depth(tmp_path / "out" / "a_sigma.exr", np.full(GT.shape, 0.1, np.float32))
+    result = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "gt"))
+    assert result.uncertainty is not None
+    assert result.uncertainty.within_1_sigma == pytest.approx(0.683, abs=0.03)
+    assert not any("have no ground truth" in note for note in result.notes)
