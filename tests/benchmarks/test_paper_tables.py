@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.paper_figures import ROWS, PaperRow, networks_of
+from benchmarks.paper_figures import ROWS, PaperRow
 from benchmarks.paper_report import bars_of, markdown
 from benchmarks.paper_sets import ROOMS, FrameSet, TableFrame, rendered, scan_of, shared
 from benchmarks.paper_tables import entries_of, scores_of, table_of
-from pnpdepth_cli.models.registry import names
 
 LENS = np.array([721.3, 721.3, 455.5, 36.4], np.float32)
 
@@ -20,23 +19,8 @@ def test_the_papers_figures_give_the_gains_printed_beside_them(row: PaperRow) ->
     for measure, printed in enumerate(row.gains):
         gain = 100 * (1 - row.after[measure] / row.before[measure])
         assert gain == pytest.approx(printed, abs=0.12)  # four decimals are printed of the errors
-
-
-def test_every_tiny_network_has_its_rows() -> None:
-    tiny = [name for name in names() if "-tiny" in name]
-    rows = [(row.street, row.name, networks_of(row, tiny)) for row in ROWS]
-    assert rows == [
-        (False, "Eigen", ["eigen-tiny"]),
-        (False, "FCRN", ["fcrn-tiny"]),
-        (False, "Uhrig", ["sparseconv-tiny"]),
-        (False, "Ma", ["sparse2dense-tiny"]),
-        (False, "Jaritz", ["latefusion-tiny"]),
-        (True, "Eigen", []),
-        (True, "Zhou", ["sfmlearner-tiny"]),
-        (True, "Uhrig", ["sparseconv-tiny"]),
-        (True, "Chodosh", ["adnn-tiny"]),
-        (True, "Ma", ["sparse2dense-tiny-kitti"]),
-    ]
+    kinds = ("-rgb", "-d", "-rgb-kitti", "-d-kitti")  # image or depth alone: in none of the rows
+    assert not any(row.takes(f"sparse2dense-r18-deconv2{kind}") for kind in kinds)
 
 
 def test_all_depths_are_scored_on_the_same_pixels() -> None:
@@ -82,11 +66,6 @@ def test_the_same_number_of_points_of_a_frame_is_the_same_points() -> None:
     first, second, other = (frame.points(100, seed) for seed in (7, 7, 8))
     assert torch.equal(first.xy, second.xy)
     assert not torch.equal(first.xy, other.xy)
-
-
-@pytest.mark.parametrize("modality", ["-rgb", "-d", "-rgb-kitti", "-d-kitti"])
-def test_editions_with_only_image_or_depth_as_input_have_no_row(modality: str) -> None:
-    assert not any(row.takes(f"sparse2dense-r18-deconv2{modality}") for row in ROWS)
 
 
 def test_real_frames_at_hand_are_cut_as_the_paper_cuts_them(shared_data: Path) -> None:

@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.sequence import (
@@ -295,12 +295,7 @@ def _outside(output: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list[U
     folder, kept, ignored = output.resolve(), list[Frame](), list[Unmatched]()
     is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
     for frame in frames:
-        inside = (
-            path
-            for path in source_files(frame)
-            if is_inside(path.parent) or (path.is_symlink() and is_inside(path))
-        )
-        path = next(inside, None)
+        path = next((path for path in source_files(frame) if is_inside(path.parent)), None)
         if path is None:
             kept.append(frame)
         else:
@@ -318,24 +313,25 @@ def _with_own_files(
     Names that differ in Unicode normalisation only are one file on macOS.
     """
     endings = [path.name for path in Outputs.in_folder(Path(), "", refine).paths()]
-    owners = dict.fromkeys((CSV, JSON), "the summary")  # of files, and of folders with results
-    folders = dict[str, str]()
+    owners, folders = dict[str, str](), dict[str, str]()  # names of frames by file, by folder
     kept, refused = list[Frame](), list[tuple[Frame, str]]()
     for frame in frames:
-        name, shown = unicodedata.normalize("NFC", frame.name), one_line(frame.name)
-        files = [name + ending for ending in endings]
-        above = [str(folder) for folder in PurePosixPath(name).parents][:-1] if "/" in name else []
+        name = unicodedata.normalize("NFC", frame.name)
+        files, parts = [name + ending for ending in endings], name.split("/")
+        above = ["/".join(parts[:depth]) for depth in range(1, len(parts))]
         other = next(filter(None, map(owners.get, (*files, *above))), None)
         other = other or next(filter(None, map(folders.get, files)), None)
-        why = name_problem(name) or (f"needs a file of {other}" if other else None)
-        if why is None and above and fnmatch(above[-1], LOCKS):
-            why = "needs a file of the lock"
+        why = name_problem(name)
+        if not {*files, *above}.isdisjoint((CSV, JSON)) or (above and fnmatch(above[0], LOCKS)):
+            why = why or "needs a file of the batch's own"
+        elif other is not None:
+            why = why or f"needs a file of frame {one_line(other)!r}"
         if why is not None:
-            refused.append((frame, f"the name {shown!r} {why}; rename it"))
+            refused.append((frame, f"the name {one_line(frame.name)!r} {why}; rename it"))
             continue
         kept.append(frame)
-        owners |= dict.fromkeys(files, f"frame {shown!r}")
-        folders |= dict.fromkeys(above, f"frame {shown!r}")
+        owners |= dict.fromkeys(files, frame.name)
+        folders |= dict.fromkeys(above, frame.name)
     return kept, refused
 
 

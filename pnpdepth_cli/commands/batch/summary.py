@@ -7,7 +7,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import IO, Any
 
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
@@ -192,7 +192,7 @@ def profile_of(seconds: Mapping[str, float], frames: int, wall_s: float) -> dict
 
 
 def write_summaries(
-    folder: Path, head: Mapping[str, Any], rows: TextIO, baselines: Sequence[str]
+    folder: Path, head: Mapping[str, Any], rows: IO[str], baselines: Sequence[str]
 ) -> None:
     """Writes `summary.json`, the head with the rows as its list `frames`, and `summary.csv`.
 
