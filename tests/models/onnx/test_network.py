@@ -20,12 +20,12 @@ from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.models.aligned import AlignedDepth
-from pnpdepth_cli.models.formats.onnx import graph
-from pnpdepth_cli.models.formats.onnx.table import OPERATORS
 from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.models.onnx import graph
+from pnpdepth_cli.models.onnx.table import OPERATORS
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
-from tests.models.formats.onnx.onnx_files import write_network
+from tests.models.onnx.onnx_files import write_network
 from tests.models.weights.files import little
 
 

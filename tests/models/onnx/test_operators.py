@@ -15,8 +15,8 @@ from pathlib import Path  # noqa: E402
 
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
-from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph  # noqa: E402
-from pnpdepth_cli.models.formats.onnx.table import OPERATORS  # noqa: E402
+from pnpdepth_cli.models.onnx.graph import OnnxGraph  # noqa: E402
+from pnpdepth_cli.models.onnx.table import OPERATORS  # noqa: E402
 
 F32, I64 = np.float32, np.int64
 
