@@ -227,22 +227,22 @@ class ModelDefinition:
     """What was assumed where no definition was given; it is printed."""
 
     def __post_init__(self) -> None:
+        size = "Fixed(height, width), Multiple(of) or Near(of=…)"
         validity.instance(self, "name", str, "a text")
         validity.one_of(self, "input_kind", choices.INPUT_KINDS)
-        size = "Fixed(height, width), Multiple(of) or Near(of=…)"
         validity.instance(self, "size", (Fixed, Multiple, Near), size)
         validity.function(self, "build")
-        if self.normalisation is not None:
-            validity.instance(self, "normalisation", Normalisation, "Normalisation(mean=…, std=…)")
         validity.one_of(self, "output_kind", choices.OUTPUT_KINDS)
         validity.one_of(self, "output_scale", choices.OUTPUT_SCALES)
         validity.names(self, "layers")
         for settings in ("defaults", "masked", "masked_dense"):
             validity.instance(self, settings, Settings, "Settings(…)")
-        if self.image_encoder is not None:
-            validity.instance(self, "image_encoder", str, "the name of a submodule")
-        if self.checkpoint is not None:
-            validity.instance(self, "checkpoint", Path, "a pathlib.Path")
+        for field, kind, wanted in (
+            ("normalisation", Normalisation, "Normalisation(mean=…, std=…)"),
+            ("image_encoder", str, "the name of a submodule"),
+            ("checkpoint", Path, "a pathlib.Path"),
+        ):
+            validity.instance(self, field, (kind, type(None)), wanted)
         for hook in ("read_checkpoint", "arguments", "output", "verify", "coarse"):
             if getattr(self, hook) is not None:
                 validity.function(self, hook)
@@ -268,3 +268,21 @@ class ModelDefinition:
         if self.arguments is not None:
             return self.arguments(rgb, sparse)
         return _inputs_in_order(self.input_kind, rgb, sparse)
+
+
+def undescribed(**known: Any) -> ModelDefinition:
+    """Returns a definition for a network of rgb that brings no description of its numbers.
+
+    The points decide its normalisation and what its output means.
+
+    Args:
+        known: The fields that are known.
+    """
+    return ModelDefinition(
+        input_kind="rgb",
+        normalisation=None,
+        output_kind="unknown",
+        output_scale="unknown",
+        defaults=UNTUNED_DEFAULTS,
+        **known,
+    )

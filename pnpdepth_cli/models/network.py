@@ -16,9 +16,9 @@ from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
-from pnpdepth_cli.models.formats.python_file import importing_beside
 from pnpdepth_cli.models.frame import FrameMap, synthetic_frame
 from pnpdepth_cli.models.precision import dtype_of, lower
+from pnpdepth_cli.models.python_file import importing_beside
 from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.suggest_layers import suggest_layers
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
@@ -145,42 +145,38 @@ class Network:
             ModelError: It holds no prediction, or several tensors that `output` of the definition
                 does not choose from.
         """
-        chosen = self._tensor_of(output)
-        tensor = chosen.float()
-        if tensor.ndim == 3:
-            tensor = tensor[:, None]
-        if tensor.ndim == 2:
-            tensor = tensor[None, None]
-        if tensor.ndim != 4 or tuple(tensor.shape[:2]) != (1, 1):
-            raise ModelError(
-                f"network {self.definition.name!r} gives a tensor of shape {tuple(chosen.shape)},"
-                " where one depth map (1, 1, h, w) is expected; pick it by the definition's output"
-            )
-        return tensor
-
-    def _tensor_of(self, output: Any) -> Tensor:
+        name = self.definition.name
         if self.definition.output is not None:
-            with wrap_user_errors(f"output of network {self.definition.name!r}"):
+            with wrap_user_errors(f"output of network {name!r}"):
                 chosen = self.definition.output(output)
             if not isinstance(chosen, Tensor):
                 raise ModelError(
-                    f"output of network {self.definition.name!r} gives a"
-                    f" {type(chosen).__name__}, where a tensor is expected"
+                    f"output of network {name!r} gives a {type(chosen).__name__}, where a tensor is"
+                    " expected"
                 )
-            return chosen
-        tensors: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
-        if not tensors:
+        else:
+            tensors: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
+            if not tensors:
+                raise ModelError(
+                    f"network {name!r} returns a {type(output).__name__} without a tensor in it;"
+                    " its forward, or `output` of its definition, must give the depth"
+                )
+            if len(tensors) != 1:
+                paths = ", ".join(".".join(path) for path, _ in tensors)
+                raise ModelError(
+                    f"network {name!r} returns {len(tensors)} tensors ({paths}); its definition"
+                    " must pick the depth with `output`"
+                )
+            chosen = tensors[0][1]
+        tensor = chosen.float()
+        if tensor.ndim in (2, 3):
+            tensor = tensor[:, None] if tensor.ndim == 3 else tensor[None, None]
+        if tensor.ndim != 4 or tuple(tensor.shape[:2]) != (1, 1):
             raise ModelError(
-                f"network {self.definition.name!r} returns a {type(output).__name__} without a"
-                " tensor in it; its forward, or `output` of its definition, must give the depth"
+                f"network {name!r} gives a tensor of shape {tuple(chosen.shape)}, where one depth"
+                " map (1, 1, h, w) is expected; pick it by the definition's output"
             )
-        if len(tensors) != 1:
-            names = ", ".join(".".join(path) for path, _ in tensors)
-            raise ModelError(
-                f"network {self.definition.name!r} returns {len(tensors)} tensors ({names}); its"
-                " definition must pick the depth with `output`"
-            )
-        return tensors[0][1]
+        return tensor
 
 
 def load_network(
@@ -210,14 +206,23 @@ def load_network(
     dtype = dtype_of(precision, torch_device)
     definition = find_definition(spec)
     path = checkpoint or definition.checkpoint
-    module = _built(definition, spec)
-    notes: list[str] = []
-    if definition.complete and checkpoint is not None:
-        raise UsageError(
-            f"network {definition.name!r} comes with its weights; --checkpoint does not go with it"
+    if isinstance(definition.build, nn.Module):
+        raise ModelError(
+            f"build of network {definition.name!r} is a {type(definition.build).__name__} that is"
+            " made already; a class or a function that makes it is expected, as in lambda: net"
         )
+    # `build` may import modules beside the model file.
+    with wrap_user_errors(f"build of network {definition.name!r}"), importing_beside(spec):
+        module = definition.build()
+    if not isinstance(module, nn.Module):
+        raise ModelError(f"build of {definition.name!r} gives no torch module")
+    notes: list[str] = []
     if definition.complete:
-        pass
+        if checkpoint is not None:
+            raise UsageError(
+                f"network {definition.name!r} comes with its weights; --checkpoint does not go with"
+                " it"
+            )
     elif path is not None:
         notes = load_checkpoint(module, definition, path)
     elif untrained:
@@ -244,20 +249,6 @@ def load_network(
     if definition.layers or definition.defaults.layer:
         return network
     return _with_suggested_layers(network)
-
-
-def _built(definition: ModelDefinition, spec: str) -> nn.Module:
-    """The network that `build` returns; it may import modules beside the model file."""
-    if isinstance(definition.build, nn.Module):
-        raise ModelError(
-            f"build of network {definition.name!r} is a {type(definition.build).__name__} that is"
-            " made already; a class or a function that makes it is expected, as in lambda: net"
-        )
-    with wrap_user_errors(f"build of network {definition.name!r}"), importing_beside(spec):
-        module = definition.build()
-    if not isinstance(module, nn.Module):
-        raise ModelError(f"build of {definition.name!r} gives no torch module")
-    return module
 
 
 def _with_suggested_layers(network: Network) -> Network:

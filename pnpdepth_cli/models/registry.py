@@ -21,7 +21,7 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import ModelDefinition
-from pnpdepth_cli.models.formats.python_file import python_definition
+from pnpdepth_cli.models.python_file import python_definition
 
 DEFAULT_MODEL = "compact"
 
@@ -109,17 +109,17 @@ def _from_file(spec: str) -> ModelDefinition | None:
     if file.endswith(".py"):
         return python_definition(Path(file), part)
     if file.endswith(".onnx"):
-        from pnpdepth_cli.models.formats.onnx.network import onnx_definition
+        from pnpdepth_cli.models.onnx.network import onnx_definition
 
         return onnx_definition(Path(file), part)
     if spec.endswith(".pt2"):
-        from pnpdepth_cli.models.formats.torch_export import exported_definition
+        from pnpdepth_cli.models.torch_export import exported_definition
 
         return exported_definition(Path(spec))
     if spec.endswith(_WEIGHTS_ONLY):
         raise ModelError(_why_weights_are_no_network(Path(spec)))
     if Path(spec).is_dir():
-        from pnpdepth_cli.models.formats.hugging_face import hf_definition
+        from pnpdepth_cli.models.hugging_face import hf_definition
 
         return hf_definition(Path(spec))
     return None

@@ -54,7 +54,7 @@ def test_an_onnx_file_is_refined_layers_listed_and_checked(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
-    from tests.models.formats.onnx.onnx_files import write_network
+    from tests.models.onnx.onnx_files import write_network
 
     net = str(write_network(frame.folder / "net.onnx"))
     out = frame.folder / "o.exr"

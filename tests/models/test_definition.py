@@ -99,9 +99,6 @@ def test_an_unknown_fit_is_not_taken_for_stretch() -> None:
 )
 def test_a_normalisation_holds_three_numbers_each(field: str, values: Any) -> None:
     assert "three numbers" in refused(Normalisation, **{field: values})
-
-
-def test_a_deviation_is_above_zero_and_a_mean_need_not_be() -> None:
     assert "three numbers above 0" in refused(Normalisation, std=(1, 0, 1))
     assert Normalisation(mean=(-1, 0, 1)).mean == (-1, 0, 1)
 
@@ -131,11 +128,8 @@ def test_a_field_of_a_definition_that_makes_no_sense_is_refused_by_its_name(
     assert message in refused(definition, **{field: value})
 
 
-def test_a_long_value_is_shortened() -> None:
+def test_a_long_value_is_shortened_and_numbers_of_numpy_and_lists_are_as_good() -> None:
     assert len(refused(definition, size=["x\n" * 100])) < 200
-
-
-def test_numbers_of_numpy_and_lists_are_as_good() -> None:
     assert Multiple(np.int64(8)).of == 8  # type: ignore[arg-type]
     Normalisation(mean=[0.5, 0.5, 0.5], std=np.ones(3))  # type: ignore[arg-type]
     assert definition(layers=["a"], checkpoint=Path("x.pt"), normalisation=None).layers == ["a"]

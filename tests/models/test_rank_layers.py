@@ -51,11 +51,8 @@ def test_the_cheapest_layer_whose_field_is_wide_enough_comes_first(
     assert [one.rank for one in rank_layers(LAYERS, wanted)] == ranks
 
 
-def test_the_spacing_of_uniform_points_is_the_root_of_the_area_of_each() -> None:
+def test_a_field_spans_several_gaps_between_points_and_half_the_image() -> None:
     assert point_spacing((100, 400), 100) == 20
-
-
-def test_a_field_spans_several_gaps_and_half_the_image() -> None:
     assert wanted_field((100, 400), 20) == 120
     assert wanted_field((100, 400), 2) == 50
 
@@ -103,7 +100,7 @@ def test_few_points_want_a_deep_layer_and_many_a_late_one(
     assert best_layer(network, (IMAGE,), (64, 96), 0) is None
 
 
-@pytest.mark.parametrize("count", [1, 4, 9, 25, 100, 400, 10_000])
+@pytest.mark.parametrize("count", [1, 9, 25, 100, 10_000])
 def test_the_best_of_eight_layers_is_found_by_measuring_few(
     network: Network, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
@@ -125,7 +122,7 @@ def test_the_best_of_eight_layers_is_found_by_measuring_few(
     assert len(measured) <= 5
 
 
-@pytest.mark.parametrize("count", [50, 500, 20_000])
+@pytest.mark.parametrize("count", [50, 20_000])
 def test_the_layer_of_the_default_is_the_one_that_layers_ranks_first(
     tmp_path: Path, network: Network, count: int
 ) -> None:

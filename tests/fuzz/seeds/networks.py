@@ -39,7 +39,7 @@ def _networks(folder: Path) -> list[Seed]:
     _write_exported(folder / "net.pt2")
     names = ["net.pt2"]
     with contextlib.suppress(ImportError):  # the extra is not installed
-        from tests.models.formats.onnx.onnx_files import write_network
+        from tests.models.onnx.onnx_files import write_network
 
         names.append(write_network(folder / "net.onnx", shape=(1, 3, HEIGHT, WIDTH)).name)
     return [Seed(file=name, command=("models", "check", name)) for name in names]

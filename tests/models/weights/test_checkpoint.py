@@ -24,8 +24,8 @@ from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
-from pnpdepth_cli.models.formats.hugging_face import hf_definition
-from pnpdepth_cli.models.formats.torch_export import exported_definition
+from pnpdepth_cli.models.hugging_face import hf_definition
+from pnpdepth_cli.models.torch_export import exported_definition
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 from tests.models.weights.files import refused, write_npy
 from tests.models.weights.test_tensor_bundle import bundle, entry

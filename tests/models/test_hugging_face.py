@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.definition import Fixed, Near
-from pnpdepth_cli.models.formats.hugging_face import hf_definition
 from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -191,122 +192,108 @@ def test_prompt_depth_anything_receives_the_points_as_coarse_dense_depth(tmp_pat
     assert torch.allclose(prompt[0, 0, 1:-1, 1:-1], rising[1:-1].expand(190, -1), atol=1e-3)
 
 
-def test_a_metric_depth_anything_gives_depth_in_metres(tmp_path: Path) -> None:
-    folder = saved(tmp_path / "m", "depth_anything")
-    config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps(config | {"depth_estimation_type": "metric"}))
-    definition = hf_definition(folder)
-    assert (definition.output_kind, definition.default_alignment) == ("depth", "none")
-
-
-def test_the_image_is_resized_as_the_folder_says(tmp_path: Path) -> None:
-    assert hf_definition(saved(tmp_path / "d", "dpt")).size == Fixed(64, 64)
-    near = hf_definition(saved(tmp_path / "a", "depth_anything")).size
-    assert near == Near(of=14, height=56, width=56)
-    assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
-    assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
-    assert FrameMap.fit(Near(of=14, height=518, width=518), 5, 9).network == (294, 518)
-
-
-def test_incomplete_folders_are_refused_with_a_remedy(tmp_path: Path) -> None:
-    folder = saved(tmp_path / "net", "glpn")
-    weights = folder / "model.safetensors"
-    weights.rename(folder / "pytorch_model.bin")
-    with pytest.raises(CheckpointError, match=r"pnpdepth models convert .*pytorch_model\.bin"):
-        hf_definition(folder)
-    (folder / "pytorch_model.bin").unlink()
-    with pytest.raises(CheckpointError, match="no model"):
-        hf_definition(folder)
-    (folder / "config.json").write_text(json.dumps({"model_type": "bert"}))
-    with pytest.raises(ModelError, match="'bert' are not known"):
-        hf_definition(folder)
-    (folder / "config.json").write_text("{")
-    with pytest.raises(ModelError, match="is not JSON"):
-        hf_definition(folder)
-    (folder / "config.json").unlink()
-    with pytest.raises(ModelError, match=r"config\.json is missing"):
-        hf_definition(folder)
-
-
-@pytest.mark.parametrize(
-    ("name", "size"),
-    [
-        ("depth_anything", Near(of=14, height=518, width=518)),
-        ("prompt_depth_anything", Near(of=14, height=756, width=756)),
-        ("dpt", Fixed(384, 384)),
-        ("zoedepth", Near(of=32, height=384, width=512)),
-        ("glpn", Near(of=32)),
-        ("depth_pro", Fixed(1536, 1536)),
-    ],
-)
-def test_a_folder_as_transformers_saves_it_is_prepared_as_usual_for_its_type(
-    name: str, size: Fixed | Near, tmp_path: Path
-) -> None:
-    folder = saved(tmp_path / "net", name)
-    (folder / "preprocessor_config.json").unlink()
-    definition = hf_definition(folder)
-    assert definition.size == size
-    assert definition.normalisation is not None
-    mean = {"depth_anything": 0.485, "prompt_depth_anything": 0.485, "glpn": 0.0}.get(name, 0.5)
-    assert definition.normalisation.mean[0] == mean
-    assert f"no preprocessor_config.json; assumed, as usual for {name}" in definition.assumed
-
-
-def test_a_multiple_may_be_a_fraction_of_the_image(tmp_path: Path) -> None:
-    folder = changed(
-        saved(tmp_path / "net", "zoedepth"),
-        "preprocessor_config.json",
-        {"ensure_multiple_of": 1 / 32},
-    )
-    assert hf_definition(folder).size == Near(of=32, height=64, width=96)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"depths": [1_000_000_000, 1, 1, 1]}, "1000000000 is larger than any part of a network"),
-        ({"depths": [900_000, 1, 1, 1]}, "describes a larger network than its weights"),
-        ({"hidden_sizes": [8, 8, 16, 1_000_000]}, "describes a larger network than its weights"),
-    ],
-)
-def test_a_network_far_larger_than_its_weights_is_not_built(
-    change: dict[str, Any], message: str, tmp_path: Path
-) -> None:
-    folder = changed(saved(tmp_path / "net", "glpn"), "config.json", change)
-    with little(megabytes=900, seconds=30), pytest.raises(ModelError, match=message):
-        load_network(str(folder), None)
-
-
-def test_weights_that_do_not_fit_the_configuration_are_refused(tmp_path: Path) -> None:
-    folder = saved(tmp_path / "net", "glpn")
-    config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps(config | {"decoder_hidden_size": 16}))
-    with pytest.raises((CheckpointError, ModelError)):
-        load_network(str(folder), None)
-
-
 def changed(folder: Path, name: str, change: dict[str, Any]) -> Path:
     settings = json.loads((folder / name).read_text())
     (folder / name).write_text(json.dumps(settings | change))
     return folder
 
 
+def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "a", "depth_anything")
+    assert hf_definition(folder).size == Near(of=14, height=56, width=56)
+    definition = hf_definition(changed(folder, "config.json", {"depth_estimation_type": "metric"}))
+    assert (definition.output_kind, definition.default_alignment) == ("depth", "none")
+    assert hf_definition(saved(tmp_path / "d", "dpt")).size == Fixed(64, 64)
+    folder = saved(tmp_path / "z", "zoedepth")
+    changed(folder, "preprocessor_config.json", {"ensure_multiple_of": 1 / 32})  # of the image
+    assert hf_definition(folder).size == Near(of=32, height=64, width=96)
+    assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
+    assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
+    assert FrameMap.fit(Near(of=14, height=518, width=518), 5, 9).network == (294, 518)
+
+
 @pytest.mark.parametrize(
-    "change",
+    ("name", "size", "mean"),
     [
-        {"_attn_implementation": "org/kernel"},
-        {"attn_implementation": {"backbone_config": "org/kernel"}},
-        {"backbone_config": {"_attn_implementation_internal": "flash_attention_2"}},
+        ("depth_anything", Near(of=14, height=518, width=518), 0.485),
+        ("prompt_depth_anything", Near(of=14, height=756, width=756), 0.485),
+        ("dpt", Fixed(384, 384), 0.5),
+        ("zoedepth", Near(of=32, height=384, width=512), 0.5),
+        ("glpn", Near(of=32), 0.0),
+        ("depth_pro", Fixed(1536, 1536), 0.5),
     ],
 )
-def test_an_attention_that_may_be_fetched_is_refused(
-    change: dict[str, Any], tmp_path: Path
+def test_a_folder_as_transformers_saves_it_is_prepared_as_usual_for_its_type(
+    name: str, size: Fixed | Near, mean: float, tmp_path: Path
 ) -> None:
-    folder = changed(saved(tmp_path / "net", "glpn"), "config.json", change)
-    with pytest.raises(ModelError, match="may fetch and run code"):
+    folder = saved(tmp_path / "net", name)
+    (folder / "preprocessor_config.json").unlink()
+    definition = hf_definition(folder)
+    assert definition.size == size
+    assert definition.normalisation is not None
+    assert definition.normalisation.mean[0] == mean
+    assert f"no preprocessor_config.json; assumed, as usual for {name}" in definition.assumed
+
+
+# ------------------------------------------------------------------ what is refused
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return saved(tmp_path_factory.mktemp("original") / "net", "glpn")
+
+
+@pytest.fixture
+def folder(original: Path, tmp_path: Path) -> Path:
+    """A folder of a GLPN."""
+    return Path(shutil.copytree(original, tmp_path / "net"))
+
+
+def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
+    (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
+    with pytest.raises(CheckpointError, match=r"pnpdepth models convert .*pytorch_model\.bin"):
         hf_definition(folder)
-    changed(folder, "config.json", dict.fromkeys(change, "sdpa"))
-    assert hf_definition(folder).name == "net"
+    (folder / "pytorch_model.bin").unlink()
+    with pytest.raises(CheckpointError, match="no model"):
+        hf_definition(folder)
+    for text, message in (
+        ('{"model_type": "bert"}', "'bert' are not known"),
+        ("{", "is not JSON"),
+        ('{"a":' + "[" * 100_000 + "]" * 100_000 + "}", "is not JSON"),
+    ):
+        (folder / "config.json").write_text(text)
+        with pytest.raises(ModelError, match=message):
+            hf_definition(folder)
+    (folder / "config.json").unlink()
+    with pytest.raises(ModelError, match=r"config\.json is missing"):
+        hf_definition(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depths": [1_000_000_000, 1, 1, 1]}, "1000000000 is larger than any part of a network"),
+        ({"depths": [90_000, 1, 1, 1]}, "describes a larger network than its weights"),
+        ({"hidden_sizes": [8, 8, 16, 1_000_000]}, "describes a larger network than its weights"),
+        ({"decoder_hidden_size": 4}, "transformers cannot load it|its weights leave"),
+        ({"_attn_implementation": "org/kernel"}, "may fetch and run code"),
+        ({"attn_implementation": {"backbone_config": "org/kernel"}}, "may fetch and run code"),
+        ({"x": {"_attn_implementation_internal": "flash_attention_2"}}, "may fetch and run code"),
+    ],
+)
+def test_a_network_larger_than_its_weights_or_of_fetched_code_is_not_built(
+    change: dict[str, Any], message: str, folder: Path
+) -> None:
+    changed(folder, "config.json", change)
+    with (
+        little(megabytes=900, seconds=30),
+        pytest.raises((CheckpointError, ModelError), match=message),
+    ):
+        load_network(str(folder), None)
+
+
+def test_plain_attention_is_taken(folder: Path) -> None:
+    assert hf_definition(changed(folder, "config.json", {"attn_implementation": "sdpa"}))
 
 
 @pytest.mark.parametrize(
@@ -315,45 +302,31 @@ def test_an_attention_that_may_be_fetched_is_refused(
         {"size_divisor": "x"},
         {"size_divisor": [32]},
         {"size_divisor": 10**12},
-        {"rescale_factor": "x"},
         {"rescale_factor": None},
         {"rescale_factor": 0},
         {"rescale_factor": 10**400},
         {"do_normalize": True, "image_mean": {"r": 1}},
         {"do_normalize": True, "image_std": [10**400] * 3},
+        {"size": [1, 2]},
+        {"size": {"height": "x", "width": 3}},
+        {"size": 10**9},
     ],
 )
 def test_settings_that_are_no_numbers_are_refused_in_one_line(
-    change: dict[str, Any], tmp_path: Path
+    change: dict[str, Any], folder: Path
 ) -> None:
-    folder = changed(saved(tmp_path / "net", "glpn"), "preprocessor_config.json", change)
+    (folder / "preprocessor_config.json").write_text(json.dumps({"size_divisor": 32} | change))
+    if "size" in change:
+        (folder / "preprocessor_config.json").write_text(json.dumps(change))
     with pytest.raises(ModelError, match=r"preprocessor_config\.json: ") as error:
         hf_definition(folder)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 600
 
 
-@pytest.mark.parametrize("size", ["x", [1, 2], {"height": "x", "width": 3}, 10**9, None])
-def test_a_size_that_is_none_is_refused(size: Any, tmp_path: Path) -> None:
-    folder = saved(tmp_path / "net", "dpt")
-    with pytest.raises(ModelError, match="must be a height and a width"):
-        hf_definition(changed(folder, "preprocessor_config.json", {"size": size}))
-
-
-@pytest.mark.parametrize("name", ["config.json", "preprocessor_config.json"])
-def test_settings_nested_too_deep_are_refused(name: str, tmp_path: Path) -> None:
-    folder = saved(tmp_path / "net", "glpn")
-    (folder / name).write_text('{"a":' + "[" * 100_000 + "]" * 100_000 + "}")
-    with pytest.raises(ModelError, match="is not JSON"):
-        hf_definition(folder)
-
-
-def test_code_in_a_folder_is_never_run(tmp_path: Path) -> None:
-    folder = saved(tmp_path / "net", "glpn")
+def test_code_in_a_folder_is_never_run(folder: Path, tmp_path: Path) -> None:
     marker = tmp_path / "ran"
     (folder / "code.py").write_text(f"open({str(marker)!r}, 'w')")
-    config = json.loads((folder / "config.json").read_text())
-    config["auto_map"] = {"AutoModelForDepthEstimation": "code.Net", "AutoConfig": "code.Config"}
-    (folder / "config.json").write_text(json.dumps(config))
-    load_network(str(folder), None)
+    code = {"AutoModelForDepthEstimation": "code.Net", "AutoConfig": "code.Config"}
+    load_network(str(changed(folder, "config.json", {"auto_map": code})), None)
     assert not marker.exists()

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.formats.onnx.table import (
+from pnpdepth_cli.models.onnx.table import (
     Inputs,
     Node,
     Operator,

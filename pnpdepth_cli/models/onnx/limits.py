@@ -20,7 +20,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten
 
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.formats.onnx.table import Unsupported
+from pnpdepth_cli.models.onnx.table import Unsupported
 
 _MAX_WRITTEN_OUT = 1 << 28  # bytes
 _NODE_BYTES = 1 << 12  # that a node takes in memory at least; depth networks have up to 10,000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -86,27 +87,19 @@ def test_an_invalid_field_of_a_definition_is_named_with_its_file_and_line(
     assert "\n" not in str(error.value)
 
 
-def test_a_network_instance_is_not_taken_for_a_function(tmp_path: Path) -> None:
-    file = written(tmp_path, "from torch import nn\nnet = nn.Conv2d(3, 1, 1)\n")
-    with pytest.raises(ModelError, match=r"'net' in .* is a Conv2d that is made already; name its"):
-        find_definition(f"{file}:net")
-
-
-def test_a_missing_file_or_attribute_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="does not exist"):
-        find_definition(str(tmp_path / "absent.py"))
-    file = written(tmp_path, "x = 1")
-    with pytest.raises(ModelError, match="defines no 'network'"):
-        find_definition(f"{file}:network")
-    with pytest.raises(ModelError, match=r"'x' in model file .* is a int"):
-        find_definition(f"{file}:x")
-
-
-def test_the_search_path_is_as_before(tmp_path: Path) -> None:
-    import sys
-
+def test_what_is_missing_or_no_definition_is_named_and_the_search_path_stays(
+    tmp_path: Path,
+) -> None:
     before = list(sys.path)
-    for text in ("x = 1", "raise ValueError", "import sys; sys.path.pop(0)"):
-        with pytest.raises(ModelError):
-            find_definition(str(written(tmp_path, text)))
-    assert sys.path == before
+    file = written(tmp_path, "from torch import nn\nnet = nn.Conv2d(3, 1, 1)\nx = 1\n")
+    for spec, message in (
+        (tmp_path / "absent.py", "does not exist"),
+        (f"{file}:network", "defines no 'network'"),
+        (f"{file}:x", r"'x' in model file .* is a int"),
+        (f"{file}:net", r"'net' in .* is a Conv2d that is made already; name its"),
+        (written(tmp_path, "raise ValueError", "raising.py"), "raises ValueError"),
+        (written(tmp_path, "import sys; sys.path.pop(0)", "popping.py"), "defines no 'definition'"),
+    ):
+        with pytest.raises(ModelError, match=message):
+            find_definition(str(spec))
+        assert sys.path == before

@@ -19,14 +19,14 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.formats.onnx import (  # noqa: F401  (each registers its operators)
+from pnpdepth_cli.models.onnx import (  # noqa: F401  (each registers its operators)
     arithmetic,
     layers,
     resizing,
     tensors,
 )
-from pnpdepth_cli.models.formats.onnx.limits import SizeLimit
-from pnpdepth_cli.models.formats.onnx.table import HOST_INPUTS, OPERATORS, Node, Unsupported
+from pnpdepth_cli.models.onnx.limits import SizeLimit
+from pnpdepth_cli.models.onnx.table import HOST_INPUTS, OPERATORS, Node, Unsupported
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")

@@ -17,7 +17,7 @@ from typing import Any
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
-from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, undescribed
 
 _ASSUMED_MULTIPLE = 32
 """Image sides are padded to multiples of this where no definition says otherwise."""
@@ -110,16 +110,11 @@ def _assumed_definition(build: Callable[..., Any], attribute: str, file: Path) -
             f"{attribute!r} in model file {file} needs arguments ({', '.join(required)}); write a"
             " function without any that returns the network, and name that"
         )
-    return ModelDefinition(
+    return undescribed(
         name=f"{file.stem}.{attribute}",
         summary=f"{attribute} of {file.name}",
-        input_kind="rgb",
         size=Multiple(_ASSUMED_MULTIPLE),
-        normalisation=None,
-        output_kind="unknown",
-        output_scale="unknown",
         build=build,
-        defaults=UNTUNED_DEFAULTS,
         assumed=f"{attribute!r} of {file.name} is not a definition; assumed: one rgb image in,"
         f" sides padded to multiples of {_ASSUMED_MULTIPLE}; what its numbers mean is decided from"
         " the points",

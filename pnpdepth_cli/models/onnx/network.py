@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
-from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph
-from pnpdepth_cli.models.formats.onnx.limits import inlined
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
+from pnpdepth_cli.models.onnx.graph import OnnxGraph
+from pnpdepth_cli.models.onnx.limits import inlined
 
 MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
@@ -47,19 +47,14 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
     height, width = input_shape[1:3] if channels_last else input_shape[2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
     is_part = _pruned(model, chosen, file)
-    return ModelDefinition(
+    return undescribed(
         name=file.stem,
-        input_kind="rgb",
         size=Fixed(int(height), int(width))
         if fixed
         else Multiple(_patch_size(model) or _ASSUMED_MULTIPLE),
         build=lambda: OnnxGraph(model, file),
         complete=True,
-        normalisation=None,
-        defaults=UNTUNED_DEFAULTS,
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
-        output_kind="unknown",
-        output_scale="unknown",
         checkpoint=file,
         arguments=lambda rgb, _: (_as_input(rgb, channels_last),),
         output=_as_map,

@@ -20,11 +20,12 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves, tree_map_only
 
 from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
 from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, view_of
 
 _ASSUMED_MULTIPLE = 32
@@ -112,8 +113,10 @@ class ExportedGraph(nn.Module):
         values: dict[str, Any] = dict(zip(self.inputs, inputs, strict=True))
         values |= {name: getattr(self, attribute) for name, attribute in self.held.items()}
         for step, ends in zip(self._steps, self._ends, strict=True):
-            keywords = {name: _resolved(value, values) for name, value in step.keywords.items()}
-            result = step.run(*(_resolved(value, values) for value in step.arguments), **keywords)
+            arguments, keywords = tree_map_only(
+                _Value, lambda value: values[value.name], (step.arguments, step.keywords)
+            )
+            result = step.run(*arguments, **keywords)
             if isinstance(step.outputs, str):
                 values[step.outputs] = result
             else:
@@ -200,18 +203,13 @@ def exported_definition(file: Path) -> ModelDefinition:
             " expected"
         )
     height, width = shapes[0][2:]
-    return ModelDefinition(
+    return undescribed(
         name=file.stem,
         summary="torch.export archive",
-        input_kind="rgb",
         size=Fixed(height, width) if height and width else Multiple(_ASSUMED_MULTIPLE),
-        normalisation=None,
-        output_kind="unknown",
-        output_scale="unknown",
         build=lambda: ExportedGraph(program, tensors),
         complete=True,
         checkpoint=file,
-        defaults=UNTUNED_DEFAULTS,
     )
 
 
@@ -305,16 +303,9 @@ def _outputs_in(stated: Mapping[str, Any]) -> list[str | None]:
 
 def _names_in(step: _Step) -> set[str]:
     """The values that a step reads or gives."""
-    read = [*step.arguments, *step.keywords.values()]
-    read += [one for value in read if isinstance(value, list) for one in value]
+    read = tree_leaves((step.arguments, step.keywords))
     given = [step.outputs] if isinstance(step.outputs, str) else step.outputs
     return {*filter(None, given), *(one.name for one in read if isinstance(one, _Value))}
-
-
-def _resolved(value: Any, values: Mapping[str, Any]) -> Any:
-    if isinstance(value, list):
-        return [_resolved(one, values) for one in value]
-    return values[value.name] if isinstance(value, _Value) else value
 
 
 def _same(value: Any) -> Any:

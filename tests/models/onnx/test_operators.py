@@ -15,9 +15,8 @@ from pathlib import Path  # noqa: E402
 
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
-from pnpdepth_cli.errors import ModelError  # noqa: E402
-from pnpdepth_cli.models.formats.onnx.graph import OnnxGraph  # noqa: E402
-from pnpdepth_cli.models.formats.onnx.table import OPERATORS  # noqa: E402
+from pnpdepth_cli.models.onnx.graph import OnnxGraph  # noqa: E402
+from pnpdepth_cli.models.onnx.table import OPERATORS  # noqa: E402
 
 F32, I64 = np.float32, np.int64
 
@@ -91,23 +90,15 @@ def test_an_operator_of_one_input_is_as_in_onnxruntime(op: str, attributes: dict
     check(op, [X], opset=18, **attributes)
 
 
-@pytest.mark.parametrize("op", ["Log", "Sqrt", "Reciprocal", "Asin", "Acos"])
-def test_an_operator_of_a_bounded_input_is_as_in_onnxruntime(op: str) -> None:
-    check(op, [np.clip(POSITIVE, 0.1, 0.9)])
-
-
-@pytest.mark.parametrize("approximate", ["none", "tanh"])
-def test_gelu(approximate: str) -> None:
-    check("Gelu", [X], opset=20, approximate=approximate)
-
-
 BINARY = ["Add", "Sub", "Mul", "Div", "Equal", "Greater", "Less", "GreaterOrEqual", "LessOrEqual",
           "Max", "Min", "Sum", "Mean"]  # fmt: skip
 
 
-@pytest.mark.parametrize("op", BINARY)
-def test_an_operator_of_two_inputs_broadcasts(op: str) -> None:
-    check(op, [X, normal(4, 1, 1)])
+def test_an_operator_of_a_bounded_input_or_of_two_inputs_is_as_in_onnxruntime() -> None:
+    for op in ("Log", "Sqrt", "Reciprocal", "Asin", "Acos"):
+        check(op, [np.clip(POSITIVE, 0.1, 0.9)])
+    for op in BINARY:
+        check(op, [X, normal(4, 1, 1)])
 
 
 def test_powers_divisions_and_remainders() -> None:
@@ -126,15 +117,14 @@ def test_logic() -> None:
     check("Where", [a, normal(3), normal(2, 3)])
 
 
-def test_clip_of_old_and_new_opsets() -> None:
+def test_activations_of_old_and_new_opsets() -> None:
+    for approximate in ("none", "tanh"):
+        check("Gelu", [X], opset=20, approximate=approximate)
     check("Clip", [X], opset=6, min=0.0, max=6.0)
     check("Clip", [X], opset=6, max=0.5)
     check("Clip", [X, np.array(0, F32), np.array(6, F32)])
     check("Clip", [X, None, np.array(0.5, F32)])
     check("Clip", [X, np.array(2, F32), np.array(1, F32)])
-
-
-def test_prelu_softmax_and_broadcast_of_old_opsets() -> None:
     check("PRelu", [X, normal(4, 1, 1)])
     check("Softmax", [X], opset=9)
     check("Softmax", [X], opset=11, axis=2)
@@ -154,12 +144,10 @@ REDUCTIONS = sorted(name for name in OPERATORS if name.startswith("Reduce"))
 
 @pytest.mark.parametrize("op", REDUCTIONS)
 def test_reductions_of_old_and_new_opsets(op: str) -> None:
-    x = POSITIVE
-    old = 11
-    check(op, [x], opset=old, axes=[2, -1], keepdims=0)
-    check(op, [x], opset=old)
-    check(op, [x, np.array([1], I64)], opset=18)
-    check(op, [x, np.array([], I64)], opset=18, noop_with_empty_axes=1)
+    check(op, [POSITIVE], opset=11, axes=[2, -1], keepdims=0)
+    check(op, [POSITIVE], opset=11)
+    check(op, [POSITIVE, np.array([1], I64)], opset=18)
+    check(op, [POSITIVE, np.array([], I64)], opset=18, noop_with_empty_axes=1)
 
 
 PADS = [
@@ -287,26 +275,18 @@ def test_normalisations() -> None:
 
 
 def test_dequantised_weights_are_folded_into_numbers() -> None:
-    quantised = np.random.default_rng(0).integers(-128, 127, (4, 3)).astype(np.int8)
+    x, quantised = normal(1, 3), np.random.default_rng(0).integers(-9, 9, (3, 4)).astype(np.int8)
     scale, zero = np.abs(normal(4)) + 0.01, np.arange(4, dtype=np.int8)
-    nodes = [
-        helper.make_node("DequantizeLinear", ["q", "s", "z"], ["w"], axis=0),
-        helper.make_node("MatMul", ["w", "in0"], ["out0"]),
-    ]
-    graph = helper.make_graph(
-        nodes, "g", [helper.make_tensor_value_info("in0", TensorProto.FLOAT, [3, 2])],
-        [onnx.ValueInfoProto(name="out0")],
-        [numpy_helper.from_array(v, n) for n, v in (("q", quantised), ("s", scale), ("z", zero))],
-    )  # fmt: skip
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)])
-    model.ir_version = 10
-    x = normal(3, 2)
-    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    model = model_of("MatMul", [x, None], 13, 1)
+    dequantise = helper.make_node("DequantizeLinear", ["q", "s", "z"], ["w"], axis=1)
+    model.graph.node[0].input[1] = "w"
+    model.graph.node.insert(0, dequantise)
+    for value, name in ((quantised, "q"), (scale, "s"), (zero, "z")):
+        model.graph.initializer.append(numpy_helper.from_array(value, name))
     module = OnnxGraph(model, Path("x.onnx"))
     assert [name for name, _ in module.named_children()] == ["MatMul_out0"]
-    np.testing.assert_allclose(
-        module(torch.from_numpy(x)).numpy(), session.run(None, {"in0": x})[0], rtol=1e-5, atol=1e-5
-    )
+    expected = x @ ((quantised - zero).astype(F32) * scale)
+    np.testing.assert_allclose(module(torch.from_numpy(x)).numpy(), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_shapes() -> None:
@@ -351,17 +331,14 @@ def test_pads(mode: str) -> None:
 
 SLICES = [
     ([1], [5], [2], [2]), ([-1], [-100], [3], [-1]), ([4], [0], [2], [-2]),
-    ([0], [2**62], [1], [1]),
-    ([1, -3], [3, -1], [1, -1], [1, 1]), ([5], [2], [2], [1]), ([-100], [3], [3], [1]),
+    ([0], [2**62], [1], [1]), ([1, -3], [3, -1], [1, -1], [1, 1]), ([5], [2], [2], [1]),
+    ([-100], [3], [3], [1]),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("parts", SLICES, ids=str)
-def test_slices(parts: tuple[list[int], ...]) -> None:
-    check("Slice", [X, *(np.array(p, I64) for p in parts)])
-
-
-def test_slices_of_old_opsets() -> None:
+def test_slices() -> None:
+    for parts in SLICES:
+        check("Slice", [X, *(np.array(p, I64) for p in parts)])
     check("Slice", [X], opset=9, starts=[1, 0], ends=[3, -1], axes=[2, 3])
     check("Slice", [X], opset=9, starts=[0, 1], ends=[1, 3])
 
@@ -385,9 +362,3 @@ def test_every_operator_in_the_table_is_tested_here() -> None:
     source = Path(__file__).read_text()
     untested = {op for op in OPERATORS if f'"{op}"' not in source} - set(REDUCTIONS)
     assert not untested  # "Constant" has no input; networks have it
-
-
-def test_an_operator_that_is_not_covered_is_named() -> None:
-    model = model_of("NonZero", [X], 13, 1)
-    with pytest.raises(ModelError, match=r"not covered: NonZero \(1 ×\)"):
-        OnnxGraph(model, Path("x.onnx"))
