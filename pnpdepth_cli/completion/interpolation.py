@@ -207,7 +207,7 @@ def remembered(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any
 
         @functools.wraps(function)
         def call(*args: Any) -> Any:
-            if sum(np.size(arg) for arg in args) > 2 * _MOST_REMEMBERED:
+            if sum(len(arg) for arg in args if not isinstance(arg, int)) > _MOST_REMEMBERED:
                 return function(*args)
             return known(*(arg if isinstance(arg, int) else arg.tobytes() for arg in args))
 

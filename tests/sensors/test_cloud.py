@@ -41,15 +41,6 @@ def plane_depth(normal: tuple[float, float, float], distance: float) -> np.ndarr
     return (distance / (rays @ np.array(normal))).astype(np.float32)
 
 
-def test_points_project_back_onto_their_pixels() -> None:
-    depth = np.random.default_rng(0).uniform(1, 9, (HEIGHT, WIDTH)).astype(np.float32)
-    cloud = whole(depth, CAMERA, edge=0)
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    pixels = np.column_stack([columns.ravel(), rows.ravel()])
-    assert cloud.xyz[:, 2] == pytest.approx(depth.ravel(), rel=1e-6)
-    assert CAMERA.pixels_of(cloud.xyz.astype(np.float64)) == pytest.approx(pixels, abs=1e-4)
-
-
 def test_points_of_a_lens_with_distortion_project_back_onto_their_pixels() -> None:
     camera = Camera(intrinsics=INTRINSICS, distortion=(-0.1, 0.02, 0.001, -0.002, 0.0))
     depth = np.full((HEIGHT, WIDTH), 2, np.float32)

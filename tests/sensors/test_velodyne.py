@@ -2,9 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.sensors import (
@@ -20,16 +17,6 @@ SIZE = (80, 101)
 
 def camera(**fields: object) -> Camera:
     return Camera(**({"intrinsics": K, "rotation": FORWARD_LEFT_UP} | fields))  # type: ignore[arg-type]
-
-
-def rotation(x: float, y: float, z: float) -> NDArray[np.float64]:
-    """By Rodrigues' formula about the axis (x, y, z), by its length in radians."""
-    angle = float(np.linalg.norm([x, y, z]))
-    if angle == 0:
-        return np.eye(3)
-    a, b, c = np.array([x, y, z]) / angle
-    cross = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def test_a_scan_projects_as_computed_by_hand() -> None:
@@ -96,67 +83,6 @@ def test_the_outermost_half_pixels_belong_to_the_image_and_no_more() -> None:
     # u = 50 - 10 y: the left border of the image is at -0.5, the right one at 100.5
     scan = np.array([[10.0, y, 0] for y in (5.0499, 5.0501, -5.0499, -5.0501)])
     assert project_velodyne(scan, camera(), SIZE, keep_occluded=True).index.tolist() == [0, 2]
-
-
-angles = st.floats(-0.3, 0.3)
-offsets = st.floats(-1.5, 1.5)
-lens = st.sampled_from(
-    [(), (-0.2, 0.03, 0.001, -0.002), (-0.3, 0.1, 0.0, 0.001, -0.02), (0.1,) * 2 + (0.0,) * 6]
-)
-
-
-@settings(deadline=None, max_examples=40)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    turn=st.tuples(angles, angles, angles),
-    move=st.tuples(offsets, offsets, offsets),
-    focal=st.floats(60, 900),
-    distortion=lens,
-)
-def test_a_projected_point_unprojects_to_where_it_was(
-    seed: int,
-    turn: tuple[float, float, float],
-    move: tuple[float, float, float],
-    focal: float,
-    distortion: tuple[float, ...],
-) -> None:
-    size = (300, 400)
-    focal += 300 if distortion else 0  # undistortion settles only so far from the axis
-    intrinsics = np.array([[focal, 0.3, 201.7], [0, 1.1 * focal, 148.2], [0, 0, 1]])
-    eye = camera(
-        intrinsics=intrinsics,
-        rotation=rotation(*turn) @ FORWARD_LEFT_UP,
-        translation=np.array(move),
-        distortion=distortion,
-    )
-    scan = np.random.default_rng(seed).uniform([-20, -20, -4], [60, 20, 4], (400, 3))
-    try:
-        got = project_velodyne(scan, eye, size, keep_occluded=True)
-    except NoPointsError:
-        return
-    back = eye.to_scanner(eye.unproject(got.xy.astype(np.float64), got.depth))
-    np.testing.assert_allclose(back, scan[got.index], atol=2e-3)
-    # and from the middle of its pixel, to where the pixel's rounding allows
-    rounded = eye.to_scanner(eye.unproject(np.floor(got.xy + 0.5), got.depth))
-    off = np.linalg.norm(rounded - scan[got.index], axis=1)
-    assert (off <= 1.6 * got.depth / focal + 1e-3).all()
-
-
-@settings(deadline=None, max_examples=60)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    coefficients=st.tuples(*[st.floats(-0.05, 0.05)] * 8).flatmap(
-        lambda c: st.sampled_from([c[:4], c[:5], c])
-    ),
-)
-def test_distortion_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
-    import cv2
-
-    points = np.random.default_rng(seed).uniform([-4, -4, 8], [4, 4, 30], (50, 3))
-    eye = camera(distortion=coefficients)
-    ours = eye.pixels_of(points)
-    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(coefficients))
-    np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-8)
 
 
 def test_a_lens_model_does_not_fold_points_from_outside_into_the_image() -> None:
