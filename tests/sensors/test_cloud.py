@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.sensors import cloud as module
@@ -50,6 +50,7 @@ def test_points_of_a_lens_with_distortion_project_back_onto_their_pixels() -> No
     assert camera.pixels_of(xyz) == pytest.approx(pixels, abs=1e-3)
 
 
+@settings(max_examples=25, deadline=None)
 @given(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(0.5, 20))
 def test_a_plane_has_its_normal_everywhere_and_no_edge(a: float, b: float, distance: float) -> None:
     normal = np.array([a, b, 1.0]) / np.linalg.norm([a, b, 1.0])

@@ -111,6 +111,7 @@ def test_torch_transformer_layers_with_their_fast_path_come_out_the_same(
             assert split.static_graph == (kind is not LooksAtValues)
 
 
+@pytest.mark.slow
 def test_a_compiled_network_can_be_cut() -> None:
     network, x = build("unet"), image()
     whole = plain(network, x)
