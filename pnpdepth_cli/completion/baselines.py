@@ -85,10 +85,6 @@ class Baseline:
         return bound.depth(points, prediction)
 
 
-def _points(title: str, depth: Callable[..., Tensor], *, pointwise: bool = True) -> Baseline:
-    return Baseline(title=title, of_points=depth, pointwise=pointwise)
-
-
 def _aligned(title: str, kind: str, space: str) -> Baseline:
     return Baseline(title=title, of_prediction=partial(aligned, kind=kind, space=space))
 
@@ -165,11 +161,15 @@ def _lines_at(
 
 
 TABLE = {
-    "nearest": _points("nearest point", nearest),
-    "linear": _points("linear between points (Delaunay)", linear),
-    "linear-log": _points("linear between points, in log depth", partial(linear, space="log")),
-    "idw": _points("inverse distance weighting", inverse_distance),
-    "morphological": _points("morphological fill (IP-Basic)", morphological, pointwise=False),
+    "nearest": Baseline(title="nearest point", of_points=nearest, pointwise=True),
+    "linear": Baseline(title="linear between points (Delaunay)", of_points=linear, pointwise=True),
+    "linear-log": Baseline(
+        title="linear between points, in log depth",
+        of_points=partial(linear, space="log"),
+        pointwise=True,
+    ),
+    "idw": Baseline(title="inverse distance weighting", of_points=inverse_distance, pointwise=True),
+    "morphological": Baseline(title="morphological fill (IP-Basic)", of_points=morphological),
     "median": _aligned("median of ratios", kind="median", space="depth"),
     "scale": _aligned("scale", kind="scale", space="depth"),
     "affine": _aligned("scale and shift", kind="affine", space="depth"),

@@ -163,7 +163,7 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     rng = np.random.default_rng(seed)
     turned = _rotated(camera, sensor.rotation_noise_deg, rng)
     beams = sensor.directions(rng) @ turned.rotation.T
-    drops = DropCounter(len(beams))
+    drops = DropCounter()
     z = _depth_at_first_hit(np.asarray(depth, np.float64), turned, beams)
     met = drops.keep(np.isfinite(z), "meets nothing that the camera sees")
     distance = (z[met] - camera.translation[2]) / beams[met, 2]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
@@ -45,8 +46,11 @@ def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None
     camera = Camera(
         intrinsics=K, rotation=FORWARD_LEFT_UP, translation=np.array([-left_m, 0.0, 0.0])
     )
-    everything = project_velodyne(scan, camera, SIZE, keep_occluded=True).index
-    kept = project_velodyne(scan, camera, SIZE).index
+    tree = cKDTree(camera.pixels_of(camera.from_scanner(scan)))
+    everything, kept = (
+        tree.query(project_velodyne(scan, camera, SIZE, keep_occluded=keep).xy)[1]
+        for keep in (True, False)
+    )
     removed = np.setdiff1d(everything, kept)
     truly_hidden = np.intersect1d(everything, np.flatnonzero(hidden))
     assert len(truly_hidden) > 50
