@@ -192,12 +192,12 @@ EXPORTS = Table(
 """Files for reconstruction programs: `pnpdepth_cli.commands.exports.Export`."""
 
 PROPAGATIONS = Table(
-    "completion/propagations",
+    "completion/propagation",
     group="propagations",
     noun="propagation",
     names=("gp", "diffusion"),
 )
-"""How the residual at the points is propagated: `pnpdepth_cli.completion.propagations`."""
+"""How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
 
 BASELINES = Table(
     "completion/baselines",

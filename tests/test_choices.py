@@ -10,7 +10,7 @@ import torch
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.choices import Table
-from pnpdepth_cli.completion import baselines, propagations
+from pnpdepth_cli.completion import baselines, propagation
 from pnpdepth_cli.core import losses, update_rules
 from pnpdepth_cli.core.update_rules import SCHEDULES
 from pnpdepth_cli.errors import UsageError
@@ -52,7 +52,7 @@ def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_th
         (choices.LOSSES, losses.TABLE),
         (choices.UPDATES, update_rules.TABLE),
         (choices.BASELINES, baselines.TABLE),
-        (choices.PROPAGATIONS, propagations.TABLE),
+        (choices.PROPAGATIONS, propagation.TABLE),
     ],
 )
 def test_a_table_lists_the_names_of_its_module_in_their_order(

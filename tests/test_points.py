@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.points import SparsePoints, in_frame
@@ -20,6 +20,7 @@ def points(xy: list[tuple[float, float]], size: tuple[int, int]) -> SparsePoints
     return SparsePoints(xy=torch.tensor(xy, dtype=torch.float32), depth=depth, size=size)
 
 
+@settings(max_examples=40, deadline=None)
 @given(sides, sides, sides, sides, st.lists(st.tuples(shares, shares), min_size=1, max_size=9))
 def test_a_frame_there_and_back_is_the_same_frame(
     height: int, width: int, h: int, w: int, pixels: list[tuple[float, float]]
@@ -39,6 +40,7 @@ def test_pixel_areas_move_not_pixel_centres() -> None:
     assert there.xy.tolist() == [[0.5, 0.5], [6.5, 2.5]]
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31))
 def test_on_the_grid_a_sample_is_plain_indexing(height: int, width: int, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
@@ -50,6 +52,7 @@ def test_on_the_grid_a_sample_is_plain_indexing(height: int, width: int, seed: i
     assert torch.equal(here.sample(dense), dense.flatten())
 
 
+@settings(max_examples=40, deadline=None)
 @given(
     sides, sides, st.lists(st.tuples(shares, shares), min_size=1, max_size=9), st.integers(0, 99)
 )
@@ -88,6 +91,7 @@ def test_two_maps_at_once_are_refused() -> None:
         points([(0, 0)], (2, 2)).sample(torch.zeros(1, 2, 2, 2))
 
 
+@settings(max_examples=40, deadline=None)
 @given(
     st.integers(1, 8),
     st.integers(1, 8),

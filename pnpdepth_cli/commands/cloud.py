@@ -26,8 +26,15 @@ from pnpdepth_cli.io.cloud_files import check_cloud_suffix, write_cloud
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors.cloud import EDGE, PointCloud, VoxelGrid, cloud_from_depth
-from pnpdepth_cli.sensors.consistency import View, consistent_depth, neighbouring_views
+from pnpdepth_cli.sensors.cloud import (
+    EDGE,
+    PointCloud,
+    View,
+    VoxelGrid,
+    cloud_from_depth,
+    consistent_depth,
+    neighbouring_views,
+)
 
 _IN_MEMORY = 12
 """Depth maps of neighbouring views that are kept, with their points."""

@@ -45,13 +45,10 @@ class Alignment:
     kind: str
     """Kind of the fit, one of `choices.ALIGNMENTS`."""
     scale: float
-    """Slope of the line."""
     shift: float
-    """Intercept of the line."""
     bounds: tuple[float, float]
     """(nearest, farthest) metres; depth outside, or no positive depth at all, becomes the bound."""
     points: int
-    """Number of points that were fitted."""
     error: float = math.nan
     """Mean |log(aligned / measured depth)| of the best 70 % of the points."""
     misfit: float = math.nan

@@ -1,21 +1,50 @@
 """Baselines: dense depth without refinement, to measure a refined network against.
 
-`pnpdepth_cli.choices.BASELINES` lists the names.
+`pnpdepth_cli.choices.BASELINES` lists the names. "local" aligns a network's depth locally. A global
+alignment reads the network's numbers as a·x + b everywhere. Here a and b are fitted around
+each pixel, to its nearest points:
+
+    min over a, b of  Σ_i w_i·(y_i − a·x_i − b)² + ridge·(a − a_global)²,   w_i = 1 / distance_i³
+
+y the depth of the points and x the globally aligned prediction. Moving
+least squares (Lancaster and Salkauskas 1981) of the depth against the prediction, as in locally
+weighted alignment of monocular depth (Xu et al. 2022), but with weights that go through the
+points instead of a bandwidth: that was far better on rendered frames from 20 points to LiDAR.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
+import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.completion.alignment import aligned
-from pnpdepth_cli.completion.interpolation import inverse_distance, linear, morphological, nearest
-from pnpdepth_cli.completion.local_alignment import locally_aligned
+from pnpdepth_cli.completion.alignment import align, aligned, to_space, where_predicted
+from pnpdepth_cli.completion.interpolation import (
+    distinct,
+    inverse_distance,
+    linear,
+    morphological,
+    nearest,
+    nearest_points,
+)
+from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
+
+# Chosen on rendered frames, with predictions of three networks and of a synthetic one.
+NEIGHBOURS = 12
+POWER = 3.0
+RIDGE = 0.03
+"""Against the variance of x among the points of a pixel, in units of its variance among all."""
+
+_NODES = 400_000  # lines that are fitted; with more pixels, lines are interpolated
+_AT_A_POINT = 0.5  # pixels; closer than this, a point is as close as can be
+_OUTLIER_WEIGHT = 1e-6  # what an outlier counts where no other point is near
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,11 +59,6 @@ class Baseline:
     """Depth from a prediction (H, W), up to scale and shift with 0 unknown, and the points."""
     pointwise: bool = False
     """Whether the function takes `xy` (M, 2), so that few pixels cost less than all."""
-
-    @property
-    def needs_prediction(self) -> bool:
-        """Whether it needs a network."""
-        return self.of_prediction is not None
 
     def depth(self, points: SparsePoints, prediction: Tensor | None = None) -> Tensor:
         """Returns the depth (H, W) metres, 0 = unknown.
@@ -61,20 +85,91 @@ class Baseline:
         return bound.depth(points, prediction)
 
 
-def _points(title: str, depth: Callable[..., Tensor], *, pointwise: bool = True) -> Baseline:
-    return Baseline(title=title, of_points=depth, pointwise=pointwise)
-
-
 def _aligned(title: str, kind: str, space: str) -> Baseline:
     return Baseline(title=title, of_prediction=partial(aligned, kind=kind, space=space))
 
 
+def locally_aligned(
+    prediction: Tensor, points: SparsePoints, xy: Tensor | None = None, *, space: str = "depth"
+) -> Tensor:
+    """Returns the locally aligned depth (H, W) float32 metres, within a global alignment's bounds.
+
+    Args:
+        prediction: (H, W) depth, metric or not; not positive or not finite is unknown, and 0 in the
+            result.
+        points: Sparse depth in the same frame.
+        xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel.
+        space: Quantity in which the lines are fitted, one of `choices.SPACES`.
+
+    Raises:
+        NoPointsError: No point has a prediction.
+    """
+    device, prediction, points = prediction.device, prediction.detach().cpu(), points.tensors()
+    known, points = where_predicted(prediction, points)
+    points = distinct(points)
+    x = to_space(torch.where(known, prediction, 1.0).double(), space)
+    aligned = align(points.sample(x), points, (space,), "auto")
+    start, reading = aligned.scale * x + aligned.shift, replace(aligned, scale=1.0, shift=0.0)
+    at_points = points.sample(start)
+    std = at_points.std(correction=0) + 1e-9 * at_points.abs().mean()
+    z, z_at_points = ((y - at_points.mean()) / std for y in (start, at_points))
+    residual = to_space(points.depth.double(), space) - at_points
+    weights = inlier_weights(points, points.depth.double().log() - reading.depth(at_points).log())
+    if xy is not None:
+        queries = SparsePoints(xy=xy.cpu(), depth=torch.ones(len(xy)), size=points.size)
+        known = queries.sample(torch.where(known, 1.0, torch.nan)).isfinite()
+        start, z = queries.sample(start), queries.sample(z)
+    shift, slope = _lines(points, xy, residual, z_at_points, weights)
+    depth = reading.depth(start + shift + slope * z)
+    return torch.where(known, depth, 0.0).float().to(device)
+
+
+def _lines(
+    points: SparsePoints, xy: Tensor | None, residual: Tensor, z: Tensor, inlier_weight: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Shift and slope of the line through residual (N,) over z (N,) around every pixel."""
+    if xy is not None:
+        return _lines_at(xy.double().cpu(), points, residual, z, inlier_weight)
+    height, width = points.size
+    step = math.ceil(math.sqrt(height * width / _NODES))
+    rows, columns = (
+        torch.linspace(0, n - 1, math.ceil((n - 1) / step) + 1, dtype=torch.float64)
+        for n in points.size
+    )
+    nodes = torch.cartesian_prod(rows, columns).flip(1)
+    lines = torch.stack(_lines_at(nodes, points, residual, z, inlier_weight))
+    lines = lines.reshape(1, 2, len(rows), len(columns))
+    if step > 1:
+        lines = F.interpolate(lines, points.size, mode="bilinear", align_corners=True)
+    return lines[0, 0], lines[0, 1]
+
+
+def _lines_at(
+    nodes: Tensor, points: SparsePoints, residual: Tensor, z: Tensor, inlier_weight: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The same, (M,), around nodes (M, 2)."""
+    distance, near = nearest_points(points, nodes, min(NEIGHBOURS, len(points)))
+    weight = distance.clamp_min(_AT_A_POINT).pow(-POWER)
+    weight = weight / weight.sum(dim=1, keepdim=True) * (inlier_weight[near] + _OUTLIER_WEIGHT)
+    weight = weight / weight.sum(dim=1, keepdim=True)
+    z, residual = z[near], residual[near]
+    mean_z, mean = ((weight * v).sum(dim=1, keepdim=True) for v in (z, residual))
+    slope = (weight * (z - mean_z) * (residual - mean)).sum(dim=1, keepdim=True) / (
+        (weight * (z - mean_z).square()).sum(dim=1, keepdim=True) + RIDGE
+    )
+    return (mean - slope * mean_z)[:, 0], slope[:, 0]
+
+
 TABLE = {
-    "nearest": _points("nearest point", nearest),
-    "linear": _points("linear between points (Delaunay)", linear),
-    "linear-log": _points("linear between points, in log depth", partial(linear, space="log")),
-    "idw": _points("inverse distance weighting", inverse_distance),
-    "morphological": _points("morphological fill (IP-Basic)", morphological, pointwise=False),
+    "nearest": Baseline(title="nearest point", of_points=nearest, pointwise=True),
+    "linear": Baseline(title="linear between points (Delaunay)", of_points=linear, pointwise=True),
+    "linear-log": Baseline(
+        title="linear between points, in log depth",
+        of_points=partial(linear, space="log"),
+        pointwise=True,
+    ),
+    "idw": Baseline(title="inverse distance weighting", of_points=inverse_distance, pointwise=True),
+    "morphological": Baseline(title="morphological fill (IP-Basic)", of_points=morphological),
     "median": _aligned("median of ratios", kind="median", space="depth"),
     "scale": _aligned("scale", kind="scale", space="depth"),
     "affine": _aligned("scale and shift", kind="affine", space="depth"),

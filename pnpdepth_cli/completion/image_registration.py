@@ -56,9 +56,8 @@ class ImageRegistration:
     zoom: float
     """Ratio of the focal lengths, image over depth."""
     right: float
-    """Shift in pixels."""
+    """Shift in pixels, as `down`."""
     down: float
-    """Shift in pixels."""
 
     def __str__(self) -> str:
         return f"{self.zoom:.3f},{self.right:.1f},{self.down:.1f}"

@@ -8,7 +8,10 @@ everywhere. Without any, NoPointsError is raised.
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -22,16 +25,15 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import from_space, to_space
-from pnpdepth_cli.completion.remembered import remembered
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
-IDW_NEIGHBOURS = 6
-IDW_POWER = 4.0
 FILL_SHARE = 0.03
 """Fraction of the pixels with a point for which the kernels of `morphological` are as published."""
 
+_MOST_REMEMBERED = 1 << 16  # coordinate pairs up to which a result is remembered
 _IDW_PIXELS = 1 << 18  # pixels looked up at once: what bounds the memory
+_IDW_NEIGHBOURS, _IDW_POWER = 6, 4.0
 _AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
 _WORTH_THREADS = 1 << 15  # neighbours; for fewer, threads cost more than they save
 _DIAMOND = np.array(
@@ -71,14 +73,9 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
     return _shaped(dense, points, xy)
 
 
-def in_hull(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
-    """Returns bool (H, W), or (M,), whether each pixel lies in the convex hull of the points.
-
-    Args:
-        points: Sparse depth.
-        xy: (M, 2) pixel coordinates. None: every pixel.
-    """
-    pixels = _queries(points, xy)
+def in_hull(points: SparsePoints) -> Tensor:
+    """Returns bool (H, W), whether each pixel lies in the convex hull of the points."""
+    pixels = _queries(points, None)
     inside = torch.zeros(len(pixels), dtype=torch.bool)
     if len(points) >= 3:
         try:
@@ -88,18 +85,14 @@ def in_hull(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
                 inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
         except QhullError:  # all points on one line
             pass
-    return inside.reshape(points.size if xy is None else (len(xy),)).to(points.depth.device)
+    return inside.reshape(points.size).to(points.depth.device)
 
 
 def inverse_distance(
     points: SparsePoints,
     xy: Tensor | None = None,
-    *,
-    neighbours: int = IDW_NEIGHBOURS,
-    power: float = IDW_POWER,
-    space: str = "log",
 ) -> Tensor:
-    """Returns the mean of the nearest points, weighted by 1 / distance^power.
+    """Returns the mean log depth of the six nearest points, weighted by 1 / distance⁴, as depth.
 
     Shepard, "A two-dimensional interpolation function for irregularly-spaced data", 1968, of the
     nearest points only.
@@ -107,18 +100,15 @@ def inverse_distance(
     Args:
         points: Sparse depth.
         xy: (M, 2) pixel coordinates. None: every pixel.
-        neighbours: Number of nearest points.
-        power: Of the distance.
-        space: Quantity that is averaged, one of `choices.SPACES`.
     """
     points = distinct(points)
-    value = to_space(points.depth.double().cpu(), space)
+    value = points.depth.double().cpu().log()
     pixels, means = _queries(points, xy), []
     for some in torch.split(pixels, _IDW_PIXELS):
-        distance, number = nearest_points(points, some, min(neighbours, len(points)))
-        weight = distance.clamp_min(_AT_A_POINT).pow(-power)
+        distance, number = nearest_points(points, some, min(_IDW_NEIGHBOURS, len(points)))
+        weight = distance.clamp_min(_AT_A_POINT).pow(-_IDW_POWER)
         means.append((weight * value[number]).sum(dim=1) / weight.sum(dim=1))
-    return _shaped(from_space(torch.cat(means), space), points, xy)
+    return _shaped(torch.cat(means).exp(), points, xy)
 
 
 def morphological(points: SparsePoints) -> Tensor:
@@ -134,17 +124,24 @@ def morphological(points: SparsePoints) -> Tensor:
     height, width = points.size
     shrink = min(1.0, math.sqrt(len(points) / (FILL_SHARE * height * width)))
     coarse = points.resized(max(1, round(height * shrink)), max(1, round(width * shrink)))
-    sparse = _within_frame(coarse).scatter().cpu()[0, 0]
+    # points outside the frame are moved onto its outermost pixels
+    last = coarse.xy.new_tensor([coarse.size[1] - 1, coarse.size[0] - 1])
+    coarse = replace(coarse, xy=torch.minimum(coarse.xy.clamp_min(0), last))
+    sparse = coarse.scatter().cpu()[0, 0]
     # minus depth: the maximum is the nearest, and minus infinity is unknown
     value = torch.where(sparse > 0, -sparse, -torch.inf).numpy()
+    five, seven = (np.ones((side, side), np.uint8) for side in (5, 7))
     value = _dilated(value, _DIAMOND)
-    value = -_dilated(-_dilated(value, _square(5)), _square(5))
-    value = np.where(np.isinf(value), _dilated(value, _square(7)), value)
+    value = -_dilated(-_dilated(value, five), five)
+    value = np.where(np.isinf(value), _dilated(value, seven), value)
     nearest_known = distance_transform_edt(
         np.isinf(value), return_distances=False, return_indices=True
     )
     smooth = torch.from_numpy(cv2.medianBlur(value[tuple(nearest_known)], 5))
-    dense = -_blurred(smooth[None, None])
+    kernel = torch.exp(-0.5 * (torch.arange(-2.0, 3.0) / _BLUR_SIGMA) ** 2)
+    kernel = (kernel / kernel.sum()).reshape(1, 1, 1, 5)
+    padded = F.pad(smooth[None, None], (2, 2, 2, 2), mode="replicate")
+    dense = -F.conv2d(F.conv2d(padded, kernel), kernel.transpose(2, 3))
     if dense.shape[-2:] != points.size:
         dense = F.interpolate(dense, points.size, mode="bilinear", align_corners=False)
     return dense[0, 0].to(points.depth.device)
@@ -193,6 +190,32 @@ def nearest_points(points: SparsePoints, xy: Tensor, count: int) -> tuple[Tensor
     return torch.from_numpy(distance), torch.from_numpy(number)
 
 
+def remembered(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Returns a decorator that remembers a function's last `maxsize` results, by its arguments.
+
+    Arguments are float64 arrays (N, 2), which the function gets read-only, and whole numbers.
+    Results are shared between calls and must not be changed. Many candidates are compared on the
+    same points, and each asks for their neighbours and triangles.
+    """
+
+    def decorated(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.lru_cache(maxsize)
+        def known(*keys: bytes | int) -> Any:
+            return function(
+                *(k if isinstance(k, int) else np.frombuffer(k).reshape(-1, 2) for k in keys)
+            )
+
+        @functools.wraps(function)
+        def call(*args: Any) -> Any:
+            if sum(len(arg) for arg in args if not isinstance(arg, int)) > _MOST_REMEMBERED:
+                return function(*args)
+            return known(*(arg if isinstance(arg, int) else arg.tobytes() for arg in args))
+
+        return call
+
+    return decorated
+
+
 @remembered(8)
 def _nearest(points: NDArray[np.float64], xy: NDArray[np.float64], count: int) -> Any:
     """The same of coordinates (N, 2) and (M, 2)."""
@@ -215,26 +238,6 @@ def _triangles(points: NDArray[np.float64]) -> Delaunay | None:
         return None
 
 
-def _within_frame(points: SparsePoints) -> SparsePoints:
-    """The points; those outside the frame are moved onto its outermost pixels."""
-    height, width = points.size
-    last = points.xy.new_tensor([width - 1, height - 1])
-    xy = torch.minimum(points.xy.clamp_min(0), last)
-    return SparsePoints(xy=xy, depth=points.depth, size=points.size)
-
-
 def _dilated(value: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[np.float32]:
     # What lies outside has no effect: a replicated pixel is below the kernel itself.
     return np.asarray(cv2.dilate(value, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)
-
-
-def _square(side: int) -> NDArray[np.uint8]:
-    return np.ones((side, side), np.uint8)
-
-
-def _blurred(value: Tensor) -> Tensor:
-    offset = torch.arange(-2.0, 3.0)
-    kernel = torch.exp(-0.5 * (offset / _BLUR_SIGMA) ** 2)
-    kernel = (kernel / kernel.sum()).reshape(1, 1, 1, 5)
-    padded = F.pad(value, (2, 2, 2, 2), mode="replicate")
-    return F.conv2d(F.conv2d(padded, kernel), kernel.transpose(2, 3))

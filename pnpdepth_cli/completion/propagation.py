@@ -3,7 +3,7 @@
 With r the residual in log depth, the result is exp(r) · prediction, so that it is positive
 everywhere. r stays within its values at the points. Outliers are removed first.
 
-How r is predicted is a table, `choices.PROPAGATIONS`: the entries of `completion/propagations`. A
+How r is predicted is a table, `choices.PROPAGATIONS`: the entries of `TABLE`. A
 prediction of 0, or not finite, is unknown and stays 0; points there and points outside the frame
 have no effect. Of points at the same coordinates the nearest counts.
 """
@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import PROPAGATIONS
+from pnpdepth_cli.completion import gaussian_process
+from pnpdepth_cli.completion.diffusion import diffuse
 from pnpdepth_cli.completion.outliers import without_outliers
 from pnpdepth_cli.completion.residual_field import Kernel, ResidualField, residual_field
 from pnpdepth_cli.points import SparsePoints
@@ -40,6 +42,23 @@ class Propagation:
     """Residual (H, W) float32 at every pixel."""
     at: Callable[[ResidualField, SparsePoints], Tensor] | None = None
     """Residual (M,) at the coordinates of M points. None: it is sampled from `dense`."""
+
+
+def _gp_at(field: ResidualField, queries: SparsePoints) -> Tensor:
+    """With many points, each query is predicted from the points nearest to it."""
+    return gaussian_process.predict_at(field, queries.xy, field.features_at(queries))
+
+
+TABLE = {
+    "gp": Propagation(
+        title="Gaussian process",
+        fit=gaussian_process.fit,
+        dense=gaussian_process.predict,
+        at=_gp_at,
+    ),
+    "diffusion": Propagation(title="edge-aware diffusion", dense=diffuse),
+}
+"""The propagations by name, as in `choices.PROPAGATIONS`."""
 
 
 @dataclass(frozen=True, kw_only=True)

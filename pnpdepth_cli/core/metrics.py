@@ -172,7 +172,8 @@ def _terms(p: Tensor, g: Tensor, thresholds: tuple[float, float, float]) -> dict
     }
 
 
-SUMS = ("known", *_terms(torch.empty(0), torch.empty(0), DELTA_THRESHOLDS))
+_SUMMED = tuple(_terms(torch.empty(0), torch.empty(0), DELTA_THRESHOLDS))
+SUMS = ("pixels", "known", *_SUMMED[1:])
 """The quantities summed over pixels, in the order of the last axis of sums tensors."""
 
 

@@ -175,10 +175,10 @@ def frame_parts(structure: Any, frames: int) -> list[Any]:
             )
     parts = {path: tensor.tensor_split(frames) for path, tensor in tensors_in(structure)}
 
-    return [
-        map_tensors(structure, lambda path, _, index=index: parts[path][index])
-        for index in range(frames)
-    ]
+    def of_frame(index: int) -> Any:
+        return map_tensors(structure, lambda path, _: parts[path][index])
+
+    return [of_frame(index) for index in range(frames)]
 
 
 def _losses(frames: Sequence[_FrameRefinement], output: Any) -> list[Tensor]:

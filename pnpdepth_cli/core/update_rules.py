@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from pnpdepth_cli.errors import LayerError, UsageError
 from pnpdepth_cli.points import SparsePoints
 
 Update = Callable[[Tensor], Tensor]
+Rule = TypeVar("Rule", bound=Callable[..., Update])
 
 TABLE: dict[str, Callable[[], Update]] = {}
 """Functions that make a rule, by name."""
@@ -28,9 +29,14 @@ MAX_RMS = 10.0
 """Largest root mean square of an L-BFGS direction; that of the first direction is 1."""
 
 
-def update_rule(name: str) -> Callable[[Any], Any]:
+def update_rule(name: str) -> Callable[[Rule], Rule]:
     """Enters the decorated function in the table."""
-    return lambda function: TABLE.setdefault(name, function)
+
+    def enter(function: Rule) -> Rule:
+        TABLE[name] = function
+        return function
+
+    return enter
 
 
 @update_rule("sign")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulated
 from pnpdepth_cli.sensors.camera import Camera
-from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar
+from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar, simulate_lidar
 from pnpdepth_cli.sensors.projection import edge_agreement, occluded_in_map, project_velodyne
 from pnpdepth_cli.sensors.samplers import (
     PATTERNS,
@@ -17,7 +17,6 @@ from pnpdepth_cli.sensors.samplers import (
     sample_points,
     with_noise,
 )
-from pnpdepth_cli.sensors.simulate import simulate_lidar
 from pnpdepth_cli.sensors.sparse import Points, as_depth_image, describe_dropped
 
 __all__ = [

@@ -96,7 +96,7 @@ def _added(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: 
     """The points known so far, and of these (M, 3) those that agree with measured ones."""
     from scipy.spatial import cKDTree
 
-    drops = DropCounter(len(xyz))
+    drops = DropCounter()
     xyz = xyz[drops.keep(xyz[:, 2] > 0, "behind the camera")]
     xy = camera.pixels_of(xyz)
     inside = drops.keep(in_frame(xy, known.size), "outside the image")

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.sensors.camera import Camera
-from pnpdepth_cli.sensors.sparse import Mask, Points
-
-Floats = NDArray[np.float64]
+from pnpdepth_cli.sensors.sparse import Floats, Mask, Points
 
 MIN_INLIERS = 30
 """Matches that agree with the motion; fewer support no estimate."""

@@ -12,8 +12,6 @@ along a scan line and farther apart across, and some lie between points of a nea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -57,14 +55,6 @@ _INTERLEAVED = 0.003  # least fraction of points that lie between points of a ne
 _INTERLEAVED_REACH = (4, 2)  # pixels to each side, and half the width, of the area compared
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProjectedScan(Points):
-    """The points of a scan that the camera sees, in the scan's order."""
-
-    index: Indices
-    """(N,) row of each point in the scan."""
-
-
 def project_velodyne(
     points: NDArray[np.floating],
     camera: Camera,
@@ -73,8 +63,8 @@ def project_velodyne(
     euclidean: bool = False,
     limits: tuple[float, float] = (0.0, np.inf),
     keep_occluded: bool = False,
-) -> ProjectedScan:
-    """Returns the scan as sparse depth in an image.
+) -> Points:
+    """Returns the scan as sparse depth in an image, in the scan's order.
 
     Args:
         points: (N, 3) or more columns, x y z in metres in the scanner's frame.
@@ -93,7 +83,7 @@ def project_velodyne(
             f"range {limits[0]:g} to {limits[1]:g} m is empty; give 0 ≤ minimum < maximum"
         )
     xyz = np.asarray(points)[:, :3]
-    drops = DropCounter(len(xyz))
+    drops = DropCounter()
     distance = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     in_range = (distance >= limits[0]) & (distance <= limits[1])
     seen = camera.from_scanner(xyz[drops.keep(in_range, "out of range")])
@@ -111,10 +101,9 @@ def project_velodyne(
             " scan and calibration belong to this camera"
         )
     depth = np.linalg.norm(seen, axis=1) if euclidean else seen[:, 2]
-    return ProjectedScan(
+    return Points(
         xy=xy.astype(np.float32),
         depth=depth.astype(np.float32),
-        index=drops.index,
         size=size,
         dropped=drops.dropped,
     )

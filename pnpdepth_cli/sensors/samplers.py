@@ -239,7 +239,7 @@ def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> 
         values[outliers] = rng.uniform(low, high, len(outliers))
     if noise.jitter_px > 0:
         xy = xy + rng.normal(0, noise.jitter_px, xy.shape)
-    drops = DropCounter(len(values))
+    drops = DropCounter()
     if noise.metres > 0 or noise.relative > 0:
         near = drops.keep(np.abs(values) < FARTHEST_M, "noise put it too far")
         xy, values = xy[near], values[near]

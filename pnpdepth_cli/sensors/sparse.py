@@ -34,16 +34,14 @@ def pixel_index(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.i
 
 
 class DropCounter:
-    """Rows of an array that are left after each step, and how many each step dropped."""
+    """How many rows of an array each step dropped."""
 
-    def __init__(self, count: int) -> None:
-        self.index: NDArray[np.intp] = np.arange(count)
+    def __init__(self) -> None:
         self.dropped: dict[str, int] = {}
 
     def keep(self, mask: Mask, otherwise: str) -> Mask:
-        """Keeps the rows, of those left, where `mask` is true; returns it. `otherwise` says why."""
+        """Counts the rows where `mask` is false as dropped, with the reason; returns the mask."""
         self.dropped[otherwise] = int(len(mask) - np.count_nonzero(mask))
-        self.index = self.index[mask]
         return mask
 
     def keep_seen(self, xyz: Floats, xy: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:

@@ -5,8 +5,6 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from pnpdepth_cli.choices import SPACES
@@ -59,8 +57,7 @@ def test_a_factor_of_depth_is_undone_in_every_space(space: str, kind: str) -> No
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("kind", ["median", "scale", "affine"])
-@pytest.mark.parametrize("count", [30, 2000])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("count", "seed"), [(30, 0), (30, 1), (2000, 2)])
 def test_20_percent_gross_outliers_move_the_fit_by_less_than_2_percent(
     space: str, kind: str, count: int, seed: int
 ) -> None:
@@ -127,25 +124,6 @@ def test_a_value_held_at_a_bound_still_has_a_gradient() -> None:
     held.sum().backward()
     assert below.grad is not None
     assert float(below.grad) == pytest.approx(1.0, rel=1e-4)
-
-
-@given(
-    scale=st.floats(0.01, 100),
-    shift=st.floats(-2, 2),
-    seed=st.integers(0, 2**16),
-    count=st.integers(2, 60),
-)
-@settings(max_examples=30, deadline=None)
-def test_the_same_points_give_the_same_alignment_and_depths_are_finite_and_positive(
-    scale: float, shift: float, seed: int, count: int
-) -> None:
-    d = scene(count, seed)
-    x = scale / d + shift
-    one, other = (align(x, points_of(d), ("depth", "inverse"), "auto") for _ in range(2))
-    assert one == other
-    depth = one.depth(torch.linspace(-1e6, 1e6, 101))
-    assert bool((depth > 0).all())
-    assert bool(depth.isfinite().all())
 
 
 def test_what_cannot_be_aligned_is_refused() -> None:

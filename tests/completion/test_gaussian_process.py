@@ -75,18 +75,6 @@ def test_prediction_by_blocks_is_near_the_exact_prediction(
     assert float((blocks - exact).abs().mean()) < 0.005
 
 
-@pytest.mark.parametrize("exact", [True, False])
-def test_the_residual_is_met_at_points_without_noise(
-    exact: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not exact:
-        monkeypatch.setattr(kriging, "_MAX_EXACT", 10)
-        monkeypatch.setattr(kriging, "_MAX_EXACT_SMALL", 10)
-    residuals = replace(field(90), kernel=Kernel(noise=1e-7))
-    mean = predict(residuals)
-    assert torch.allclose(residuals.points.sample(mean).double(), residuals.residual, atol=2e-3)
-
-
 @pytest.mark.parametrize(
     ("count", "size", "atol"), [(3, SIZE, 1e-5), (40, SIZE, 1e-5), (900, (60, 80), 0.02)]
 )

@@ -97,11 +97,6 @@ def test_points_or_an_image_without_an_edge_leave_the_image(case: str) -> None:
     assert estimated([known] if known is not None else []) is None
 
 
-def test_the_same_frame_gives_the_same_bytes() -> None:
-    first, second = (evidence_of(3, UNREGISTERED) for _ in range(2))
-    assert first.log_likelihood.tobytes() == second.log_likelihood.tobytes()
-
-
 @example(right=0, down=0)
 @given(right=st.integers(-6, 6), down=st.integers(-6, 6))
 def test_an_image_moved_by_whole_pixels_keeps_its_values(right: int, down: int) -> None:

@@ -1,18 +1,20 @@
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from torch import Tensor
 
 from pnpdepth_cli.choices import SPACES
-from pnpdepth_cli.completion.alignment import from_space, to_space
+from pnpdepth_cli.completion import interpolation
+from pnpdepth_cli.completion.alignment import from_space
 from pnpdepth_cli.completion.interpolation import (
     in_hull,
     inverse_distance,
@@ -169,26 +171,17 @@ def test_the_hull_holds_the_pixels_between_three_points_and_none_of_fewer_or_of_
     points = points_at(xy, [1.0] * len(xy), (3, 4))
     expected = torch.tensor([[(x, y) in inside for x in range(4)] for y in range(3)])
     assert torch.equal(in_hull(points), expected)
-    queries = torch.tensor([(1.0, 1.0), (3.0, 1.0)])
-    assert in_hull(points, queries).tolist() == [(1, 1) in inside, False]
 
 
-def test_inverse_distance_is_shepards_mean_of_the_nearest_points() -> None:
-    points = scattered(60)
-    distance, number = distances(points).clamp_min(0.25).sort(dim=-1)
-    weight = distance[..., :5].pow(-2.5)
-    mean = (weight * points.depth[number[..., :5]].double()).sum(-1) / weight.sum(-1)
-    dense = inverse_distance(points, neighbours=5, power=2.5, space="depth")
-    assert torch.allclose(dense, mean.float(), rtol=1e-6)
-
-
-def test_inverse_distance_does_not_depend_on_how_many_pixels_are_looked_up_at_once(
+def test_inverse_distance_is_shepards_mean_of_the_nearest_points(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     points = scattered(60)
-    whole = inverse_distance(points)
+    distance, number = distances(points).clamp_min(0.25).sort(dim=-1)
+    weight = distance[..., :6].pow(-4.0)
+    mean = (weight * points.depth[number[..., :6]].double().log()).sum(-1) / weight.sum(-1)
     monkeypatch.setattr("pnpdepth_cli.completion.interpolation._IDW_PIXELS", 97)
-    assert torch.equal(inverse_distance(points), whole)
+    assert torch.allclose(inverse_distance(points), mean.exp().float(), rtol=1e-6)
 
 
 def test_morphological_lets_what_is_near_grow_over_what_is_far() -> None:
@@ -211,7 +204,17 @@ def test_morphological_of_few_points_is_that_of_a_smaller_image() -> None:
     assert torch.allclose(large[4::10, 4::10], small, atol=0.2)
 
 
-@pytest.mark.parametrize("space", SPACES)
-def test_a_space_is_left_as_it_was_entered(space: str) -> None:
-    depth = torch.tensor([0.1, 1.0, math.e, 80.0], dtype=torch.float64)
-    assert torch.allclose(from_space(to_space(depth, space), space), depth, rtol=1e-12)
+def test_the_last_results_of_a_few_coordinates_are_remembered_and_those_of_many_are_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(interpolation, "_MOST_REMEMBERED", 5)
+    calls: list[int] = []
+
+    @interpolation.remembered(2)
+    def total(xy: NDArray[np.float64], factor: int) -> float:
+        calls.append(len(xy))
+        return float(xy.sum()) * factor
+
+    for count, factor in [(5, 1), (5, 1), (5, 3), (4, 1), (5, 1), (6, 1), (6, 1)]:
+        assert total(np.full((count, 2), 0.5), factor) == count * factor
+    assert calls == [5, 5, 4, 5, 6, 6]

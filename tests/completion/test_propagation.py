@@ -5,7 +5,6 @@ import torch
 
 from pnpdepth_cli.choices import PROPAGATIONS
 from pnpdepth_cli.completion.propagation import propagate, propagate_at
-from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene
 
@@ -132,12 +131,3 @@ def test_depth_at_positions_equals_the_dense_depth(kind: str) -> None:
     depth = propagate(prediction, points, rgb, kind=kind).depth
     at_positions = propagate_at(prediction, points, rgb, positions, kind=kind)
     assert torch.allclose(at_positions, queries.sample(depth), rtol=1e-4)
-
-
-def test_impossible_requests_are_refused() -> None:
-    gt, rgb, prediction = scene()
-    points = random_points(gt, 9)
-    with pytest.raises(UsageError, match="unknown propagation 'magic'"):
-        propagate(prediction, points, rgb, kind="magic")
-    with pytest.raises(NoPointsError):
-        propagate(torch.zeros(SIZE), points, rgb)

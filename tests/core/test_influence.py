@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from torch import nn
 
@@ -30,14 +29,6 @@ def test_a_stride_behind_the_cut_widens_the_patch_of_z() -> None:
     assert field(network, "0") == InfluentialField((7, 7), (7, 7))
 
 
-def test_upsampling_behind_the_cut_widens_the_patch_of_the_output() -> None:
-    torch.manual_seed(0)
-    network = nn.Sequential(conv(3, 4, stride=4), nn.Upsample(scale_factor=4.0), conv(4, 1))
-    small = field(network, "0")
-    assert small.in_z in ((1, 1), (2, 2), (1, 2), (2, 1))
-    assert small.in_output == tuple(4 * side + 2 for side in small.in_z)
-
-
 def test_attention_reaches_everywhere_and_tokens_have_no_patch() -> None:
     assert field(build("vit"), "encoder.blocks.0[0]", 16) == InfluentialField(None, (16, 16))
 
@@ -47,11 +38,3 @@ def test_a_cut_that_does_not_reach_the_output_has_no_field() -> None:
     network.head = nn.Sequential(conv(3, 1))
     network.forward = lambda x: (network.cut(network.front(x)), network.head(x))[1]  # type: ignore[method-assign]
     assert field(network, "cut") == InfluentialField((0, 0), (0, 0))
-
-
-@pytest.mark.parametrize("grad", [True, False])
-def test_the_callers_grad_mode_makes_no_difference(grad: bool) -> None:
-    torch.manual_seed(0)
-    network = nn.Sequential(conv(3, 2), conv(2, 1))
-    with torch.set_grad_enabled(grad):
-        assert field(network, "0") == InfluentialField((3, 3), (5, 5))

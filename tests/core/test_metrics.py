@@ -8,7 +8,7 @@ from math import isnan, log, sqrt
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.core.metrics import (
@@ -67,6 +67,7 @@ depths = st.one_of(
 )
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(depths, depths), min_size=1, max_size=40))
 def test_scores_are_those_of_plain_numpy(pairs: list[tuple[float, float]]) -> None:
     predicted, gt = np.array([(2.0, 3.0), *pairs], np.float32).T
@@ -110,23 +111,7 @@ def test_shapes_that_differ_are_refused() -> None:
         score(torch.ones(2, 3), torch.ones(3, 2))
 
 
-positive = st.lists(st.tuples(st.floats(0.5, 90), st.floats(0.5, 90)), min_size=2, max_size=30)
-
-
-@given(positive, st.floats(0.25, 4))
-def test_another_unit_of_length_changes_each_measure_as_its_unit_says(
-    pairs: list[tuple[float, float]], factor: float
-) -> None:
-    predicted, gt = torch.tensor(pairs, dtype=torch.float64).T
-    before = asdict(score(predicted, gt, (1.3, 1.7, 2.1)))
-    after = asdict(score(predicted * factor, gt * factor, (1.3, 1.7, 2.1)))
-    power = {"m": 1, "1/km": -1}
-    for measure in MEASURES:
-        if not measure.higher_is_better:  # a ratio may sit on a threshold
-            expected = before[measure.key] * factor ** power.get(measure.unit, 0)
-            assert after[measure.key] == pytest.approx(expected, rel=1e-9, abs=1e-5), measure.key
-
-
+@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(depths, depths, st.integers(0, 2)), min_size=1, max_size=40))
 def test_the_sums_of_the_parts_are_the_sums_of_the_image(
     rows: list[tuple[float, float, int]],

@@ -6,8 +6,6 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pnpdepth_cli.core.update_rules import SCHEDULES, Channels, blurred, step_size
 from pnpdepth_cli.errors import LayerError, UsageError
@@ -68,23 +66,6 @@ def test_the_reach_is_a_gaussian_of_so_many_spacings_of_the_points() -> None:
     for row, column in ((5, 20), (4, 20), (9, 23), (0, 0), (7, 39)):
         expected = weight(row, 10, 5, down) * weight(column, 40, 20, across)
         assert float(result[row, column]) == pytest.approx(expected, rel=1e-4)
-
-
-@given(
-    count=st.integers(1, 5000),
-    spacings=st.floats(0.01, 5),
-    shape=st.tuples(st.integers(1, 3), st.integers(1, 12), st.integers(1, 12)),
-)
-def test_a_gradient_that_is_the_same_everywhere_stays_so_whatever_the_points(
-    count: int, spacings: float, shape: tuple[int, int, int]
-) -> None:
-    gradient = torch.full((1, *shape), 0.7)
-    torch.testing.assert_close(blurred(gradient, points(count, (64, 96)), spacings), gradient)
-
-
-def test_many_points_keep_a_gradient_in_its_cell() -> None:
-    gradient = torch.randn(1, 2, 6, 8, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(blurred(gradient, points(4800, (60, 80)), 1.0), gradient)
 
 
 @pytest.mark.parametrize(("shape", "inside"), [((1, 3, 4, 5), (2, 3)), ((1, 7, 3), (1,))])

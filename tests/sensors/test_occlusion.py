@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     Camera,
@@ -18,7 +18,6 @@ from pnpdepth_cli.sensors import (
 )
 from pnpdepth_cli.sensors.projection import hidden_points
 
-STREET = Path(__file__).resolve().parents[2] / "samples" / "street"
 K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
 SIZE = (480, 640)
 
@@ -47,8 +46,11 @@ def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None
     camera = Camera(
         intrinsics=K, rotation=FORWARD_LEFT_UP, translation=np.array([-left_m, 0.0, 0.0])
     )
-    everything = project_velodyne(scan, camera, SIZE, keep_occluded=True).index
-    kept = project_velodyne(scan, camera, SIZE).index
+    tree = cKDTree(camera.pixels_of(camera.from_scanner(scan)))
+    everything, kept = (
+        tree.query(project_velodyne(scan, camera, SIZE, keep_occluded=keep).xy)[1]
+        for keep in (True, False)
+    )
     removed = np.setdiff1d(everything, kept)
     truly_hidden = np.intersect1d(everything, np.flatnonzero(hidden))
     assert len(truly_hidden) > 50
@@ -56,13 +58,6 @@ def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None
     visible = np.setdiff1d(everything, truly_hidden)
     assert len(np.intersect1d(kept, visible)) >= 0.98 * len(visible)
     assert scan[removed, 0].min() == 20  # the foreground itself stays
-
-
-def test_a_scanner_at_the_cameras_position_hides_nothing_far_from_an_edge() -> None:
-    scan, _ = board_before_wall(0.0)
-    camera = Camera(intrinsics=K, rotation=FORWARD_LEFT_UP)
-    got = project_velodyne(scan, camera, SIZE)
-    assert got.dropped["hidden by foreground"] < 0.02 * len(scan)
 
 
 def test_ground_at_a_grazing_angle_hides_no_ground() -> None:
@@ -99,24 +94,6 @@ def kept_and_removed(
     agrees = np.abs(depth[known] - gt[known]) <= 0.1 * gt[known]
     gone = hidden[known]
     return float((~gone[agrees]).mean()), float(gone[~agrees].mean())
-
-
-def test_on_the_rendered_street_most_points_that_contradict_the_ground_truth_go() -> None:
-    calibration = read_calibration(STREET / "calib.txt")
-    camera = Camera(
-        intrinsics=calibration.intrinsics,
-        rotation=calibration.rotation,
-        translation=calibration.translation,
-    )
-    gt = read_depth(STREET / "gt.png").values
-    scan = read_scan(STREET / "000000.bin").points
-    points = project_velodyne(scan, camera, gt.shape, keep_occluded=True)
-    column, row = np.floor(points.xy + 0.5).astype(int).T
-    kept_rows = project_velodyne(scan, camera, gt.shape).index
-    hidden = ~np.isin(points.index, kept_rows)
-    kept, removed = kept_and_removed(hidden, points.depth, gt[row, column])
-    assert kept >= 0.95
-    assert removed >= 0.7
 
 
 def test_on_kitti_most_points_that_contradict_the_ground_truth_go(shared_data: Path) -> None:

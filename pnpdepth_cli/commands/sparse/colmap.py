@@ -117,7 +117,7 @@ def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
     row = row[known]
     if not len(row):
         raise NoPointsError(f"{model.folder} has no points in {name!r}; register it with matches")
-    drops = DropCounter(len(row))
+    drops = DropCounter()
     least = min(options.min_track, len(model.images))
     row = row[drops.keep(points.track[row] >= least, f"seen in fewer than {least} images")]
     why = f"with a reprojection error above {options.max_reprojection:g} px"

@@ -19,8 +19,7 @@ from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors import Camera, describe_dropped, edge_agreement, project_velodyne
-from pnpdepth_cli.sensors.projection import ProjectedScan
+from pnpdepth_cli.sensors import Camera, Points, describe_dropped, edge_agreement, project_velodyne
 
 _MORE_IF_INVERTED = 3.0
 """Times as many points in the image with inverted extrinsics that give a warning."""
@@ -54,7 +53,7 @@ _ONE_DIRECTION = ("KITTI", "nuScenes", "DDAD")
 class ScanPoints:
     """A projected scan."""
 
-    points: ProjectedScan
+    points: Points
     camera: Camera
     """With the pose of the scanner."""
     record: dict[str, Any]

@@ -63,9 +63,9 @@ class CutPoint:
         modules = dict(network.named_modules(remove_duplicate=False))
         if name.module not in modules or not name.module:
             near = difflib.get_close_matches(name.module, filter(None, modules), n=3, cutoff=0.5)
-            hint = (
-                f"did you mean {', '.join(near)}?" if near else "`pnpdepth layers --all` lists all"
-            )
+            hint = f"did you mean {', '.join(near)}?"
+            if not near:
+                hint = "`pnpdepth layers --all` lists all of them"
             raise LayerError(f"layer {name.module!r} is not in this network; {hint}")
         return cls(
             layer=layer,

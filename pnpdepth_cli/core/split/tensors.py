@@ -98,12 +98,11 @@ class NetworkState:
         # Frozen torch scripts have neither a mode nor buffers that can be set.
         plain = [m for m in modules if not isinstance(m, torch.jit.ScriptModule)]
         parameters, buffers = (
-            [
-                t
-                for t in dict.fromkeys(t for own in of_modules for t in own.values())
-                if t is not None
-            ]
-            for of_modules in ([m._parameters for m in modules], [m._buffers for m in modules])
+            [tensor for tensor in dict.fromkeys(tensors) if tensor is not None]
+            for tensors in (
+                [p for m in modules for p in m._parameters.values()],
+                [b for m in modules for b in m._buffers.values()],
+            )
         )
         self.tensors = [SavedTensors(t) for t in (*parameters, *buffers)]
         self._originals = [saved.value for saved in self.tensors]

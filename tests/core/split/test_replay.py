@@ -18,15 +18,6 @@ def recording(**changes: object) -> Recording:
     return Recording(calls=calls, cut=1, **fields)  # type: ignore[arg-type]
 
 
-def test_a_call_is_looked_up_by_its_submodule_and_number() -> None:
-    assert [recording().index(ONE, count) for count in range(3)] == [0, 2, None]
-    assert recording().index(nn.Identity(), 0) is None
-
-
-def test_cached_calls_and_the_cut_are_intercepted() -> None:
-    assert recording().intercepted() == {ONE, TWO}
-
-
 @pytest.mark.parametrize("arguments", [(X[..., :4],), (X.double(),), (X, X), (X, 1), ([X],)])
 def test_arguments_of_other_shapes_types_or_structure_need_another_recording(
     arguments: tuple[object, ...],

@@ -15,7 +15,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model_zoo_defs.compact import Compact
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.core.split.tensors import tensors_in
@@ -89,34 +88,6 @@ def test_an_encoder_under_inference_mode_can_be_left_and_the_decoder_refined(lay
         assert z.grad is not None
 
 
-@pytest.mark.parametrize("every", [13, pytest.param(1, marks=pytest.mark.slow)])
-def test_it_holds_at_the_layers_of_compact(every: int) -> None:
-    torch.manual_seed(0)
-    network = Compact().eval()
-    for parameter in network.parameters():
-        if parameter.ndim > 1:  # some start at zero, where any cut would do
-            nn.init.normal_(parameter, std=0.1)
-    x, sparse = image(32, 32), torch.zeros(1, 1, 32, 32)
-    sparse[..., ::5, ::3] = 1 + 4 * torch.rand(sparse[..., ::5, ::3].shape)
-    arguments = (x, sparse, 1 + 4 * torch.rand(1, 1, 32, 32))
-    several = {"encoder", "fit", "start"}  # return several tensors
-    layers = [
-        layer
-        for layer, module in network.named_modules()
-        if not isinstance(module, nn.ModuleDict | nn.ModuleList)
-        and layer not in several
-        and layer.split(".")[0] not in ("", "scale")
-    ]
-    assert len(layers) > 90
-    with torch.no_grad():
-        whole = network(*arguments)
-        for layer in layers[::every]:
-            with Split(network, layer) as split:
-                z = split.front(*arguments)
-                assert torch.equal(split.rear(z), whole), layer
-                assert torch.equal(split.rear(z), whole), layer
-
-
 class LooksAtValues(nn.TransformerEncoderLayer):
     """Scales its output by a number that it reads with numpy."""
 
@@ -140,6 +111,7 @@ def test_torch_transformer_layers_with_their_fast_path_come_out_the_same(
             assert split.static_graph == (kind is not LooksAtValues)
 
 
+@pytest.mark.slow
 def test_a_compiled_network_can_be_cut() -> None:
     network, x = build("unet"), image()
     whole = plain(network, x)
@@ -341,19 +313,6 @@ def test_z_is_safe_where_the_cut_layer_gives_back_its_own_input() -> None:
 # ------------------------------------------------------------------ naming the layer
 
 
-def test_every_call_of_a_layer_can_be_named_and_is_another_cut() -> None:
-    network, x = build("repeated"), image()
-
-    def z(layer: str) -> Tensor:
-        with Split(network, layer) as split, torch.no_grad():
-            return split.front(x)
-
-    calls = [z(f"same#{call}") for call in (1, 2, 3)]
-    assert not torch.equal(calls[0], calls[1])
-    assert not torch.equal(calls[1], calls[2])
-    assert torch.equal(z("enter"), z("alias"))  # one layer under two names
-
-
 @pytest.mark.parametrize(
     ("text", "name"),
     [
@@ -372,32 +331,6 @@ def test_a_name_has_its_parts(text: str, name: LayerName) -> None:
 def test_a_name_of_another_form_is_refused(text: str) -> None:
     with pytest.raises(LayerError, match="the form is"):
         LayerName.parse(text)
-
-
-@pytest.mark.parametrize(
-    ("kind", "names"),
-    [
-        ("tuple", ("cut[0]", "cut[1]")),
-        ("list", ("cut[0]", "cut[1]")),
-        ("dict", ("cut[deep]", "cut[shallow]")),
-        ("namedtuple", ("cut[0]", "cut[1]")),
-        ("dataclass", ("cut[deep]", "cut[shallow]")),
-        ("nested", ("cut[out][0][0]", "cut[out][1][x]")),
-    ],
-)
-def test_a_layer_with_several_outputs_names_them_and_each_can_be_cut(
-    kind: str, names: tuple[str, ...]
-) -> None:
-    network, x = build(f"{kind} output"), image()
-    with Split(network, "cut") as split, pytest.raises(LayerError) as error:
-        split.front(x)
-    assert str(error.value).endswith(f"say which: {', '.join(names)}")
-    for name in names:
-        with Split(network, name) as split, torch.no_grad():
-            z = split.front(x)
-            changed = split.rear(z + 1)
-            assert torch.equal(split.rear(z), plain(network, x))
-        assert not torch.equal(changed, plain(network, x))
 
 
 def with_an_unused_layer() -> nn.Module:
@@ -421,6 +354,7 @@ def with_an_unused_layer() -> nn.Module:
         (Repeated, "same", "is called 3 times; say which call: same#1, same#2"),
         (Repeated, "same#4", "only 3 times"),
         (NETWORKS["dict output"], "cut[wide]", "it has cut[deep], cut[shallow]"),
+        (NETWORKS["nested output"], "cut", "say which: cut[out][0][0], cut[out][1][x]"),
         (NETWORKS["side effects"], "hide", "returns no tensor"),
         (InPlace, "flat", "memory of an earlier tensor"),
     ],
@@ -560,17 +494,6 @@ class Failing(nn.Module):
         if self.calls == self.n:
             raise self.kind("failing")
         return self.inner(x)
-
-
-def test_two_splits_of_one_network_can_be_open_one_in_the_other() -> None:
-    network, x = build("unet"), image()
-    whole, before = plain(network, x), state_of(network)
-    with torch.no_grad(), Split(network, "bottleneck") as outer:
-        z = outer.front(x)
-        with Split(network, "ups.0") as inner:
-            assert torch.equal(inner.rear(inner.front(x)), whole)
-        assert torch.equal(outer.rear(z), whole)
-    assert same(before, state_of(network))
 
 
 def test_a_forward_keeps_its_signature_while_cut() -> None:

@@ -9,12 +9,10 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from torch import nn
 
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import is_transparent, map_tensors, tensors_in
-from tests.completion.naive import plain
-from tests.core.networks import Encoded, Updating, build, image
+from tests.core.networks import Encoded, Updating, image
 
 
 class Two(NamedTuple):
@@ -82,13 +80,6 @@ def test_mapping_replaces_each_tensor_and_keeps_everything_else(
     assert [id(tensor) for _, tensor in tensors_in(structure)] == [id(b) for _, b in before]
 
 
-def test_attributes_of_a_mapped_output_object_follow_its_keys() -> None:
-    mapped = map_tensors(Encoded(last=t, hidden=None), lambda path, tensor: tensor * 7)
-    assert torch.equal(mapped.last, t * 7)
-    assert mapped["last"] is mapped.last
-    assert mapped.hidden is None
-
-
 def test_containers_are_new_even_when_empty_so_that_what_the_network_does_to_one_is_not_kept() -> (
     None
 ):
@@ -102,29 +93,6 @@ def test_what_could_hide_a_tensor_is_not_transparent() -> None:
     for hidden in (object(), iter([t]), {"a": {1, 2}}, lambda: t, types.MappingProxyType({"a": t})):
         assert not is_transparent(hidden)
         assert map_tensors(hidden, lambda path, tensor: tensor) is not None
-
-
-def test_buffers_start_from_the_same_values_in_every_pass() -> None:
-    network, x = build("updating"), image()
-    whole = plain(network, x)
-    average = network.get_buffer("average")
-    with Split(network, "cut") as split, torch.no_grad():
-        z = split.front(x)
-        for _ in range(4):
-            assert torch.equal(split.rear(z), whole)
-    assert float(network.get_buffer("passes")) == 0
-    assert network.get_buffer("average") is average
-    assert not average.any()
-
-
-def test_batch_norms_in_training_mode_keep_their_statistics() -> None:
-    network, x = build("resnet").train(), image()
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    with Split(network, "layer2") as split, torch.no_grad():
-        split.rear(split.front(x))
-    assert network.training
-    after = network.state_dict()
-    assert all(torch.equal(value, after[name]) for name, value in before.items())
 
 
 def test_a_parameter_that_the_forward_overwrites_is_put_back() -> None:
@@ -142,13 +110,3 @@ def test_a_parameter_that_the_forward_overwrites_is_put_back() -> None:
         assert torch.equal(split.rear(z), split.rear(z))
         assert not torch.equal(network.head.weight, before)
     assert torch.equal(network.head.weight, before)
-
-
-def test_modes_and_flags_come_back_one_by_one() -> None:
-    network = nn.Sequential(nn.Linear(3, 3), nn.Dropout(), nn.Linear(3, 1))
-    network[1].eval()
-    network[2].bias.requires_grad_(False)
-    with Split(network, "0"):
-        assert not any(module.training for module in network.modules())
-    assert [module.training for module in network.modules()] == [True, True, False, True]
-    assert [p.requires_grad for p in network.parameters()] == [True, True, True, False]
