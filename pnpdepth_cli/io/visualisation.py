@@ -293,10 +293,9 @@ def improvement(
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
     unknown = "" if known.all() else "no ground truth"
     amount = f"{strongest:.3g} m"
-    save_gain_figure(
+    return save_gain_figure(
         path, panel, gain, amount=amount, noun="pixels", colors=colors, unknown=unknown
     )
-    return float((gain > 0).mean())
 
 
 def improvement_at_points(
@@ -339,8 +338,7 @@ def improvement_at_points(
     remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
     panel = Panel(title="Change of error", pixels=discs, remark=remark)
     amount = f"{strongest:.3g} {unit}"
-    save_gain_figure(path, panel, gain, amount=amount, noun=noun, colors=colors)
-    return float((gain > 0).mean())
+    return save_gain_figure(path, panel, gain, amount=amount, noun=noun, colors=colors)
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:

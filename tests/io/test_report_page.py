@@ -111,7 +111,11 @@ def test_it_opens_from_disk_without_an_error_and_without_a_network(page: webdriv
     assert {url.split(":")[0] for url in requests} <= {"file", "data"}
 
 
-def test_names_stay_text(page: webdriver.Chrome) -> None:
+def test_names_stay_text_and_what_failed_is_listed_with_its_reason(page: webdriver.Chrome) -> None:
+    assert one(page, "#without-title").text == "Not refined: 1"
+    text = one(page, "#reasons").text
+    assert text.startswith("d")
+    assert "d.png" in text
     assert page.title.endswith("Batch refinement")
     (name,) = [name for name in names(page) if "onerror" in name]
     assert name == STRANGE.replace("\n", "\\u000a")
@@ -120,7 +124,7 @@ def test_names_stay_text(page: webdriver.Chrome) -> None:
     assert not page.find_elements(By.CSS_SELECTOR, "img[src=x]")
 
 
-def test_the_worst_frame_is_first_and_a_click_turns_the_order(
+def test_the_worst_frame_is_first_and_it_sorts_by_every_column_and_can_be_searched(
     page: webdriver.Chrome, report: Path
 ) -> None:
     worst_first = shown_by(report, "rmse_gain")
@@ -130,11 +134,6 @@ def test_the_worst_frame_is_first_and_a_click_turns_the_order(
     header.find_element(By.TAG_NAME, "button").click()
     assert names(page) == worst_first[::-1]
     assert header.get_attribute("aria-sort") == "descending"
-
-
-def test_it_sorts_by_every_column_and_by_name_and_can_be_searched(
-    page: webdriver.Chrome, report: Path
-) -> None:
     one(page, "#sort-column option[value='2']").click()  # an error: the largest is the worst
     assert names(page) == shown_by(report, page_data(report)["columns"][2]["key"])[::-1]
     one(page, "#sort-column option[value='-1']").click()
@@ -188,13 +187,6 @@ def test_the_slider_moves_by_keyboard_and_pointer_and_names_its_position(
     actions = webdriver.ActionChains(page)
     actions.move_to_element_with_offset(one(page, "#views .stage"), left, 0).click().perform()
     assert abs(int(slider.get_property("value")) - 25) <= 1
-
-
-def test_what_failed_is_listed_with_its_reason(page: webdriver.Chrome) -> None:
-    assert one(page, "#without-title").text == "Not refined: 1"
-    text = one(page, "#reasons").text
-    assert text.startswith("d")
-    assert "d.png" in text
 
 
 def test_the_histogram_counts_all_frames_and_has_a_text_alternative(page: webdriver.Chrome) -> None:
