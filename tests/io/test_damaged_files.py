@@ -85,27 +85,6 @@ def test_the_file_is_read_and_every_truncation_is_refused_in_one_line_and_silent
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=30, deadline=None)
-@given(data=st.data())
-def test_altered_bytes_never_raise_anything_but_our_errors(
-    name: str,
-    data: st.DataObject,
-    valid: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    content = bytearray((valid / name).read_bytes())
-    # Most of a file's meaning is in its first bytes.
-    positions = st.one_of(
-        st.integers(0, min(400, len(content)) - 1), st.integers(0, len(content) - 1)
-    )
-    for position in data.draw(st.lists(positions, min_size=1, max_size=6)):
-        content[position] = data.draw(st.integers(0, 255))
-    path = tmp_path_factory.getbasetemp() / name
-    path.write_bytes(content)
-    assert_only_our_errors(path)
-
-
 @settings(max_examples=150, deadline=None)
 @given(
     magic=st.sampled_from(

@@ -3,23 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 
-from pnpdepth_cli.io.report import (
-    Column,
-    Head,
-    begin_report,
-    image_key,
-    save_views,
-    write_report,
-)
 from tests.commands.batches import add_frame, batch, pairs_on_disk
 from tests.commands.report_pages import frames_of, page_data
 
@@ -230,53 +219,3 @@ def test_every_control_has_a_name(page: webdriver.Chrome) -> None:
             one(page, "#rows .open").send_keys(Keys.ENTER)
     for image in page.find_elements(By.CSS_SELECTOR, "#views img"):
         assert image.get_attribute("alt")
-
-
-@pytest.fixture(scope="module")
-def thousand(tmp_path_factory: pytest.TempPathFactory, report: Path) -> Path:
-    """A report of 1,000 frames, every one with its own images."""
-    folder = tmp_path_factory.mktemp("thousand")
-    images = begin_report(folder, {})
-    pixels = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
-    save_views(images, "0", {"map": pixels, "second": pixels})
-    data = page_data(report)
-    head = Head(
-        kind="Batch refinement",
-        title="a thousand",
-        columns=[Column(**column) for column in data["columns"]],
-        sort_by="rmse_gain",
-        labels=data["labels"],
-        thumb="second",
-    )
-    example = frames_of(report)["a"]
-
-    def frame(number: int) -> dict[str, Any]:
-        key = image_key(str(number))
-        views = {}
-        for view in ("second", "map"):
-            shutil.copy(images / f"0_{view}.jpg", images / f"{key}_{view}.jpg")
-            views[view] = {"src": f"images/{key}_{view}.jpg"}
-        values = [number % 97 / 100 - 0.3] * len(head.columns)
-        name = f"drive/{number:06}"
-        return example | {"name": name, "key": key, "values": values, "views": views}
-
-    write_report(folder, head, map(frame, range(1000)))
-    return folder
-
-
-def test_a_thousand_frames_are_usable_within_seconds_and_few_thumbnails_are_read(
-    chrome: webdriver.Chrome, thousand: Path
-) -> None:
-    size(chrome, 1280, 900)
-    for _ in range(2):  # images that the browser has in memory are not read ahead either
-        chrome.get_log("performance")
-        chrome.get((thousand / "index.html").as_uri())
-    assert len(names(chrome)) == 1000
-    spent_ms = chrome.execute_script(
-        "return performance.getEntriesByType('navigation')[0].loadEventEnd"
-    )
-    assert spent_ms < 10_000  # 2 s on a machine that does nothing else
-    one(chrome, "#rows .open").send_keys(Keys.ARROW_DOWN)
-    wait(chrome, lambda: loaded(chrome, "#rows tr:first-child img"))
-    read = [e for e in chrome.get_log("performance") if "requestWillBeSent" in e["message"]]
-    assert 2 < len(read) < 200

@@ -136,22 +136,15 @@ def test_a_failed_frame_is_listed_with_its_reason(root: Path, report: Path) -> N
     assert len(page_data(report)["without"]) == 4
 
 
-def test_the_page_states_the_refinement_and_that_it_may_differ_per_frame(
-    root: Path, report: Path, tmp_path: Path
+def test_without_ground_truth_gains_are_those_at_held_out_points_and_settings_are_stated(
+    root: Path, report: Path
 ) -> None:
-    batch(root, html=report, refine={"propagate": "gp"})
+    shutil.rmtree(root / "gt")
+    batch(root, html=report, refine={"holdout": 0.3, "propagate": "gp"})
     facts = dict(page_data(report)["facts"])
     assert facts["Refinement"] == "5 updates of z at middle (sign, l1, step 0.01)"
     assert (facts["Alignment"], facts["Propagation"]) == ("none", "gp")
-    batch(root, output=root / "auto", html=tmp_path / "auto", refine={"propagate": None})
-    facts = dict(page_data(tmp_path / "auto")["facts"])
-    assert facts["Refinement"].endswith("(the default method)")
-    assert "Alignment" not in facts
-
-
-def test_without_ground_truth_gains_are_those_at_held_out_points(root: Path, report: Path) -> None:
-    shutil.rmtree(root / "gt")
-    batch(root, html=report, refine={"holdout": 0.3})
+    assert facts["Held out"] == "30% of the points, seed 0"
     frame = frames_of(report)["a"]
     assert frame["values"]["rmse_gain"] is not None
     assert any("at held-out points" in note for note in frame["notes"])
@@ -214,13 +207,6 @@ def test_outputs_inside_the_inputs_or_around_them_are_refused(root: Path, tmp_pa
     for output in (root, root / "out", tmp_path):
         assert "holds the results" in refused(root, output, overwrite=True)
     assert not (root / "out").exists()
-
-
-def test_a_list_has_its_files_elsewhere_which_are_safe_as_well(root: Path, tmp_path: Path) -> None:
-    listed = tmp_path / "frames.csv"
-    listed.write_text("image,sparse\ndrive/rgb/a.png,drive/sparse/a.png\n")
-    with pytest.raises(OutputError, match=r"holds .*rgb/a\.png, which is read"):
-        batch(root, source=listed, output=tmp_path / "out", html=root, refine={"overwrite": True})
 
 
 def test_another_batchs_report_is_replaced_only_on_request(root: Path, report: Path) -> None:
