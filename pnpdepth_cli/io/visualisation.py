@@ -219,7 +219,9 @@ def _zoom_panel(
     for start, depth in zip(starts, depths.values(), strict=True) if part else ():
         shown = cv2.resize(scale.paint(depth[area]), (part, rows), interpolation=cv2.INTER_NEAREST)
         pixels[:, start : start + part] = shown
-        pixels[:, start - 1 : start + 1] = 255  # a line to the depth before; none at the first
+        if start:
+            pixels[:, end - 1 : start + 1] = 255
+        end = start + part
     most = "where most changed" if "linear" not in depths else "where after differs most"
     return Panel(title="Zoom", pixels=pixels, remark=f"{' | '.join(depths)}, {most} (frame)")
 
