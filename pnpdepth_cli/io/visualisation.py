@@ -214,12 +214,12 @@ def _zoom_panel(
     area = np.s_[y : y + height, x : x + width]
     rows, columns = size
     part = columns // len(depths)
-    pixels = np.full((rows, columns, 3), 255, np.uint8)
+    pixels, end = np.full((rows, columns, 3), 255, np.uint8), 0
     starts = np.linspace(0, columns - part, len(depths)).round().astype(int)
     for start, depth in zip(starts, depths.values(), strict=True) if part else ():
         shown = cv2.resize(scale.paint(depth[area]), (part, rows), interpolation=cv2.INTER_NEAREST)
         pixels[:, start : start + part] = shown
-        if start:
+        if end:  # a line to the depth before
             pixels[:, end - 1 : start + 1] = 255
         end = start + part
     most = "where most changed" if "linear" not in depths else "where after differs most"
