@@ -16,23 +16,19 @@ def default_afterwards() -> Iterator[None]:
     set_max_pixels(None)
 
 
-def test_the_default_is_64_megapixels_or_less_on_a_small_machine() -> None:
+def test_the_default_is_64_megapixels_or_less_and_files_grow_with_max_pixels() -> None:
+    set_max_pixels(1 << 30)
+    assert (budget().max_pixels, budget().max_file_bytes) == (1 << 30, 1 << 32)
+    set_max_pixels(9)
+    assert (budget().max_pixels, budget().max_file_bytes) == (9, 1 << 20)
+    for number in (0, -1):
+        with pytest.raises(UsageError, match="--max-pixels"):
+            set_max_pixels(number)
+    set_max_pixels(None)
     assert 1 << 20 < budget().max_pixels <= 64_000_000
     assert budget().max_file_bytes == 1 << 30
     assert budget().max_image_bytes == 8 * budget().max_pixels
-
-
-def test_max_pixels_replaces_the_default_and_files_grow_with_it() -> None:
-    set_max_pixels(1 << 30)
-    assert (budget().max_pixels, budget().max_file_bytes) == (1 << 30, 1 << 32)
-    set_max_pixels(None)
-    assert budget().max_pixels <= 64_000_000
-
-
-@pytest.mark.parametrize("number", [0, -1])
-def test_no_pixels_at_all_is_wrong_usage(number: int) -> None:
-    with pytest.raises(UsageError, match="--max-pixels"):
-        set_max_pixels(number)
+    assert budget().max_decoded_bytes > 32 * budget().max_pixels
 
 
 def test_a_small_file_may_hold_an_image_of_one_colour_but_not_any_number_of_values() -> None:

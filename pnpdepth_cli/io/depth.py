@@ -146,7 +146,7 @@ def depth_from_stored(path: Path, stored: StoredArray, scale: float | None) -> D
 def known_metres(values: NDArray[Any]) -> NDArray[np.float32]:
     """Returns float32 of the same shape with 0 for everything but a finite depth above 0."""
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        metres = np.array(values, dtype=np.float32)
+        metres = np.array(values, dtype=np.float32, order="C")
         metres[~(np.isfinite(metres) & (metres > 0))] = 0
     return metres
 

@@ -148,15 +148,16 @@ def save_gain_figure(
     noun: str,
     colors: str,
     unknown: str = "",
-) -> None:
-    """Writes a PNG of one map of N gains with a colour bar, and how many are above 0 or below.
+) -> float:
+    """Writes a PNG of one map of N gains with a colour bar; returns the fraction above 0.
 
     `amount` is the gain of full colour, with its unit; `noun` what is counted; `unknown` what the
     dark pixels are, "" where there are none.
     """
     figure, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
-    improved, worse = float((gain > 0).mean()), float((gain < 0).mean())
-    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {100 * worse:.1f} % worse"
+    improved = float((gain > 0).mean())
+    worse = 100 * float((gain < 0).mean())
+    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {worse:.1f} % worse"
     ends = (f"worse by {amount} or more", f"better by {amount} or more")
     figure.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown or None, "footer": footer}
     bar = np.repeat(signed_bar(colors, 220)[None], 18, axis=0)
@@ -173,6 +174,7 @@ def save_gain_figure(
         draw.text((x + 28, y), unknown, font=small, fill=_INK, anchor="lm")
     draw.text((MARGIN, y + 40), footer, font=font, fill=_INK, anchor="lm")
     _save(figure, path)
+    return improved
 
 
 def _save(figure: PIL.Image.Image, path: Path) -> None:

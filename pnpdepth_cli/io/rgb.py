@@ -185,28 +185,22 @@ def read_focal_length(path: Path, size: tuple[int, int]) -> ExifFocalLength | No
     (Exif 2.32, tags 0x920A, 0xA20E, 0xA210). The image is used at the size (H, W).
     """
     values = _tags(path)
-    focal = _of_film(values, size) or _of_sensor(values, size)
-    if focal is None or not _PLAUSIBLE[0] <= focal.pixels / max(size) <= _PLAUSIBLE[1]:
-        return None
-    return focal
-
-
-def _of_film(values: Mapping[int, float], size: tuple[int, int]) -> ExifFocalLength | None:
-    film_mm = values.get(_FOCAL_LENGTH_35MM)
-    if not film_mm:
-        return None
-    pixels = film_mm / _FILM_DIAGONAL_MM * math.hypot(*size)
-    return ExifFocalLength(pixels=pixels, source=f"EXIF, equivalent to {film_mm:g} mm on film")
-
-
-def _of_sensor(values: Mapping[int, float], size: tuple[int, int]) -> ExifFocalLength | None:
-    focal_mm, resolution = values.get(_FOCAL_LENGTH), values.get(_RESOLUTION)
+    film_mm, focal_mm, resolution = map(
+        values.get, (_FOCAL_LENGTH_35MM, _FOCAL_LENGTH, _RESOLUTION)
+    )
     unit_mm = _UNIT_MM.get(int(values.get(_RESOLUTION_UNIT, 2)))
-    if not focal_mm or not resolution or unit_mm is None:
+    if film_mm:
+        pixels = film_mm / _FILM_DIAGONAL_MM * math.hypot(*size)
+        source = f"EXIF, equivalent to {film_mm:g} mm on film"
+    elif focal_mm and resolution and unit_mm:
+        taken = max(values.get(_WIDTH, 0), values.get(_HEIGHT, 0)) or max(size)
+        pixels = focal_mm * resolution / unit_mm * max(size) / taken
+        source = f"EXIF, {focal_mm:g} mm and the sensor's pixels"
+    else:
         return None
-    taken = max(values.get(_WIDTH, 0), values.get(_HEIGHT, 0)) or max(size)
-    pixels = focal_mm * resolution / unit_mm * max(size) / taken
-    return ExifFocalLength(pixels=pixels, source=f"EXIF, {focal_mm:g} mm and the sensor's pixels")
+    if not _PLAUSIBLE[0] <= pixels / max(size) <= _PLAUSIBLE[1]:
+        return None
+    return ExifFocalLength(pixels=pixels, source=source)
 
 
 def _tags(path: Path) -> dict[int, float]:

@@ -214,12 +214,14 @@ def _zoom_panel(
     area = np.s_[y : y + height, x : x + width]
     rows, columns = size
     part = columns // len(depths)
-    pixels = np.full((rows, columns, 3), 255, np.uint8)
+    pixels, end = np.full((rows, columns, 3), 255, np.uint8), 0
     starts = np.linspace(0, columns - part, len(depths)).round().astype(int)
     for start, depth in zip(starts, depths.values(), strict=True) if part else ():
         shown = cv2.resize(scale.paint(depth[area]), (part, rows), interpolation=cv2.INTER_NEAREST)
         pixels[:, start : start + part] = shown
-        pixels[:, start - 1 : start + 1] = 255  # a line to the depth before; none at the first
+        if end:  # a line to the depth before
+            pixels[:, end - 1 : start + 1] = 255
+        end = start + part
     most = "where most changed" if "linear" not in depths else "where after differs most"
     return Panel(title="Zoom", pixels=pixels, remark=f"{' | '.join(depths)}, {most} (frame)")
 
@@ -293,10 +295,9 @@ def improvement(
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
     unknown = "" if known.all() else "no ground truth"
     amount = f"{strongest:.3g} m"
-    save_gain_figure(
+    return save_gain_figure(
         path, panel, gain, amount=amount, noun="pixels", colors=colors, unknown=unknown
     )
-    return float((gain > 0).mean())
 
 
 def improvement_at_points(
@@ -339,8 +340,7 @@ def improvement_at_points(
     remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
     panel = Panel(title="Change of error", pixels=discs, remark=remark)
     amount = f"{strongest:.3g} {unit}"
-    save_gain_figure(path, panel, gain, amount=amount, noun=noun, colors=colors)
-    return float((gain > 0).mean())
+    return save_gain_figure(path, panel, gain, amount=amount, noun=noun, colors=colors)
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:

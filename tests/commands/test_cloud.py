@@ -48,17 +48,14 @@ def test_the_colours_come_from_the_image_that_the_record_names(tmp_path: Path) -
     assert json.loads((tmp_path / "a.ply.json").read_text()) == record
 
 
-def test_the_field_of_view_is_that_of_the_outer_pixels(tmp_path: Path) -> None:
-    written(frame(tmp_path, "a"), tmp_path / "a.ply", fov_deg=90.0)
+def test_the_field_of_view_or_a_calibration_file_gives_the_camera(tmp_path: Path) -> None:
+    path = frame(tmp_path, "a")
+    written(path, tmp_path / "a.ply", fov_deg=90.0)
     x = points_of(tmp_path / "a.ply")[:, 0]
     assert x.max() == pytest.approx(2 * (WIDTH - 1) / WIDTH, rel=1e-5)
-
-
-def test_a_calibration_file_gives_the_camera(tmp_path: Path) -> None:
     (tmp_path / "k.txt").write_text(f"30 0 {WIDTH / 2} 0 30 {HEIGHT / 2} 0 0 1\n")
-    path = frame(tmp_path, "a")
-    written(path, tmp_path / "a.ply", fov_deg=None, calib=tmp_path / "k.txt")
-    points = points_of(tmp_path / "a.ply")
+    written(path, tmp_path / "b.ply", fov_deg=None, calib=tmp_path / "k.txt")
+    points = points_of(tmp_path / "b.ply")
     assert points[0] == pytest.approx([-WIDTH / 2 / 15, -HEIGHT / 2 / 15, 2], rel=1e-5)
 
 
@@ -85,18 +82,21 @@ def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
     )
 
 
-def test_frames_with_and_without_a_pose_are_not_mixed(tmp_path: Path) -> None:
-    with_camera(frame(tmp_path / "out", "a"), [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]])
-    with_camera(frame(tmp_path / "out", "b"), None)
+def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path: Path) -> None:
+    out, cloud = tmp_path / "out", tmp_path / "o.ply"
+    with_camera(frame(out, "a"), [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]])
+    path = with_camera(frame(out, "b"), None)
     with pytest.raises(InputError, match=r"b_depth\.png has no pose in its record"):
-        written(tmp_path / "out", tmp_path / "o.ply", fov_deg=None)
-
-
-def test_a_depth_of_another_size_than_its_record_needs_its_own_camera(tmp_path: Path) -> None:
-    path = with_camera(frame(tmp_path, "a"), None)
+        written(out, cloud, fov_deg=None)
+    (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    with pytest.raises(InputError, match="3 poses for 2"):
+        written(out, cloud, poses=tmp_path / "p.txt")
+    cv2.imwrite(str(tmp_path / "big.png"), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))
+    with pytest.raises(SizeError, match="--image"):
+        written(path, cloud, image=tmp_path / "big.png")
     write_depth(path, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))
     with pytest.raises(SizeError, match="unlike its record"):
-        written(path, tmp_path / "o.ply", fov_deg=None)
+        written(path, cloud, fov_deg=None)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> N
     assert record["points"] == (HEIGHT - 4) * (WIDTH - 8)
 
 
-def test_frames_with_poses_are_one_cloud_in_the_world_frame(tmp_path: Path) -> None:
+def test_frames_are_one_cloud_in_the_world_frame_in_which_voxels_merge_them(tmp_path: Path) -> None:
     for name in "ab":
         frame(tmp_path / "out", name)
     (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 100 0 1 0 0 0 0 1 0\n")
@@ -151,10 +151,6 @@ def test_frames_with_poses_are_one_cloud_in_the_world_frame(tmp_path: Path) -> N
     first, second = np.split(points, 2)
     assert second == pytest.approx(first + np.array([100, 0, 0]), abs=1e-4)
 
-
-def test_voxels_merge_what_two_frames_see(tmp_path: Path) -> None:
-    for name in "ab":
-        frame(tmp_path / "out", name)
     whole = written(tmp_path / "out", tmp_path / "a.ply")["points"]
     merged = written(tmp_path / "out", tmp_path / "b.ply", voxel=0.5)["points"]
     points = points_of(tmp_path / "a.ply")
@@ -191,17 +187,3 @@ def test_an_existing_output_is_kept_without_overwrite(tmp_path: Path) -> None:
         written(path, tmp_path / "o.ply")
     assert (tmp_path / "o.ply").read_text() == "mine"
     assert written(path, tmp_path / "o.ply", overwrite=True)["points"]
-
-
-def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
-    path = frame(tmp_path, "a")
-    cv2.imwrite(str(tmp_path / "big.png"), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))
-    with pytest.raises(SizeError, match="--image"):
-        written(path, tmp_path / "o.ply", image=tmp_path / "big.png")
-
-
-def test_poses_that_do_not_belong_to_the_files_are_refused(tmp_path: Path) -> None:
-    frame(tmp_path / "out", "a")
-    (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
-    with pytest.raises(InputError, match="2 poses for 1"):
-        written(tmp_path / "out", tmp_path / "o.ply", poses=tmp_path / "p.txt")

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.commands.export import ExportRequest, export_results
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
@@ -63,22 +62,12 @@ def root(tmp_path: Path) -> Path:
     return project(tmp_path)
 
 
-def test_the_exports_are_the_files_of_their_folder() -> None:
-    assert list(EXPORTS) == ["colmap", "nerfstudio", "gaussian-splatting"]
-
-
-def test_colmap_reads_the_depth_maps_it_is_given(root: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
-    export(results(root), "colmap", root)
-    maps = pycolmap.DepthMap()
-    maps.read(str(root / "stereo/depth_maps/b.png.geometric.bin"))
-    assert (maps.width, maps.height) == (WIDTH, HEIGHT)
-    assert (maps.to_array() == DEPTH).all()
+@pytest.mark.parametrize("unit_scale", [None, 0.25])
+def test_maps_have_the_layout_that_colmap_publishes_and_are_in_model_units(
+    root: Path, unit_scale: float | None
+) -> None:
+    export(results(root, unit_scale=unit_scale), "colmap", root)
     assert (root / "stereo/fusion.cfg").read_text() == "a.png\nb.png\nc.png\n"
-
-
-def test_maps_have_the_layout_that_colmap_publishes(root: Path) -> None:
-    export(results(root), "colmap", root)
     for kind, channels in (("depth", 1), ("normal", 3)):
         data = (root / f"stereo/{kind}_maps/a.png.geometric.bin").read_bytes()
         *header, rest = data.split(b"&", 3)
@@ -86,16 +75,19 @@ def test_maps_have_the_layout_that_colmap_publishes(root: Path) -> None:
         columns_first = np.frombuffer(rest, "<f4").reshape((WIDTH, HEIGHT, channels), order="F")
         values = columns_first.transpose(1, 0, 2)
         if kind == "depth":
-            assert (values[..., 0] == DEPTH).all()
+            assert values[..., 0] == pytest.approx(DEPTH, rel=1e-6)
         else:
             assert np.linalg.norm(values, axis=2) == pytest.approx(1, abs=1e-5)
             assert (values[..., 2] < 0).all()  # towards the camera
 
 
-def test_colmap_fuses_the_maps_into_the_surface(root: Path) -> None:
+def test_colmap_reads_the_maps_and_fuses_them_into_the_surface(root: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     depth = np.full((HEIGHT, WIDTH), 4, np.float32)  # all cameras look along z at a wall
     export(results(root, depth), "colmap", root)
+    maps = pycolmap.DepthMap()
+    maps.read(str(root / "stereo/depth_maps/b.png.geometric.bin"))
+    assert (maps.to_array() == depth).all()
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels = 3
     (root / "fused").mkdir()
@@ -103,16 +95,6 @@ def test_colmap_fuses_the_maps_into_the_surface(root: Path) -> None:
     xyz = np.array([point.xyz for point in fused.points3D.values()])
     assert len(xyz) > 500
     assert xyz[:, 2] == pytest.approx(4, abs=1e-3)
-
-
-@pytest.mark.parametrize("unit_scale", [None, 0.25])
-def test_depth_maps_are_in_model_units_whatever_the_unit_of_the_depth(
-    root: Path, unit_scale: float | None
-) -> None:
-    export(results(root, unit_scale=unit_scale), "colmap", root / "dense")
-    data = (root / "dense/stereo/depth_maps/a.png.geometric.bin").read_bytes()
-    values = np.frombuffer(data.split(b"&", 3)[3], "<f4").reshape(HEIGHT, WIDTH)
-    assert values == pytest.approx(DEPTH, rel=1e-6)
 
 
 def test_3dgs_gets_the_inverse_depth_of_the_model(root: Path) -> None:
@@ -170,16 +152,12 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     assert world[:3] == pytest.approx(expected * factor, rel=1e-3)
 
 
-def test_images_in_the_folder_itself_are_not_copied(root: Path) -> None:
-    export(results(root), "nerfstudio", root)
-    content = json.loads((root / "transforms.json").read_text())
-    assert [each["file_path"] for each in content["frames"]] == [f"images/{n}.png" for n in NAMES]
-
-
 def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path: Path) -> None:
     folder = results(project(tmp_path, "OPENCV"))
-    export(folder, "nerfstudio", tmp_path / "scene")
-    entry = json.loads((tmp_path / "scene/transforms.json").read_text())["frames"][0]
+    export(folder, "nerfstudio", tmp_path)
+    entry, *_ = frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    # images in the folder itself are not copied
+    assert [each["file_path"] for each in frames] == [f"images/{n}.png" for n in NAMES]
     names = ("k1", "k2", "p1", "p2", "k3")
     assert [entry[name] for name in names] == [-0.1, 0.02, 0.001, -0.002, 0]
     for to in ("colmap", "gaussian-splatting"):
@@ -222,6 +200,7 @@ def change(path: Path, **entries: Any) -> None:
         ({"camera": None}, InputError, "a_depth.exr lacks a record with its camera"),
         ({"inputs": {}}, InputError, "a_depth.exr lacks its image"),
         ({"unit": "m"}, InputError, "in different units"),
+        ({"inputs": {"sparse": {"image": "b.png"}}}, InputError, "two frames have one image name"),
         ({"size": [9, 9]}, SizeError, "--protocol whole"),
         *(
             (entries, FileFormatError, "beside it is damaged; refine it again")
@@ -254,26 +233,15 @@ def test_results_that_cannot_be_exported_are_one_line(
     assert sorted(root.parent.rglob("*")) == before
 
 
-def test_two_frames_of_one_image_name_are_refused(root: Path) -> None:
-    folder = results(root)
-    known = json.loads((folder / "a.json").read_text())["inputs"]
-    change(folder / "a.json", inputs=known | {"sparse": known["sparse"] | {"image": "b.png"}})
-    with pytest.raises(InputError, match="two frames have one image name"):
-        export(folder, "colmap", root / "dense")
-
-
-def test_depth_without_poses_is_no_scene_of_nerfstudio(root: Path) -> None:
+def test_depth_without_poses_is_no_scene_of_nerfstudio_and_files_are_kept_without_overwrite(
+    root: Path,
+) -> None:
     folder = results(root)
     camera = json.loads((folder / "c.json").read_text())["camera"]
     change(folder / "c.json", camera=camera | {"pose": None})
     with pytest.raises(InputError, match=r"c_depth\.exr has no pose"):
         export(folder, "nerfstudio", root / "scene")
     export(folder, "colmap", root / "dense")
-
-
-def test_existing_files_are_kept_without_overwrite(root: Path) -> None:
-    folder = results(root)
-    export(folder, "colmap", root)
     with pytest.raises(OutputError, match="--overwrite"):
-        export(folder, "colmap", root)
-    export(folder, "colmap", root, overwrite=True)
+        export(folder, "colmap", root / "dense")
+    export(folder, "colmap", root / "dense", overwrite=True)

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.io.cloud_files import write_cloud
+from pnpdepth_cli.io.scans import read_scan
 
 RNG = np.random.default_rng(0)
 XYZ = RNG.uniform(-5, 5, (200, 3)).astype(np.float32)
@@ -18,20 +19,16 @@ NORMALS = (XYZ / np.linalg.norm(XYZ, axis=1, keepdims=True)).astype(np.float32)
 
 
 @pytest.mark.parametrize("rgb", [RGB, None])
-def test_trimesh_reads_points_and_colours_of_a_ply(tmp_path: Path, rgb: np.ndarray | None) -> None:
+def test_trimesh_and_our_own_reader_read_a_ply(tmp_path: Path, rgb: np.ndarray | None) -> None:
     trimesh = pytest.importorskip("trimesh")
-    write_cloud(tmp_path / "a.ply", [(XYZ, NORMALS, rgb)])
+    parts = [
+        (XYZ[p], NORMALS[p], rgb if rgb is None else rgb[p]) for p in (slice(70), slice(70, 200))
+    ]
+    assert write_cloud(tmp_path / "a.ply", parts) == 200
     cloud = trimesh.load(tmp_path / "a.ply")
     assert (cloud.vertices.astype(np.float32) == XYZ).all()
     if rgb is not None:
         assert (cloud.colors[:, :3] == rgb).all()
-
-
-def test_our_own_reader_takes_a_ply_as_a_scan(tmp_path: Path) -> None:
-    from pnpdepth_cli.io.scans import read_scan
-
-    parts = [(XYZ[part], NORMALS[part], RGB[part]) for part in (slice(0, 70), slice(70, 200))]
-    assert write_cloud(tmp_path / "a.ply", parts) == 200
     assert (read_scan(tmp_path / "a.ply").points[:, :3] == XYZ).all()
 
 
@@ -52,17 +49,14 @@ def test_a_laz_keeps_points_to_a_tenth_of_a_millimetre(tmp_path: Path) -> None:
     assert (np.column_stack([las.red, las.green, las.blue]) // 257 == RGB).all()
 
 
-def test_a_suffix_without_a_writer_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"\.ply, \.glb, \.laz"):
-        write_cloud(tmp_path / "a.obj", [(XYZ, NORMALS, RGB)])
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("suffix", "package"), [(".glb", "trimesh"), (".laz", "laspy")])
-def test_a_missing_package_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, package: str
+def test_an_unknown_suffix_and_a_missing_package_are_named_and_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(UsageError, match=r"pnpdepth\[cloud\]"):
-        write_cloud(tmp_path / f"a{suffix}", [(XYZ, NORMALS, RGB)])
+    for package in ("trimesh", "laspy"):
+        monkeypatch.setitem(sys.modules, package, None)
+    for suffix, message in (
+        (".obj", r"\.ply, \.glb, \.laz"), (".glb", r"pnpdepth\[cloud\]"), (".laz", r"\[cloud\]")
+    ):  # fmt: skip
+        with pytest.raises(PnpDepthError, match=message):
+            write_cloud(tmp_path / f"a{suffix}", [(XYZ, NORMALS, RGB)])
     assert list(tmp_path.iterdir()) == []

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 import io
 
-import pytest
+from pnpdepth_cli.io.csv_text import write_csv
 
-from pnpdepth_cli.io.csv_text import text_cell, write_csv
-
-
-@pytest.mark.parametrize("text", ["=1+1", "+1+1", "-1+2", "@SUM(A1)", "\t=1", "\r=1", "-", "\t1"])
-def test_a_formula_becomes_text(text: str) -> None:
-    assert text_cell(text) == f"'{text}"
+FORMULAS = ["=1+1", "+1+1", "-1+2", "@SUM(A1)", "\t=1", "-", "\t1"]
+OTHERS = ["frame", "1=1", "'=1", "", "-0.25", "+5.20", "-1e-3", "–"]
 
 
-@pytest.mark.parametrize("text", ["frame", "1=1", "'=1", "", "-0.25", "+5.20", "-1e-3", "–"])
-def test_other_text_and_numbers_stay_as_they_are(text: str) -> None:
-    assert text_cell(text) == text
-
-
-def test_every_text_of_a_table_is_checked_and_numbers_stay_numbers() -> None:
+def test_formulas_become_text_and_other_text_and_numbers_stay_as_they_are() -> None:
     file = io.StringIO()
-    write_csv(file, ["name", "=x"], [["@a,b", -1.5], ["c", None], ["+7.5", 3]])
-    assert file.getvalue() == "name,'=x\n\"'@a,b\",-1.5\nc,\n+7.5,3\n"
-    assert list(csv.reader(io.StringIO(file.getvalue())))[1] == ["'@a,b", "-1.5"]
+    write_csv(file, ["name", "=x"], [["@a,b", -1.5], ["c", None], FORMULAS, OTHERS])
+    head, comma, none, formulas, others = file.getvalue().splitlines()
+    assert (head, comma, none) == ("name,'=x", '"\'@a,b",-1.5', "c,")
+    assert formulas.split(",") == [f"'{text}" for text in FORMULAS]
+    assert others.split(",") == OTHERS

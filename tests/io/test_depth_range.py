@@ -1,44 +1,50 @@
-from __future__ import annotations
+"""The line about the range of a depth file, and the warning about a wrong scale."""
 
-from pathlib import Path
+from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
+from pnpdepth_cli.io.depth import describe_range, implausible
 
-
-def test_the_summary_has_count_range_and_what_was_assumed() -> None:
-    depth = np.linspace(2.125, 63.4, 1842)
-    line = describe_range(depth, "16-bit PNG ÷ 256", assumed_scale=True)
-    assert line == "1,842 points, 2.1–63.4 m (16-bit PNG ÷ 256; --depth-scale to change)"
-
-
-def test_unknown_depth_does_not_count_and_one_is_singular() -> None:
-    assert describe_range(np.array([0, np.nan, 5.0]), "PFM") == "1 point, 5.0 m (PFM)"
-    assert describe_range(np.zeros(3), "PFM", noun="pixels") == ("no pixels with known depth (PFM)")
+PNG = "16-bit PNG ÷ 256"
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "text"),
+    ("depth", "source", "assumed", "line"),
     [
-        (0.4, 9.96, "0.4–10.0 m"),
-        (0.034, 0.97, "0.034–1.0 m"),
-        (12, 12345.6, "12.0–12,345.6 m"),
-        (0.0001, 2, "1.0e-04–2.0 m"),
+        ([0, np.nan, 5.0], "PFM", False, "1 point, 5.0 m (PFM)"),
+        ([0, 0], "PFM", False, "no points with known depth (PFM)"),
+        ([0.4, 9.96], "x", False, "2 points, 0.4–10.0 m (x)"),
+        ([0.034, 0.97], "x", False, "2 points, 0.034–1.0 m (x)"),
+        ([12, 12345.6], "x", False, "2 points, 12.0–12,345.6 m (x)"),
+        ([0.0001, 2], "x", False, "2 points, 1.0e-04–2.0 m (x)"),
+        (
+            [2.125, 63.4] * 500,
+            PNG,
+            True,
+            f"1,000 points, 2.1–63.4 m ({PNG}; --depth-scale to change)",
+        ),
+        ([3, 13], "PNG ÷ 1000", True, "2 points, 3.0–13.0 m (PNG ÷ 1000; --depth-scale to change)"),
+        ([3.125, 13.28], PNG, False, f"2 points, 3.1–13.3 m ({PNG})"),
+        (
+            [3.125, 13.28],
+            PNG,
+            True,
+            f"2 points, 3.1–13.3 m ({PNG} assumed; if it holds millimetres, --depth-scale 1000"
+            " makes it 0.8–3.4 m)",
+        ),
     ],
 )
-def test_numbers_are_written_as_people_do(low: float, high: float, text: str) -> None:
-    assert text in describe_range(np.array([low, high]), "x")
+def test_the_range_has_count_ends_and_what_was_assumed(
+    depth: list[float], source: str, assumed: bool, line: str
+) -> None:
+    assert describe_range(np.array(depth), source, assumed_scale=assumed) == line
 
 
-@pytest.mark.parametrize("median", [0.02, 0.5, 80, 1000])
-def test_plausible_metres_need_no_word(median: float) -> None:
+@pytest.mark.parametrize("median", [0, 0.02, 0.5, 80, 1000])
+def test_plausible_metres_and_nothing_known_need_no_word(median: float) -> None:
     assert implausible(np.full(5, median), 256) is None
-
-
-def test_nothing_known_needs_no_word() -> None:
-    assert implausible(np.zeros(4)) is None
 
 
 @pytest.mark.parametrize(
@@ -65,23 +71,3 @@ def test_a_float_file_in_millimetres_is_an_error_that_names_metres() -> None:
         "median depth 2,500.0 m is implausible, the scale is probably wrong: "
         "a float file must hold metres; divided by 1000 it would be 2.5 m"
     )
-
-
-def test_real_millimetres_read_as_single_codes_are_noticed(shared_data: Path) -> None:
-    path = shared_data / "icl_nuim" / "depth" / "00000.png"
-    right, wrong = read_depth(path, scale=1000), read_depth(path, scale=1)
-    assert implausible(right.values, right.scale) is None
-    warning = implausible(wrong.values, wrong.scale)
-    assert warning is not None
-    assert "--depth-scale 1000 (now 1)" in warning
-
-
-def test_a_map_that_may_be_a_room_in_millimetres_gets_a_note() -> None:
-    kitchen = np.array([[800, 3400]]) / 256
-    line = describe_range(kitchen, "16-bit PNG ÷ 256", assumed_scale=True)
-    assert line == (
-        "2 points, 3.1–13.3 m (16-bit PNG ÷ 256 assumed; if it holds millimetres, --depth-scale"
-        " 1000 makes it 0.8–3.4 m)"
-    )
-    for source, assumed in (("16-bit PNG ÷ 256", False), ("16-bit PNG ÷ 1000", True)):
-        assert "millimetres" not in describe_range(kitchen, source, assumed_scale=assumed)

@@ -1,3 +1,5 @@
+"""Depth files of every format as metres, 0 where unknown."""
+
 from __future__ import annotations
 
 import math
@@ -6,6 +8,7 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,10 +26,16 @@ METRES = np.array([[0, 1.5, np.nan], [np.inf, -2, 80.25]], dtype=np.float32)
 KNOWN = np.array([[0, 1.5, 0], [0, 0, 80.25]], dtype=np.float32)
 
 
-def save(path: Path, values: np.ndarray, text: str | None = None) -> Path:
-    """Writes by the suffix; `text` is the scale that the file itself gives."""
+def save(path: Path, values: Any, text: str | None = None) -> Path:
+    """Writes by the suffix, a mapping as channels; `text` is the scale in the file itself."""
     if path.suffix == ".npy":
         np.save(path, values)
+    elif path.suffix == ".npz":
+        np.savez(path, **values)
+    elif path.suffix == ".exr":
+        write_exr(path, values)
+    elif path.suffix == ".pfm":
+        path.write_bytes(values)
     elif text is None:
         cv2.imwrite(str(path), values)
     elif path.suffix == ".png":
@@ -36,6 +45,11 @@ def save(path: Path, values: np.ndarray, text: str | None = None) -> Path:
     else:
         Image.fromarray(values).save(path, description=f"pnpdepth:scale={text}")
     return path
+
+
+def ones(*names: str) -> dict[str, np.ndarray]:
+    """Channels of 1, 2, ... metres."""
+    return {name: np.full((2, 3), 1 + k, np.float32) for k, name in enumerate(names)}
 
 
 @pytest.mark.parametrize("name", ["d.png", "d.tif"])
@@ -60,71 +74,126 @@ def test_a_given_scale_beats_that_in_the_file_which_beats_kittis(
     assert np.array_equal(depth.valid, CODES > 0)
 
 
-@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "many"])
-def test_a_senseless_scale_in_the_file_is_refused(tmp_path: Path, text: str) -> None:
-    with pytest.raises(FileFormatError, match=f"pnpdepth:scale={text}"):
-        read_depth(save(tmp_path / "d.png", CODES, text))
-
-
 @pytest.mark.parametrize("scale", [0.0, -256.0, math.nan, math.inf])
-def test_a_senseless_given_scale_is_wrong_usage(tmp_path: Path, scale: float) -> None:
+def test_a_senseless_scale_is_refused_given_or_in_the_file(tmp_path: Path, scale: float) -> None:
     with pytest.raises(UsageError, match="--depth-scale must be a finite number above 0"):
         read_depth(save(tmp_path / "d.png", CODES), scale=scale)
+    for text in (str(scale), "many"):
+        with pytest.raises(FileFormatError, match=f"pnpdepth:scale={text}"):
+            read_depth(save(tmp_path / "d.png", CODES, text))
 
 
-def test_the_largest_code_is_unknown_and_gets_a_note(tmp_path: Path) -> None:
-    path = tmp_path / "d.png"
-    cv2.imwrite(str(path), np.array([[65535, 1000, 65535]], dtype=np.uint16))
-    depth = read_depth(path, scale=1000)
-    assert depth.values.tolist() == [[0, 1, 0]]
-    assert depth.source == "16-bit PNG ÷ 1000, 2 pixels of value 65535 taken as unknown"
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.int64, np.uint64])
-def test_integers_in_npy_need_a_scale_as_png_does(tmp_path: Path, dtype: type) -> None:
-    depth = read_depth(save(tmp_path / "d.npy", np.array([[0, 128]], dtype=dtype)))
-    assert depth.values.tolist() == [[0, 0.5]]
-    assert depth.assumed_scale
-    assert depth.source == f"{np.dtype(dtype)} NPY ÷ 256"
-    negative = read_depth(save(tmp_path / "d.npy", np.array([[-1, 256]], dtype=np.int16)))
-    assert negative.values.tolist() == [[0, 1]]
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, ">f4"])
-def test_floats_are_metres_whatever_the_scale_and_known_where_finite_and_above_zero(
-    tmp_path: Path, dtype: str
-) -> None:
-    path = save(tmp_path / "d.npy", METRES.astype(dtype))
-    for depth in (read_depth(path), read_depth(path, scale=1000)):
-        assert np.array_equal(depth.values, KNOWN)
-        assert not depth.assumed_scale
-        assert depth.scale is None
-    beyond_float32 = read_depth(save(tmp_path / "d.npy", np.array([[1e300, 2.0]])))
-    assert beyond_float32.values.tolist() == [[0, 2]]
-
-
-@pytest.mark.parametrize("shape", [(2, 3), (1, 2, 3), (2, 3, 1), (1, 1, 2, 3), (1, 2, 3, 1)])
-def test_npy_may_have_one_channel_before_or_behind_and_be_a_batch_of_one(
-    tmp_path: Path, shape: tuple[int, ...]
-) -> None:
-    np.save(tmp_path / "d.npy", METRES.reshape(shape))
-    assert np.array_equal(read_depth(tmp_path / "d.npy").values, KNOWN)
+PIXELS = np.array([[-1, 256]])
+ANYTHING, A = {"anything": METRES}, {"A": METRES.astype(np.float16)}
+GREY = {"R": METRES, "G": METRES, "B": METRES, "A": np.ones_like(METRES)}
+UNSIGNED, HALVES = {"Z": np.array([[512, 0]], np.uint32)}, np.array([[0, 128]], np.uint8)
+BOTTOM_UP = METRES[::-1]
+PFM = b"Pf\n3 2\n-1.0\n" + BOTTOM_UP.astype("<f4").tobytes()
+FACTOR = "PFM, scale factor 0.25 of its header not applied"
 
 
 @pytest.mark.parametrize(
-    "shape", [(), (6,), (2, 2, 3), (3, 2, 1, 1), (1, 2, 2, 3), (1, 1, 1, 2, 3), (0, 4), (4, 0)]
+    ("name", "values", "expected", "source"),
+    [
+        *(
+            ("d.npy", METRES.astype(kind), KNOWN, f"{np.dtype(kind)} NPY")
+            for kind in (np.float16, np.float32, np.float64, ">f4")
+        ),
+        *(
+            ("d.npy", METRES.reshape(shape), KNOWN, "float32 NPY")
+            for shape in [(1, 2, 3), (2, 3, 1), (1, 1, 2, 3), (1, 2, 3, 1)]
+        ),
+        *(
+            ("d.npy", np.maximum(PIXELS, low).astype(kind), [[0, 1]], f"{np.dtype(kind)} NPY ÷ 256")
+            for kind, low in ((np.uint16, 0), (np.int16, -1), (np.int64, -1), (np.uint64, 0))
+        ),
+        ("d.npy", HALVES, [[0, 0.5]], "uint8 NPY ÷ 256"),
+        ("d.npy", np.array([[1e300, 2.0]]), [[0, 2]], "float64 NPY"),
+        ("d.npz", ANYTHING, KNOWN, "float32 NPZ array anything"),
+        ("d.exr", ANYTHING, KNOWN, "EXR channel anything"),
+        ("d.exr", A, KNOWN, "EXR channel A"),
+        ("d.exr", GREY, KNOWN, "EXR channel R"),
+        ("d.exr", UNSIGNED, [[2, 0]], "EXR channel Z ÷ 256"),
+        ("d.exr", ones("R", "G", "B", "depth"), [[4] * 3] * 2, "EXR channel depth"),
+        ("d.exr", ones("V.Combined.R", "V.Depth.Z"), [[2] * 3] * 2, "EXR channel V.Depth.Z"),
+        ("d.exr", ones("A", "Y"), [[2] * 3] * 2, "EXR channel Y"),
+        ("d.tiff", METRES, KNOWN, "32-bit float TIFF"),
+        ("d.tiff", METRES.astype(np.float64), KNOWN, "64-bit float TIFF"),
+        ("d.pfm", PFM, KNOWN, "PFM"),
+        ("d.pfm", b"Pf 3 2 1\n" + BOTTOM_UP.astype(">f4").tobytes(), KNOWN, "PFM"),
+        ("d.pfm", b"Pf\n1 1\n-0.25\n" + np.float32(2).tobytes(), [[2]], FACTOR),
+        (
+            "d.png",
+            np.array([[65535, 256, 65535]], np.uint16),
+            [[0, 1, 0]],
+            "16-bit PNG ÷ 256, 2 pixels of value 65535 taken as unknown",
+        ),
+    ],
 )
-def test_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    np.save(tmp_path / "d.npy", np.ones(shape, np.float32))
-    with pytest.raises(FileFormatError, match=r"is \(H, W\)|no pixels"):
-        read_depth(tmp_path / "d.npy")
+def test_every_format_gives_metres_where_they_are_finite_and_above_zero(
+    tmp_path: Path, name: str, values: Any, expected: Any, source: str
+) -> None:
+    path = save(tmp_path / name, values)
+    depth = read_depth(path)
+    assert depth.values.tolist() == np.asarray(expected, np.float32).tolist()
+    assert depth.source == source
+    assert depth.assumed_scale == ("÷" in source)
+    if "÷" not in source:  # floats are metres, whatever the scale
+        assert np.array_equal(read_depth(path, scale=1000).values, depth.values)
+        assert depth.scale is None
 
 
-@pytest.mark.parametrize("values", [np.array([[True]]), np.array([[1j]]), np.array([["a"]])])
-def test_what_is_no_number_is_refused(tmp_path: Path, values: np.ndarray) -> None:
-    np.save(tmp_path / "d.npy", values)
-    with pytest.raises(FileFormatError, match="depth is float or integer"):
-        read_depth(tmp_path / "d.npy")
+def broken_pfm(header: bytes, count: int) -> tuple[str, Any, str]:
+    return "d.pfm", header + bytes(count), r"d\.pfm"
+
+
+def eight_bits(suffix: str) -> tuple[str, Any, str]:
+    return f"d{suffix}", np.zeros((3, 4), np.uint8), "8 bits cannot hold depth"
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        *(
+            ("d.npy", np.ones(shape, np.float32), r"is \(H, W\)|no pixels")
+            for shape in [(), (6,), (2, 2, 3), (3, 2, 1, 1), (1, 2, 2, 3), (1, 1, 1, 2, 3), (0, 4)]
+        ),
+        *(("d.npy", np.array([[value]]), "depth is float or integer") for value in (True, 1j, "a")),
+        ("d.npz", {}, "holds no array"),
+        *map(eight_bits, (".png", ".tif", ".jpg", ".webp")),
+        ("d.png", np.zeros((3, 4, 4), np.uint16), "several channels"),
+        ("d.tif", np.zeros((3, 4, 3), np.float32), "3 channels"),
+        ("d.pfm", b"PF\n1 1\n-1\n" + bytes(12), "colour PFM"),
+        broken_pfm(b"Pf\n2 1\n-1\n", 7),
+        broken_pfm(b"Pf\n2 1\n-1\n", 9),
+        broken_pfm(b"Pf\n2 1\n0\n", 8),
+        broken_pfm(b"Pf\n2 1\n1e999\n", 8),
+        broken_pfm(b"Pf\n2 1\n--1\n", 8),
+        broken_pfm(b"Pf\n2 0\n-1\n", 0),
+        broken_pfm(b"Pf\n-2 1\n-1\n", 8),
+        broken_pfm(b"Pf\n2\n-1\n", 8),
+        broken_pfm(b"Pf", 0),
+        ("d.pfm", b"hello", r"d\.pfm is not a depth file; give a 16-bit PNG, EXR, NPY"),
+        ("d.pfm", b"", r"d\.pfm is empty"),
+    ],
+)
+def test_what_is_no_depth_is_refused_with_its_reason(
+    tmp_path: Path, name: str, values: Any, message: str
+) -> None:
+    with pytest.raises(FileFormatError, match=message):
+        read_depth(save(tmp_path / name, values))
+
+
+def test_a_palette_a_folder_and_a_zip_of_something_else_are_refused(tmp_path: Path) -> None:
+    Image.new("P", (4, 3)).save(tmp_path / "p.png")
+    with zipfile.ZipFile(tmp_path / "d.npz", "w") as archive:
+        archive.writestr("readme.txt", "hello")
+    for name, message in (
+        ("p.png", "a palette"), ("d.npz", "is not an array"), ("", "is a folder"),
+        ("none.png", r"none\.png: no such file; check the path"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            read_depth(tmp_path / name)
 
 
 class WritesAFile:
@@ -139,51 +208,28 @@ class WritesAFile:
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz"])
 def test_pickled_objects_are_never_loaded(tmp_path: Path, suffix: str) -> None:
-    trace = tmp_path / "trace"
-    evil = np.array([WritesAFile(str(trace))], dtype=object)
-    path = tmp_path / f"d{suffix}"
-    if suffix == ".npy":
-        np.save(path, evil, allow_pickle=True)
-    else:
-        np.savez(path, evil)
+    evil = np.array([WritesAFile(str(tmp_path / "trace"))], dtype=object)
     with pytest.raises(FileFormatError, match="allow_pickle"):
+        read_depth(save(tmp_path / f"d{suffix}", evil if suffix == ".npy" else {"a": evil}))
+    assert not (tmp_path / "trace").exists()
+
+
+@pytest.mark.parametrize("names", [("R", "G", "B"), ("depth", "Z"), ("U", "V"), ("R", "Y")])
+@pytest.mark.parametrize("suffix", [".exr", ".npz"])
+def test_ambiguous_channels_or_arrays_are_listed_unless_one_is_chosen(
+    tmp_path: Path, names: tuple[str, ...], suffix: str
+) -> None:
+    path = save(tmp_path / f"d{suffix}", ones(*names))
+    listing = ", ".join(sorted(names) if suffix == ".exr" else names)
+    with pytest.raises(FileFormatError, match=re.escape(f"({listing}); choose one with --channel")):
         read_depth(path)
-    assert not trace.exists()
-
-
-def test_npz_with_one_array_needs_no_key(tmp_path: Path) -> None:
-    np.savez(tmp_path / "d.npz", anything=METRES)
-    depth = read_depth(tmp_path / "d.npz")
-    assert np.array_equal(depth.values, KNOWN)
-    assert depth.source == "float32 NPZ array anything"
-
-
-def test_npz_with_several_arrays_lists_them_unless_one_is_chosen(tmp_path: Path) -> None:
-    path = tmp_path / "d.npz"
-    np.savez(path, near=METRES, far=METRES * 2)
-    with pytest.raises(FileFormatError, match=r"2 arrays \(near, far\); choose one with --channel"):
-        read_depth(path)
-    assert np.array_equal(read_depth(path, channel="far").values, KNOWN * 2)
-    with pytest.raises(UsageError, match="no array 'mid'; --channel can be one of: near, far"):
-        read_depth(path, channel="mid")
-
-
-def test_an_empty_npz_is_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "d.npz")
-    with pytest.raises(FileFormatError, match="holds no array"):
-        read_depth(tmp_path / "d.npz")
-
-
-def test_a_zip_of_something_else_is_refused(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "d.npz", "w") as archive:
-        archive.writestr("readme.txt", "hello")
-    with pytest.raises(FileFormatError, match="is not an array"):
-        read_depth(tmp_path / "d.npz")
+    assert read_depth(path, channel=names[1]).values[0, 0] == 2
+    with pytest.raises(UsageError, match=f"no .* 'Q'; --channel can be one of: {listing}"):
+        read_depth(path, channel="Q")
 
 
 def test_a_subsampled_exr_channel_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "d.exr"
-    write_exr(path, {"Z": np.ones((4, 4), np.float32)})
+    path = save(tmp_path / "d.exr", {"Z": np.ones((4, 4), np.float32)})
     # In the list of channels: name, float, not linear, then the sampling in x and y.
     entry = b"Z\0" + struct.pack("<4I", 2, 0, 1, 1)
     content = path.read_bytes()
@@ -193,79 +239,30 @@ def test_a_subsampled_exr_channel_is_refused(tmp_path: Path) -> None:
         read_depth(path)
 
 
-def test_transparency_in_a_16_bit_png_changes_no_depth(tmp_path: Path) -> None:
-    Image.fromarray(CODES).save(tmp_path / "d.png", transparency=256)
-    assert np.array_equal(read_depth(tmp_path / "d.png").values, CODES.astype(np.float32) / 256)
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32])
-@pytest.mark.parametrize("name", ["Z", "depth", "anything", "A"])
-def test_the_only_exr_channel_is_taken_whatever_its_name(
-    tmp_path: Path, dtype: type, name: str
-) -> None:
-    write_exr(tmp_path / "d.exr", {name: METRES.astype(dtype)})
-    depth = read_depth(tmp_path / "d.exr")
-    assert np.array_equal(depth.values, KNOWN)
-    assert depth.source == f"EXR channel {name}"
-
-
 @pytest.mark.parametrize(
-    ("names", "chosen"),
+    ("corner", "rows", "columns"),
     [
-        (("R", "G", "B", "Z"), "Z"),
-        (("R", "G", "B", "depth"), "depth"),
-        (("View.Combined.R", "View.Depth.Z"), "View.Depth.Z"),
-        (("A", "Y"), "Y"),
+        ((1, 1), (1, 3), (1, 4)),
+        ((-1, -1), (0, 1), (0, 2)),
+        ((3, 2), (2, 4), (3, 5)),
+        ((9, 9), 0, 0),
     ],
 )
-def test_of_several_exr_channels_the_one_named_for_depth_is_taken(
-    tmp_path: Path, names: tuple[str, ...], chosen: str
+def test_a_cropped_exr_is_placed_in_its_display_window(
+    tmp_path: Path, corner: tuple[int, int], rows: Any, columns: Any
 ) -> None:
-    values = {name: np.full((2, 3), 1 + k, np.float32) for k, name in enumerate(names)}
-    write_exr(tmp_path / "d.exr", values)
-    depth = read_depth(tmp_path / "d.exr")
-    assert depth.source == f"EXR channel {chosen}"
-    assert np.array_equal(depth.values, values[chosen])
-
-
-@pytest.mark.parametrize("names", [("R", "G", "B"), ("depth", "Z"), ("U", "V"), ("R", "Y")])
-def test_an_ambiguous_exr_lists_its_channels_unless_one_is_chosen(
-    tmp_path: Path, names: tuple[str, ...]
-) -> None:
-    path = tmp_path / "d.exr"
-    write_exr(path, {name: np.full((2, 3), 1 + k, np.float32) for k, name in enumerate(names)})
-    listing = re.escape(f"({', '.join(sorted(names))}); choose one with --channel")
-    with pytest.raises(FileFormatError, match=listing):
-        read_depth(path)
-    assert read_depth(path, channel=names[1]).values[0, 0] == 2
-    with pytest.raises(UsageError, match="no channel 'Q'; --channel can be one of"):
-        read_depth(path, channel="Q")
-
-
-def test_an_exr_with_equal_r_g_b_gives_that_grey(tmp_path: Path) -> None:
-    write_exr(
-        tmp_path / "d.exr", {"R": METRES, "G": METRES, "B": METRES, "A": np.ones_like(METRES)}
-    )
-    assert np.array_equal(read_depth(tmp_path / "d.exr").values, KNOWN)
-
-
-def test_an_exr_of_integers_needs_a_scale_too(tmp_path: Path) -> None:
-    write_exr(tmp_path / "d.exr", {"Z": np.array([[512, 0]], dtype=np.uint32)})
-    depth = read_depth(tmp_path / "d.exr")
-    assert depth.values.tolist() == [[2, 0]]
-    assert depth.assumed_scale
-
-
-def test_a_cropped_exr_is_placed_in_its_display_window(tmp_path: Path) -> None:
     window = (np.array([0, 0], np.int32), np.array([4, 3], np.int32))
-    crop = (np.array([1, 1], np.int32), np.array([3, 2], np.int32))
-    write_exr(tmp_path / "d.exr", {"Z": KNOWN}, displayWindow=window, dataWindow=crop)
+    crop = (np.array(corner, np.int32), np.array(corner, np.int32) + np.array([2, 1], np.int32))
+    write_exr(tmp_path / "d.exr", {"Z": KNOWN + 1}, displayWindow=window, dataWindow=crop)
     expected = np.zeros((4, 5), np.float32)
-    expected[1:3, 1:4] = KNOWN
+    if rows:
+        inside = expected[slice(*rows), slice(*columns)]
+        top, left = (max(-start, 0) for start in corner[::-1])
+        inside[:] = (KNOWN + 1)[top : top + inside.shape[0], left : left + inside.shape[1]]
     assert np.array_equal(read_depth(tmp_path / "d.exr").values, expected)
 
 
-def test_the_channels_of_a_multi_part_exr_carry_the_part_name(tmp_path: Path) -> None:
+def test_parts_and_tiles_of_an_exr_are_read(tmp_path: Path) -> None:
     header = {"type": OpenEXR.scanlineimage}
     parts = [
         OpenEXR.Part(dict(header), {"Y": METRES * 2}, "left"),
@@ -275,47 +272,26 @@ def test_the_channels_of_a_multi_part_exr_carry_the_part_name(tmp_path: Path) ->
         file.write(str(tmp_path / "d.exr"))
     assert read_depth(tmp_path / "d.exr").source == "EXR channel right.Z"
     assert np.array_equal(read_depth(tmp_path / "d.exr", channel="left.Y").values, KNOWN * 2)
-
-
-def test_a_tiled_exr_is_read(tmp_path: Path) -> None:
     depth = np.arange(1, 6001, dtype=np.float32).reshape(60, 100)
-    write_exr(
-        tmp_path / "d.exr", {"Z": depth}, type=OpenEXR.tiledimage, tiles=OpenEXR.TileDescription()
-    )
-    assert np.array_equal(read_depth(tmp_path / "d.exr").values, depth)
+    tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+    write_exr(tmp_path / "t.exr", {"Z": depth}, **tiles)
+    assert np.array_equal(read_depth(tmp_path / "t.exr").values, depth)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_float_tiff_holds_metres(tmp_path: Path, dtype: type) -> None:
-    cv2.imwrite(str(tmp_path / "d.tiff"), METRES.astype(dtype))
-    depth = read_depth(tmp_path / "d.tiff")
-    assert np.array_equal(depth.values, KNOWN)
-    assert depth.source == f"{np.dtype(dtype).itemsize * 8}-bit float TIFF"
-
-
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".webp"])
-def test_8_bits_are_refused_as_a_preview_of_depth(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"d{suffix}"
-    Image.fromarray(np.zeros((3, 4), np.uint8)).save(path)
-    with pytest.raises(FileFormatError, match="8 bits cannot hold depth"):
-        read_depth(path)
-
-
-def test_a_16_bit_png_of_three_equal_channels_is_depth_and_gets_a_note(tmp_path: Path) -> None:
-    path = tmp_path / "rgb.png"
-    cv2.imwrite(str(path), np.repeat(np.where(CODES == 0, 65535, CODES)[:, :, None], 3, axis=2))
-    depth = read_depth(path, scale=100)
-    assert np.array_equal(depth.values, (CODES / 100).astype(np.float32))
-    assert depth.source == (
-        "16-bit PNG of three equal channels ÷ 100, 1 pixels of value 65535 taken as unknown"
-    )
-    # one colour made transparent (tRNS, before the pixels) changes no depth
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_transparent_colour_in_a_16_bit_png_changes_no_depth(
+    tmp_path: Path, channels: int
+) -> None:
+    pixels = CODES if channels == 1 else np.repeat(CODES[:, :, None], 3, axis=2)
+    path = save(tmp_path / "d.png", pixels)
     content = path.read_bytes()
-    body = b"tRNS" + struct.pack(">3H", 256, 256, 256)
-    chunk = struct.pack(">I", 6) + body + struct.pack(">I", zlib.crc32(body))
+    body = b"tRNS" + struct.pack(f">{channels}H", *[256] * channels)
+    chunk = struct.pack(">I", 2 * channels) + body + struct.pack(">I", zlib.crc32(body))
     start = content.index(b"IDAT") - 4
     path.write_bytes(content[:start] + chunk + content[start:])
-    assert np.array_equal(read_depth(path, scale=100).values, depth.values)
+    depth = read_depth(path, scale=100)
+    assert np.array_equal(depth.values, (CODES / 100).astype(np.float32))
+    assert ("of three equal channels" in depth.source) == (channels == 3)
 
 
 @pytest.mark.parametrize("channel", [0, 1, 2])
@@ -324,59 +300,20 @@ def test_a_16_bit_png_with_one_channel_off_by_one_code_is_refused(
 ) -> None:
     pixels = np.repeat(CODES[:, :, None], 3, axis=2)
     pixels[1, 2, channel] += 1
-    cv2.imwrite(str(tmp_path / "rgb.png"), pixels)
     with pytest.raises(FileFormatError, match="several channels; depth is one 16-bit grey"):
-        read_depth(tmp_path / "rgb.png")
-
-
-def test_colour_and_palette_are_refused(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "rgba.png"), np.zeros((3, 4, 4), np.uint16))
-    with pytest.raises(FileFormatError, match="several channels"):
-        read_depth(tmp_path / "rgba.png")
-    Image.new("P", (4, 3)).save(tmp_path / "p.png")
-    with pytest.raises(FileFormatError, match="a palette"):
-        read_depth(tmp_path / "p.png")
-    cv2.imwrite(str(tmp_path / "rgb.tif"), np.zeros((3, 4, 3), np.float32))
-    with pytest.raises(FileFormatError, match="3 channels"):
-        read_depth(tmp_path / "rgb.tif")
-    (tmp_path / "c.pfm").write_bytes(b"PF\n1 1\n-1\n" + bytes(12))
-    with pytest.raises(FileFormatError, match="colour PFM"):
-        read_depth(tmp_path / "c.pfm")
+        read_depth(save(tmp_path / "rgb.png", pixels))
 
 
 def test_the_content_decides_not_the_suffix(tmp_path: Path) -> None:
-    path = tmp_path / "d.exr"
-    with path.open("wb") as file:
-        np.save(file, METRES)
+    path = save(tmp_path / "d.npy", METRES).rename(tmp_path / "d.exr")
     assert np.array_equal(read_depth(path).values, KNOWN)
 
 
-def test_missing_empty_and_unknown_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.png: no such file; check the path"):
-        read_depth(tmp_path / "none.png")
-    (tmp_path / "e.png").touch()
-    with pytest.raises(FileFormatError, match=r"e\.png is empty"):
-        read_depth(tmp_path / "e.png")
-    (tmp_path / "t.png").write_text("hello")
-    with pytest.raises(FileFormatError, match=r"t\.png is not a depth file; give a 16-bit PNG"):
-        read_depth(tmp_path / "t.png")
-    with pytest.raises(InputError, match="is a folder"):
-        read_depth(tmp_path)
-
-
-def test_kitti_depth_is_read_as_the_benchmark_defines_it(shared_data: Path) -> None:
+def test_real_depth_of_lidar_and_kinect_is_read_as_its_codes(shared_data: Path) -> None:
     path = next((shared_data / "kitti_dc" / "groundtruth").glob("*.png"))
     depth = read_depth(path)
-    codes = np.asarray(Image.open(path))
-    assert depth.values.shape == (375, 1242)
-    assert np.array_equal(depth.values, codes.astype(np.float32) / 256)
+    assert np.array_equal(depth.values, np.asarray(Image.open(path)).astype(np.float32) / 256)
     assert depth.assumed_scale
-    assert 0.1 < depth.valid.mean() < 0.3
-
-
-def test_kinect_depth_in_millimetres_loses_its_saturated_pixels(shared_data: Path) -> None:
-    for path in sorted((shared_data / "7scenes").glob("*.depth.png"))[:10]:
+    for path in sorted((shared_data / "7scenes").glob("*.depth.png"))[:3]:
         codes = np.asarray(Image.open(path))
-        depth = read_depth(path, scale=1000)
-        assert np.array_equal(depth.valid, (codes > 0) & (codes < 65535))
-        assert depth.values.max() < 10
+        assert np.array_equal(read_depth(path, scale=1000).valid, (codes > 0) & (codes < 65535))

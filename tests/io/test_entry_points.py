@@ -20,7 +20,7 @@ def read(path, data, channel):
     rows = [line.split() for line in data.decode().splitlines()[1:]]
     return StoredArray(values=np.array(rows, np.float32), description="table of metres")
 
-def write(file, metres, options):
+def write(file, metres, text):
     lines = ["METRES", *(" ".join(map(repr, row)) for row in metres.tolist())]
     file.write_text("\\n".join(lines))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import check_pixel_count
@@ -86,25 +86,22 @@ def test_tags_that_share_their_bytes_are_refused(where: str, tmp_path: Path) -> 
             read(path)
 
 
+SHAPES = ["(\n", "(6, 8", "(True, 5)", "(2L, 3)", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
+DTYPES = ["f999", "<q8", ",", "i4, i4", "M8[x]", "\x00f4"]
+
+
 @pytest.mark.parametrize(
-    "shape", ["(\n", "(6, 8", "(True, 5)", "(2L, 3)", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
+    ("descr", "shape"), [*(("<f4", shape) for shape in SHAPES), *((d, "(2, 2)") for d in DTYPES)]
 )
-def test_a_header_of_npy_that_is_no_header_is_damaged(tmp_path: Path, shape: str) -> None:
-    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+def test_a_header_of_npy_that_is_no_header_is_damaged(
+    tmp_path: Path, descr: str, shape: str
+) -> None:
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     path = tmp_path / "a.npy"
     path.write_bytes(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + bytes(4 * 6 * 8))
-    with pytest.raises(FileFormatError, match="NPY cannot be read") as caught:
+    with pytest.raises(FileFormatError, match=r"NPY cannot be read|holds .* values") as caught:
         read_depth(path)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("descr", ["f999", "<q8", ",", "i4, i4", "M8[x]", "\x00f4"])
-def test_a_dtype_of_npy_that_is_none_is_an_input_error(tmp_path: Path, descr: str) -> None:
-    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': (2, 2), }}".encode()
-    path = tmp_path / "a.npy"
-    path.write_bytes(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + bytes(64))
-    with pytest.raises(InputError):
-        read_depth(path)
 
 
 @pytest.mark.parametrize(

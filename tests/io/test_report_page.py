@@ -3,23 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 
-from pnpdepth_cli.io.report import (
-    Column,
-    Head,
-    begin_report,
-    image_key,
-    save_views,
-    write_report,
-)
 from tests.commands.batches import add_frame, batch, pairs_on_disk
 from tests.commands.report_pages import frames_of, page_data
 
@@ -111,7 +100,11 @@ def test_it_opens_from_disk_without_an_error_and_without_a_network(page: webdriv
     assert {url.split(":")[0] for url in requests} <= {"file", "data"}
 
 
-def test_names_stay_text(page: webdriver.Chrome) -> None:
+def test_names_stay_text_and_what_failed_is_listed_with_its_reason(page: webdriver.Chrome) -> None:
+    assert one(page, "#without-title").text == "Not refined: 1"
+    text = one(page, "#reasons").text
+    assert text.startswith("d")
+    assert "d.png" in text
     assert page.title.endswith("Batch refinement")
     (name,) = [name for name in names(page) if "onerror" in name]
     assert name == STRANGE.replace("\n", "\\u000a")
@@ -120,7 +113,7 @@ def test_names_stay_text(page: webdriver.Chrome) -> None:
     assert not page.find_elements(By.CSS_SELECTOR, "img[src=x]")
 
 
-def test_the_worst_frame_is_first_and_a_click_turns_the_order(
+def test_the_worst_frame_is_first_and_it_sorts_by_every_column_and_can_be_searched(
     page: webdriver.Chrome, report: Path
 ) -> None:
     worst_first = shown_by(report, "rmse_gain")
@@ -130,11 +123,6 @@ def test_the_worst_frame_is_first_and_a_click_turns_the_order(
     header.find_element(By.TAG_NAME, "button").click()
     assert names(page) == worst_first[::-1]
     assert header.get_attribute("aria-sort") == "descending"
-
-
-def test_it_sorts_by_every_column_and_by_name_and_can_be_searched(
-    page: webdriver.Chrome, report: Path
-) -> None:
     one(page, "#sort-column option[value='2']").click()  # an error: the largest is the worst
     assert names(page) == shown_by(report, page_data(report)["columns"][2]["key"])[::-1]
     one(page, "#sort-column option[value='-1']").click()
@@ -190,13 +178,6 @@ def test_the_slider_moves_by_keyboard_and_pointer_and_names_its_position(
     assert abs(int(slider.get_property("value")) - 25) <= 1
 
 
-def test_what_failed_is_listed_with_its_reason(page: webdriver.Chrome) -> None:
-    assert one(page, "#without-title").text == "Not refined: 1"
-    text = one(page, "#reasons").text
-    assert text.startswith("d")
-    assert "d.png" in text
-
-
 def test_the_histogram_counts_all_frames_and_has_a_text_alternative(page: webdriver.Chrome) -> None:
     bars = page.find_elements(By.CSS_SELECTOR, "#chart .bar title")
     counts = [int(b.get_attribute("textContent").split(": ")[1].split()[0]) for b in bars]
@@ -238,53 +219,3 @@ def test_every_control_has_a_name(page: webdriver.Chrome) -> None:
             one(page, "#rows .open").send_keys(Keys.ENTER)
     for image in page.find_elements(By.CSS_SELECTOR, "#views img"):
         assert image.get_attribute("alt")
-
-
-@pytest.fixture(scope="module")
-def thousand(tmp_path_factory: pytest.TempPathFactory, report: Path) -> Path:
-    """A report of 1,000 frames, every one with its own images."""
-    folder = tmp_path_factory.mktemp("thousand")
-    images = begin_report(folder, {})
-    pixels = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
-    save_views(images, "0", {"map": pixels, "second": pixels})
-    data = page_data(report)
-    head = Head(
-        kind="Batch refinement",
-        title="a thousand",
-        columns=[Column(**column) for column in data["columns"]],
-        sort_by="rmse_gain",
-        labels=data["labels"],
-        thumb="second",
-    )
-    example = frames_of(report)["a"]
-
-    def frame(number: int) -> dict[str, Any]:
-        key = image_key(str(number))
-        views = {}
-        for view in ("second", "map"):
-            shutil.copy(images / f"0_{view}.jpg", images / f"{key}_{view}.jpg")
-            views[view] = {"src": f"images/{key}_{view}.jpg"}
-        values = [number % 97 / 100 - 0.3] * len(head.columns)
-        name = f"drive/{number:06}"
-        return example | {"name": name, "key": key, "values": values, "views": views}
-
-    write_report(folder, head, map(frame, range(1000)))
-    return folder
-
-
-def test_a_thousand_frames_are_usable_within_seconds_and_few_thumbnails_are_read(
-    chrome: webdriver.Chrome, thousand: Path
-) -> None:
-    size(chrome, 1280, 900)
-    for _ in range(2):  # images that the browser has in memory are not read ahead either
-        chrome.get_log("performance")
-        chrome.get((thousand / "index.html").as_uri())
-    assert len(names(chrome)) == 1000
-    spent_ms = chrome.execute_script(
-        "return performance.getEntriesByType('navigation')[0].loadEventEnd"
-    )
-    assert spent_ms < 10_000  # 2 s on a machine that does nothing else
-    one(chrome, "#rows .open").send_keys(Keys.ARROW_DOWN)
-    wait(chrome, lambda: loaded(chrome, "#rows tr:first-child img"))
-    read = [e for e in chrome.get_log("performance") if "requestWillBeSent" in e["message"]]
-    assert 2 < len(read) < 200

@@ -162,7 +162,9 @@ def test_a_missing_view_is_reported(page: webdriver.Chrome, root: Path) -> None:
         moved.rename(script)
 
 
-def test_a_report_without_views_allows_and_holds_no_other_script(tmp_path: Path) -> None:
+def test_a_report_without_views_holds_no_other_script_and_views_need_report_and_camera(
+    tmp_path: Path,
+) -> None:
     root = pairs_on_disk(tmp_path, ("a",))
     report = root / "out" / "report"
     batch(root, html=report, html_3d=True, refine={"fov_deg": 60.0})
@@ -174,10 +176,7 @@ def test_a_report_without_views_allows_and_holds_no_other_script(tmp_path: Path)
     text = (report / "index.html").read_text()
     assert " file:;" not in text.split("script-src")[1].split('"')[0]
 
-
-def test_views_without_a_report_or_a_camera_are_refused(tmp_path: Path) -> None:
-    root = pairs_on_disk(tmp_path, ("a",))
     with pytest.raises(UsageError, match="--html-3d adds to the report"):
         batch(root, html_3d=True)
     with pytest.raises(UsageError, match="--html-3d needs the camera"):
-        batch(root, html=root / "out" / "report", html_3d=True)
+        batch(root, html=report, html_3d=True)

@@ -61,7 +61,7 @@ def _write(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> 
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    channel = OpenEXR.Channel(np.ascontiguousarray(metres, dtype=np.float32))
+    channel = OpenEXR.Channel(metres)
     try:
         with OpenEXR.File(header, {"Z": channel}) as image:
             image.write(str(file))

@@ -68,9 +68,6 @@ def test_every_frame_is_on_the_page_which_links_the_panels_of_its_files_on_disk(
     assert frame["scale_m"] == [preview["low_m"], preview["high_m"]]
     assert frame["map"]["footer"] == figure["footer"]
 
-
-def test_gains_are_those_of_depth_against_ground_truth(root: Path, report: Path) -> None:
-    batch(root, html=report)
     batch(root, output=root / "plain", refine={"iterations": 0})
     gt = read_depth(root / "gt/b.png").values
     before, after = (
@@ -83,24 +80,23 @@ def test_gains_are_those_of_depth_against_ground_truth(root: Path, report: Path)
     assert values["mae_gain"] == 1 - values["mae_after"] / values["mae_before"]
     assert values["mae_gain"] != 0
     assert 0 < values["improved"] < 1
+    (table, _) = page_data(report)["tables"]
+    assert table["header"] == ["", "before", "after", "gain"]
+    assert [row[0] for row in table["rows"]][:2] == ["RMSE [m] ↓", "MAE [m] ↓"]
 
 
-def test_frames_of_an_earlier_run_without_a_report_are_in_it(root: Path, report: Path) -> None:
-    batch(root, limit=2)
-    listener = RecordingListener()
-    batch(root, listener, html=report)
-    assert listener.names == ["c", "d"]
-    resumed = everything(report)
-    shutil.rmtree(report)
-    shutil.rmtree(root / "out")
-    batch(root, html=report)
-    assert resumed == everything(report)
-
-
-def test_a_second_run_writes_the_same_page_and_only_an_image_that_is_missing(
+def test_what_runs_before_and_what_was_lost_is_in_the_next_report_without_being_drawn_again(
     root: Path, report: Path
 ) -> None:
-    batch(root, html=report)
+    answers = iter([False, True, True, True])
+    batch(root, html=report, stopped=lambda: next(answers))
+    assert list(frames_of(report)) == ["a"]
+    assert page_data(report)["tiles"][0][2] == "3 pending"
+    batch(root, html=report, shard=(1, 2))  # a and c
+    shutil.rmtree(report)
+    listener = RecordingListener()
+    batch(root, listener, html=report)
+    assert listener.names == ["b", "d"]
     before = everything(report)
     missing = report / "images" / f"{frames_of(report)['b']['key']}_preview.png"
     drawn = {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
@@ -140,29 +136,15 @@ def test_a_failed_frame_is_listed_with_its_reason(root: Path, report: Path) -> N
     assert len(page_data(report)["without"]) == 4
 
 
-def test_a_batch_that_is_stopped_has_a_report_of_what_is_done(root: Path, report: Path) -> None:
-    answers = iter([False, True, True, True])
-    batch(root, html=report, stopped=lambda: next(answers))
-    assert list(frames_of(report)) == ["a"]
-    assert page_data(report)["tiles"][0][2] == "3 pending"
-
-
-def test_the_page_states_the_refinement_and_that_it_may_differ_per_frame(
-    root: Path, report: Path, tmp_path: Path
+def test_without_ground_truth_gains_are_those_at_held_out_points_and_settings_are_stated(
+    root: Path, report: Path
 ) -> None:
-    batch(root, html=report, refine={"propagate": "gp"})
+    shutil.rmtree(root / "gt")
+    batch(root, html=report, refine={"holdout": 0.3, "propagate": "gp"})
     facts = dict(page_data(report)["facts"])
     assert facts["Refinement"] == "5 updates of z at middle (sign, l1, step 0.01)"
     assert (facts["Alignment"], facts["Propagation"]) == ("none", "gp")
-    batch(root, output=root / "auto", html=tmp_path / "auto", refine={"propagate": None})
-    facts = dict(page_data(tmp_path / "auto")["facts"])
-    assert facts["Refinement"].endswith("(the default method)")
-    assert "Alignment" not in facts
-
-
-def test_without_ground_truth_gains_are_those_at_held_out_points(root: Path, report: Path) -> None:
-    shutil.rmtree(root / "gt")
-    batch(root, html=report, refine={"holdout": 0.3})
+    assert facts["Held out"] == "30% of the points, seed 0"
     frame = frames_of(report)["a"]
     assert frame["values"]["rmse_gain"] is not None
     assert any("at held-out points" in note for note in frame["notes"])
@@ -201,14 +183,6 @@ def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
     )
 
 
-def test_the_shard_that_ends_last_reports_all_frames(root: Path, report: Path) -> None:
-    batch(root, html=report, shard=(1, 2))
-    assert list(frames_of(report)) == ["a", "c"]
-    batch(root, html=report, shard=(2, 2))
-    assert tuple(frames_of(report)) == NAMES
-    assert len(images_of(report)) == len(NAMES) * len(_FILES)
-
-
 def test_the_report_may_lie_in_the_results_and_the_results_among_the_frames(root: Path) -> None:
     report = root / "out" / "report"
     for _ in range(2):
@@ -233,13 +207,6 @@ def test_outputs_inside_the_inputs_or_around_them_are_refused(root: Path, tmp_pa
     for output in (root, root / "out", tmp_path):
         assert "holds the results" in refused(root, output, overwrite=True)
     assert not (root / "out").exists()
-
-
-def test_a_list_has_its_files_elsewhere_which_are_safe_as_well(root: Path, tmp_path: Path) -> None:
-    listed = tmp_path / "frames.csv"
-    listed.write_text("image,sparse\ndrive/rgb/a.png,drive/sparse/a.png\n")
-    with pytest.raises(OutputError, match=r"holds .*rgb/a\.png, which is read"):
-        batch(root, source=listed, output=tmp_path / "out", html=root, refine={"overwrite": True})
 
 
 def test_another_batchs_report_is_replaced_only_on_request(root: Path, report: Path) -> None:
@@ -286,15 +253,6 @@ def test_a_disk_that_is_full_while_linking_ends_the_run_and_the_next_one_goes_on
     shutil.rmtree(report)
     batch(root, html=report)
     assert resumed == everything(report)
-
-
-@pytest.mark.parametrize(("unit", "shown"), [("m", "RMSE [m]"), ("units", "RMSE [units]")])
-def test_errors_have_the_unit_of_the_depths(unit: str, shown: str) -> None:
-    mean = {stage: {"rmse": 0.5, "irmse": 2.0} for stage in ("before", "after")} | {"frames": 1}
-    rows = report_batch._means("scores", mean, unit).rows
-    titles = [row[0] for row in rows]
-    assert f"{shown} ↓" in titles
-    assert "iRMSE [1/km] ↓" in titles
 
 
 @pytest.mark.parametrize("colors", COLORS)
