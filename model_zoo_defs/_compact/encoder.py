@@ -32,7 +32,7 @@ class SamePaddedConv(nn.Conv2d):
         # A kernel with a first row and column of zeros is padded alike at both ends, without a copy
         # of x.
         weight = self.weight if self.stride == (1, 1) else F.pad(self.weight, (1, 0, 1, 0))
-        return self._conv_forward(x, weight, self.bias)
+        return cast(Tensor, self._conv_forward(x, weight, self.bias))
 
 
 class InvertedBottleneck(nn.Module):

@@ -139,7 +139,8 @@ class OpenNetwork:
         with coarse(self.network.module) as at_full_size:
             (result,) = refine_from(split, z0, points, settings, depth_of=(reader,))
         if isinstance(result, Refinement):
-            result = replace(result, before=reader(at_full_size[0]))
+            before, after = (reader(at_full_size[number]) for number in (0, -1))
+            result = replace(result, before=before, after=after)
         return result
 
     def _plain(

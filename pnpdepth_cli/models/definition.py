@@ -199,9 +199,9 @@ class ModelDefinition:
     """Name of a submodule whose output depends on the image alone. It runs once for several sets of
     points of one image."""
     coarse: Callable[[Any], AbstractContextManager[list[Any]]] | None = None
-    """Called with the network; while it is open, forward with gradients returns a smaller depth of
-    the same field of view, sooner, and the first one's full depth goes to the list. The default
-    method takes the gradient of its updates of z there."""
+    """Called with the network; while it is open, forward returns a smaller depth of the same field
+    of view, sooner. The first forward, and each without gradients, also adds its full depth to the
+    list. The default method takes the gradient of its updates of z there."""
     takes_prior: bool = False
     """True if forward takes one more argument, which may be left out: a dense prior (1, 1, H, W) in
     metres with 0 = unknown, such as another network's depth aligned with the points."""

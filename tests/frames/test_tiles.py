@@ -174,7 +174,9 @@ def test_a_divergence_in_one_tile_is_one_of_the_frame(monkeypatch: pytest.Monkey
         return replace(refined, diverged=error) if len(calls) == 2 else refined
 
     monkeypatch.setattr(tiles, "refine_frame", diverging)
-    assert tiled(OneNumber(), PLAIN, everywhere((64, 150))).diverged is error
+    refined = tiled(OneNumber(), PLAIN, everywhere((64, 150)))
+    assert refined.diverged is error
+    assert refined.notes[-1] == "tiles: 3 of 64×64 pixels"
     assert len(calls) == 4  # the whole frame, and three tiles
 
 
