@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, OutputError, SizeError
+from pnpdepth_cli.errors import FileFormatError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import check_pixel_count, read_bytes
 from pnpdepth_cli.io.formats import (
@@ -33,6 +33,10 @@ _FARTHEST_INDOORS_M = 40.0
 """Below it, a map read by KITTI's scale may be a room in millimetres: 40 m are 10.2 m then."""
 # Codes per metre in use, most likely first: millimetres, KITTI, TUM RGB-D, centimetres.
 _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
+_SCALE_FACTORS = {"1000/256": 1000 / 256, "5000/1000": 5.0, "1000": 1000.0}
+_NEAR_FACTOR = 1.1  # ratio to one of these factors that noise explains
+_OTHER_SCALE = 1.5  # ratio of two depths of a frame that no noise explains
+_MIN_COMPARED = 10  # fewer pixels decide nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,6 +229,37 @@ def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
         f"{fact}: --depth-scale {better:g} (now {scale:g}) "
         f"would make it {metres(median * scale / better)} m"
     )
+
+
+def check_same_scale(
+    truth: NDArray[np.float32], other: NDArray[np.float32], what: str, options: str
+) -> list[str]:
+    """Returns a warning if ground truth and other depth differ by a factor where both are known.
+
+    Args:
+        truth: (H, W) ground truth, 0 = unknown.
+        other: (H, W) depth of the same frame, such as sparse depth or a prediction.
+        what: What the other depth is, such as "the sparse depth".
+        options: The options that set the scales of both.
+
+    Raises:
+        UsageError: The factor is about that between two scales in use, such as 1000 / 256.
+    """
+    both = (truth > 0) & (other > 0)
+    count = int(both.sum())
+    if count < _MIN_COMPARED:
+        return []
+    ratio = float(np.median(truth[both] / other[both]))
+    if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
+        return []
+    fact = (
+        f"the ground truth is {ratio:.3g} times {what} where both are known (median of"
+        f" {count:,} pixels)"
+    )
+    for name, factor in _SCALE_FACTORS.items():
+        if 1 / _NEAR_FACTOR <= max(ratio, 1 / ratio) / factor <= _NEAR_FACTOR:
+            raise UsageError(f"{fact}, about {name}: one file is read by a wrong scale; {options}")
+    return [f"warning: {fact}, so one of their scales is wrong; {options}"]
 
 
 def metres(value: float) -> str:

@@ -112,22 +112,18 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str,
             outputs.improvement, image, inputs, frame, outputs.colors
         )
     if outputs.cloud is not None:
-        record["cloud"] = _write_cloud(outputs.cloud, image, inputs, frame)
+        assert inputs.camera is not None
+        pose = inputs.camera.pose  # known, it moves the cloud into the world's frame
+        parts = cloud_from_depth(frame.after, inputs.camera.camera, rgb=image, keep=frame.valid)
+        moved = (part if pose is None else part.transformed(pose) for part in parts)
+        points = write_cloud(outputs.cloud, moved)
+        record["cloud"] = {"points": points, "frame": "camera" if pose is None else "world"}
     if outputs.view is not None:
         write_view(outputs.view, image, inputs, frame)
     kinds = ("depth", "sigma", "valid", "preview", "improvement", "cloud", "view")
     written = outputs.by_kind()
     record["outputs"] = {kind: str(written[kind]) if kind in written else None for kind in kinds}
     return record
-
-
-def _write_cloud(path: Path, image: Image | None, inputs: Inputs, frame: Refined) -> dict[str, Any]:
-    """Writes the cloud of the refined depth, in the world's frame if the pose is known."""
-    assert inputs.camera is not None
-    parts = cloud_from_depth(frame.after, inputs.camera.camera, rgb=image, keep=frame.valid)
-    pose = inputs.camera.pose
-    points = write_cloud(path, (part if pose is None else part.transformed(pose) for part in parts))
-    return {"points": points, "frame": "camera" if pose is None else "world"}
 
 
 def _write_improvement(

@@ -17,6 +17,7 @@ from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.frames.resolve import redefined
 from pnpdepth_cli.io.atomic import all_or_none
+from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.models.network import load_network
 
 
@@ -104,7 +105,8 @@ def write_refined(
             record |= write_outputs(outputs, inputs, frame)
         record["seconds"] = watch.seconds
         record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
-        outputs.write_record(record)
+        if outputs.record is not None:
+            write_json(outputs.record, record)
     for path in {*planned.paths()} - {*outputs.paths()}:
         path.unlink(missing_ok=True)  # of an earlier result
     return RefineOutcome(record=record, outputs=outputs, diverged=frame.diverged)
