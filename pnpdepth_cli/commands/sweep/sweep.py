@@ -14,8 +14,7 @@ from pnpdepth_cli.commands.batch.frames import Task, find_frames, reference_fram
 from pnpdepth_cli.commands.batch.reading import read_frame
 from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.refinement.inputs import Inputs
-from pnpdepth_cli.commands.refinement.record import model_record
-from pnpdepth_cli.commands.refinement.refine import load_refiner
+from pnpdepth_cli.commands.refinement.refine import load_refiner, model_record
 from pnpdepth_cli.commands.sweep.axes import Cell, Study, values_of
 from pnpdepth_cli.commands.sweep.journal import Journal
 from pnpdepth_cli.commands.sweep.plan import Plan, Runs
