@@ -12,6 +12,7 @@ import click
 from pnpdepth_cli.choices import PATTERNS, SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.commands.refinement.request import sample_pattern
 from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
 
 _seed = click.option(
@@ -50,15 +51,9 @@ def project(
     from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 
     target = SparseTarget(output=output, overlay=overlay, overwrite=overwrite)
-    height_and_width = options.height_and_width(size) if size else None
-    record = project_scan(
-        scan,
-        ScanOptions(**options.taken(ScanOptions, values)),
-        target,
-        image=image,
-        size=height_and_width,
-    )
-    _print(record, as_json=as_json)
+    of_scan = ScanOptions(**options.taken(ScanOptions, values))
+    shape = options.height_and_width(size) if size else None
+    _print(project_scan(scan, of_scan, target, image=image, size=shape), as_json=as_json)
 
 
 @click.command(short_help="Sample sparse depth from dense depth.")
@@ -81,7 +76,6 @@ def project(
     help="Gaussian noise of the depth, metres or P%; outliers=P% of random depth; jitter=PIXELS.",
 )
 @options.depth_scale
-@options.channel
 @options.sparse_output
 @options.overwrite
 @options.as_json
@@ -117,7 +111,7 @@ def sample(
 
     values["scale"] = values.pop("depth_scale")
     target = make.SparseTarget(output=output, overwrite=overwrite)
-    chosen, added = make.read_pattern(pattern, count), make.read_noise(noise)
+    chosen, added = sample_pattern(pattern, count), make.read_noise(noise)
     _print(make.sample_depth(depth, target, chosen, noise=added, **values), as_json=as_json)
 
 
@@ -146,7 +140,6 @@ def sample(
 )
 @_seed
 @options.depth_scale
-@options.channel
 @options.sparse_output
 @options.overwrite
 @options.as_json

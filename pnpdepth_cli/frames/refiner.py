@@ -23,7 +23,7 @@ from pnpdepth_cli.completion.image_registration import (
 )
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
-from pnpdepth_cli.frames.arrays import frame_of_arrays
+from pnpdepth_cli.frames.arrays import Unit, frame_of_arrays
 from pnpdepth_cli.frames.default import check_fixed, refine_default, split_hidden
 from pnpdepth_cli.frames.frame import (
     METRES,
@@ -141,7 +141,13 @@ class Refiner:
         """The user's network, cut and open; None with the default method, or while closed."""
         return self._opened if isinstance(self._opened, Split) else None
 
-    def refine(self, image: ArrayLike | None, sparse: ArrayLike | SparsePoints) -> Refined:
+    def refine(
+        self,
+        image: ArrayLike | None,
+        sparse: ArrayLike | SparsePoints,
+        *,
+        unit: Unit | None = None,
+    ) -> Refined:
         """Returns one frame of arrays refined.
 
         Args:
@@ -149,12 +155,14 @@ class Refiner:
                 sparse depth only.
             sparse: Depth map (H, W) in metres with 0 for unknown, rows (N, 3) of x, y and depth
                 (pixel centres at whole numbers), or SparsePoints.
+            unit: Of the depth of an array, "m" or "mm"; needed for integers, and where half of the
+                depths are beyond 200.
 
         Raises:
             InputError: Image or points cannot be used.
             DivergedError: The loss became non-finite; `last_good` is the Refined before that.
         """
-        refined = self.refine_frame(frame_of_arrays(image, sparse, self._register))
+        refined = self.refine_frame(frame_of_arrays(image, sparse, self._register, unit))
         refined = replace(refined, notes=(*self.network.notes, *refined.notes))
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)

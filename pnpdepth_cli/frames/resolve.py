@@ -202,11 +202,12 @@ def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[N
         listed += f", mean of {len(frames)} frames"
     if rival is None:
         return candidates[chosen], (
-            f"input: rgb range {chosen!r} (error after alignment: {listed}); --normalise changes it"
+            f"input: rgb range {chosen!r} (error after alignment: {listed}); --set normalise=NAME"
+            " changes it"
         )
     return candidates[chosen], (
-        f"input: rgb range {chosen!r}, unsure (error after alignment: {listed}); --normalise"
-        f" {chosen} confirms it, --normalise {rival} is the next likely"
+        f"input: rgb range {chosen!r}, unsure (error after alignment: {listed}); --set"
+        f" normalise={chosen} confirms it, normalise={rival} is the next likely"
     )
 
 

@@ -50,7 +50,7 @@ def read_colmap_points(
         raise SizeError(
             f"{image} is {size[1]}×{size[0]} but its camera in {model.folder} is"
             f" {camera.size[1]}×{camera.size[0]}; give the photo that COLMAP was given, unrotated,"
-            " or --sparse-size-ok if it was only resized"
+            " or --set sparse-size-ok if it was only resized"
         )
     check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
     points = _observed(model, name, options)

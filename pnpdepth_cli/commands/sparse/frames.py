@@ -204,7 +204,7 @@ def _write_calibration(
     if not calibration.has_pose:
         say(
             f"warning: {bag.path} has no static transform from {names[0]} to {names[1]}; refine"
-            " with --extrinsics"
+            " with --scan extrinsics=FILE"
         )
     else:
         say(f"calibration: {source}")

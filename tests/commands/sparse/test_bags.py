@@ -94,7 +94,7 @@ def test_several_topics_are_listed_and_one_can_be_named(tmp_path: Path) -> None:
 def test_a_bag_without_calibration_gets_a_note_that_names_it(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "a.mcap", static=False)
     messages = written(bag, tmp_path / "a")
-    assert "no static transform from camera to lidar; refine with --extrinsics" in messages[-1]
+    assert "no static transform from camera to lidar; refine with --scan extrinsics" in messages[-1]
     assert not read_calibration(tmp_path / "a" / "calib.txt").has_pose
     messages = written(write_bag(tmp_path / "b.mcap", info=False), tmp_path / "b")
     assert "has no camera_info of /front/image_raw; refine with --calib" in messages[-1]

@@ -34,7 +34,7 @@ def scene(tmp_path: Path) -> ScanOnDisk:
 
 def test_extrinsics_of_a_file_complete_a_calibration(scene: ScanOnDisk) -> None:
     options = ScanOptions(calib=scene.calib)
-    with pytest.raises(UsageError, match=r"has no pose of the scanner; .* or give --extrinsics"):
+    with pytest.raises(UsageError, match=r"has no pose of the scanner; .* or give --scan ext"):
         read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
     options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
     read = read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
