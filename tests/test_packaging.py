@@ -48,10 +48,15 @@ def test_every_file_that_is_no_module_is_listed_for_the_wheel() -> None:
         assert {path for path in files - listed if path.suffix not in (".py", ".pyc")} == set()
 
 
-def test_the_package_runs_as_a_module_like_the_command() -> None:
+def test_the_package_runs_as_a_module_like_the_command(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pnpdepth_cli"]
     done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"pnpdepth, version {pnp.__version__}\n"
+    command += ["refine", "no.png", "--sparse", "no.png"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert done.stderr.startswith("pnpdepth: ")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module")

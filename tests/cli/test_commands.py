@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -119,22 +118,6 @@ def test_layers_lists_shape_stride_cost_and_field_and_why_some_cannot_be_cut(
     assert "never runs" in rows["unused"]["problem"]
 
 
-def test_the_installed_command_runs_and_ends_without_a_traceback(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
-    done = subprocess.run(
-        [*command, "refine", "no.png", "--sparse", "no.png"],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        env={**os.environ, "COLUMNS": "80"},
-    )
-    assert done.returncode == 3
-    assert done.stderr.startswith("pnpdepth: ")
-    assert done.stderr.count("\n") == 1
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("command", ["sample", "simulate", "compare"])
 @pytest.mark.parametrize("seed", ["-1", "99999999999999999999"])
 def test_a_seed_that_no_generator_takes_is_refused(
@@ -172,17 +155,6 @@ def test_a_stdout_that_cannot_show_every_character_shows_the_others(
     assert done.returncode == 0, done.stderr.decode()
     assert shown in done.stdout
     assert len(done.stdout) > 500
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_a_full_stdout_is_one_line() -> None:
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "pnpdepth_cli", "--help"],
-            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
-        )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stderr == "pnpdepth: stdout cannot be written to: No space left on device\n"
 
 
 @pytest.mark.parametrize(

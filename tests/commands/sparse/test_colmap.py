@@ -151,15 +151,12 @@ def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) ->
     kept = read(project, min_track=2, max_reprojection=3).points
     assert kept.dropped["seen in fewer than 2 images"] == 0
     assert len(kept) >= len(points)
-
-
-def test_a_model_of_two_images_is_not_asked_for_tracks_of_three(tmp_path: Path) -> None:
-    write_text_model(tmp_path, names=("a.png", "b.png"))
-    options = ColmapOptions()
-    points = read_colmap_points(
-        tmp_path, options, Path("a.png"), (HEIGHT, WIDTH), any_size=False
+    write_text_model(project / "two", names=("a.png", "b.png"))  # not asked for tracks of three
+    size = (HEIGHT, WIDTH)
+    pair = read_colmap_points(
+        project / "two", ColmapOptions(), Path("a.png"), size, any_size=False
     ).points
-    assert points.dropped["seen in fewer than 2 images"] == 0
+    assert pair.dropped["seen in fewer than 2 images"] == 0
 
 
 def test_points_behind_the_camera_are_counted_and_a_model_of_nothing_else_refused(
