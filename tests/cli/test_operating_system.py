@@ -223,14 +223,3 @@ def test_several_outputs_to_one_file_are_refused(
         assert "--csv and --markdown are the same file" in capsys.readouterr().err
         assert run([command, str(GT), str(GT), "--latex", table, "--markdown", other]) == 2
         assert "--markdown and --latex are the same file" in capsys.readouterr().err
-
-
-def test_a_conversion_into_its_own_source_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source = tmp_path / "a.safetensors"
-    source.write_bytes(b"kept")
-    for target in (source, tmp_path / "." / "a.safetensors"):
-        assert run(["models", "convert", str(source), str(target), "--overwrite"]) == 2
-        assert "is the checkpoint itself" in capsys.readouterr().err
-        assert source.read_bytes() == b"kept"
