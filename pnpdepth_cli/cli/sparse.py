@@ -15,10 +15,6 @@ from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.commands.refinement.request import sample_pattern
 from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
 
-_seed = click.option(
-    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Random seed."
-)
-
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
 @click.argument("scan", type=options.FILE)
@@ -69,7 +65,7 @@ def project(
     "--count", metavar="N|P%", help="Number of points (of lines for `lines`), or % of known pixels."
 )
 @click.option("--image", type=options.FILE, help="Image for `features` and `edges`.")
-@_seed
+@options.seed
 @click.option(
     "--noise",
     metavar="NOISE,...",
@@ -138,7 +134,7 @@ def sample(
     help="Of the scanner: metres right of, below and in front of the camera, or as in the"
     " calibration.",
 )
-@_seed
+@options.seed
 @options.depth_scale
 @options.sparse_output
 @options.overwrite

@@ -112,7 +112,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     else:
         size = whole or own.size
     camera = camera_of_frame(request, sparse, size)
-    used, held_out = split_points(own, request.hold_out.holdout, method.seed)
+    used, held_out = _split(own, request.hold_out.holdout, method.seed)
     points, neighbours, lost = read_neighbours(
         files, used, camera, lambda other: _points_of(request, other, size)
     )
@@ -149,26 +149,15 @@ def _register(request: RefineRequest) -> Register:
     return registration_to_make(files.registration, request.method)
 
 
-def split_points(
-    points: SparsePoints, holdout: float, seed: int
-) -> tuple[SparsePoints, SparsePoints]:
-    """Returns (points to use, points held out).
-
-    Args:
-        points: All points.
-        holdout: Fraction of the points to hold out at random; at least one unless it is 0.
-        seed: Of the choice.
-
-    Raises:
-        UsageError: The fraction is not in 0…1, or there are too few points for it.
-    """
-    if not 0 <= holdout < 1:
-        raise UsageError(f"--holdout must be a fraction, 0 <= F < 1, got {holdout}")
+def _split(points: SparsePoints, fraction: float, seed: int) -> tuple[SparsePoints, SparsePoints]:
+    """The points to use, and a random fraction of them, at least one unless it is 0, held out."""
+    if not 0 <= fraction < 1:
+        raise UsageError(f"--holdout must be a fraction, 0 <= F < 1, got {fraction}")
     mask = torch.zeros(len(points), dtype=torch.bool)
-    if holdout > 0:
+    if fraction > 0:
         if len(points) < 2:
             raise UsageError("holdout needs at least two sparse points")
-        count = min(max(1, round(holdout * len(points))), len(points) - 1)
+        count = min(max(1, round(fraction * len(points))), len(points) - 1)
         order = np.random.default_rng(seed).permutation(len(points))
         mask[torch.from_numpy(order[:count])] = True
     return points.select(~mask), points.select(mask)
