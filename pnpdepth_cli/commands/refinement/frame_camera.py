@@ -83,7 +83,8 @@ def camera_of_frame(
         UsageError: An output needs the camera, and nothing gives it; or --fov repeats it.
         SizeError: The calibration is of another image.
     """
-    files, outputs, image, known = request.files, request.outputs, request.files.image_file, None
+    files, outputs, image = request.files, request.outputs, request.files.image_file
+    known: FrameCamera | None = None
     if sparse.camera is not None:
         known = FrameCamera(camera=sparse.camera, source=sparse.camera_source, pose=sparse.pose)
     elif files.scan.calib is not None:

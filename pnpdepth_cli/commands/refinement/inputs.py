@@ -78,7 +78,10 @@ def read_inputs(request: RefineRequest) -> Inputs:
     """
     files, method, crop = request.files, request.method, request.files.protocol.apply
     notes, record = list[str](), dict[str, Any]()
-    rgb, gt, whole, gt_scale = None, None, None, None
+    rgb: ImageArray | None = None
+    gt: ImageArray | None = None
+    whole: tuple[int, int] | None = None
+    gt_scale: float | None = None
     if files.image is not None:
         image, note = _read_image(files, files.image)
         whole, rgb = (image.shape[0], image.shape[1]), np.ascontiguousarray(crop(image))
@@ -167,7 +170,9 @@ def _points_of(request: RefineRequest, files: FrameFiles, size: tuple[int, int])
     """The points of another frame of the sequence, read or sampled as it does itself."""
     if files.sparse is not None:
         return _read_sparse(request, files, size).points
-    crop, rgb, gt = files.protocol.apply, None, None
+    crop = files.protocol.apply
+    rgb: ImageArray | None = None
+    gt: ImageArray | None = None
     if files.image is not None:
         rgb = np.ascontiguousarray(crop(_read_image(files, files.image)[0]))
     if files.gt is not None:

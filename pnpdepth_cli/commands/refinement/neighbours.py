@@ -59,7 +59,8 @@ def read_neighbours(
             f"{_name_of(files)}: moving points to other frames needs the camera; give --calib, or a"
             " column calib in a list"
         )
-    own, scans, record, notes = _in_numpy(used), [], [], []
+    own, scans, notes = _in_numpy(used), list[NeighbourScan](), list[str]()
+    record: list[dict[str, Any]] = []
     for neighbour in files.neighbours:
         points, source = _in_numpy(points_of(neighbour.files)), _source_of(neighbour.files)
         known = neighbour.motion
@@ -67,7 +68,7 @@ def read_neighbours(
             estimate = _estimated(files, neighbour.files, own, points, camera.camera)
         else:
             estimate = MotionEstimate(motion=np.array(known), basis=neighbour.poses)
-        entry = {
+        entry: dict[str, Any] = {
             "path": str(source),
             "sha256": fingerprint(file_of(source)).sha256,
             "poses": neighbour.poses,

@@ -66,17 +66,6 @@ def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> 
     assert not [note for note in read.notes if "extrinsics" in note]
 
 
-def test_a_fisheye_lens_of_a_plain_calibration_is_applied(scene: ScanOnDisk) -> None:
-    plain = scene.calib.read_text()
-    moved = []
-    for lens in ("", "\ndistortion: [0.1, 0, 0, 0]\nlens: fisheye\n"):
-        scene.calib.write_text(plain + lens)
-        options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
-        points = read_scan_points(scene.scan, options, (HEIGHT, WIDTH)).points
-        moved.append(points.xy[:5])
-    assert np.abs(moved[0] - moved[1]).max() > 0.01
-
-
 def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> None:
     folder = shared_data / "kitti_object"
     for path in sorted((folder / "calib").glob("*.txt")):
