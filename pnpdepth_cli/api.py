@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
 from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, Scores
 from pnpdepth_cli.core.metrics import score as score_tensors
 from pnpdepth_cli.errors import SizeError
-from pnpdepth_cli.frames.frame import Refined, Registration
+from pnpdepth_cli.frames.frame import Refined, Registration, Unit, in_metres
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.network import Network
@@ -50,6 +49,7 @@ def refine(
     sparse: ArrayLike | SparsePoints,
     settings: Settings | None = None,
     *,
+    unit: Unit | None = None,
     uncertainty: bool = False,
     registration: Registration = "auto",
 ) -> Refined:
@@ -59,7 +59,8 @@ def refine(
         network: From `load_network`.
         image: As of `Refiner.refine`.
         sparse: As of `Refiner.refine`.
-        settings: As of `Refiner`, like the two below.
+        settings: As of `Refiner`, like `uncertainty` and `registration`.
+        unit: As of `Refiner.refine`.
         uncertainty: Whether the standard deviation of the depth is estimated too.
         registration: Whether the image is moved into the frame of the points.
 
@@ -68,27 +69,33 @@ def refine(
         DivergedError: As of `Refiner.refine`.
     """
     with Refiner(network, settings, uncertainty=uncertainty, registration=registration) as refiner:
-        return refiner.refine(image, sparse)
+        return refiner.refine(image, sparse, unit=unit)
 
 
 def score(
     depth: ArrayLike,
     ground_truth: ArrayLike,
     *,
+    unit: Unit | None = None,
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS,
 ) -> Scores:
     """Returns the errors of a depth map at all pixels with known ground truth and known depth.
 
     Args:
         depth: Predicted depth, any shape, metres.
-        ground_truth: Ground truth of the same shape, metres. Zero, negative and non-finite values
-            are unknown, in both.
+        ground_truth: Ground truth of the same shape. Zero, negative and non-finite values are
+            unknown, in both.
+        unit: Of the ground truth, "m" or "mm"; needed where it is of integers.
         thresholds: Of δ1, δ2 and δ3.
 
     Raises:
         SizeError: The shapes differ.
+        InputError: The unit is not given, and may be another than metres.
     """
-    arrays = [np.asarray(values, dtype=np.float32) for values in (depth, ground_truth)]
+    arrays = [
+        in_metres(depth, "the predicted depth"),
+        in_metres(ground_truth, "the ground truth", unit),
+    ]
     if arrays[0].shape != arrays[1].shape:
         raise SizeError(f"depth is {arrays[0].shape} but ground truth is {arrays[1].shape}")
     predicted, known = (torch.from_numpy(values) for values in arrays)

@@ -21,15 +21,14 @@ from pnpdepth_cli.errors import UsageError
 class Table(Mapping[str, Any]):
     """The entries of an open list by name; listing the names imports none of them.
 
-    An entry of this package is the object `attribute` of the module `path/<name>.py` ("-" in a name
-    is "_" in the file); subpackages and modules whose name starts with "_" are no entries. With
-    `names` it is `TABLE[name]` of the module `path.py`. An entry of another package is its entry
-    point `<name>` in the group `pnpdepth.<group>`. The package's own entries win over entry points
-    of the same name.
+    An entry of this package is the object `attribute` of the module `path/<name>.py`, or the module
+    itself without one ("-" in a name is "_" in the file; names that start with "_" and subpackages
+    are none). With `names` it is `TABLE[name]` of the module `path.py`. An entry of another package
+    is its entry point `<name>` in the group `pnpdepth.<group>`; the package's own entries win.
 
     Args:
         path: Path of the folder or the module relative to `package`, such as "io/formats".
-        attribute: Name of the object in each module; None makes the entry the module itself.
+        attribute: Name of the object in each module.
         group: Last part of the entry point group.
         noun: What one entry is called in messages.
         names: All names in the module's table, in the order of their listing.
@@ -110,33 +109,81 @@ UPDATES = Table(
 )
 """U: each entry creates a rule that turns gradients into directions of z."""
 
-Schedule = Literal["constant", "linear", "cosine"]
-SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
-"""How the step size changes over the updates of z."""
+PROPAGATIONS = Table(
+    "completion/propagation", group="propagations", noun="propagation", names=("gp", "diffusion")
+)
+"""How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
 
-Parameters = Literal["elements", "channels"]
-PARAMETERS: tuple[Parameters, ...] = get_args(Parameters)
-"""What is updated of z: every element, or a scale and a shift of each channel."""
+BASELINES = Table(
+    "completion/baselines",
+    group="baselines",
+    noun="baseline",
+    names=(
+        *("nearest", "linear", "linear-log", "idw", "morphological", "median", "scale", "affine"),
+        *("scale-disparity", "affine-disparity", "local"),
+    ),
+)
+"""Dense depth without refinement: `pnpdepth_cli.completion.baselines`."""
 
-Target = Literal["given", "masked"]
-TARGETS: tuple[Target, ...] = get_args(Target)
-"""Which points the loss is taken at: those the network was given, or points hidden from it."""
+NETWORKS = Table(
+    "",
+    group="models",
+    noun="network",
+    first=(
+        *("compact", "eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense"),
+        *("latefusion", "nconv", "pncnn"),
+    ),
+    package="model_zoo_defs",
+)
+"""The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
 
-Mask = Literal["points", "blocks", "lines"]
-MASKS: tuple[Mask, ...] = get_args(Mask)
-"""What is hidden as a whole: single points, blocks of the frame, or scan lines."""
+FORMATS = Table(
+    "io/formats",
+    "FORMAT",
+    group="formats",
+    noun="depth format",
+    first=("png", "exr", "npy", "npz", "pfm", "tiff"),
+)
+"""Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
-Precision = Literal["fp32", "bf16", "fp16"]
-PRECISIONS: tuple[Precision, ...] = get_args(Precision)
-"""The number format of the network's convolutions and matrix products."""
+LAYOUTS = Table(
+    "io/layouts",
+    group="layouts",
+    noun="layout",
+    names=(
+        *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
+        *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
+        *("arkitscenes", "hypersim", "nuscenes", "ddad", "pairs", "image-depth", "nyu-h5"),
+    ),
+)
+"""Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
 
-Align = Literal["none", "median", "scale", "affine", "auto"]
-ALIGNMENTS: tuple[Align, ...] = get_args(Align)
-"""How the network's output is fitted to the sparse points."""
+EXPORTS = Table(
+    "commands/exports",
+    "EXPORT",
+    group="exports",
+    noun="export",
+    first=("colmap", "nerfstudio", "gaussian-splatting"),
+)
+"""Files for reconstruction programs: `pnpdepth_cli.commands.exports.Export`."""
 
-PRESETS = ("paper",)
-"""Methods by one name: `pnpdepth_cli.settings.PAPER`."""
+MEASURE_GROUPS = Table(
+    "commands/evaluation/measures",
+    group="measures",
+    noun="group of measures",
+    names=("area", "cloud", "distance", "edges", "flicker", "normals"),
+)
+"""Measures that `eval` computes only on request."""
 
+# The method
+PRESETS = ("paper",)  # methods by one name: `pnpdepth_cli.settings.PAPER`
+SCHEDULES = ("constant", "linear", "cosine")  # of the step size over the updates
+PARAMETERS = ("elements", "channels")  # of z: every element, or scale and shift of each channel
+TARGETS = ("given", "masked")  # points of the loss: given to the network, or hidden from its input
+MASKS = ("points", "blocks", "lines")  # hidden as a whole: points, blocks of the frame, scan lines
+ALIGNMENTS = ("none", "median", "scale", "affine", "auto")  # of the output with the points
+
+# Networks
 Space = Literal["depth", "inverse", "log"]
 SPACES: tuple[Space, ...] = get_args(Space)
 """The quantities in which depth is predicted, fitted or interpolated."""
@@ -157,71 +204,10 @@ Fit = Literal["stretch", "crop"]
 FITS: tuple[Fit, ...] = get_args(Fit)
 """How an image is brought to a network's fixed input size."""
 
-NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")
-"""The rgb ranges a network may expect: 0…1, ImageNet's mean and deviation, −1…1, 0…255."""
+NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mean and std, −1…1, 0…255
+PRECISIONS = ("fp32", "bf16", "fp16")  # of the network's convolutions and matrix products
 
-NETWORKS = Table(
-    "",
-    None,
-    group="models",
-    noun="network",
-    first=(
-        *("compact", "eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense"),
-        *("latefusion", "nconv", "pncnn"),
-    ),
-    package="model_zoo_defs",
-)
-"""The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
-
-FORMATS = Table(
-    "io/formats",
-    "FORMAT",
-    group="formats",
-    noun="depth format",
-    first=("png", "exr", "npy", "npz", "pfm", "tiff"),
-)
-"""Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
-
-EXPORTS = Table(
-    "commands/exports",
-    "EXPORT",
-    group="exports",
-    noun="export",
-    first=("colmap", "nerfstudio", "gaussian-splatting"),
-)
-"""Files for reconstruction programs: `pnpdepth_cli.commands.exports.Export`."""
-
-PROPAGATIONS = Table(
-    "completion/propagation",
-    group="propagations",
-    noun="propagation",
-    names=("gp", "diffusion"),
-)
-"""How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
-
-BASELINES = Table(
-    "completion/baselines",
-    group="baselines",
-    noun="baseline",
-    names=(
-        *("nearest", "linear", "linear-log", "idw", "morphological", "median", "scale", "affine"),
-        *("scale-disparity", "affine-disparity", "local"),
-    ),
-)
-"""Dense depth without refinement: `pnpdepth_cli.completion.baselines`."""
-
-LAYOUTS = Table(
-    "io/layouts",
-    group="layouts",
-    noun="layout",
-    names=(
-        *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
-        *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
-        *("arkitscenes", "hypersim", "nuscenes", "ddad", "pairs", "image-depth", "nyu-h5"),
-    ),
-)
-"""Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
-
+# Files and sensors
 STORES = {
     "s3": "s3fs",
     "gs": "gcsfs",
@@ -232,15 +218,9 @@ STORES = {
 }
 """Stores of files by the scheme of their addresses, with the package that fsspec needs."""
 
-COLORS = ("blue-orange", "paper")
-"""Colours of what became better and worse: blue and orange, or the paper's red and green."""
-
-PREVIEWS = ("all", "worst", "none")
-"""Which frames get images of their result; worst: those worse than linear interpolation."""
-
-FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
-"""What of a frame the paper's experiments use: `pnpdepth_cli.io.dataset.protocols.PROTOCOLS`."""
-
+COLORS = ("blue-orange", "paper")  # of better and worse; the paper's are red and green
+PREVIEWS = ("all", "worst", "none")  # which frames get images; worst: worse than linear
+FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")  # `io.dataset.protocols`
 PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
 
@@ -251,33 +231,13 @@ LENSES = (
     *("radial-tangential", "fisheye", "fov", "thin-prism-fisheye", "rad-tan-thin-prism-fisheye"),
     *("division", "eucm"),
 )
-"""Lens distortions: `pnpdepth_cli.sensors.lens`."""
+"""Lens distortions: `pnpdepth_cli.sensors.camera`."""
 
+# Evaluation
 EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
-"""Published protocols of scoring depth: `pnpdepth_cli.commands.evaluation.protocols.PROTOCOLS`."""
-
-PLOT_FORMATS = ("png", "svg", "pdf")
-"""Files that `sweep` plots to."""
-
-MEASURE_GROUPS = Table(
-    "commands/evaluation/measures",
-    group="measures",
-    noun="group of measures",
-    names=("area", "cloud", "distance", "edges", "flicker", "normals"),
-)
-"""Measures that `eval` computes only on request."""
-
-AVERAGES = ("per-image", "pooled")
-"""How errors are averaged: every image or every pixel has equal weight."""
-
-RESIZES = ("nearest", "bilinear")
-"""How a prediction of another size is resized to the ground truth."""
-
-MISSING = ("skip", "min", "max", "fail")
-"""Empty predictions are not scored, scored as the lower or the upper bound, or refused."""
-
-SCALINGS = ("none", "median", "affine", "affine-disparity", "log")
-"""How the prediction of an image is scaled to its ground truth: `commands.evaluation.frames`."""
-
+AVERAGES = ("per-image", "pooled")  # every image, or every pixel, has equal weight
+RESIZES = ("nearest", "bilinear")  # of a prediction to the size of the ground truth
+MISSING = ("skip", "min", "max", "fail")  # empty predictions: unscored, at a bound, or refused
+SCALINGS = ("none", "median", "affine", "affine-disparity", "log")  # of each image to its truth
 PREDICTION_KINDS = ("depth", "disparity")
-"""What the files of a prediction hold."""
+PLOT_FORMATS = ("png", "svg", "pdf")

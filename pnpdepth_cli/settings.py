@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
-from typing import Any, NoReturn
+from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
@@ -73,12 +73,6 @@ class OptionField:
         """The field's name with dashes, as another option takes it."""
         return self.name.replace("_", "-")
 
-    @property
-    def placeholder(self) -> str:
-        """What stands for the value in a help text."""
-        names = self.option.choices
-        return self.option.metavar or ("|".join(names) if names else self.type.upper())
-
 
 def option(default: Any, help: str, **details: Any) -> Any:
     """Returns a dataclass field that the user can set.
@@ -140,10 +134,7 @@ class Settings:
         axis=Axis(title="layer cut at (0 first, 1 last)"),
     )
     iterations: int = option(
-        None,
-        "Number of updates; 0 is no refinement.",
-        metavar="K",
-        axis=Axis(title="updates"),
+        None, "Number of updates; 0 is no refinement.", metavar="K", axis=Axis(title="updates")
     )
     lr: float | str = option(
         None,
@@ -261,14 +252,13 @@ class Settings:
     )
 
     def __post_init__(self) -> None:
-        for name, names in _NAMES.items():
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, str) and value in names):
-                _refuse(name, f"one of {', '.join(names)}", value)
-        for name, (valid, wanted) in _CHECKS.items():
-            value = getattr(self, name)
-            if value is not None and not valid(value):
-                _refuse(name, wanted, value)
+        for name, value in self.given().items():
+            names = _NAMES.get(name)
+            valid, wanted = _CHECKS.get(name, (lambda _: True, ""))
+            if names is not None:
+                wanted = f"one of {', '.join(names)}"
+            if not valid(value) or (names and not (isinstance(value, str) and value in names)):
+                raise UsageError(f"{name.replace('_', '-')} must be {wanted}, got {value!r}")
         if self.lr is not None and not str(self.lr).strip().endswith("%"):
             object.__setattr__(self, "lr", float(self.lr))  # one spelling of a step
 
@@ -322,13 +312,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _is_step(value: object) -> bool:
-    try:
-        return 0 < float(str(value).strip().removesuffix("%")) < math.inf
-    except ValueError:
-        return False
-
-
 def _is_whole(value: Any) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
 
@@ -337,21 +320,14 @@ def _is_weight(value: Any) -> bool:
     return _is_number(value) and value >= 0
 
 
-def _refuse(name: str, wanted: str, value: object) -> NoReturn:
-    raise UsageError(f"{name.replace('_', '-')} must be {wanted}, got {value!r}")
+def _is_step(value: object) -> bool:
+    try:
+        return 0 < float(str(value).strip().removesuffix("%")) < math.inf
+    except ValueError:
+        return False
 
 
-_NAMES: Mapping[str, Collection[str]] = {
-    "preset": choices.PRESETS,
-    "loss": choices.LOSSES,
-    "update": choices.UPDATES,
-    "schedule": choices.SCHEDULES,
-    "target": choices.TARGETS,
-    "mask": choices.MASKS,
-    "align": choices.ALIGNMENTS,
-    "propagate": ("none", *choices.PROPAGATIONS),
-}
-
+_NAMES = {o.name: o.option.choices for o in options_of(Settings) if o.option.choices is not None}
 _CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
     "layer": (lambda value: isinstance(value, str), "the name of a layer, or a fraction as text"),
     "iterations": (_is_whole, "a whole number >= 0"),

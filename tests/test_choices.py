@@ -16,6 +16,7 @@ from pnpdepth_cli.core.update_rules import SCHEDULES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.models.precision import dtype_of
+from pnpdepth_cli.sensors import LIDARS, PATTERNS
 
 
 @pytest.fixture
@@ -65,6 +66,9 @@ def test_a_table_lists_the_names_of_its_module_in_their_order(
 def test_every_name_of_a_closed_list_is_implemented() -> None:
     assert tuple(SCHEDULES) == choices.SCHEDULES
     assert tuple(NORMALISATIONS) == choices.NORMALISATIONS
+    assert tuple(PATTERNS) == choices.PATTERNS
+    papers = (f"paper-{name}" for name in choices.SENSORS)
+    assert tuple(LIDARS) == (*choices.SENSORS, *papers)
     for precision in choices.PRECISIONS:
         dtype_of(precision, torch.device("cuda"))
 

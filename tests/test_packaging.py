@@ -14,7 +14,6 @@ import pytest
 
 import pnpdepth_cli as pnp
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.models.registry import find_definition
 
 ROOT = Path(__file__).parent.parent
 
@@ -49,19 +48,15 @@ def test_every_file_that_is_no_module_is_listed_for_the_wheel() -> None:
         assert {path for path in files - listed if path.suffix not in (".py", ".pyc")} == set()
 
 
-def test_the_shipped_weights_are_there_and_small() -> None:
-    checkpoint = find_definition("compact").checkpoint
-    assert checkpoint is not None
-    assert 1e6 < checkpoint.stat().st_size < 20e6
-
-
-def test_the_package_runs_as_a_module_like_the_command() -> None:
+def test_the_package_runs_as_a_module_like_the_command(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pnpdepth_cli"]
     done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"pnpdepth, version {pnp.__version__}\n"
-    wrong = subprocess.run([*command, "refin"], capture_output=True, text=True, check=False)
-    assert wrong.returncode == 2
-    assert "Usage: pnpdepth " in wrong.stderr
+    command += ["refine", "no.png", "--sparse", "no.png"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert done.stderr.startswith("pnpdepth: ")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module")
@@ -81,15 +76,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_wheel_is_below_25_mb_and_has_no_training_code(wheel: Path) -> None:
+def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(
+    wheel: Path, tmp_path: Path
+) -> None:
     assert wheel.stat().st_size < 25e6
     names = zipfile.ZipFile(wheel).namelist()
     assert "model_zoo_defs/weights/compact.safetensors" in names
     assert not [name for name in names if "training" in name or name.startswith("tests")]
-
-
-@pytest.mark.slow
-def test_the_wheel_refines_a_sample_from_an_empty_folder(wheel: Path, tmp_path: Path) -> None:
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
     empty = tmp_path / "empty"
     empty.mkdir()

@@ -79,14 +79,11 @@ def test_another_resolution_of_the_map_is_the_same_field_of_view_and_infinity_ha
     assert here.sample(dense).tolist() == [1.0, 5.5]  # not infinity times 0
 
 
-def test_a_sample_is_differentiable_in_the_map() -> None:
+def test_a_sample_is_differentiable_in_one_map() -> None:
     dense = torch.zeros(1, 1, 2, 3, requires_grad=True)
     points([(0.25, 0), (2, 1)], (2, 3)).sample(dense).sum().backward()
     assert dense.grad is not None
     assert dense.grad.flatten().tolist() == [0.75, 0.25, 0, 0, 0, 1]
-
-
-def test_two_maps_at_once_are_refused() -> None:
     with pytest.raises(ValueError, match="one map"):
         points([(0, 0)], (2, 2)).sample(torch.zeros(1, 2, 2, 2))
 
@@ -114,13 +111,6 @@ def test_a_point_outside_the_frame_is_not_scattered() -> None:
     outside = points([(-0.6, 0), (0, -3), (2.6, 0), (0, 2.7)], (3, 3))
     assert not outside.scatter().any()
     assert points([(-0.5, -0.5), (2.5, 2.5), (2.4999, 0)], (3, 3)).scatter().count_nonzero() == 3
-
-
-def test_selecting_and_moving_keep_points_together() -> None:
-    here = points([(0, 1), (2, 3), (4, 5)], (6, 6))
-    chosen = here.select(torch.tensor([True, False, True])).tensors()
-    assert (chosen.xy.tolist(), chosen.depth.tolist()) == ([[0, 1], [4, 5]], [1, 3])
-    assert (len(here), len(chosen), chosen.size) == (3, 2, (6, 6))
 
 
 def test_arrays_become_tensors_without_copy_and_follow_the_same_rules() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,19 +56,9 @@ def test_arrays_are_refined_as_the_command_refines_files(
     assert pnp.score(refined.depth, truth).mae < pnp.score(refined.before, truth).mae
 
 
-def test_a_refiner_stays_open_and_leaves_the_network_as_it_was(
+def test_a_refiner_stays_open_and_takes_maps_rows_and_points_alike(
     network: pnp.Network, frame: Frame
 ) -> None:
-    rgb, sparse = frame
-    before = {name: value.clone() for name, value in network.module.state_dict().items()}
-    with pnp.Refiner(network) as refiner:
-        first, again = refiner.refine(rgb, sparse), refiner.refine(rgb, sparse)
-    assert np.array_equal(first.depth, again.depth)
-    assert all(torch.equal(before[n], v) for n, v in network.module.state_dict().items())
-    assert not any("forward" in module.__dict__ for module in network.module.modules())
-
-
-def test_maps_rows_and_points_are_the_same(network: pnp.Network, frame: Frame) -> None:
     rgb, sparse = frame
     y, x = np.nonzero(sparse)
     rows = np.stack([x, y, sparse[y, x]], axis=1)
@@ -76,22 +67,50 @@ def test_maps_rows_and_points_are_the_same(network: pnp.Network, frame: Frame) -
         depth=torch.from_numpy(rows[:, 2].astype(np.float32)),
         size=sparse.shape,
     )
-    settings = pnp.Settings(iterations=1)
-    with pnp.Refiner(network, settings=settings) as refiner:
-        depths = [
-            refiner.refine(rgb, sparse_depth).depth for sparse_depth in (sparse, rows, points)
-        ]
-    assert np.array_equal(depths[0], depths[1])
-    assert np.array_equal(depths[0], depths[2])
+    before = {name: value.clone() for name, value in network.module.state_dict().items()}
+    with pnp.Refiner(network, pnp.Settings(iterations=1)) as refiner:
+        depths = [refiner.refine(rgb, given).depth for given in (sparse, sparse, rows, points)]
+    assert all(np.array_equal(depths[0], depth) for depth in depths[1:])
+    assert all(torch.equal(before[n], v) for n, v in network.module.state_dict().items())
+    assert not any("forward" in module.__dict__ for module in network.module.modules())
 
 
-def test_integer_images_are_scaled(network: pnp.Network, frame: Frame) -> None:
+def test_integers_are_scaled_images_by_their_type_and_depth_by_its_unit(
+    network: pnp.Network, frame: Frame
+) -> None:
     rgb, sparse = frame
-    coarse = np.round(rgb * 255).astype(np.uint8)
-    settings = pnp.Settings(iterations=0)
-    ours = pnp.refine(network, coarse, sparse, settings=settings).depth
-    as_float = (coarse / 255).astype(np.float32)
-    assert np.array_equal(ours, pnp.refine(network, as_float, sparse, settings=settings).depth)
+    settings = pnp.Settings(iterations=0, align="scale")
+    image, codes = np.round(rgb * 255).astype(np.uint8), np.round(sparse * 1000).astype(np.uint16)
+    as_floats = (image / 255).astype(np.float32), (codes / 1000).astype(np.float32)
+    expected = pnp.refine(network, *as_floats, settings).depth
+    assert np.array_equal(pnp.refine(network, image, codes, settings, unit="mm").depth, expected)
+    rows = np.argwhere(codes)[:, ::-1]
+    rows = np.column_stack([rows, codes[codes > 0]])
+    assert np.array_equal(pnp.refine(network, image, rows, settings, unit="mm").depth, expected)
+    truth = np.full((2, 2), 1500, np.int32)
+    assert pnp.score(np.full((2, 2), 1.25), truth, unit="mm").mae == 0.25
+
+
+@pytest.mark.parametrize(
+    ("depth", "fact"),
+    [
+        (np.full((4, 4), 3, np.uint16), "the sparse depth is of uint16; give its unit"),
+        (np.array([[1, 2, 3], [0, 1, 2]]), "the sparse depth is of int64; give its unit"),
+        (np.full((4, 4), 3471.0), "3,471 in the median, which is too far for metres; give"),
+    ],
+)
+def test_depth_that_may_be_in_another_unit_needs_one(
+    depth: NDArray[Any], fact: str, network: pnp.Network
+) -> None:
+    image = np.zeros((4, 4, 3))
+    with pytest.raises(pnp.InputError, match=fact) as caught:
+        pnp.refine(network, image, depth)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(pnp.UsageError, match="unit must be one of m, mm, got 'cm'"):
+        pnp.refine(network, image, depth, unit="cm")  # type: ignore[arg-type]
+    if depth.shape == (4, 4):
+        with pytest.raises(pnp.InputError, match="the ground truth is"):
+            pnp.score(np.ones((4, 4)), depth)
 
 
 @pytest.mark.parametrize(

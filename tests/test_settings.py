@@ -16,20 +16,14 @@ from pnpdepth_cli.settings import PAPER, Settings
 NAN, INF = math.nan, math.inf
 
 
-def test_what_is_left_open_is_the_papers() -> None:
+def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
     assert Settings().complete() == PAPER
     paper = (PAPER.iterations, PAPER.lr, PAPER.loss, PAPER.update, PAPER.align)
     assert paper == (5, 0.01, "l1", "sign", "none")
     assert Settings(iterations=3, blur=0.0).given() == {"iterations": 3, "blur": 0.0}
-
-
-def test_the_first_settings_win_and_a_field_can_be_opened_again() -> None:
     user, network = Settings(lr="3%", blur=0.0), Settings(lr=0.5, blur=2.0, loss="log")
     assert user.over(network) == Settings(lr="3%", blur=0.0, loss="log")
     assert user.over(network).opened("blur") == Settings(lr="3%", loss="log")
-
-
-def test_a_preset_gives_way_to_what_is_given_beside_it() -> None:
     preset = Settings(preset="paper", iterations=2).with_preset()
     assert preset.complete() == Settings(preset="paper", iterations=2).over(PAPER)
     assert Settings(iterations=2).with_preset() == Settings(iterations=2)

@@ -21,7 +21,7 @@ from pnpdepth_cli.cli import options
     help="Calibration of the camera: a file with K, or a KITTI file or raw folder.  [default: the"
     " record's, else EXIF]",
 )
-@click.option("--camera", type=int, metavar="N", help="KITTI camera number, 0 to 3.  [default: 2]")
+@options.camera
 @click.option(
     "--fov", "fov_deg", type=float, metavar="DEG", help="Horizontal field of view, without --calib."
 )
@@ -31,7 +31,7 @@ from pnpdepth_cli.cli import options
     help="Camera poses of a folder's files in their order (KITTI or TUM rows).  [default: the"
     " records']",
 )
-@click.option("--depth-scale", type=float, metavar="S", help="Integer depth files hold metres × S.")
+@options.depth_scale
 @click.option("--max-depth", type=float, default=math.inf, metavar="M", help="Drop farther pixels.")
 @click.option(
     "--max-sigma",

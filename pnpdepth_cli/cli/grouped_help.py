@@ -14,23 +14,20 @@ import click
 OTHER = "Other"
 """Title of the options that no group lists."""
 
-LIDAR = ("--calib", "--extrinsics", "--camera", "--scan")
+LIDAR = ("--calib", "--camera", "--scan")
 COLMAP = ("--colmap",)
-FILE_READING = (
-    *("--depth-scale", "--gt-scale", "--channel", "--sparse-size-ok"),
-    "--registration",
-)
+FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--registration")
 NETWORK = (
-    *("--model", "--checkpoint", "--layer", "--align", "--output-kind"),
-    *("--normalise", "--precision", "--device", "--tile"),
+    *("--model", "--checkpoint", "--layer", "--align", "--output-kind", "--normalise"),
+    *("--precision", "--device", "--tile"),
 )
 METHOD = (
     *("--preset", "--time-budget", "--iterations", "--lr", "--loss", "--update"),
     *("--target", "--propagate", "--set", "--holdout", "--seed"),
 )
 OUTPUT = (
-    *("--output", "--format", "--output-scale", "--ply", "--fov", "--colors", "--previews"),
-    *("--baselines", "--uncertainty", "--overwrite", "--json"),
+    *("--output", "--format", "--ply", "--fov", "--baselines", "--uncertainty"),
+    *("--overwrite", "--json"),
 )
 CLUSTER = ("--ray", "--ray-workers", "--cpus-per-worker", "--retries")
 COMMON = frozenset(

@@ -34,20 +34,18 @@ class Address(click.Path):
         return parse_file(text) if isinstance(text, str) else text
 
 
-def click_option(each: OptionField) -> Callable[[Any], Any]:
+def click_option(declared: OptionField) -> Callable[[Any], Any]:
     """Returns the click option of a field of a request."""
-    option = each.option
-    details: dict[str, Any] = {}
-    if each.type == "bool":
-        details["is_flag"] = True
-    else:
-        details["type"] = _type_of(each)
-    if option.value_if_bare is not None:
+    option = declared.option
+    details: dict[str, Any] = {"type": _type_of(declared)}
+    if declared.type == "bool":
+        details = {"is_flag": True}
+    elif option.value_if_bare is not None:
         details |= {"is_flag": False, "flag_value": option.value_if_bare}
     return click.option(
-        each.flag,
-        each.name,
-        default=each.default,
+        declared.flag,
+        declared.name,
+        default=declared.default,
         metavar=option.metavar,
         help=option.help,
         show_default=option.show_default,
@@ -58,31 +56,30 @@ def click_option(each: OptionField) -> Callable[[Any], Any]:
 _ASSIGNED = "_assigned"
 """Ending of the parameters of options that take several fields."""
 _HELP_OF_GROUPS = {
-    "--set": "Less common settings, as in blur=1,keep-best.",
+    "--set": "Less common options, as in blur=1,keep-best.",
     "--scan": "How a LiDAR scan is read.",
     "--colmap": "Which points of a COLMAP model are used, and their unit.",
-    "--bag": "Which messages of a ROS bag make a frame.",
 }
 
 
 def _assigning(flag: str, members: Sequence[OptionField]) -> Callable[[Any], Any]:
     """The click option that takes values of these fields, as in `blur=1,keep-best`."""
-    by_name = {each.name_within: each for each in members}
+    by_name = {member.name_within: member for member in members}
+    forms = {name: _form(member) for name, member in by_name.items()}
 
     def parse(text: str) -> dict[str, Any]:
         chosen: dict[str, Any] = {}
         for part in text.split(","):
             name, equals, value = part.strip().partition("=")
-            each = by_name.get(name)
-            if each is None:
+            if name not in by_name:
                 raise UsageError(f"{flag} {name}: choose from {', '.join(by_name)}")
-            if (each.type == "bool") == bool(equals):
-                raise UsageError(f"{flag} {part} must be {_assignment(each)}")
-            kind = click.types.convert_type(bool if each.type == "bool" else _type_of(each))
-            chosen[each.name] = kind(value or "true")
+            member = by_name[name]
+            if (member.type == "bool") == bool(equals):
+                raise UsageError(f"{flag} {part} must be {forms[name]}")
+            chosen[member.name] = click.types.convert_type(_type_of(member))(value or "true")
         return chosen
 
-    described = " · ".join(f"{_assignment(each)}: {each.option.help}" for each in members)
+    described = " · ".join(f"{forms[name]}: {by_name[name].option.help}" for name in by_name)
     return click.option(
         flag,
         flag.strip("-") + _ASSIGNED,
@@ -93,19 +90,22 @@ def _assigning(flag: str, members: Sequence[OptionField]) -> Callable[[Any], Any
     )
 
 
-def _assignment(each: OptionField) -> str:
-    return each.name_within if each.type == "bool" else f"{each.name_within}={each.placeholder}"
+def _form(member: OptionField) -> str:
+    """How a field is given: NAME, or NAME=VALUE."""
+    names = member.option.choices
+    value = member.option.metavar or ("|".join(names) if names else member.type.upper())
+    return member.name_within if member.type == "bool" else f"{member.name_within}={value}"
 
 
-def _type_of(each: OptionField) -> Any:
-    option = each.option
+def _type_of(declared: OptionField) -> Any:
+    option = declared.option
     if option.choices is not None:
         return click.Choice(list(option.choices))
     if option.parse is not None:
         return option.parse
     if option.least is not None or option.most is not None:
         return click.IntRange(option.least, option.most)
-    return {"int": int, "float": float, "str": str, "Path": FILE}[each.type]
+    return {"int": int, "float": float, "str": str, "bool": bool, "Path": FILE}[declared.type]
 
 
 def options_of_groups(
@@ -117,12 +117,15 @@ def options_of_groups(
         *groups: Dataclasses of `pnpdepth_cli.commands.refinement.request`.
         without: Names of fields that are left out.
     """
+    wanted = [each for group in groups for each in options_of(group) if each.name not in without]
+    within: dict[str, list[OptionField]] = {}
+    for each in wanted:
+        if each.option.within is not None:
+            within.setdefault(each.option.within, []).append(each)
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        wanted = [e for group in groups for e in options_of(group) if e.name not in without]
-        within = {each.option.within: None for each in wanted if each.option.within is not None}
-        for flag in within:
-            command = _assigning(flag, [e for e in wanted if e.option.within == flag])(command)
+        for flag, members in within.items():
+            command = _assigning(flag, members)(command)
         for each in reversed(wanted):
             if each.option.within is None:
                 command = click_option(each)(command)
@@ -158,22 +161,19 @@ checkpoint = _only(NetworkChoice, "checkpoint")
 precision = _only(NetworkChoice, "precision")
 device = _only(NetworkChoice, "device")
 layer = _only(Settings, "layer")
-target = _only(Settings, "target")
+output_kind = _only(NetworkChoice, "output_kind")
+normalise = _only(NetworkChoice, "normalise")
 depth_scale = _only(FrameFiles, "depth_scale")
 channel = _only(FrameFiles, "channel")
 seed = _only(Settings, "seed")
 overwrite = _only(OutputOptions, "overwrite")
 camera = _only(ScanOptions, "camera")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-
-
 sample = click.option(
     "--sample",
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
-
-
 scan = options_of_groups(ScanOptions)
 sparse_output = click.option(
     "-o",

@@ -12,11 +12,8 @@ import click
 from pnpdepth_cli.choices import PATTERNS, SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.commands.refinement.request import sample_pattern
 from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
-
-_seed = click.option(
-    "--seed", type=options.SEED, default=0, show_default=True, metavar="N", help="Random seed."
-)
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
@@ -50,15 +47,9 @@ def project(
     from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 
     target = SparseTarget(output=output, overlay=overlay, overwrite=overwrite)
-    height_and_width = options.height_and_width(size) if size else None
-    record = project_scan(
-        scan,
-        ScanOptions(**options.taken(ScanOptions, values)),
-        target,
-        image=image,
-        size=height_and_width,
-    )
-    _print(record, as_json=as_json)
+    of_scan = ScanOptions(**options.taken(ScanOptions, values))
+    shape = options.height_and_width(size) if size else None
+    _print(project_scan(scan, of_scan, target, image=image, size=shape), as_json=as_json)
 
 
 @click.command(short_help="Sample sparse depth from dense depth.")
@@ -74,14 +65,13 @@ def project(
     "--count", metavar="N|P%", help="Number of points (of lines for `lines`), or % of known pixels."
 )
 @click.option("--image", type=options.FILE, help="Image for `features` and `edges`.")
-@_seed
+@options.seed
 @click.option(
     "--noise",
     metavar="NOISE,...",
     help="Gaussian noise of the depth, metres or P%; outliers=P% of random depth; jitter=PIXELS.",
 )
 @options.depth_scale
-@options.channel
 @options.sparse_output
 @options.overwrite
 @options.as_json
@@ -117,7 +107,7 @@ def sample(
 
     values["scale"] = values.pop("depth_scale")
     target = make.SparseTarget(output=output, overwrite=overwrite)
-    chosen, added = make.read_pattern(pattern, count), make.read_noise(noise)
+    chosen, added = sample_pattern(pattern, count), make.read_noise(noise)
     _print(make.sample_depth(depth, target, chosen, noise=added, **values), as_json=as_json)
 
 
@@ -144,9 +134,8 @@ def sample(
     help="Of the scanner: metres right of, below and in front of the camera, or as in the"
     " calibration.",
 )
-@_seed
+@options.seed
 @options.depth_scale
-@options.channel
 @options.sparse_output
 @options.overwrite
 @options.as_json

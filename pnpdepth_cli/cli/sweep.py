@@ -18,6 +18,8 @@ from pnpdepth_cli.errors import FramesFailedError, StorageError
 
 _SCAN_DETAILS = ("inverse_extrinsics", "euclidean", "keep_occluded", "point_fields")
 """A scan that needs these is projected first."""
+_RARE = ("output_kind", "normalise", "precision", "sparse_size_ok", "channel")
+"""Options of one frame; --set of sweep has parameters."""
 
 
 @click.command(
@@ -79,7 +81,9 @@ _SCAN_DETAILS = ("inverse_extrinsics", "euclidean", "keep_occluded", "point_fiel
     "--cost", is_flag=True, help="Add the time of the refinement to tables, and a plot over it."
 )
 @options.options_of_groups(ScanOptions, without=_SCAN_DETAILS)
-@options.options_of_groups(FrameFiles, NetworkChoice)
+@options.options_of_groups(FrameFiles, NetworkChoice, without=_RARE)
+@options.output_kind
+@options.normalise
 @options.as_json
 def sweep(
     vary: tuple[str, ...],

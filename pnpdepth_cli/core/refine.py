@@ -305,5 +305,5 @@ def bad_prediction(at_points: Tensor) -> ModelError:
     return ModelError(
         f"the network's prediction is not finite at {int((~at_points.isfinite()).sum()):,} of"
         f" {len(at_points):,} sparse points, before any update of z; are its weights, its input"
-        " range (--normalise) and --precision right?"
+        " range (normalise) and precision right?"
     )

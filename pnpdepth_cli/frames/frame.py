@@ -222,8 +222,46 @@ def no_points(points: SparsePoints) -> SparsePoints:
     return points.select(torch.zeros(len(points), dtype=torch.bool))
 
 
+Unit = Literal["m", "mm"]
+UNITS = {"m": 1.0, "mm": 1000.0}
+"""Units of depth, so many to the metre."""
+
+FARTHEST_MEDIAN_M = 200.0
+"""No frame has half of its depths farther than this; a larger median is in another unit."""
+
+
+def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[np.float32]:
+    """Returns depth as float32 metres; not finite or <= 0 is unknown.
+
+    Args:
+        depth: Of any shape.
+        what: What it is, for messages.
+        unit: Of the depth; needed for integers, and for depth that is too large for metres.
+
+    Raises:
+        InputError: The unit is needed.
+        UsageError: There is no such unit.
+    """
+    values = np.asarray(depth)
+    if unit is not None:
+        if unit not in UNITS:
+            raise UsageError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
+        return (values / UNITS[unit]).astype(np.float32)
+    known = values[np.isfinite(values) & (values > 0)]
+    if values.dtype.kind in "iu":
+        fact = f"of {values.dtype}"
+    elif known.size and np.median(known) > FARTHEST_MEDIAN_M:
+        fact = f"{np.median(known):,.0f} in the median, which is too far for metres"
+    else:
+        return values.astype(np.float32)
+    raise InputError(f'{what} is {fact}; give its unit, such as unit="mm" or unit="m"')
+
+
 def frame_of_arrays(
-    image: ArrayLike | None, sparse: ArrayLike | SparsePoints, register: Register = None
+    image: ArrayLike | None,
+    sparse: ArrayLike | SparsePoints,
+    register: Register = None,
+    unit: Unit | None = None,
 ) -> Frame:
     """Returns the frame of an image and its sparse depth; see `Refiner.refine`.
 
@@ -232,7 +270,8 @@ def frame_of_arrays(
     """
     rgb = None if image is None else _rgb(image)
     size = None if rgb is None else (rgb.shape[0], rgb.shape[1])
-    points = _points(sparse, size).resized(*size) if size else _points(sparse, None)
+    points = _points(sparse, size, unit)
+    points = points.resized(*size) if size else points
     inside = points.cropped(0, 0, *points.size)
     if not len(inside):
         raise NoPointsError(f"none of the {len(points)} sparse points lies in the image")
@@ -253,22 +292,28 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
     return values.astype(np.float32)
 
 
-def _points(sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None) -> SparsePoints:
+def _points(
+    sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None, unit: Unit | None
+) -> SparsePoints:
     """The points in their own frame, which is the image's for rows of x, y, depth."""
     if isinstance(sparse, SparsePoints):
         return sparse.tensors()
-    values = np.asarray(sparse, dtype=np.float32)
+    values = np.asarray(sparse)
     if values.ndim != 2:
         raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
     if values.shape[1] == 3 and values.shape != size:
         if size is None:
             raise SizeError("rows of x, y and depth need an image for the size of the frame")
-        known = np.isfinite(values).all(axis=1) & (values[:, 2] > 0)
-        xy, depth = values[known, :2], values[known, 2]
+        column = in_metres(values[:, 2], "the sparse depth", unit)
+        known = np.isfinite(values).all(axis=1) & (column > 0)
+        xy, depth = values[known, :2].astype(np.float32), column[known]
     else:
         if size is not None and values.shape != size:
             raise SizeError(f"the sparse depth map is {values.shape} but the image is {size}")
-        size = (values.shape[0], values.shape[1])
+        size, values = (
+            (values.shape[0], values.shape[1]),
+            in_metres(values, "the sparse depth", unit),
+        )
         rows, columns = np.nonzero(np.isfinite(values) & (values > 0))
         xy = np.stack([columns, rows], axis=1).astype(np.float32)
         depth = values[rows, columns]

@@ -30,6 +30,7 @@ from pnpdepth_cli.frames.frame import (
     Frame,
     Refined,
     Registration,
+    Unit,
     WarmStart,
     frame_of_arrays,
     is_dense,
@@ -142,7 +143,13 @@ class Refiner:
         """The user's network, cut and open; None with the default method, or while closed."""
         return self._opened if isinstance(self._opened, Split) else None
 
-    def refine(self, image: ArrayLike | None, sparse: ArrayLike | SparsePoints) -> Refined:
+    def refine(
+        self,
+        image: ArrayLike | None,
+        sparse: ArrayLike | SparsePoints,
+        *,
+        unit: Unit | None = None,
+    ) -> Refined:
         """Returns one frame of arrays refined.
 
         Args:
@@ -150,12 +157,14 @@ class Refiner:
                 sparse depth only.
             sparse: Depth map (H, W) in metres with 0 for unknown, rows (N, 3) of x, y and depth
                 (pixel centres at whole numbers), or SparsePoints.
+            unit: Of the depth of an array, "m" or "mm"; needed for integers, and where half of the
+                depths are beyond 200.
 
         Raises:
             InputError: Image or points cannot be used.
             DivergedError: The loss became non-finite; `last_good` is the Refined before that.
         """
-        refined = self.refine_frame(frame_of_arrays(image, sparse, self._register))
+        refined = self.refine_frame(frame_of_arrays(image, sparse, self._register, unit))
         refined = replace(refined, notes=(*self.network.notes, *refined.notes))
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)

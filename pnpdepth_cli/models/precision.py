@@ -29,7 +29,7 @@ def dtype_of(precision: str, device: torch.device) -> torch.dtype | None:
     if precision not in PRECISIONS:
         raise UsageError(f"precision {precision!r} is not one of {' '.join(PRECISIONS)}")
     if precision == "fp16" and device.type == "cpu":
-        raise DeviceError("precision fp16 is for GPUs; on a CPU take --precision bf16 or fp32")
+        raise DeviceError("precision fp16 is for GPUs; on a CPU take precision bf16 or fp32")
     return _DTYPES[precision]
 
 
@@ -57,7 +57,7 @@ def lower(module: nn.Module, dtype: torch.dtype, device: torch.device) -> None:
                 raise
             raise ModelError(
                 f"the network's forward, with parts of it in {dtype}, raises {describe(error)}; try"
-                " --precision fp32"
+                " precision fp32"
             ) from error
 
     module.forward = lowered

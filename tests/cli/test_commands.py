@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -29,24 +28,21 @@ def refine(frame: FrameOnDisk, *more: str) -> list[str]:
     ]  # fmt: skip
 
 
-def test_refine_talks_on_stderr_and_leaves_stdout_empty(
+def test_refine_talks_on_stderr_and_only_json_is_on_stdout(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of(refine(frame, "--gt", str(frame.gt))) == 0
     out, err = capsys.readouterr()
     assert out == ""
     assert "60 points, 1.6–3.0 m" in err
+    assert "this depth is worse than linear interpolation" in err
     for word in ("RMSE", "δ1", "before", "after", "wrote", "peak"):
         assert word in err
-
-
-def test_json_prints_the_record_and_nothing_else_on_stdout(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of(refine(frame, "--json")) == 0
+    (line,) = [text for text in err.splitlines() if text.startswith("gt: ")]
+    assert "--depth-scale" not in line
+    assert code_of(refine(frame, "--json", "--overwrite")) == 0
     record = json.loads(capsys.readouterr().out)
-    assert record["settings"]["layer"] == "middle"
-    assert record["settings"]["iterations"] == 5
+    assert (record["settings"]["layer"], record["settings"]["iterations"]) == ("middle", 5)
     assert len(record["model"]["checkpoint_sha256"]) == 64
 
 
@@ -90,76 +86,36 @@ def test_a_divergence_ends_with_code_5_after_writing(
     assert (frame.folder / "out" / "img_depth.png").exists()
 
 
-def test_an_output_below_a_file_is_refused_in_one_line(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [("gt.png/out", ""), ("depth.jpg", "depth is written as .png"), ("depth.hdr", "written as")],
+)
+def test_an_output_that_cannot_be_written_is_refused_in_one_line(
+    output: str, message: str, frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of([*refine(frame), "-o", str(frame.gt / "out")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    assert code_of([*refine(frame), "-o", str(frame.folder / output)]) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert err.count("\n") == 1
+    assert not (frame.folder / output).exists()
 
 
-def test_layers_lists_shape_stride_cost_and_field(
+def test_layers_lists_shape_stride_cost_and_field_and_why_some_cannot_be_cut(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["layers", "--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
     assert code_of([*arguments, "--json", "--size", "40x48"]) == 0
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
     assert list(rows) == ["encode", "middle"]
-    assert rows["encode"]["shape"] == [1, 8, 20, 24]
-    assert rows["encode"]["stride"] == 2
+    assert (rows["encode"]["shape"], rows["encode"]["stride"]) == ([1, 8, 20, 24], 2)
     assert rows["encode"]["cost_behind"] > rows["middle"]["cost_behind"] > 0
     # a 4×4 transposed convolution of stride 2 reads 2×2 elements, the 3×3 before it 4×4
-    assert rows["middle"]["field_in_z"] == [2, 2]
-    assert rows["encode"]["field_in_z"] == [4, 4]
-    assert rows["middle"]["field_in_output"] == [6, 6]
-
-
-def test_layers_all_lists_every_submodule_and_why_some_cannot_be_cut(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["layers", "--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
+    assert [row["field_in_z"] for row in rows.values()] == [[4, 4], [2, 2]]
+    assert [row["field_in_output"] for row in rows.values()] == [[14, 14], [6, 6]]
     assert code_of([*arguments, "--json", "--all"]) == 0
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
     assert set(rows) == {"encode", "encode.0", "encode.1", "middle", "unused", "decode"}
     assert "never runs" in rows["unused"]["problem"]
-
-
-def test_models_lists_the_variants_of_a_network_only_if_asked(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert code_of(["models"]) == 0
-    short = capsys.readouterr()
-    assert "sparse2dense-tiny" in short.out
-    assert "sparse2dense-r18-deconv2" not in short.out
-    assert "sparse2dense: 48 more" in short.err
-    assert code_of(["models", "--all"]) == 0
-    every = capsys.readouterr()
-    assert "sparse2dense-r18-deconv2-d-kitti" in every.out
-    assert "more" not in every.err
-
-
-def test_models_lists_compact_with_its_defaults(capsys: pytest.CaptureFixture[str]) -> None:
-    assert code_of(["models", "--json"]) == 0
-    listed = {model["name"]: model for model in json.loads(capsys.readouterr().out)}
-    assert listed["compact"]["input_kind"] == "rgb+sparse"
-    assert listed["compact"]["layer"] in listed["compact"]["layers"]
-    assert code_of(["models"]) == 0
-    assert "compact" in capsys.readouterr().out
-
-
-def test_the_installed_command_runs_and_ends_without_a_traceback(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
-    done = subprocess.run(
-        [*command, "refine", "no.png", "--sparse", "no.png"],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        env={**os.environ, "COLUMNS": "80"},
-    )
-    assert done.returncode == 3
-    assert done.stderr.startswith("pnpdepth: ")
-    assert done.stderr.count("\n") == 1
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("command", ["sample", "simulate", "compare"])
@@ -201,34 +157,6 @@ def test_a_stdout_that_cannot_show_every_character_shows_the_others(
     assert len(done.stdout) > 500
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_a_full_stdout_is_one_line() -> None:
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "pnpdepth_cli", "--help"],
-            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
-        )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stderr == "pnpdepth: stdout cannot be written to: No space left on device\n"
-
-
-@pytest.mark.parametrize("name", ["depth.jpg", "depth.hdr"])
-def test_a_file_that_depth_is_not_written_as_does_not_become_a_folder(
-    name: str, frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of([*refine(frame), "-o", str(frame.folder / name)]) == 2
-    assert "depth is written as .png" in capsys.readouterr().err
-    assert not (frame.folder / name).exists()
-
-
-def test_the_scale_of_the_truth_names_its_own_option(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of(refine(frame, "--gt", str(frame.gt))) == 0
-    (line,) = [text for text in capsys.readouterr().err.splitlines() if text.startswith("gt: ")]
-    assert "--depth-scale" not in line
-
-
 @pytest.mark.parametrize(
     ("variables", "spins"),
     [({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
@@ -252,13 +180,6 @@ def test_idle_threads_sleep_soon_unless_the_user_sets_how_they_wait(
     assert done.stdout.splitlines()[-1] == spins
 
 
-def test_a_depth_worse_than_linear_interpolation_is_named_so(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of(refine(frame, "--gt", str(frame.gt))) == 0
-    assert "this depth is worse than linear interpolation" in capsys.readouterr().err
-
-
 def test_the_default_method_prints_its_stages_beside_linear_interpolation(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -266,13 +187,8 @@ def test_the_default_method_prints_its_stages_beside_linear_interpolation(
     command = ["refine", str(frame.image), "--sparse", str(frame.sparse), *options]
     assert code_of([*command, "--gt", str(frame.gt), "-o", str(frame.folder / "gt")]) == 0
     rows = capsys.readouterr().err
-    order = [
-        "tiny aligned",
-        "with points, fused",
-        "z updated",
-        "residual propagated",
-        "linear interpolation",
-    ]
+    order = ["tiny aligned", "with points, fused", "z updated", "residual propagated"]
+    order.append("linear interpolation")
     assert sorted(order, key=rows.index) == order
     assert "updates (sign" not in rows
     assert code_of([*command, "-o", str(frame.folder / "no")]) == 0

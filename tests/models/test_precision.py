@@ -76,7 +76,7 @@ class Strict(nn.Module):
 def test_a_network_without_bf16_is_refused_with_a_remedy() -> None:
     network = Strict()
     lower(network, torch.bfloat16, CPU)
-    with pytest.raises(ModelError, match="--precision fp32"), torch.no_grad():
+    with pytest.raises(ModelError, match="precision fp32"), torch.no_grad():
         network(torch.rand(1, 3, 4, 4))
 
 

@@ -10,6 +10,7 @@ from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, frame_record, 
 from pnpdepth_cli.commands.evaluation.scoring import FrameScores
 from pnpdepth_cli.commands.tables import (
     Cell,
+    Style,
     Table,
     chosen_measures,
     column_title,
@@ -142,7 +143,7 @@ def comparison_table(comparison: Comparison) -> Table:
         rows.append([title, base.label, mean, *["–"] * 4])
         for run, gains in zip(others, comparison.gains, strict=True):
             found = gains[measure.key]
-            style = (
+            style: Style = (
                 "dim" if not found.p_adjusted < ALPHA else "good" if found.percent > 0 else "bad"
             )
             rows.append([

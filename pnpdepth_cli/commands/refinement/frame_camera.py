@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import LENSES
-from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
-from pnpdepth_cli.commands.sparse.scans import camera_of, check_size
+from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.sparse.scans import SparseDepth, camera_of, check_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.dataset.protocols import Protocol
 from pnpdepth_cli.io.rgb import read_focal_length
 from pnpdepth_cli.sensors.camera import Camera
 
@@ -33,11 +32,6 @@ class FrameCamera:
     pose: NDArray[np.float64] | None = None
     """(3, 4) x_world = pose · (x, 1), in the unit of the depth. None: unknown."""
     notes: tuple[str, ...] = ()
-
-    def in_part(self, protocol: Protocol, size: tuple[int, int]) -> FrameCamera:
-        """Returns the camera of the part that a protocol keeps of an image of (H, W)."""
-        intrinsics = protocol.intrinsics_in_crop(self.camera.intrinsics, size)
-        return replace(self, camera=replace(self.camera, intrinsics=intrinsics))
 
     def record(self) -> dict[str, Any]:
         """Returns what a record keeps of it; `of_record` reads it."""
@@ -76,27 +70,34 @@ class FrameCamera:
 
 
 def camera_of_frame(
-    request: RefineRequest, of_points: FrameCamera | None, size: tuple[int, int]
+    request: RefineRequest, sparse: SparseDepth, size: tuple[int, int]
 ) -> FrameCamera | None:
     """Returns the camera of the frame in the part that its protocol keeps; None if unknown.
 
     Args:
         request: What is asked for. EXIF is read only where an output needs the camera.
-        of_points: The camera that came with the sparse depth, of the whole image.
+        sparse: The sparse depth, with the camera of the whole image if it came with one.
         size: (H, W) of the whole image.
 
     Raises:
         UsageError: An output needs the camera, and nothing gives it; or --fov repeats it.
         SizeError: The calibration is of another image.
     """
-    files, outputs = request.files, request.outputs
-    known = of_points or _of_files(files, size)
+    files, outputs, image = request.files, request.outputs, request.files.image_file
+    known: FrameCamera | None = None
+    if sparse.camera is not None:
+        known = FrameCamera(camera=sparse.camera, source=sparse.camera_source, pose=sparse.pose)
+    elif files.scan.calib is not None:
+        known = camera_of_file(files.scan.calib, files.scan.camera, size, image)
+    elif files.camera_file is not None:
+        known = camera_of_file(files.camera_file, files.camera_number, size, image)
+    elif files.calibration is not None:
+        known = FrameCamera(camera=camera_of(files.calibration), source=files.calibration.source)
     if outputs.fov_deg is not None:
         if known is not None:
             raise UsageError(f"the camera is known ({known.source}); leave out --fov")
         known = camera_of_fov(outputs.fov_deg, size)
     if known is None and outputs.needs_camera:
-        image = files.image if isinstance(files.image, Path) else None
         known = None if image is None else camera_of_exif(image, size)
         if known is None:
             flag, named = "--ply" if outputs.ply else "--html-3d", image or files.sparse
@@ -104,7 +105,10 @@ def camera_of_frame(
                 f"{flag} needs the camera, and {named} has neither a calibration nor a focal length"
                 " in EXIF; give --calib or --fov"
             )
-    return None if known is None else known.in_part(files.protocol, size)
+    if known is None:
+        return None
+    intrinsics = files.protocol.intrinsics_in_crop(known.camera.intrinsics, size)
+    return replace(known, camera=replace(known.camera, intrinsics=intrinsics))
 
 
 def camera_of_file(
@@ -139,19 +143,6 @@ def camera_of_exif(image: Path, size: tuple[int, int]) -> FrameCamera | None:
     """Returns the camera of an image's EXIF, without distortion; None if EXIF does not give it."""
     focal = read_focal_length(image, size)
     return None if focal is None else _pinhole(focal.pixels, size, focal.source)
-
-
-def _of_files(files: FrameFiles, size: tuple[int, int]) -> FrameCamera | None:
-    """The camera of the calibration, if there is one."""
-    image = files.image if isinstance(files.image, Path) else None
-    if files.scan.calib is not None:
-        return camera_of_file(files.scan.calib, files.scan.camera, size, image)
-    if files.camera_file is not None:
-        return camera_of_file(files.camera_file, files.camera_number, size, image)
-    calibration = files.calibration
-    if calibration is None:
-        return None
-    return FrameCamera(camera=camera_of(calibration), source=calibration.source)
 
 
 def _pinhole(focal_px: float, size: tuple[int, int], source: str) -> FrameCamera:

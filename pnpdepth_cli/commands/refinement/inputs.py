@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,17 +12,14 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera, camera_of_frame
-from pnpdepth_cli.commands.refinement.neighbours import (
-    read_neighbours,
-    with_moved_points,
-)
+from pnpdepth_cli.commands.refinement.neighbours import read_neighbours
 from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
-from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
-from pnpdepth_cli.commands.sparse.scans import read_scan_points
+from pnpdepth_cli.commands.sparse.options import METRES, ColmapOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.scans import SparseDepth, read_scan_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
-from pnpdepth_cli.frames.frame import METRES, Frame, Register, registration_to_make, tensor_of
-from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source
+from pnpdepth_cli.frames.frame import Frame, Register, registration_to_make, tensor_of
+from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source, file_of
 from pnpdepth_cli.io.dataset.reading import check_same_view, depth_of, masked, moved_to, rgb_of
 from pnpdepth_cli.io.depth import (
     DepthImage,
@@ -36,12 +34,7 @@ from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import (
-    Points,
-    as_depth_image,
-    occluded_in_map,
-    sample_points,
-)
+from pnpdepth_cli.sensors import as_depth_image, occluded_in_map, sample_points
 
 ImageArray = NDArray[np.float32]
 
@@ -80,90 +73,76 @@ class Inputs(Frame):
         return len(self.own) - (0 if self.held_out is None else len(self.held_out))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Part:
-    """An image or depth map of the frame."""
-
-    values: ImageArray
-    """(H, W) or (H, W, 3), the part that the protocol keeps."""
-    whole: tuple[int, int]
-    """(H, W) before the protocol's crop."""
-    record: dict[str, Any]
-    notes: tuple[str, ...] = ()
-    kind: DepthKind | None = None
-    """Of the file of a depth map."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Sparse:
-    """The sparse depth of the frame."""
-
-    points: SparsePoints
-    scale: float | None
-    """Integers per metre of its file."""
-    record: dict[str, Any]
-    notes: tuple[str, ...]
-    unit: str = METRES
-    camera: FrameCamera | None = None
-    """The camera of the whole image, where it came with the points."""
-    kind: DepthKind | None = None
-    """Of a depth map."""
-
-
 def read_inputs(request: RefineRequest) -> Inputs:
     """Returns the frame that is asked for.
 
     Raises:
         InputError: A file cannot be used, or the files do not fit together.
     """
-    files = request.files
-    image = None if files.image is None else _read_image(files, files.image)
-    whole = None if image is None else image.whole
-    ground_truth = None if files.gt is None else _read_ground_truth(files, files.gt, whole)
-    if ground_truth is not None:
-        _check_ground_truth(files, ground_truth, whole)
+    files, method, crop = request.files, request.method, request.files.protocol.apply
+    notes, record = list[str](), dict[str, Any]()
+    rgb: ImageArray | None = None
+    gt: ImageArray | None = None
+    whole: tuple[int, int] | None = None
+    gt_scale: float | None = None
+    if files.image is not None:
+        image, note = _read_image(files, files.image)
+        whole, rgb = (image.shape[0], image.shape[1]), np.ascontiguousarray(crop(image))
+        record["image"] = _file_record(files.image)
+        notes += [f"image: {note}"] if note else []
+    truth_notes: list[str] = []
+    if files.gt is not None:
+        truth, of_truth, truth_notes = _read_ground_truth(files, files.gt, whole)
+        gt, gt_scale = np.ascontiguousarray(crop(truth.values)), truth.scale
+        if whole not in (None, truth.values.shape):
+            raise _size_error(files, truth.values.shape, whole)
+        if not bool((gt > 0).any()):
+            raise InputError(f"ground truth {files.gt} has no pixel with known depth")
     if files.sparse is None:
-        sparse = _sampled(files, image, ground_truth, request.method.seed)
+        sparse = _sampled(files, rgb, gt, gt_scale, method.seed)
     else:
-        sparse = _read_sparse(request, files.sparse, whole)
-    sparse = _without_far_points(sparse)
-    if ground_truth is not None and sparse.unit != METRES:
+        sparse = _read_sparse(request, files, whole)
+    own, far = _without_far_points(sparse)
+    if gt is not None and sparse.unit != METRES:
         raise UsageError(
             f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
             " --colmap unit-scale, or leave out --gt"
         )
-    if ground_truth is not None and ground_truth.values.shape != sparse.points.size:
-        raise _size_error(files, ground_truth.values.shape, sparse.points.size)
-    size = whole or (None if ground_truth is None else ground_truth.whole) or sparse.points.size
-    camera = camera_of_frame(request, sparse.camera, size)
-    used, held_out = split_points(sparse.points, request.hold_out.holdout, request.method.seed)
-    neighbours = read_neighbours(
+    if gt is not None and gt.shape != own.size:
+        raise _size_error(files, gt.shape, own.size)
+    record["sparse"] = sparse.record
+    notes += (*sparse.notes, *far, *truth_notes)
+    if files.gt is not None:
+        record["gt"] = of_truth
+        size = whole or (truth.values.shape[0], truth.values.shape[1])
+    else:
+        size = whole or own.size
+    camera = camera_of_frame(request, sparse, size)
+    used, held_out = _split(own, request.hold_out.holdout, method.seed)
+    points, neighbours, lost = read_neighbours(
         files, used, camera, lambda other: _points_of(request, other, size)
     )
-    parts = {"image": image, "sparse": sparse, "gt": ground_truth}
-    notes = [note for part in parts.values() if part is not None for note in part.notes]
-    if ground_truth is not None and files.sparse is not None:
-        notes += _leak_warning(sparse.points, ground_truth.values)
-        notes += _scale_warning(sparse, ground_truth)
-    notes += (*(() if camera is None else camera.notes), *neighbours.notes)
-    points = used
-    if neighbours.scans and camera is not None:
-        points = with_moved_points(used, neighbours.scans, camera.camera)
+    if gt is not None and files.sparse is not None:
+        depth = own.scatter()[0, 0].numpy()
+        notes += _leak_warning(depth, gt)
+        notes += _scale_warning(depth, gt, {"--depth-scale": sparse.kind, "--gt-scale": truth.kind})
+    notes += (*(() if camera is None else camera.notes), *lost)
+    if neighbours:
+        record["neighbours"] = neighbours
     return Inputs(
         request=request,
-        rgb=None if image is None else tensor_of(image.values),
+        rgb=None if rgb is None else tensor_of(rgb),
         points=points,
-        own=sparse.points,
+        own=own,
         held_out=held_out,
         register=_register(request),
-        gt=None if ground_truth is None else ground_truth.values,
+        gt=gt,
         sparse_scale=sparse.scale,
-        record={name: part.record for name, part in parts.items() if part is not None}
-        | ({"neighbours": list(neighbours.record)} if neighbours.record else {}),
+        record=record,
         notes=tuple(notes),
         unit=sparse.unit,
         camera=camera,
-        has_neighbours=bool(neighbours.scans),
+        has_neighbours=bool(neighbours),
     )
 
 
@@ -176,26 +155,15 @@ def _register(request: RefineRequest) -> Register:
     return registration_to_make(files.registration, request.method)
 
 
-def split_points(
-    points: SparsePoints, holdout: float, seed: int
-) -> tuple[SparsePoints, SparsePoints]:
-    """Returns (points to use, points held out).
-
-    Args:
-        points: All points.
-        holdout: Fraction of the points to hold out at random; at least one unless it is 0.
-        seed: Of the choice.
-
-    Raises:
-        UsageError: The fraction is not in 0…1, or there are too few points for it.
-    """
-    if not 0 <= holdout < 1:
-        raise UsageError(f"--holdout must be a fraction, 0 <= F < 1, got {holdout}")
+def _split(points: SparsePoints, fraction: float, seed: int) -> tuple[SparsePoints, SparsePoints]:
+    """The points to use, and a random fraction of them, at least one unless it is 0, held out."""
+    if not 0 <= fraction < 1:
+        raise UsageError(f"--holdout must be a fraction, 0 <= F < 1, got {fraction}")
     mask = torch.zeros(len(points), dtype=torch.bool)
-    if holdout > 0:
+    if fraction > 0:
         if len(points) < 2:
             raise UsageError("holdout needs at least two sparse points")
-        count = min(max(1, round(holdout * len(points))), len(points) - 1)
+        count = min(max(1, round(fraction * len(points))), len(points) - 1)
         order = np.random.default_rng(seed).permutation(len(points))
         mask[torch.from_numpy(order[:count])] = True
     return points.select(~mask), points.select(mask)
@@ -204,55 +172,185 @@ def split_points(
 def _points_of(request: RefineRequest, files: FrameFiles, size: tuple[int, int]) -> SparsePoints:
     """The points of another frame of the sequence, read or sampled as it does itself."""
     if files.sparse is not None:
-        return _read_sparse(replace(request, files=files), files.sparse, size).points
-    image = None if files.image is None else _read_image(files, files.image)
-    ground_truth = None if files.gt is None else _read_ground_truth(files, files.gt, size)
-    return _sampled(files, image, ground_truth, request.method.seed).points
+        return _read_sparse(request, files, size).points
+    crop = files.protocol.apply
+    rgb: ImageArray | None = None
+    gt: ImageArray | None = None
+    if files.image is not None:
+        rgb = np.ascontiguousarray(crop(_read_image(files, files.image)[0]))
+    if files.gt is not None:
+        gt = np.ascontiguousarray(crop(_read_ground_truth(files, files.gt, size)[0].values))
+    return _sampled(files, rgb, gt, None, request.method.seed).points
 
 
-def _read_sparse(request: RefineRequest, path: Path, size: tuple[int, int] | None) -> _Sparse:
-    """The sparse depth of one file for an image of (H, W)."""
-    files = request.files
-    if path.is_dir():
-        return _read_colmap(files, path, size)
-    if files.colmap != ColmapOptions():
-        raise UsageError(f"{path} is no COLMAP model, so --colmap does not apply")
-    if files.is_scan(path):
-        return _read_scan(files, path, size)
-    keep = files.scan.keep_occluded or request.method.preset is not None
-    return _read_points(files, path, size, keep_occluded=keep)
+def _read_image(files: FrameFiles, source: Source) -> tuple[ImageArray, str | None]:
+    """The image (H, W, 3), and what a person should know of it."""
+    if isinstance(source, Hdf5Array):
+        return rgb_of(source), None
+    image = read_rgb(source, upright=files.sparse is None or not files.sparse.is_dir())
+    return image.values, image.note
 
 
-def _without_far_points(sparse: _Sparse) -> _Sparse:
-    """The sparse depth without points farther than anything in one image can be, with a note."""
-    depth = sparse.points.depth
-    median = float(depth.median())
-    far = depth > _FAR * median
-    count = int(far.sum())
-    if not count or len(depth) < _MIN_COMPARED:
-        return sparse
-    note = (
-        f"sparse: dropped {count:,} of {len(depth):,} points more than {_FAR:,.0f} times as far as"
-        f" the median of {metres(median)} {sparse.unit}; the farthest was at"
-        f" {metres(float(depth.max()))} {sparse.unit}"
+def _read_ground_truth(
+    files: FrameFiles, source: Source, size: tuple[int, int] | None
+) -> tuple[DepthImage, dict[str, Any], list[str]]:
+    """The ground truth of an image (H, W), what a record keeps of it, and lines for a person."""
+    if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
+        scan = read_scan_points(source, files.scan, size, files.image_file, files.calibration)
+        truth = DepthImage(values=as_depth_image(scan.points), source="", assumed_scale=False)
+        return truth, scan.record, [note.replace("sparse:", "gt:", 1) for note in scan.notes]
+    if isinstance(source, Hdf5Array):
+        truth = DepthImage(values=depth_of(source), source="HDF5", assumed_scale=False)
+    else:
+        scale = files.gt_scale or files.depth_scale
+        truth = read_depth(source, scale=scale, channel=files.channel)
+    values = masked(truth.values, files.gt_masks)
+    if files.gt_size_ok and size is not None and values.shape != size:
+        values = moved_to(file_of(source), values, size)
+    described = describe_range(
+        values,
+        truth.source,
+        assumed_scale=truth.assumed_scale,
+        noun="pixels",
+        option="--gt-scale",
     )
-    return replace(sparse, points=sparse.points.select(~far), notes=(*sparse.notes, note))
+    record = _file_record(source) | {"read_as": truth.source}
+    return replace(truth, values=values), record, [f"gt: {described}"]
 
 
-def _scale_warning(sparse: _Sparse, ground_truth: _Part) -> list[str]:
+def _file_record(source: Source) -> dict[str, Any]:
+    return {"path": str(source), "sha256": fingerprint(file_of(source)).sha256}
+
+
+def _sampled(
+    files: FrameFiles,
+    rgb: ImageArray | None,
+    gt: ImageArray | None,
+    scale: float | None,
+    seed: int,
+) -> SparseDepth:
+    """Points sampled from the ground truth, whose file has so many integers per metre."""
+    if files.sample is None:
+        raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
+    if gt is None:
+        raise InputError(f"{files.image} has no ground truth to sample points from; add it")
+    try:
+        points = sample_points(gt, files.sample, seed, image=rgb)
+    except UsageError as error:  # the pattern itself is good, this frame is too poor for it
+        raise InputError(f"{files.gt}: {error}") from error
+    source = f"{files.sample.kind} of the ground truth, seed {seed}"
+    return SparseDepth(
+        points=points.tensors(),
+        scale=scale,
+        record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": seed},
+        notes=(f"sparse: {describe_range(points.depth, source)}",),
+    )
+
+
+def _read_sparse(
+    request: RefineRequest, files: FrameFiles, size: tuple[int, int] | None
+) -> SparseDepth:
+    """The sparse depth of an image (H, W), in the part of it that the protocol keeps."""
+    path, image = files.sparse, files.image_file
+    assert path is not None
+    if path.is_dir():
+        if size is None or image is None:
+            raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
+        if files.scan != ScanOptions():
+            raise UsageError(
+                f"{path} is a COLMAP model, so the options of a LiDAR scan do not apply"
+            )
+        sparse = read_colmap_points(path, files.colmap, image, size, any_size=files.sparse_size_ok)
+    elif files.colmap != ColmapOptions():
+        raise UsageError(f"{path} is no COLMAP model, so --colmap does not apply")
+    elif files.is_scan(path):
+        sparse = read_scan_points(path, files.scan, size, image, files.calibration)
+    else:
+        keep = files.scan.keep_occluded or request.method.preset is not None
+        sparse = _read_points(files, path, size, keep_occluded=keep)
+    points = sparse.points.tensors()
+    # an array of the image's size that takes no memory, to find the size of the part
+    part = files.protocol.apply(np.broadcast_to(np.False_, points.size)).shape
+    if part != points.size:
+        xy = torch.from_numpy(files.protocol.in_crop(points.xy.numpy(), points.size))
+        points = _inside(path, SparsePoints(xy=xy, depth=points.depth, size=(part[0], part[1])))
+    return replace(sparse, points=points)
+
+
+def _read_points(
+    files: FrameFiles, path: Path, image_size: tuple[int, int] | None, *, keep_occluded: bool
+) -> SparseDepth:
+    """The points of a depth map or a list, in the image."""
+    scale = files.sparse_scale or files.depth_scale
+    sparse = read_sparse(path, size=image_size, scale=scale, channel=files.channel)
+    visible, depth = sparse.points, sparse.points.depth
+    size = image_size or visible.size
+    check_same_view(str(path), visible.size, size)
+    if visible.size != size and not files.sparse_size_ok:
+        raise SizeError(
+            f"{path} is {visible.size[1]}×{visible.size[0]} but {files.image} is"
+            f" {size[1]}×{size[0]}; --set sparse-size-ok maps the points if both show the same view"
+        )
+    described = describe_range(depth, sparse.source, assumed_scale=sparse.assumed_scale)
+    notes, record = [f"sparse: {described}"], _file_record(path) | {"read_as": sparse.source}
+    hidden = None if keep_occluded else occluded_in_map(visible)
+    if hidden is not None and hidden.any():
+        visible, count = visible.select(~hidden), int(hidden.sum())
+        record["dropped"] = {"hidden by foreground": count}
+        notes.append(
+            f"sparse: a projected LiDAR scan; dropped {count:,} points occluded from the camera by"
+            " nearer ones; --scan keep-occluded keeps them"
+        )
+    points = _inside(path, visible.tensors().resized(*size))
+    if len(points) < len(visible):
+        notes.append(f"sparse: {len(visible) - len(points):,} points outside the image")
+    if unlikely := implausible(depth, sparse.scale):
+        notes.append(f"warning: {unlikely}")
+    return SparseDepth(
+        points=points,
+        scale=sparse.scale,
+        kind=DepthKind(sparse.source, sparse.scale, sparse.assumed_scale),
+        record=record,
+        notes=tuple(notes),
+    )
+
+
+def _inside(path: Path, points: SparsePoints) -> SparsePoints:
+    inside = points.cropped(0, 0, *points.size)
+    if not len(inside):
+        raise NoPointsError(f"{path}: none of its {len(points)} points lies in the image")
+    return inside
+
+
+def _without_far_points(sparse: SparseDepth) -> tuple[SparsePoints, list[str]]:
+    """The points without those farther than anything in one image can be, and a note."""
+    points: SparsePoints = sparse.points
+    median = float(points.depth.median())
+    far = points.depth > _FAR * median
+    if not bool(far.any()) or len(points) < _MIN_COMPARED:
+        return points, []
+    note = (
+        f"sparse: dropped {int(far.sum()):,} of {len(points):,} points more than {_FAR:,.0f} times"
+        f" as far as the median of {metres(median)} {sparse.unit}; the farthest was at"
+        f" {metres(float(points.depth.max()))} {sparse.unit}"
+    )
+    return points.select(~far), [note]
+
+
+def _scale_warning(
+    sparse: ImageArray, gt: ImageArray, kinds: Mapping[str, DepthKind | None]
+) -> list[str]:
     """A warning if ground truth and sparse depth differ by a factor where both are known.
 
     Raises:
         InputError: A scale that was assumed explains it.
     """
-    depth, gt = sparse.points.scatter()[0, 0].numpy(), ground_truth.values
-    both = (depth > 0) & (gt > 0)
+    both = (sparse > 0) & (gt > 0)
     if int(both.sum()) < _MIN_COMPARED:
         return []
-    ratio = float(np.median(gt[both] / depth[both]))
+    ratio = float(np.median(gt[both] / sparse[both]))
     if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
         return []
-    kinds = {"--depth-scale": sparse.kind, "--gt-scale": ground_truth.kind}
     scale_warning("sparse points", 1 / ratio, kinds)
     return [
         f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
@@ -261,13 +359,13 @@ def _scale_warning(sparse: _Sparse, ground_truth: _Part) -> list[str]:
     ]
 
 
-def _leak_warning(points: SparsePoints, gt: ImageArray) -> list[str]:
+def _leak_warning(sparse: ImageArray, gt: ImageArray) -> list[str]:
     """A warning if most of the ground truth is the sparse depth itself.
 
     KITTI's ground truth holds the points of its own scan by design, which is less than half of it.
     """
     known = gt > 0
-    leaked = int((known & (points.scatter()[0, 0].numpy() == gt)).sum())
+    leaked = int((known & (sparse == gt)).sum())
     fraction = leaked / int(known.sum())
     if fraction < _LEAK_FRACTION:
         return []
@@ -278,188 +376,10 @@ def _leak_warning(points: SparsePoints, gt: ImageArray) -> list[str]:
     ]
 
 
-def _read_image(files: FrameFiles, source: Source) -> _Part:
-    if isinstance(source, Hdf5Array):
-        rgb, note = rgb_of(source), None
-    else:
-        image = read_rgb(source, upright=files.sparse is None or not files.sparse.is_dir())
-        rgb, note = image.values, image.note
-    return _Part(
-        values=np.ascontiguousarray(files.protocol.apply(rgb)),
-        whole=(rgb.shape[0], rgb.shape[1]),
-        record=_file_record(source),
-        notes=(f"image: {note}",) if note else (),
-    )
-
-
-def _read_ground_truth(
-    files: FrameFiles, source: Source, image_size: tuple[int, int] | None
-) -> _Part:
-    if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
-        image = files.image if isinstance(files.image, Path) else None
-        scan = read_scan_points(source, files.scan, image_size, image, files.calibration)
-        return _Part(
-            values=np.ascontiguousarray(files.protocol.apply(as_depth_image(scan.points))),
-            whole=scan.points.size,
-            record=scan.record,
-            notes=tuple(note.replace("sparse:", "gt:", 1) for note in scan.notes),
-        )
-    if isinstance(source, Hdf5Array):
-        ground_truth = DepthImage(values=depth_of(source), source="HDF5", assumed_scale=False)
-    else:
-        scale = files.gt_scale or files.depth_scale
-        ground_truth = read_depth(source, scale=scale, channel=files.channel)
-    values = masked(ground_truth.values, files.gt_masks)
-    if files.gt_size_ok and image_size not in (None, values.shape):
-        assert image_size is not None
-        path = source.path if isinstance(source, Hdf5Array) else source
-        values = moved_to(path, values, image_size)
-    described = describe_range(
-        values,
-        ground_truth.source,
-        assumed_scale=ground_truth.assumed_scale,
-        noun="pixels",
-        option="--gt-scale",
-    )
-    return _Part(
-        values=np.ascontiguousarray(files.protocol.apply(values)),
-        whole=(values.shape[0], values.shape[1]),
-        record=_file_record(source) | {"read_as": ground_truth.source},
-        notes=(f"gt: {described}",),
-        kind=ground_truth.kind,
-    )
-
-
-def _file_record(source: Source) -> dict[str, Any]:
-    path = source.path if isinstance(source, Hdf5Array) else source
-    return {"path": str(source), "sha256": fingerprint(path).sha256}
-
-
-def _sampled(
-    files: FrameFiles, image: _Part | None, ground_truth: _Part | None, seed: int
-) -> _Sparse:
-    """Points sampled from the ground truth."""
-    if files.sample is None:
-        raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
-    if ground_truth is None:
-        raise InputError(f"{files.image} has no ground truth to sample points from; add it")
-    rgb = None if image is None else image.values
-    try:
-        points = sample_points(ground_truth.values, files.sample, seed, image=rgb)
-    except UsageError as error:  # the pattern itself is good, this frame is too poor for it
-        raise InputError(f"{files.gt}: {error}") from error
-    source = f"{files.sample.kind} of the ground truth, seed {seed}"
-    return _Sparse(
-        points=points.tensors(),
-        scale=ground_truth.kind.scale if ground_truth.kind else None,
-        record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": seed},
-        notes=(f"sparse: {describe_range(points.depth, source)}",),
-    )
-
-
-def _read_scan(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
-    image = files.image if isinstance(files.image, Path) else None
-    scan = read_scan_points(path, files.scan, image_size, image, files.calibration)
-    points = _in_protocol(files, path, scan.points.tensors())
-    return _Sparse(
-        points=points,
-        scale=None,
-        record=scan.record,
-        notes=scan.notes,
-        camera=FrameCamera(camera=scan.camera, source=f"calibration of {path.name}"),
-    )
-
-
-def _read_colmap(files: FrameFiles, path: Path, image_size: tuple[int, int] | None) -> _Sparse:
-    if image_size is None or not isinstance(files.image, Path):
-        raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
-    if files.scan != ScanOptions():
-        raise UsageError(f"{path} is a COLMAP model, so the options of a LiDAR scan do not apply")
-    observed = read_colmap_points(
-        path, files.colmap, files.image, image_size, any_size=files.sparse_size_ok
-    )
-    return _Sparse(
-        points=_in_protocol(files, path, observed.points.tensors()),
-        scale=observed.scale,
-        record=observed.record,
-        notes=observed.notes,
-        unit=observed.unit,
-        camera=FrameCamera(
-            camera=observed.camera, source=f"COLMAP model {path}", pose=observed.pose
-        ),
-    )
-
-
-def _read_points(
-    files: FrameFiles, path: Path, image_size: tuple[int, int] | None, *, keep_occluded: bool
-) -> _Sparse:
-    scale = files.sparse_scale or files.depth_scale
-    sparse = read_sparse(path, size=image_size, scale=scale, channel=files.channel)
-    sparse_size, depth = sparse.points.size, sparse.points.depth
-    size = image_size or sparse_size
-    check_same_view(str(path), sparse_size, size)
-    if sparse_size != size and not files.sparse_size_ok:
-        raise SizeError(
-            f"{path} is {sparse_size[1]}×{sparse_size[0]} but {files.image} is"
-            f" {size[1]}×{size[0]}; --sparse-size-ok maps the points if both show the same view"
-        )
-    visible, record, notes = _visible(sparse.points, keep_occluded)
-    points = _inside(path, visible.tensors().resized(*size))
-    described = describe_range(depth, sparse.source, assumed_scale=sparse.assumed_scale)
-    notes = [f"sparse: {described}", *notes]
-    if len(points) < len(visible):
-        notes.append(f"sparse: {len(visible) - len(points):,} points outside the image")
-    notes += [f"warning: {text}" for text in [implausible(depth, sparse.scale)] if text]
-    return _Sparse(
-        points=_in_protocol(files, path, points),
-        scale=sparse.scale,
-        record=_file_record(path) | {"read_as": sparse.source} | record,
-        notes=tuple(notes),
-        kind=DepthKind(sparse.source, sparse.scale, sparse.assumed_scale),
-    )
-
-
-def _visible(points: Points, keep_occluded: bool) -> tuple[Points, dict[str, Any], list[str]]:
-    """The points without occluded ones, and entries of the record and notes on these."""
-    hidden = None if keep_occluded else occluded_in_map(points)
-    if hidden is None or not hidden.any():
-        return points, {}, []
-    count = int(hidden.sum())
-    note = (
-        f"sparse: a projected LiDAR scan; dropped {count:,} points occluded from the camera by"
-        " nearer ones; --scan keep-occluded keeps them"
-    )
-    return points.select(~hidden), {"dropped": {"hidden by foreground": count}}, [note]
-
-
-def _in_protocol(files: FrameFiles, path: Path, points: SparsePoints) -> SparsePoints:
-    """The points in the part of the image that the protocol keeps, in coordinates of that part."""
-    # An array of the image's size that takes no memory, to find the size of that part.
-    kept = files.protocol.apply(np.broadcast_to(np.False_, points.size))
-    size = (kept.shape[0], kept.shape[1])
-    if size == points.size:
-        return points
-    xy = files.protocol.in_crop(points.xy.numpy(), points.size)
-    return _inside(path, SparsePoints(xy=torch.from_numpy(xy), depth=points.depth, size=size))
-
-
-def _inside(path: Path, points: SparsePoints) -> SparsePoints:
-    inside = points.cropped(0, 0, *points.size)
-    if not len(inside):
-        raise NoPointsError(f"{path}: none of its {len(points)} points lies in the image")
-    return inside
-
-
-def _check_ground_truth(
-    files: FrameFiles, ground_truth: _Part, image_size: tuple[int, int] | None
-) -> None:
-    if image_size is not None and ground_truth.whole != image_size:
-        raise _size_error(files, ground_truth.whole, image_size)
-    if not bool((ground_truth.values > 0).any()):
-        raise InputError(f"ground truth {files.gt} has no pixel with known depth")
-
-
-def _size_error(files: FrameFiles, size: tuple[int, ...], image_size: tuple[int, int]) -> SizeError:
+def _size_error(
+    files: FrameFiles, size: tuple[int, ...], image_size: tuple[int, ...] | None
+) -> SizeError:
+    assert image_size is not None
     return SizeError(
         f"ground truth {files.gt} is {size[1]}×{size[0]} but the image is"
         f" {image_size[1]}×{image_size[0]}"

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,25 +29,13 @@ _IN_MEMORY = 16
 """Images whose keypoints are kept."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Neighbours:
-    """What a frame takes over from the other frames of its sequence."""
-
-    scans: tuple[NeighbourScan, ...] = ()
-    """Their points, each in its own image."""
-    record: tuple[dict[str, Any], ...] = ()
-    """What a record keeps of them."""
-    notes: tuple[str, ...] = ()
-    """Warnings of those that are left out."""
-
-
 def read_neighbours(
     files: FrameFiles,
     used: SparsePoints,
     camera: FrameCamera | None,
     points_of: Callable[[FrameFiles], SparsePoints],
-) -> Neighbours:
-    """Returns the points of the frame's neighbours, with the motion from each to the frame.
+) -> tuple[SparsePoints, list[dict[str, Any]], list[str]]:
+    """Returns the points with those of the neighbours that agree with them.
 
     A neighbour whose motion is neither known nor can be estimated is left out.
 
@@ -58,34 +45,43 @@ def read_neighbours(
         camera: Of the frame.
         points_of: Returns the points of a frame's files.
 
+    Returns:
+        The points, what a record keeps of each neighbour, and warnings of those left out.
+
     Raises:
         InputError: The camera is unknown, a file cannot be read, or no motion is known.
         UsageError: A library that estimates motion is missing.
     """
     if not files.neighbours:
-        return Neighbours()
+        return used, [], []
     if camera is None:
         raise InputError(
             f"{_name_of(files)}: moving points to other frames needs the camera; give --calib, or a"
             " column calib in a list"
         )
-    scans, record, notes = [], [], []
-    for each in files.neighbours:
-        points, entry = _in_numpy(points_of(each.files)), _record_of(each.files)
-        known = each.motion
-        estimate = MotionEstimate(
-            motion=None if known is None else np.array(known), basis=each.poses
-        )
+    own, scans, notes = _in_numpy(used), list[NeighbourScan](), list[str]()
+    record: list[dict[str, Any]] = []
+    for neighbour in files.neighbours:
+        points, source = _in_numpy(points_of(neighbour.files)), _source_of(neighbour.files)
+        known = neighbour.motion
         if known is None:
-            estimate = _estimated(files, each.files, _in_numpy(used), points, camera.camera)
-        entry |= {"poses": each.poses, "basis": estimate.basis if known is None else None}
+            estimate = _estimated(files, neighbour.files, own, points, camera.camera)
+        else:
+            estimate = MotionEstimate(motion=np.array(known), basis=neighbour.poses)
+        entry: dict[str, Any] = {
+            "path": str(source),
+            "sha256": fingerprint(file_of(source)).sha256,
+            "poses": neighbour.poses,
+            "basis": estimate.basis if known is None else None,
+        }
         if estimate.motion is None:
             notes.append(
-                f"warning: {_name_of(each.files)} is left out of the accumulated points, as its"
-                f" motion is unknown: {estimate.basis}"
+                f"warning: {_name_of(neighbour.files)} is left out of the accumulated points, as"
+                f" its motion is unknown: {estimate.basis}"
             )
         else:
-            scans.append(NeighbourScan(points=points, motion=estimate.motion, apart=each.apart))
+            apart = neighbour.apart
+            scans.append(NeighbourScan(points=points, motion=estimate.motion, apart=apart))
             entry["motion"] = estimate.motion.tolist()
         record.append(entry)
     if not scans:
@@ -93,14 +89,7 @@ def read_neighbours(
             f"{_name_of(files)}: no motion to a neighbour can be estimated ({estimate.basis}); give"
             " --poses, or leave out --accumulate"
         )
-    return Neighbours(scans=tuple(scans), record=tuple(record), notes=tuple(notes))
-
-
-def with_moved_points(
-    points: SparsePoints, neighbours: Sequence[NeighbourScan], camera: Camera
-) -> SparsePoints:
-    """Returns the points, and those of the neighbours that agree with them."""
-    return accumulated(_in_numpy(points), neighbours, camera).tensors()
+    return accumulated(own, scans, camera.camera).tensors(), record, notes
 
 
 def _estimated(
@@ -108,25 +97,24 @@ def _estimated(
 ) -> MotionEstimate:
     if here.image is None or there.image is None:
         return motion_of_scans(used, points, camera)
-    keypoints = _keypoints(here.image, here.protocol), _keypoints(there.image, there.protocol)
-    return motion_of_images(*keypoints, points, camera)
-
-
-def _keypoints(image: Source, protocol: Protocol) -> Keypoints:
-    digest = fingerprint(file_of(image)).sha256
-    return _keypoints_of_content(image, protocol, digest)
+    return motion_of_images(
+        _keypoints(here.image, here.protocol, fingerprint(file_of(here.image)).sha256),
+        _keypoints(there.image, there.protocol, fingerprint(file_of(there.image)).sha256),
+        points,
+        camera,
+    )
 
 
 @functools.lru_cache(maxsize=_IN_MEMORY)
-def _keypoints_of_content(image: Source, protocol: Protocol, digest: str) -> Keypoints:
+def _keypoints(image: Source, protocol: Protocol, digest: str) -> Keypoints:
     """The keypoints of an image whose file has this digest."""
     return keypoints_of(read_frame_image(Frame(name=str(image), image=image, protocol=protocol)))
 
 
-def _record_of(files: FrameFiles) -> dict[str, Any]:
+def _source_of(files: FrameFiles) -> Source:
     source = files.sparse or files.gt
     assert source is not None
-    return {"path": str(source), "sha256": fingerprint(file_of(source)).sha256}
+    return source
 
 
 def _name_of(files: FrameFiles) -> str:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
-from pnpdepth_cli.io.record import write_json
 
 _FILE_SUFFIXES = {
     *(*IMAGE_SUFFIXES, *DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES),
@@ -87,11 +85,6 @@ class Outputs:
             return self
         return replace(self, preview=None, improvement=None, sigma_preview=None)
 
-    def write_record(self, record: dict[str, Any]) -> None:
-        """Writes the record, if it is wanted."""
-        if self.record is not None:
-            write_json(self.record, record)
-
 
 def plan_outputs(request: RefineRequest) -> Outputs:
     """Returns the paths of the results: `-o FILE.exr` for the depth alone, a folder for all.
@@ -102,26 +95,26 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     files, options = request.files, request.outputs
     sources = [files.image, files.sparse, files.gt, files.scan.calib]
     inputs = [path for path in sources if isinstance(path, Path)]
-    stem = inputs[0].stem
-    output = options.output or Path(f"{stem}_refined")
+    output = options.output or Path(f"{inputs[0].stem}_refined")
+    suffix, formats = output.suffix.lower(), " ".join(DEPTH_SUFFIXES)
     if f".{options.format}" not in DEPTH_SUFFIXES:
-        raise UsageError(f"format {options.format!r} is not one of {' '.join(DEPTH_SUFFIXES)}")
-    added = {"--uncertainty": request.hold_out.uncertainty, "--ply": options.ply}
-    if output.suffix.lower() in DEPTH_SUFFIXES and any(added.values()):
-        flag = next(flag for flag, requested in added.items() if requested)
-        raise UsageError(f"{flag} writes a second file; name a folder, not {output}, with -o")
-    if output.suffix.lower() in DEPTH_SUFFIXES:
+        raise UsageError(f"format {options.format!r} is not one of {formats}")
+    if suffix in DEPTH_SUFFIXES:
+        for flag, asked in (
+            ("--uncertainty", request.hold_out.uncertainty),
+            ("--ply", options.ply),
+        ):
+            if asked:
+                raise UsageError(
+                    f"{flag} writes a second file; name a folder, not {output}, with -o"
+                )
         outputs = Outputs(depth=output, scale=options.output_scale)
-    elif output.suffix.lower() in _FILE_SUFFIXES and not output.is_dir():
-        raise OutputError(
-            f"{output}: depth is written as {' '.join(DEPTH_SUFFIXES)}, or into a folder"
-        )
+    elif suffix in _FILE_SUFFIXES and not output.is_dir():
+        raise OutputError(f"{output}: depth is written as {formats}, or into a folder")
     elif output.is_file():
-        raise OutputError(
-            f"{output} is a file; name a folder, or a depth file ({' '.join(DEPTH_SUFFIXES)})"
-        )
+        raise OutputError(f"{output} is a file; name a folder, or a depth file ({formats})")
     else:
-        outputs = Outputs.in_folder(output, stem, request)
+        outputs = Outputs.in_folder(output, inputs[0].stem, request)
     resolved = {path.resolve() for path in inputs}
     for path in outputs.paths():
         if path.resolve() in resolved:

@@ -1,7 +1,10 @@
-"""Writes the files of a refined frame."""
+"""Writes the files of a refined frame, with its 3D view for the report of a batch."""
 
 from __future__ import annotations
 
+import base64
+import itertools
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +15,14 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.refinement.output_files import Outputs
-from pnpdepth_cli.commands.refinement.view_3d import write_view
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.frames.frame import Refined, is_dense
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud
+from pnpdepth_cli.io.colours import depth_scale
 from pnpdepth_cli.io.depth import metres, write_depth
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
+from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.visualisation import (
     improvement,
     improvement_at_points,
@@ -26,7 +30,8 @@ from pnpdepth_cli.io.visualisation import (
     sigma_preview,
     write_mask,
 )
-from pnpdepth_cli.sensors.cloud import cloud_from_depth
+from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.cloud import cloud_from_depth, kept_pixels
 
 Image = NDArray[np.float32]
 
@@ -37,6 +42,12 @@ _COARSER = (100.0, 10.0, 1.0, 0.1)  # codes per metre where 256 cannot hold the 
 _FINER = (1000.0, 10_000.0, 100_000.0)  # where 256 would round them
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
+
+LARGEST_VIEW = 200_000
+"""Points of a 3D view."""
+
+_RAY_NODES = 64
+"""Nodes of the grid of directions along the longer side: exact to 1e-4 of it for strong lenses."""
 
 
 def output_scale(outputs: Outputs, inputs: Inputs) -> float:
@@ -111,22 +122,18 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str,
             outputs.improvement, image, inputs, frame, outputs.colors
         )
     if outputs.cloud is not None:
-        record["cloud"] = _write_cloud(outputs.cloud, image, inputs, frame)
+        assert inputs.camera is not None
+        pose = inputs.camera.pose  # known, it moves the cloud into the world's frame
+        parts = cloud_from_depth(frame.after, inputs.camera.camera, rgb=image, keep=frame.valid)
+        moved = (part if pose is None else part.transformed(pose) for part in parts)
+        points = write_cloud(outputs.cloud, moved)
+        record["cloud"] = {"points": points, "frame": "camera" if pose is None else "world"}
     if outputs.view is not None:
-        write_view(outputs.view, image, inputs, frame)
+        _write_view(outputs.view, image, inputs, frame)
     kinds = ("depth", "sigma", "valid", "preview", "improvement", "cloud", "view")
     written = outputs.by_kind()
     record["outputs"] = {kind: str(written[kind]) if kind in written else None for kind in kinds}
     return record
-
-
-def _write_cloud(path: Path, image: Image | None, inputs: Inputs, frame: Refined) -> dict[str, Any]:
-    """Writes the cloud of the refined depth, in the world's frame if the pose is known."""
-    assert inputs.camera is not None
-    parts = cloud_from_depth(frame.after, inputs.camera.camera, rgb=image, keep=frame.valid)
-    pose = inputs.camera.pose
-    points = write_cloud(path, (part if pose is None else part.transformed(pose) for part in parts))
-    return {"points": points, "frame": "camera" if pose is None else "world"}
 
 
 def _write_improvement(
@@ -146,3 +153,79 @@ def _write_improvement(
         unit=inputs.unit,
         colors=colors,
     )
+
+
+def _write_view(path: Path, image: Image | None, inputs: Inputs, frame: Refined) -> None:
+    """Writes the 3D view for a report: depths, the ground truth if known, colours and camera.
+
+    Every depth is cut at its edges, as a cloud is, on one grid. An image of more pixels than
+    `LARGEST_VIEW` is thinned to every n-th row and column. In the JSON, depths are base64 of
+    uint16, 0 = unknown, else logarithmic over `range`.
+    """
+    assert inputs.camera is not None
+    height, width = inputs.size
+    stride = _stride((height, width))
+    thinned = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    maps = {"before": frame.before, "after": frame.after}
+    maps |= {} if inputs.gt is None else {"gt": inputs.gt}
+    depths = {
+        name: np.where(kept_pixels(depth, frame.valid if name == "after" else None), depth, 0)[
+            thinned
+        ]
+        for name, depth in maps.items()
+    }
+    known = np.concatenate([depth[depth > 0] for depth in depths.values()])
+    near, far = (float(known.min()), float(known.max())) if len(known) else (1.0, 1.0)
+    far = max(far, near * 1.001)
+    rays = _rays(inputs.camera.camera, (height, width))
+    write_json(
+        path,
+        {
+            "size": [depths["after"].shape[1], depths["after"].shape[0]],
+            "whole": [width, height],
+            "stride": stride,
+            "range": [near, far],
+            "middle": float(np.median(known)) if len(known) else 1.0,
+            "farthest": far,
+            "spacing": stride * float(np.ptp(rays[:, :, 0])) / max(width - 1, 1),
+            "unit": inputs.unit,
+            "rays": {"size": [rays.shape[1], rays.shape[0]], "values": _text(rays, "<f4")},
+            "depths": {name: _text(_codes(d, near, far), "<u2") for name, d in depths.items()},
+            "colours": _text(_colours(image, frame)[thinned], "|u1"),
+        },
+    )
+
+
+def _stride(size: tuple[int, int]) -> int:
+    """The least n for which every n-th row and column, from the n/2-th, are few enough pixels."""
+    return next(
+        n
+        for n in itertools.count(1)
+        if math.prod(len(range(n // 2, side, n)) for side in size) <= LARGEST_VIEW
+    )
+
+
+def _codes(depth: NDArray[np.float32], near: float, far: float) -> NDArray[np.float64]:
+    """1…65535, logarithmic from near to far; 0 where unknown."""
+    known = depth > 0
+    position = np.log(np.where(known, depth, near) / near) / math.log(far / near)
+    return np.where(known, 1 + np.rint(position * (LARGEST_CODE - 1)), 0)
+
+
+def _rays(camera: Camera, size: tuple[int, int]) -> NDArray[np.float64]:
+    """(rows, columns, 2) x/z and y/z at the nodes of a grid from the first to the last pixel."""
+    rows, columns = (np.linspace(0, n - 1, 2 + _RAY_NODES * (n - 1) // max(size)) for n in size)
+    xy = np.stack(np.meshgrid(columns, rows), axis=-1)
+    points = camera.unproject(xy.reshape(-1, 2), np.ones(xy.shape[0] * xy.shape[1]))
+    return points[:, :2].reshape(xy.shape)
+
+
+def _colours(image: Image | None, frame: Refined) -> NDArray[np.uint8]:
+    """(H, W, 3) of the image, or of the depth where there is none."""
+    if image is not None:
+        return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return depth_scale(frame.after).paint(frame.after)
+
+
+def _text(values: NDArray[Any], kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")

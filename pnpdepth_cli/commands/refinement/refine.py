@@ -2,34 +2,41 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
+import torch
+
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs
 from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
-from pnpdepth_cli.commands.refinement.record import record_of
 from pnpdepth_cli.commands.refinement.request import RefineRequest
-from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb
-from pnpdepth_cli.errors import DivergedError
-from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.errors import DivergedError, ModelError
+from pnpdepth_cli.frames.default import ALIGNED, LINEAR, RESULT
+from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
 from pnpdepth_cli.frames.refiner import Refiner
-from pnpdepth_cli.frames.resolve import redefined
+from pnpdepth_cli.frames.resolve import normalisation_name, redefined
 from pnpdepth_cli.io.atomic import all_or_none
-from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.io.record import sha256_of, write_json
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.points import SparsePoints
 
 
-@dataclass(frozen=True, kw_only=True)
-class RefineOutcome:
-    """A refined frame on disk."""
+class RefineOutcome(NamedTuple):
+    """A refined frame on disk: what its record holds, the files that were written, and why the
+    refinement stopped early, if it did."""
 
     record: dict[str, Any]
-    """What <stem>.json holds."""
     outputs: Outputs
-    """The files that were written."""
     diverged: DivergedError | None
-    """Why the refinement stopped early. None if it did not."""
 
 
 def refine_image(
@@ -75,12 +82,10 @@ def load_refiner(
         ModelError: The network cannot be loaded.
     """
     choice, hold_out = request.network, request.hold_out
+    chosen = [(choice.model, choice.checkpoint), *((spec, None) for spec in choice.more_models)]
     networks = [
         load_network(spec, checkpoint, choice.device, precision=choice.precision)
-        for spec, checkpoint in (
-            (choice.model, choice.checkpoint),
-            *((spec, None) for spec in choice.more_models),
-        )
+        for spec, checkpoint in chosen
     ]
     networks[0] = redefined(networks[0], choice.output_kind, choice.normalise)
     refiner = Refiner(
@@ -104,7 +109,163 @@ def write_refined(
             record |= write_outputs(outputs, inputs, frame)
         record["seconds"] = watch.seconds
         record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
-        outputs.write_record(record)
+        if outputs.record is not None:
+            write_json(outputs.record, record)
     for path in {*planned.paths()} - {*outputs.paths()}:
         path.unlink(missing_ok=True)  # of an earlier result
     return RefineOutcome(record=record, outputs=outputs, diverged=frame.diverged)
+
+
+def record_of(refiner: Refiner, inputs: Inputs, frame: Refined) -> dict[str, Any]:
+    """Returns what the record says of a refined frame, apart from its files and times."""
+    request, network, gt = inputs.request, refiner.network, inputs.gt
+    moved = {"moved": len(frame.used) - inputs.own_used} if inputs.has_neighbours else {}
+    of_networks = [note for member in refiner.members for note in member.network.notes]
+    stages = None if gt is None else frame.stages  # of the default method
+    return {
+        "versions": versions(),
+        "unit": inputs.unit,
+        "inputs": inputs.record,
+        "camera": None if inputs.camera is None else inputs.camera.record(),
+        "model": model_record(network, request.network.model),
+        "method": {
+            "kind": "default" if refiner.is_default else "fixed",
+            "reason": refiner.asked.fixed_by or "default",
+            "networks": [member.network.definition.name for member in refiner.members],
+        },
+        "settings": {
+            **asdict(refiner.settings),
+            "seed": refiner.asked.seed,
+            "step": frame.refinement.step,
+            "propagate": "gp" if refiner.is_default else refiner.settings.propagate,
+            "output_kind": network.definition.output_kind,
+            "normalise": normalisation_name(network.definition),
+            "holdout": request.hold_out.holdout,
+            "precision": network.precision,
+            "device": str(network.device),
+        },
+        "registration": asdict(frame.registration) if frame.registration else None,
+        "alignment": asdict(frame.alignment) if frame.alignment else None,
+        "size": [inputs.size[1], inputs.size[0]],
+        "points": {
+            "used": len(frame.used),
+            "held_out": len(frame.held_out),
+            "nearest": float(inputs.own.depth.min()),
+            "farthest": float(inputs.own.depth.max()),
+            **moved,
+        },
+        "loss": list(frame.losses),
+        "kept": frame.refinement.kept,
+        **({"warm_start": frame.refinement.warm} if frame.in_window else {}),
+        "sparse_error": _before_after(frame, lambda depth: _point_error(depth, frame.used)),
+        "held_out_error": _before_after(frame, lambda depth: _point_error(depth, frame.held_out)),
+        "scores": _before_after(frame, lambda depth: _scores(depth, gt)),
+        "linear": _compared_with_linear(frame, gt),
+        "stages": [{"stage": n, "scores": _scores(d, gt)} for n, d in stages.items()]
+        if stages
+        else None,
+        "hidden_point_steps": dict(frame.steps) or None,
+        "baselines": _baseline_scores(frame, gt) if request.hold_out.baselines else None,
+        "diverged": str(frame.diverged) if frame.diverged else None,
+        "notes": [note for note in (*inputs.notes, *of_networks, *frame.notes) if note],
+    }
+
+
+def model_record(network: Network, spec: str) -> dict[str, Any]:
+    """Returns the entries of a network in a record; `spec` is what the user called it."""
+    checkpoint = network.checkpoint
+    return {
+        "name": network.definition.name,
+        "spec": spec,
+        "checkpoint": str(checkpoint) if checkpoint else None,
+        "checkpoint_sha256": _digest(checkpoint, checkpoint.stat().st_mtime_ns)
+        if checkpoint
+        else None,
+    }
+
+
+@functools.lru_cache(maxsize=8)
+def _digest(checkpoint: Path, mtime_ns: int) -> str:
+    """The SHA-256 of a checkpoint, computed once for all frames."""
+    return sha256_of(checkpoint)
+
+
+def _point_error(depth: DepthMap, points: SparsePoints) -> dict[str, Any] | None:
+    """The errors of depth (H, W) at points of its frame; None where it is unknown at all."""
+    predicted = points.sample(torch.from_numpy(depth))
+    error = (predicted - points.depth)[predicted > 0].double()
+    if not len(error):
+        return None
+    mae, rmse = float(error.abs().mean()), float(error.square().mean().sqrt())
+    return {"points": len(error), "mae": mae, "rmse": rmse}
+
+
+def _scores(depth: DepthMap, gt: DepthMap | None) -> dict[str, Any] | None:
+    """The errors of depth (H, W) against the ground truth."""
+    if gt is None:
+        return None
+    return asdict(score(torch.from_numpy(depth), torch.from_numpy(gt)))
+
+
+def _before_after(
+    frame: Refined, measure: Callable[[DepthMap], dict[str, Any] | None]
+) -> dict[str, Any] | None:
+    before, after = measure(frame.before), measure(frame.after)
+    return None if before is None or after is None else {"before": before, "after": after}
+
+
+def _compared_with_linear(frame: Refined, gt: DepthMap | None) -> dict[str, Any]:
+    """The errors of linear interpolation of the same points, where the result is scored.
+
+    "scores" on the pixels of the ground truth where the result is known, "held_out_error" at the
+    points of `--holdout`, and "check", the MAE of each stage at the hidden points; each None
+    without such pixels or points. "worse": whether the MAE of the result is above that of linear
+    interpolation, by the first of these that there is; None without any.
+    """
+    compared: dict[str, Any] = {"scores": None, "held_out_error": None, "check": None}
+    worse: list[bool] = []
+    if gt is not None or len(frame.held_out):
+        dense = linear(frame.used).numpy()
+        truth = None if gt is None else np.where(frame.after > 0, gt, np.float32(0))
+        own, result = _scores(dense, truth), _scores(frame.after, truth)
+        if own is not None and result is not None:
+            compared["scores"] = own
+            worse.append(result["mae"] > own["mae"])
+        own, result = (_point_error(depth, frame.held_out) for depth in (dense, frame.after))
+        if own is not None and result is not None:
+            compared["held_out_error"] = own
+            worse.append(result["mae"] > own["mae"])
+    if frame.check is not None:
+        errors = {name: frame.check.error(name) for name in frame.check.predicted}
+        compared["check"] = {"points": len(frame.check.hidden), **errors}
+        worse.append(errors[RESULT] > errors[LINEAR])
+    return compared | {"worse": worse[0] if worse else None}
+
+
+def _baseline_scores(frame: Refined, gt: DepthMap | None) -> dict[str, dict[str, Any]]:
+    """The scores of every baseline, of the network and of the result, by name.
+
+    Each has the MAE at the hidden points, where there are enough points, and all metrics, where
+    there is ground truth. A baseline that fails on the frame is left out.
+    """
+    check, scores = frame.check, dict[str, dict[str, Any]]()
+    before = torch.from_numpy(frame.before)
+    for name, baseline in BASELINES.items():
+        try:
+            error = None
+            if check is not None:
+                at_hidden = baseline.at(check.hidden.xy, check.kept, check.network)
+                error = check.with_prediction(name, at_hidden).error(name)
+            metrics = None
+            if gt is not None:
+                metrics = _scores(baseline.depth(frame.used, before).numpy(), gt)
+        except ModelError:  # such as a line through points that are all equally far
+            continue
+        scores[name] = {"held_out_mae": error, "scores": metrics}
+    for name, of_check, depth in (
+        ("network", ALIGNED, frame.before),
+        ("result", RESULT, frame.after),
+    ):
+        error = None if check is None else check.error(of_check)
+        scores[name] = {"held_out_mae": error, "scores": _scores(depth, gt)}
+    return scores

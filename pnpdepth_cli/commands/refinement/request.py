@@ -41,7 +41,7 @@ def parse_codes_per_metre(text: str) -> float:
     except ValueError:
         scale = -1.0
     if not 0 < scale < float("inf"):
-        raise UsageError(f"--output-scale {text!r} is neither mm nor codes per metre such as 256")
+        raise UsageError(f"output-scale {text!r} is neither mm nor codes per metre such as 256")
     return scale
 
 
@@ -82,7 +82,9 @@ class FrameFiles:
         None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
     )
     sparse_size_ok: bool = option(
-        False, "Accept a sparse depth map of another size; its points are moved to the image."
+        False,
+        "Accept a sparse depth map of another size; its points are moved to the image.",
+        within="--set",
     )
     registration: str | tuple[float, float, float] = option(
         "auto",
@@ -111,13 +113,15 @@ class FrameFiles:
     """Which pixels of the ground truth serve as sparse depth."""
     protocol: Protocol = field(default_factory=_whole_frame)
 
+    @property
+    def image_file(self) -> Path | None:
+        """The file of the image; None for none, or for an array of a data set."""
+        return self.image if isinstance(self.image, Path) else None
+
     def is_scan(self, sparse: Path) -> bool:
-        """Returns whether sparse depth is a scan that is projected.
+        """Returns whether sparse depth is a scan that is projected; see `ScanOptions.describes`.
 
-        An .npz is one where the data set gives the pose of the scanner; else as `scan.describes`.
-
-        Raises:
-            UsageError: It is not, and an option is given that only a scan has.
+        An .npz is one where the data set gives the pose of the scanner.
         """
         if sparse.suffix.lower() == ".npz" and self.calibration is not None:
             return self.calibration.has_pose
@@ -159,17 +163,20 @@ class NetworkChoice:
         None,
         "Meaning of the network's output, replacing what its definition says.",
         choices=choices.SPACES,
+        within="--set",
     )
     normalise: str | None = option(
         None,
         "RGB range of the network's input: 0…1, ImageNet's mean and std, −1…1, 0…255.",
         choices=choices.NORMALISATIONS,
+        within="--set",
     )
     precision: str = option(
         "fp32",
         "Precision of convolutions and matrix products; z, loss and updates stay in fp32.",
         choices=choices.PRECISIONS,
         show_default=True,
+        within="--set",
     )
     device: str = option(
         "cpu",
@@ -208,6 +215,7 @@ class OutputOptions:
         " or what fits]",
         metavar="mm|S",
         parse=parse_codes_per_metre,
+        within="--set",
     )
     ply: bool = option(False, "Also write a coloured point cloud, NAME.ply.")
     fov_deg: float | None = option(
@@ -223,6 +231,7 @@ class OutputOptions:
         "Colours of better and worse: blue and orange, or the paper's red and green.",
         choices=choices.COLORS,
         show_default=True,
+        within="--set",
     )
     previews: str = option(
         "all",
@@ -230,6 +239,7 @@ class OutputOptions:
         " interpolation), or none.",
         choices=choices.PREVIEWS,
         show_default=True,
+        within="--set",
     )
     overwrite: bool = option(False, "Replace existing results.")
 
@@ -299,11 +309,26 @@ def count_or_fraction(text: str) -> tuple[int | None, float | None]:
         raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
 
 
-def sample_pattern(kind: str, count: int | None, fraction: float | None) -> SamplePattern:
-    """Returns the pattern of so many points, or this fraction of the known pixels."""
+def sample_pattern(kind: str, text: str | None) -> SamplePattern:
+    """Returns the pattern of `uniform` or `region:X,Y,W,H`, with `500` points or `5%`.
+
+    Raises:
+        UsageError: One of the texts is of another form.
+    """
     from pnpdepth_cli.sensors import SamplePattern
 
-    return SamplePattern(kind=kind, count=count, fraction=fraction)
+    kind, colon, rectangle = kind.partition(":")
+    count, fraction = (None, None) if text is None else count_or_fraction(text)
+    region = None
+    if colon:
+        try:
+            left, top, width, height = (int(word) for word in rectangle.split(","))
+        except ValueError:
+            raise UsageError(
+                f"pattern {kind}:{rectangle} is not of the form region:X,Y,W,H"
+            ) from None
+        region = left, top, width, height
+    return SamplePattern(kind=kind, count=count, fraction=fraction, region=region)
 
 
 def parse_sample(text: str | None) -> SamplePattern | None:
@@ -311,4 +336,4 @@ def parse_sample(text: str | None) -> SamplePattern | None:
     if text is None:
         return None
     kind, colon, count = text.rpartition(":")
-    return sample_pattern(kind if colon else "uniform", *count_or_fraction(count))
+    return sample_pattern(kind if colon else "uniform", count)

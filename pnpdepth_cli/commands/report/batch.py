@@ -31,7 +31,7 @@ from pnpdepth_cli.io.report import (
     write_report,
 )
 
-Row = dict[str, Any]
+Row = Mapping[str, Any]
 
 _PANELS = {
     "Depth before": "first",

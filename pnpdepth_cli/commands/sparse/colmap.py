@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.sparse.options import METRES, MODEL_UNITS, ColmapOptions
+from pnpdepth_cli.commands.sparse.scans import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
 from pnpdepth_cli.io.colmap.model import ColmapCamera, ColmapModel
 from pnpdepth_cli.io.colmap.reading import find_model, model_files, name_in_model, read_model
@@ -25,29 +24,9 @@ _SIZES_IN_RANGE = 8.0
 _LARGEST_CODE = 65535
 
 
-@dataclass(frozen=True, kw_only=True)
-class ColmapPointsOfImage:
-    """Sparse depth of one image."""
-
-    points: Points
-    """In the frame of the image, depth in `unit`."""
-    camera: Camera
-    """In pixels of the image."""
-    pose: NDArray[np.float64]
-    """(3, 4) from the camera's frame to the model's, in `unit`."""
-    unit: str
-    """METRES or MODEL_UNITS."""
-    scale: float | None
-    """Codes per unit of a 16-bit output in model units; None for metres."""
-    record: dict[str, Any]
-    """What a record keeps of it."""
-    notes: tuple[str, ...]
-    """Lines for a person."""
-
-
 def read_colmap_points(
     path: Path, options: ColmapOptions, image: Path, size: tuple[int, int], *, any_size: bool
-) -> ColmapPointsOfImage:
+) -> SparseDepth:
     """Returns the points that COLMAP matched in an image, projected into it.
 
     The camera's own lens distortion is applied to the points, so the photo stays as it was taken.
@@ -71,7 +50,7 @@ def read_colmap_points(
         raise SizeError(
             f"{image} is {size[1]}×{size[0]} but its camera in {model.folder} is"
             f" {camera.size[1]}×{camera.size[0]}; give the photo that COLMAP was given, unrotated,"
-            " or --sparse-size-ok if it was only resized"
+            " or --set sparse-size-ok if it was only resized"
         )
     check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
     points = _observed(model, name, options)
@@ -85,9 +64,10 @@ def read_colmap_points(
     notes += [f"sparse: dropped {lost}"] if lost else []
     if unit == MODEL_UNITS:
         notes.append("unit: depth is in model units; --colmap unit-scale=M gives metres per unit")
-    return ColmapPointsOfImage(
+    return SparseDepth(
         points=points.resized(*size),
         camera=_resized(_eye(camera), camera.size, size),
+        camera_source=f"COLMAP model {path}",
         pose=np.column_stack([turn, -turn @ shift * (options.unit_scale or 1.0)]),
         unit=unit,
         scale=_output_scale(model) if unit == MODEL_UNITS else None,

@@ -78,6 +78,19 @@ class FramesRequest:
     camera: int | None = None
     """Which camera of `calib`."""
 
+    def identity(self) -> dict[str, Any]:
+        """Returns what the record of the same frames begins with."""
+        paths = sorted(self.bag.iterdir()) if self.bag.is_dir() else [self.bag]
+        return {
+            "command": "frames",
+            "bag": str(self.bag),
+            "bag_files": {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths},
+            "options": asdict(self.options),
+            "limit": self.limit,
+            "calib": None if self.calib is None else str(self.calib),
+            "camera": self.camera,
+        }
+
 
 def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
     """Writes the frames of a bag in the layout `pairs`, one at a time, and returns the record.
@@ -89,8 +102,12 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         UsageError: Topics are ambiguous.
         OutputError: The folder holds files that may not be replaced.
     """
-    _check_output(request)
-    wanted, tolerance = request.options.wanted, request.options.tolerance
+    folder, wanted, tolerance = request.output, request.options.wanted, request.options.tolerance
+    ours = (folder / RECORD).is_file()
+    if ours and not request.overwrite:
+        raise OutputError(f"{folder} holds the frames of a bag; --overwrite replaces them")
+    if folder.is_file() or (not ours and folder.is_dir() and any(folder.iterdir())):
+        raise OutputError(f"{folder} exists, and holds no frames of a bag; name another with -o")
     with open_bag(request.bag) as bag:
         check_topics(bag, wanted, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES, *TRANSFORMS))
         topics = topic_of(bag, wanted, IMAGES), topic_of(bag, wanted, CLOUDS)
@@ -117,7 +134,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
             f"{request.bag}: no image of {topics[0]} has a scan of {topics[1]} within"
             f" {tolerance:g} s; check the clocks, or give a larger --tolerance"
         )
-    record = _identity(request) | {
+    record = request.identity() | {
         "image_topic": topics[0],
         "points_topic": topics[1],
         "complete": True,
@@ -134,17 +151,8 @@ def written_before(request: FramesRequest) -> bool:
     path = request.output / RECORD
     if not path.is_file():
         return False
-    identity, record = plain(_identity(request) | {"complete": True}), read_json(path)
+    identity, record = plain(request.identity() | {"complete": True}), read_json(path)
     return all(record.get(name) == value for name, value in identity.items())
-
-
-def _check_output(request: FramesRequest) -> None:
-    folder = request.output
-    ours = (folder / RECORD).is_file()
-    if ours and not request.overwrite:
-        raise OutputError(f"{folder} holds the frames of a bag; --overwrite replaces them")
-    if folder.is_file() or (not ours and folder.is_dir() and any(folder.iterdir())):
-        raise OutputError(f"{folder} exists, and holds no frames of a bag; name another with -o")
 
 
 def _clear(request: FramesRequest) -> None:
@@ -155,20 +163,7 @@ def _clear(request: FramesRequest) -> None:
             path.unlink()
     for name in ("calib.txt", POSES_FILE):
         (request.output / name).unlink(missing_ok=True)
-    write_json(request.output / RECORD, _identity(request) | {"complete": False})
-
-
-def _identity(request: FramesRequest) -> dict[str, Any]:
-    paths = sorted(request.bag.iterdir()) if request.bag.is_dir() else [request.bag]
-    return {
-        "command": "frames",
-        "bag": str(request.bag),
-        "bag_files": {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths},
-        "options": asdict(request.options),
-        "limit": request.limit,
-        "calib": None if request.calib is None else str(request.calib),
-        "camera": request.camera,
-    }
+    write_json(request.output / RECORD, request.identity() | {"complete": False})
 
 
 def _stream(bag: Bag, images: str, points: str) -> Iterator[tuple[bool, Stamped]]:
@@ -209,7 +204,7 @@ def _write_calibration(
     if not calibration.has_pose:
         say(
             f"warning: {bag.path} has no static transform from {names[0]} to {names[1]}; refine"
-            " with --extrinsics"
+            " with --scan extrinsics=FILE"
         )
     else:
         say(f"calibration: {source}")

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.commands.refinement.request import count_or_fraction
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.commands.sparse.scans import camera_of, check_size, read_scan_points
 from pnpdepth_cli.errors import OutputError, SizeError, UsageError
@@ -42,17 +41,17 @@ AT_CALIBRATION = "calib"
 
 @dataclass(frozen=True, kw_only=True)
 class SparseTarget:
-    """Where sparse depth is written."""
+    """Where sparse depth is written, with a JSON beside it that says what it was made from."""
 
     output: Path
-    """The sparse depth; its suffix is one of `SPARSE_SUFFIXES`."""
+    """Its suffix is one of `SPARSE_SUFFIXES`."""
     overlay: Path | None = None
     """A PNG of the points on the image; None for none."""
     overwrite: bool = False
 
     @property
     def record(self) -> Path:
-        """The JSON beside the output, with everything it was made from."""
+        """The JSON."""
         return self.output.with_suffix(".json")
 
     def check(self, inputs: Iterable[Path | None]) -> None:
@@ -73,6 +72,7 @@ class SparseTarget:
 
     def write(
         self,
+        command: str,
         points: Points,
         settings: dict[str, Any],
         *,
@@ -82,9 +82,15 @@ class SparseTarget:
     ) -> dict[str, Any]:
         """Writes the sparse depth, its record and the overlay, and returns the record.
 
-        A PNG or CSV keeps the settings too. `rgb`, (H, W, 3) in 0..1, is the image of the overlay.
+        Args:
+            command: What made the points.
+            points: The sparse depth.
+            settings: How it was made; kept in a PNG or CSV too.
+            inputs: Files by their part, or what a record keeps of them.
+            notes: Lines for a person.
+            rgb: (H, W, 3) in 0..1, the image of the overlay.
         """
-        provenance = {"command": settings["command"], "version": __version__, **settings}
+        provenance = {"command": command, "version": __version__, **settings}
         for path in filter(None, (self.output, self.overlay)):
             make_folder(path.parent)
         image = as_depth_image(points)
@@ -93,7 +99,13 @@ class SparseTarget:
             overlay(rgb, points.xy, points.depth, self.overlay)
         record = {
             **provenance,
-            "inputs": inputs,
+            "inputs": {
+                name: {"path": str(part), "sha256": sha256_of(part)}
+                if isinstance(part, Path)
+                else part
+                for name, part in inputs.items()
+                if part is not None
+            },
             "points": {
                 "count": len(points),
                 "fraction_of_pixels": len(points) / image.size,
@@ -139,16 +151,11 @@ def project_scan(
             raise SizeError(f"{image} is {rgb.shape[1]}×{rgb.shape[0]}, not of the size given")
         size = (rgb.shape[0], rgb.shape[1])
     projected = read_scan_points(scan, options, size, image)
-    settings = {"command": "project", **plain(asdict(options))}
+    settings = plain(asdict(options))
     if options.point_fields is None:
         del settings["point_fields"]
-    return target.write(
-        projected.points,
-        settings,
-        inputs=_files(image=image) | {"scan": projected.record},
-        notes=projected.notes,
-        rgb=rgb,
-    )
+    inputs, notes = {"image": image, "scan": projected.record}, projected.notes
+    return target.write("project", projected.points, settings, inputs=inputs, notes=notes, rgb=rgb)
 
 
 def sample_depth(
@@ -170,7 +177,7 @@ def sample_depth(
         noise: Added to the points; None for none.
         image: For the patterns that need one.
         seed: Of all random choices.
-        **reading: `scale` and `channel` of `read_depth`.
+        **reading: Options of `read_depth`.
     """
     target.check((depth, image))
     noise = noise or SampleNoise()
@@ -183,8 +190,8 @@ def sample_depth(
         notes.append(f"warning: the image has {sampled:,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, f'{pattern.kind}, seed {seed}')}")
     settings = {"pattern": asdict(pattern), "noise": asdict(noise), "seed": seed}
-    inputs = _files(depth=depth, image=image)
-    return target.write(points, {"command": "sample", **settings}, inputs=inputs, notes=notes)
+    inputs = {"depth": depth, "image": image}
+    return target.write("sample", points, settings, inputs=inputs, notes=notes)
 
 
 def simulate_scan(
@@ -209,7 +216,7 @@ def simulate_scan(
         position: Of the scanner: metres right of, below and in front of the camera as X,Y,Z, or
             `AT_CALIBRATION`. None: at the camera.
         seed: Of all noise.
-        **reading: `scale` and `channel` of `read_depth`.
+        **reading: Options of `read_depth`.
     """
     sensor = find_sensor(spec)
     target.check((depth, calib, Path(spec.partition(",")[0])))
@@ -220,14 +227,14 @@ def simulate_scan(
     points = simulate_lidar(dense, eye, sensor, seed)
     notes.append(f"sparse: {describe_range(points.depth, f'{sensor.name}, seed {seed}')}")
     settings = {
-        "command": "simulate",
         "sensor": plain(asdict(sensor)),
         "rotation": eye.rotation.tolist(),
         "translation": eye.translation.tolist(),
         "seed": seed,
     }
-    named = {"calibration": {"path": str(calib), "read_as": calibration.source}}
-    return target.write(points, settings, inputs=_files(depth=depth) | named, notes=notes)
+    read_as = {"path": str(calib), "read_as": calibration.source}
+    inputs = {"depth": depth, "calibration": read_as}
+    return target.write("simulate", points, settings, inputs=inputs, notes=notes)
 
 
 def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
@@ -238,20 +245,6 @@ def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
     )
     unlikely = implausible(dense.values, dense.scale)
     return dense.values, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
-
-
-def read_pattern(text: str, count: str | None) -> SamplePattern:
-    """Returns the pattern of `uniform` and `500` or `5%`, or of `region:X,Y,W,H`."""
-    kind, colon, rectangle = text.partition(":")
-    number, fraction = (None, None) if count is None else count_or_fraction(count)
-    region = None
-    if colon:
-        try:
-            left, top, width, height = (int(word) for word in rectangle.split(","))
-        except ValueError:
-            raise UsageError(f"pattern {text!r} is not of the form region:X,Y,W,H") from None
-        region = left, top, width, height
-    return SamplePattern(kind=kind, count=number, fraction=fraction, region=region)
 
 
 def read_noise(text: str | None) -> SampleNoise:
@@ -315,12 +308,3 @@ def _placed(path: Path, calibration: Calibration, position: str | None) -> Camer
     if metres.shape != (3,) or not np.isfinite(metres).all():
         raise UsageError(f"--position must be X,Y,Z in metres or calib, got {position!r}")
     return replace(camera, rotation=FORWARD_LEFT_UP, translation=metres)
-
-
-def _files(**paths: Path | None) -> dict[str, Any]:
-    """Path and digest of the files that are given."""
-    return {
-        name: {"path": str(path), "sha256": sha256_of(path)}
-        for name, path in paths.items()
-        if path is not None
-    }

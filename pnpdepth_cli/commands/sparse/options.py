@@ -24,6 +24,7 @@ class ScanOptions:
     extrinsics: Path | None = option(
         None,
         "Pose of the scanner in the camera's frame: matrix, quaternion or tf.",
+        within="--scan",
         metavar="FILE",
     )
     inverse_extrinsics: bool = option(

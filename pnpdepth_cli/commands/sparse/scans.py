@@ -10,56 +10,48 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.commands.sparse.options import METRES, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
-from pnpdepth_cli.io.depth import describe_range
+from pnpdepth_cli.io.depth import DepthKind, describe_range
 from pnpdepth_cli.io.extrinsics import inverse, read_extrinsics
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors import Camera, Points, describe_dropped, edge_agreement, project_velodyne
+from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.sensors import Camera, describe_dropped, edge_agreement, project_velodyne
 
-_MORE_IF_INVERTED = 3.0
-"""Times as many points in the image with inverted extrinsics that give a warning."""
-
-_NEXT_TO_NONE = 0.05
-"""Fraction of them; fewer points with the extrinsics themselves are an error."""
-
-_THIN = 0.5
-"""Largest variance of a scan's rays along its thin direction, as a fraction of the next."""
-
-_AHEAD_DEG = 15.0
-"""Largest angle to the camera's axis of points that are expected in the image,"""
-
-_MOST_OUTSIDE = 1 / 3
-"""of which a larger fraction outside gives a warning."""
-
-_OFF_CENTRE = 0.15
-"""Fraction of the image's side by which a principal point may be off centre without warning."""
-
-_CLEARLY_BETTER = 0.03
-"""Difference of `edge_agreement` by which another camera is preferred to the one that is named."""
-
-_FEW_INSIDE = 0.5
-"""Of the most points that a camera puts into the image; fewer rule it out."""
-
-_ONE_DIRECTION = ("KITTI", "nuScenes", "DDAD")
-"""Sources of calibrations whose files give the pose in one direction."""
+_MORE_IF_INVERTED = 3.0  # times as many points in the image with inverted extrinsics: a warning
+_NEXT_TO_NONE = 0.05  # of them; fewer points with the extrinsics themselves are an error
+_THIN = 0.5  # largest variance of a scan's rays along its thin direction, of the next
+_AHEAD_DEG = 15.0  # angle to the camera's axis below which points are expected in the image
+_MOST_OUTSIDE = 1 / 3  # of these points; more outside the image give a warning
+_OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
+_CLEARLY_BETTER = 0.03  # in `edge_agreement`, of a camera that replaces the one that is named
+_FEW_INSIDE = 0.5  # of the most points in the image; a camera with fewer is ruled out
+_ONE_DIRECTION = ("KITTI", "nuScenes", "DDAD")  # whose calibrations give one direction of the pose
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScanPoints:
-    """A projected scan."""
+class SparseDepth:
+    """The sparse depth of a frame, as it was read."""
 
-    points: Points
-    camera: Camera
-    """With the pose of the scanner."""
+    points: SparsePoints[Any]
+    """In the image, as arrays of either library."""
     record: dict[str, Any]
     """What a record keeps of it."""
     notes: tuple[str, ...]
     """Lines for a person."""
+    scale: float | None = None
+    """Integers per unit of depth in its file. None: it holds no integers."""
+    kind: DepthKind | None = None
+    """Of a depth map."""
+    unit: str = METRES
+    camera: Camera | None = None
+    """The camera of the whole image, where it came with the points."""
+    camera_source: str = ""
+    pose: NDArray[np.float64] | None = None
+    """(3, 4) from the camera's frame to the world's, in `unit`. None: unknown."""
 
 
 def read_scan_points(
@@ -68,7 +60,7 @@ def read_scan_points(
     size: tuple[int, int] | None,
     image: Path | None = None,
     calibration: Calibration | None = None,
-) -> ScanPoints:
+) -> SparseDepth:
     """Returns the points of a scan that are visible in an image.
 
     Args:
@@ -90,23 +82,29 @@ def read_scan_points(
             f"{path} is a scan, which needs --calib: a calibration file, or KITTI's raw folder"
         )
     named = options.calib or Path(calibration.source)
-    calibration = with_extrinsics(calibration, options)
+    if options.extrinsics is not None:
+        rotation, translation = read_extrinsics(options.extrinsics)
+        calibration = _with_pose(calibration, rotation, translation)
     if not calibration.has_pose:
         raise UsageError(
             f"{named} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or"
-            " give --extrinsics"
+            " give --scan extrinsics=FILE"
         )
+    if options.inverse_extrinsics:
+        pose = inverse((calibration.rotation, calibration.translation))
+        calibration = _with_pose(calibration, *pose)
     size = size or calibration.size
     if size is None:
         raise SizeError(f"{named} does not give the image's size; give the image too")
-    notes = check_size(named, calibration, size, image)
+    warnings = check_size(named, calibration, size, image)
     scan = read_scan(path, options.point_fields)
-    if calibration.rectified and image is not None:
-        calibration, note = chosen_camera(calibration, [(read_rgb(image).values, scan.points)])
-        notes.append(note)
+    if calibration.rectified:
+        frames = [] if image is None else [(read_rgb(image).values, scan.points)]
+        calibration, note = chosen_camera(calibration, frames)
+        warnings.append(note)
     camera = camera_of(calibration)
     if not calibration.source.startswith(_ONE_DIRECTION):
-        notes += check_direction(scan.points, camera, size)
+        warnings += check_direction(scan.points, camera, size)
     points = project_velodyne(
         scan.points,
         camera,
@@ -115,14 +113,15 @@ def read_scan_points(
         limits=(options.min_range, np.inf if options.max_range is None else options.max_range),
         keep_occluded=options.keep_occluded,
     )
-    notes += check_field_of_view(scan.points, camera, size)
+    warnings += _outside_warning(scan.points, camera, size)
     source = f"{scan.source} of {len(scan.points):,} points, {calibration.source}"
-    lost = describe_dropped(points.dropped)
-    lines = [f"sparse: {describe_range(points.depth, source)}"]
-    lines += [f"sparse: dropped {lost}"] if lost else []
-    return ScanPoints(
+    notes = [f"sparse: {describe_range(points.depth, source)}"]
+    if lost := describe_dropped(points.dropped):
+        notes.append(f"sparse: dropped {lost}")
+    return SparseDepth(
         points=points,
         camera=camera,
+        camera_source=f"calibration of {path.name}",
         record={
             "path": str(path),
             "sha256": sha256_of(path),
@@ -137,7 +136,7 @@ def read_scan_points(
             "keep_occluded": options.keep_occluded,
             "dropped": dict(points.dropped),
         },
-        notes=(*lines, *notes),
+        notes=(*notes, *warnings),
     )
 
 
@@ -158,12 +157,21 @@ def chosen_camera(
         topic: Of the images, where it is known.
     """
     named = "image_rect" in topic
-    cameras = {name: _posed(camera, raw) for name, camera in raw.rectified.items()}
+    cameras = {
+        name: _with_pose(
+            camera,
+            camera.rotation @ raw.rotation,
+            camera.rotation @ raw.translation + camera.translation,
+            has_pose=raw.has_pose,
+        )
+        for name, camera in raw.rectified.items()
+    }
     candidates = cameras if named else {"K and distortion": raw} | cameras
     scores = _scores(frames, candidates) if raw.has_pose and len(candidates) > 1 else {}
-    first = next(iter(candidates))
+    choice = first = next(iter(candidates))
     best = max(scores, key=lambda name: scores[name], default=first)
-    choice = best if scores.get(best, 0) - scores.get(first, 0) > _CLEARLY_BETTER else first
+    if best != first and scores[best] - scores[first] > _CLEARLY_BETTER:
+        choice = best
     why = f"the topic {topic}" if named else "the usual meaning of camera_info"
     if scores and (choice != first or not named):
         compared = ", ".join(f"{name} {score:+.2f}" for name, score in scores.items())
@@ -173,14 +181,14 @@ def chosen_camera(
     return candidates[choice], note
 
 
-def _posed(camera: Calibration, raw: Calibration) -> Calibration:
-    """The camera with the pose of the scanner, which is given relative to the raw camera."""
-    return replace(
-        camera,
-        rotation=camera.rotation @ raw.rotation,
-        translation=camera.rotation @ raw.translation + camera.translation,
-        has_pose=raw.has_pose,
-    )
+def _with_pose(
+    camera: Calibration,
+    rotation: NDArray[np.float64],
+    translation: NDArray[np.float64],
+    *,
+    has_pose: bool = True,
+) -> Calibration:
+    return replace(camera, rotation=rotation, translation=translation, has_pose=has_pose)
 
 
 def _scores(
@@ -200,19 +208,10 @@ def _scores(
             agreement[name].append(edge_agreement(points, rgb))
     few = _FEW_INSIDE * max(counts.values())
     return {
-        name: float(np.mean(values)) if values and counts[name] >= few else -1.0
+        name: float(np.mean(values)) if counts[name] >= few else -1.0
         for name, values in agreement.items()
+        if any(counts.values())
     }
-
-
-def with_extrinsics(calibration: Calibration, options: ScanOptions) -> Calibration:
-    """Returns the calibration with the pose of the scanner that the options name, if any."""
-    pose = calibration.rotation, calibration.translation
-    if options.extrinsics is not None:
-        pose = read_extrinsics(options.extrinsics)
-    rotation, translation = inverse(pose) if options.inverse_extrinsics else pose
-    has_pose = calibration.has_pose or options.extrinsics is not None
-    return replace(calibration, rotation=rotation, translation=translation, has_pose=has_pose)
 
 
 def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]) -> list[str]:
@@ -226,7 +225,11 @@ def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int,
     """
     rotation, translation = inverse((camera.rotation, camera.translation))
     turned = replace(camera, rotation=rotation, translation=translation)
-    inside, inverted = (_count_inside(scan, each, size) for each in (camera, turned))
+    seen = (eye.from_scanner(scan) for eye in (camera, turned))
+    inside, inverted = (
+        int(np.count_nonzero(in_frame(eye.pixels_of(xyz[xyz[:, 2] > 0]), size)))
+        for eye, xyz in zip((camera, turned), seen, strict=True)
+    )
     upright, upright_inverted = _is_upright(scan, camera), _is_upright(scan, turned)
     far_more = inverted >= _MORE_IF_INVERTED * max(inside, 1) and upright is not True
     if not far_more and not (inverted > inside and upright is False and upright_inverted):
@@ -240,10 +243,10 @@ def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int,
     return [f"warning: {text}"]
 
 
-def check_field_of_view(
+def _outside_warning(
     scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]
 ) -> list[str]:
-    """Returns a warning if many points straight ahead of the camera are outside the image."""
+    """A warning if many points straight ahead of the camera are outside the image."""
     seen = camera.from_scanner(scan)
     off_axis = np.hypot(seen[:, 0], seen[:, 1])
     ahead = seen[off_axis < np.tan(np.radians(_AHEAD_DEG)) * seen[:, 2]]
@@ -264,12 +267,6 @@ def _is_upright(scan: NDArray[np.floating], camera: Camera) -> bool | None:
     if variances[0] > _THIN * variances[1]:
         return None
     return bool(np.argmax(np.abs(camera.rotation @ axes[:, 0])) == 1)
-
-
-def _count_inside(scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]) -> int:
-    seen = camera.from_scanner(scan)
-    xy = camera.pixels_of(seen[seen[:, 2] > 0])
-    return int(np.count_nonzero(in_frame(xy, size)))
 
 
 def camera_of(calibration: Calibration) -> Camera:

@@ -97,7 +97,7 @@ class Sampling:
                 f"sensor {self.sensor!r} needs a number of points: {self.sensor}:500, or --sample"
                 " 500, or --vary points=100,500"
             )
-        return sample_pattern(self.sensor, *count_or_fraction(self.points))
+        return sample_pattern(self.sensor, self.points)
 
     def record(self) -> dict[str, Any]:
         """Returns all that decides the points except the frame and the seed."""
@@ -206,7 +206,7 @@ def _thinned(points: Points, wanted: str | None, rng: np.random.Generator) -> Po
     if wanted is None:
         return points
     available = len(points.depth)
-    number = sample_pattern("uniform", *count_or_fraction(wanted)).wanted(available)
+    number = sample_pattern("uniform", wanted).wanted(available)
     if number > available:
         raise InputError(
             f"{number:,} points of {available:,}; ask for fewer, or draw them from the ground truth"

@@ -16,8 +16,7 @@ from pnpdepth_cli.commands.batch.records import model_identity, settings_of
 from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.running import read_frame, reference_frames
 from pnpdepth_cli.commands.refinement.inputs import Inputs
-from pnpdepth_cli.commands.refinement.record import model_record
-from pnpdepth_cli.commands.refinement.refine import load_refiner
+from pnpdepth_cli.commands.refinement.refine import load_refiner, model_record
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.sweep.axes import Cell, Study, values_of
 from pnpdepth_cli.commands.sweep.outputs import (
@@ -307,7 +306,7 @@ def _network(
     else:
         raise errors[0]
 
-    def others(_: Inputs) -> list[Inputs]:
+    def others() -> list[Inputs]:
         """Further frames, which decide the input range as well; errors are reported later."""
         found = []
         for other in reference_frames(tasks, len(errors)):

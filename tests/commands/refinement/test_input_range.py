@@ -31,10 +31,6 @@ def test_0_to_1_is_kept_unless_clearly_beaten(
     assert chosen_input_range(errors) == expected
 
 
-MISLEADING, OTHER = 3.0, 2.0
-"""Error of 0…1 over that of ImageNet's range, on the first frame and on the others."""
-
-
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Frames that ranges are compared on, by the range; the first one misleads."""
@@ -54,27 +50,24 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return counted
 
 
-def open_range(root: Path) -> Path:
-    """The frames' network without an input range."""
+def settings_and_notes(root: Path) -> tuple[str, str]:
+    """The input range of a batch whose network states none, and the notes on it."""
     model = root / "net" / "my_net.py"
     model.write_text(model.read_text().replace("build=Net", "build=Net, normalisation=None"))
-    return root
+    batch(root)
+    record = json.loads((root / "out" / "a.json").read_text())
+    return record["settings"]["normalise"], " ".join(record["notes"])
 
 
 def test_a_batch_compares_input_ranges_on_three_frames(tmp_path: Path, seen: Counter[str]) -> None:
-    root = open_range(pairs_on_disk(tmp_path / "drive"))
-    batch(root)
+    chosen, notes = settings_and_notes(pairs_on_disk(tmp_path / "drive"))
     assert set(seen.values()) == {3}
-    record = json.loads((root / "out" / "a.json").read_text())
-    assert record["settings"]["normalise"] == "unit"
-    assert any("mean of 3 frames" in note for note in record["notes"])
+    assert chosen == "unit"
+    assert "mean of 3 frames" in notes
 
 
 def test_a_single_frame_decides_alone(tmp_path: Path, seen: Counter[str]) -> None:
-    root = open_range(pairs_on_disk(tmp_path / "drive", ("a",)))
-    batch(root)
-    record = json.loads((root / "out" / "a.json").read_text())
-    assert record["settings"]["normalise"] == "imagenet"
+    assert settings_and_notes(pairs_on_disk(tmp_path / "drive", ("a",)))[0] == "imagenet"
 
 
 def test_a_stated_range_needs_no_further_frame(tmp_path: Path, seen: Counter[str]) -> None:
@@ -95,7 +88,4 @@ def test_a_frame_without_points_in_view_does_not_count(
         return 0.1 if network.definition.normalisation == NORMALISATIONS["unit"] else 0.3
 
     monkeypatch.setattr(resolve, "_alignment_error", error)
-    root = open_range(pairs_on_disk(tmp_path / "drive"))
-    batch(root)
-    notes = json.loads((root / "out" / "a.json").read_text())["notes"]
-    assert any("unit 10.0%" in note for note in notes)
+    assert "unit 10.0%" in settings_and_notes(pairs_on_disk(tmp_path / "drive"))[1]

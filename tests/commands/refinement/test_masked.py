@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -32,18 +34,13 @@ def test_masked_points_change_the_depth_and_are_recorded(frame: FrameOnDisk) -> 
     assert record["scores"]["before"] != record["scores"]["after"]
 
 
-def test_the_same_seed_gives_the_same_bytes(frame: FrameOnDisk) -> None:
-    results, losses = [], []
-    for seed in (1, 1, 2):
-        losses.append(run(frame, seed=seed, overwrite=True, **MASKED).record["loss"])
-        results.append(depth_bytes(frame))
-    assert results[0] == results[1]
-    assert losses[0] == losses[1] != losses[2]
-
-
-def test_the_steps_may_see_a_reduced_image(frame: FrameOnDisk) -> None:
-    losses = [run(frame, mask_scale=s, overwrite=True, **MASKED).record["loss"] for s in (0.5, 1.0)]
-    assert losses[0] != losses[1]
+def test_the_seed_and_the_scale_of_the_image_decide_the_steps(frame: FrameOnDisk) -> None:
+    first, again, other, whole = (
+        (run(frame, overwrite=True, **MASKED, **asked).record["loss"], depth_bytes(frame))
+        for asked in ({"seed": 1}, {"seed": 1}, {"seed": 2}, {"seed": 1, "mask_scale": 1.0})
+    )
+    assert first == again
+    assert first[0] not in (other[0], whole[0])
 
 
 def test_no_iterations_give_the_plain_depth(frame: FrameOnDisk) -> None:
@@ -84,6 +81,7 @@ def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> 
         ({"mask_fraction": 1.0}, "mask-fraction must be between 0 and 1, got 1.0"),
         ({"mask_scale": 1.5}, "mask-scale must be above 0 and at most 1"),
         ({"target": "given", "mask": "lines"}, "--set mask is for points hidden"),
+        ({"model": "eigen-tiny"}, "takes no sparse depth"),
     ],
 )
 def test_what_does_not_go_together_is_refused(
@@ -93,33 +91,27 @@ def test_what_does_not_go_together_is_refused(
         run(frame, **MASKED | wrong)
 
 
-def test_points_cannot_be_hidden_from_a_network_of_images(frame: FrameOnDisk) -> None:
-    with pytest.raises(UsageError, match="takes no sparse depth"):
-        run(frame, target="masked")
-
-
-def test_dense_points_have_defaults_of_their_own(frame: FrameOnDisk) -> None:
-    definition = load_network("compact").definition
-    method = Settings(target="masked")
-    settings = resolve_settings(definition, method, dense=True)
-    assert (settings.iterations, settings.lr, settings.mask_scale) == (6, 3e-4, 0.5)
-    assert run(frame, **MASKED | {"iterations": None}).record["settings"]["lr"] == 3e-4
-
-
-@pytest.mark.parametrize(("dense", "expected"), [(False, (16, 5e-4)), (True, (8, 2e-4))])
-def test_weights_moved_by_given_points_keep_their_defaults(
-    dense: bool, expected: tuple[int, float]
+@pytest.mark.parametrize(
+    ("asked", "dense", "iterations", "lr", "mask_scale"),
+    [
+        ({"target": "masked"}, True, 6, 3e-4, 0.5),
+        ({"parameters": "weights"}, False, 16, 5e-4, 1.0),
+        ({"parameters": "weights"}, True, 8, 2e-4, 1.0),
+    ],
+)
+def test_dense_and_sparse_points_have_defaults_of_their_own(
+    asked: dict[str, Any], dense: bool, iterations: int, lr: float, mask_scale: float
 ) -> None:
     definition = load_network("compact").definition
-    settings = resolve_settings(definition, Settings(parameters="weights"), dense=dense)
-    assert (settings.iterations, settings.lr) == expected
-    assert (settings.update, settings.schedule, settings.loss) == ("adam", "cosine", "log")
-    assert (settings.target, settings.mask_scale) == ("given", 1.0)
+    settings = resolve_settings(definition, Settings(seed=5, **asked), dense=dense)
+    assert (settings.iterations, settings.lr, settings.seed) == (iterations, lr, 5)
+    assert (settings.mask_scale, settings.loss) == (mask_scale, "log")
+    update = ("adam-short", "linear") if "target" in asked else ("adam", "cosine")
+    assert (settings.update, settings.schedule) == update
 
 
-def test_seed_and_budget_reach_the_settings() -> None:
+def test_a_budget_is_of_hidden_points_only() -> None:
     definition = load_network("compact").definition
-    asked = Settings(target="masked", seed=5, time_budget_s=2.0)
-    settings = resolve_settings(definition, asked)
-    assert (settings.seed, settings.time_budget_s) == (5, 2.0)
-    assert resolve_settings(definition, Settings()).time_budget_s is None
+    asked = Settings(target="masked", time_budget_s=2.0)
+    assert resolve_settings(definition, asked).time_budget_s == 2.0
+    assert resolve_settings(definition, Settings(time_budget_s=2.0)).time_budget_s is None

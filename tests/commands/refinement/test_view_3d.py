@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from pnpdepth_cli.commands.refinement.view_3d import LARGEST_VIEW, _rays, _stride
+from pnpdepth_cli.commands.refinement.outputs import LARGEST_VIEW, _rays, _stride
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.camera import Camera

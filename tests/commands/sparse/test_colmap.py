@@ -108,29 +108,38 @@ def test_points_of_a_real_model_project_onto_their_keypoints() -> None:
         assert off.max() < 0.01
 
 
-def test_depth_is_in_model_units_in_every_output(tmp_path: Path, project: Path) -> None:
-    record = refine(frame_on_disk(tmp_path), project)
-    assert record["unit"] == "model units"
-    assert 3.4 < record["points"]["nearest"] < record["points"]["farthest"] < 4.6
-    assert any("model units (COLMAP model, image a.png" in note for note in record["notes"])
-    written = read_depth(tmp_path / "out" / "a_depth.png")
-    assert written.scale not in (None, 256)
-    assert np.log2(written.scale) % 1 == 0
-
-
-def test_a_unit_scale_makes_it_metres(tmp_path: Path, project: Path) -> None:
-    record = refine(frame_on_disk(tmp_path), project, colmap=ColmapOptions(unit_scale=0.5))
-    assert record["unit"] == "m"
-    assert 1.7 < record["points"]["nearest"] < record["points"]["farthest"] < 2.3
-    assert read_depth(tmp_path / "out" / "a_depth.png").scale == 256
-
-
-def test_ground_truth_in_metres_is_not_compared_with_model_units(
-    tmp_path: Path, project: Path
+@pytest.mark.parametrize(
+    ("unit_scale", "unit", "factor", "align"),
+    [(None, "model units", 1.0, "scale"), (0.5, "m", 0.5, "none")],
+)
+def test_depth_is_in_model_units_or_with_a_scale_in_metres(
+    unit_scale: float | None,
+    unit: str,
+    factor: float,
+    align: str,
+    tmp_path: Path,
+    project: Path,
 ) -> None:
+    colmap = ColmapOptions(unit_scale=unit_scale)
+    record = refine(frame_on_disk(tmp_path), project, colmap=colmap)
+    assert (record["unit"], record["settings"]["align"]) == (unit, align)
+    nearest, farthest = (record["points"][name] / factor for name in ("nearest", "farthest"))
+    assert 3.4 < nearest < farthest < 4.6
+    described = "model units (COLMAP model, image a.png"
+    assert any(described in note for note in record["notes"]) == (unit_scale is None)
+    scale = read_depth(tmp_path / "out" / "a_depth.png").scale
+    assert (scale == 256) == (unit_scale is not None)
+    assert np.log2(scale) % 1 == 0
+
+
+def test_what_does_not_fit_a_model_is_refused(tmp_path: Path, project: Path) -> None:
     frame = frame_on_disk(tmp_path, HEIGHT, WIDTH)
     with pytest.raises(UsageError, match="in metres but the sparse depth in model units; give"):
         refine(frame, project, gt=frame.gt)
+    with pytest.raises(UsageError, match=r"s\.png is no COLMAP model, so --colmap"):
+        run(frame, colmap=ColmapOptions(unit_scale=1.0))
+    with pytest.raises(NoPointsError, match="relax --colmap min-track or max-reprojection"):
+        read(project, max_reprojection=0.1)
 
 
 def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) -> None:
@@ -142,15 +151,12 @@ def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) ->
     kept = read(project, min_track=2, max_reprojection=3).points
     assert kept.dropped["seen in fewer than 2 images"] == 0
     assert len(kept) >= len(points)
-
-
-def test_a_model_of_two_images_is_not_asked_for_tracks_of_three(tmp_path: Path) -> None:
-    write_text_model(tmp_path, names=("a.png", "b.png"))
-    options = ColmapOptions()
-    points = read_colmap_points(
-        tmp_path, options, Path("a.png"), (HEIGHT, WIDTH), any_size=False
+    write_text_model(project / "two", names=("a.png", "b.png"))  # not asked for tracks of three
+    size = (HEIGHT, WIDTH)
+    pair = read_colmap_points(
+        project / "two", ColmapOptions(), Path("a.png"), size, any_size=False
     ).points
-    assert points.dropped["seen in fewer than 2 images"] == 0
+    assert pair.dropped["seen in fewer than 2 images"] == 0
 
 
 def test_points_behind_the_camera_are_counted_and_a_model_of_nothing_else_refused(
@@ -172,11 +178,6 @@ def test_a_pose_with_one_number_that_is_none_is_refused(project: Path, position:
     change(project, "images.txt", f"1 {' '.join(pose)} 1 a.png", f"1 {damaged} 1 a.png")
     with pytest.raises(FileFormatError, match=r"the pose of 'a\.png' is not made of finite"):
         read(project)
-
-
-def test_an_image_without_points_left_is_one_line(project: Path) -> None:
-    with pytest.raises(NoPointsError, match="relax --colmap min-track or max-reprojection"):
-        read(project, max_reprojection=0.1)
 
 
 def test_images_of_mixed_cameras_have_each_their_own(project: Path) -> None:
@@ -221,17 +222,3 @@ def test_the_largest_of_several_models_is_used(project: Path) -> None:
     listing = list_frames(project)[1]
     assert [each.name for each in listing.frames] == ["a", "b", "c"]
     assert any("another model, of 1 images" in str(each) for each in listing.spare)
-
-
-def test_a_network_of_metres_is_scaled_to_model_units(tmp_path: Path, project: Path) -> None:
-    frame = frame_on_disk(tmp_path)
-    assert refine(frame, project)["settings"]["align"] == "scale"
-    record = refine(
-        frame, project, colmap=ColmapOptions(unit_scale=1.0), output=tmp_path / "metres"
-    )
-    assert record["settings"]["align"] == "none"
-
-
-def test_options_of_a_model_are_refused_for_other_sparse_depth(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"s\.png is no COLMAP model, so --colmap"):
-        run(frame_on_disk(tmp_path), colmap=ColmapOptions(unit_scale=1.0))

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rosbags")
 
+from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.commands.sparse.scans import read_scan_points
 from pnpdepth_cli.io.calibration import read_calibration
@@ -77,28 +78,25 @@ def pixel_error(folder: Path, intrinsics: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(points.xy - at[:, :2] / at[:, 2:], axis=1).mean())
 
 
-def test_images_of_a_rectified_topic_are_projected_by_p(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "a.mcap", view=view(rectified=True, topic="/front/image_rect_color"))
-    messages = written(bag, tmp_path / "frames")
-    assert any("rectified images, by P (the topic /front/image_rect_color)" in m for m in messages)
-    calibration = read_calibration(tmp_path / "frames" / "calib.txt")
-    np.testing.assert_array_equal(calibration.intrinsics, RECTIFIED)
-    assert calibration.distortion == ()
-    assert pixel_error(tmp_path / "frames", RECTIFIED) < 1e-3
-
-
-@pytest.mark.parametrize("rectified", [True, False])
-def test_where_the_topic_does_not_say_the_edges_of_the_images_do(
-    rectified: bool, tmp_path: Path
+@pytest.mark.parametrize(
+    ("rectified", "topic", "said"),
+    [
+        (True, "/front/image_rect_color", "rectified images, by P (the topic /front/image_rect_"),
+        (True, "/front/image_raw", "rectified images, by P (image edges at jumps of depth: K and"),
+        (False, "/front/image_raw", "raw images, by K and distortion (image edges at jumps of"),
+    ],
+)
+def test_images_of_a_bag_are_rectified_by_their_topic_or_else_by_their_edges(
+    rectified: bool, topic: str, said: str, tmp_path: Path
 ) -> None:
-    bag = write_bag(tmp_path / "a.mcap", view=view(rectified=rectified, topic="/front/image_raw"))
-    messages = written(bag, tmp_path / "frames")
-    (camera,) = (text for text in messages if text.startswith("camera:"))
-    assert ("rectified images, by P (" if rectified else "raw images, by K and") in camera
-    assert "image edges at jumps of depth: K and distortion" in camera
+    bag = write_bag(tmp_path / "a.mcap", view=view(rectified=rectified, topic=topic))
+    (camera,) = (m for m in written(bag, tmp_path / "frames") if m.startswith("camera:"))
+    assert said in camera
     calibration = read_calibration(tmp_path / "frames" / "calib.txt")
     np.testing.assert_array_equal(calibration.intrinsics, RECTIFIED if rectified else K)
     assert calibration.distortion == (() if rectified else tuple(D))
+    if rectified:
+        assert pixel_error(tmp_path / "frames", RECTIFIED) < 1e-3
 
 
 @pytest.mark.parametrize("to_rectified", [True, False])
@@ -128,11 +126,18 @@ def test_a_camera_info_file_is_used_for_the_image_that_is_projected_onto(
     info |= {"p": seen.p.ravel().tolist(), "r": [0.0] * 9, "T_camera_lidar": pose.ravel().tolist()}
     calib = tmp_path / "camera_info.yaml"
     calib.write_text("".join(f"{name}: {value}\n" for name, value in info.items()))
-    read = read_scan_points(scan, ScanOptions(calib=calib), SIZE, image)
-    expected = RECTIFIED if rectified else K
-    np.testing.assert_array_equal(read.camera.intrinsics, expected)
-    assert read.camera.has_lens is not rectified
-    assert any(note.startswith("camera: rectified") == rectified for note in read.notes[-1:])
+    options, target = ScanOptions(calib=calib), SparseTarget(output=tmp_path / "s.csv")
+    record = project_scan(scan, options, target, image=image)
+    (note,) = (note for note in record["notes"] if note.startswith("camera:"))
+    assert note.startswith(
+        f"camera: {'rectified images, by P' if rectified else 'raw images, by K'}"
+    )
+    camera = read_scan_points(scan, options, SIZE, image).camera
+    np.testing.assert_array_equal(camera.intrinsics, RECTIFIED if rectified else K)
+    assert camera.has_lens is not rectified
+    blind = read_scan_points(scan, options, SIZE)  # without the image, raw is said to be assumed
+    np.testing.assert_array_equal(blind.camera.intrinsics, K)
+    assert any(note.startswith("camera: raw images, by K") for note in blind.notes)
 
 
 def test_a_calibration_replaces_that_of_the_bag(tmp_path: Path) -> None:

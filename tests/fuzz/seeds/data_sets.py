@@ -58,7 +58,15 @@ def _colmap(folder: Path, image: bytes) -> list[Seed]:
         for suffix in ("txt", "bin")
     )
     network = ("--model", "fcrn-tiny", "--propagate", "none", "--iterations", "1")
-    refine = ("refine", "photos/images/a.png", "--sparse", "model", "--sparse-size-ok", *network)
+    refine = (
+        "refine",
+        "photos/images/a.png",
+        "--sparse",
+        "model",
+        "--set",
+        "sparse-size-ok",
+        *network,
+    )
     return [
         *_indices(*(f"photos/{name}" for name in text), *(f"binary/{name}" for name in binary)),
         *(

@@ -109,7 +109,7 @@ MAKERS: dict[str, tuple[Maker, list[str]]] = {
 
 def inputs_of(frame: Frame, root: Path) -> Inputs:
     """The frame as a batch reads it; points are sampled where it has none."""
-    pattern = None if frame.sparse is not None else sample_pattern("uniform", 20, None)
+    pattern = None if frame.sparse is not None else sample_pattern("uniform", "20")
     refine = RefineRequest.from_fields(sample=pattern)
     request = BatchRequest(source=root, output=root / "out", refine=refine)
     return read_inputs(task_of(request, frame).request)

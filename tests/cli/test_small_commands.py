@@ -1,0 +1,115 @@
+"""`cloud`, `export`, `models` and `doctor` from the command line."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from pnpdepth_cli.cli.cloud import cloud
+from pnpdepth_cli.cli.export import export
+from pnpdepth_cli.cli.main import cli
+from pnpdepth_cli.commands import doctor
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.sensors.cloud import EDGE
+from tests.cli.test_commands import code_of
+from tests.commands.test_export import project, results
+
+
+def test_the_points_of_a_cloud_are_counted_and_the_camera_is_reported(tmp_path: Path) -> None:
+    write_depth(tmp_path / "d.exr", np.full((24, 32), 2, np.float32))
+    arguments = ["cloud", str(tmp_path / "d.exr"), "--fov", "60", "-o", str(tmp_path / "d.ply")]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    assert "wrote 768 points, without colours (no image is known)" in result.stdout
+    assert "camera: 27.7 pixels of focal length" in result.stderr
+    result = CliRunner().invoke(cli, [*arguments, "--overwrite", "--json"])
+    assert json.loads(result.stdout)["points"] == 768
+    assert next(option for option in cloud.params if option.name == "edge").default == EDGE
+
+
+def test_exported_frames_are_counted_and_warnings_go_to_stderr(tmp_path: Path) -> None:
+    folder = results(project(tmp_path, "OPENCV"))
+    arguments = ["export", str(folder), "--to", "colmap", "-o", str(tmp_path / "dense")]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    assert result.stdout == f"wrote 3 frames in model units: {tmp_path / 'dense'}\n"
+    assert "3 of 3 images have lens distortion" in result.stderr
+    result = CliRunner().invoke(cli, [*arguments, "--overwrite", "--json"])
+    record = json.loads(result.stdout)
+    assert record == json.loads((tmp_path / "dense" / "export_colmap.json").read_text())
+
+
+def test_every_export_is_explained_in_the_help() -> None:
+    text = CliRunner().invoke(cli, ["export", "--help"]).stdout
+    for name in next(each for each in export.params if each.name == "to").type.choices:  # type: ignore[attr-defined]
+        assert f"  {name} " in text
+
+
+def test_networks_are_listed_without_a_subcommand_and_variants_only_if_asked(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert code_of(["models", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    (compact,) = (model for model in listed if model["name"] == "compact")
+    assert compact["input_kind"] == "rgb+sparse"
+    assert compact["layer"] in compact["layers"]
+    for arguments, shown in ((["models", "list"], False), (["models", "--all"], True)):
+        assert code_of(arguments) == 0
+        out, err = capsys.readouterr()
+        assert ("sparse2dense-r18-deconv2-d-kitti" in out) == shown
+        assert ("sparse2dense: 48 more" in err) != shown
+        assert "sparse2dense-tiny" in out
+    assert code_of(["models", "--check", "net.onnx"]) == 2
+
+
+def test_fetch_offline_is_an_error_of_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub = pytest.importorskip("huggingface_hub", reason="needs the extra [hf]")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise ConnectionError("no route\nto host")
+
+    monkeypatch.setattr(hub.HfApi, "model_info", refuse)
+    assert code_of(["models", "fetch", "org/name", "-o", str(tmp_path / "name")]) == 4
+    err = capsys.readouterr().err
+    assert "no route to host" in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "name").exists()
+    assert code_of(["models", "fetch", "name"]) == 2
+
+
+def test_doctor_reports_versions_devices_extras_and_a_refined_plane() -> None:
+    result = CliRunner().invoke(cli, ["doctor", "--json"])
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert report["pnpdepth"] == metadata.version("pnpdepth")
+    assert f"torch {metadata.version('torch')}" in report["packages"]
+    assert report["devices"][0].startswith(f"cpu: {torch.get_num_threads()} threads")
+    assert any(line.startswith("onnx: ") for line in report["extras"])
+    assert not any(line.startswith("test: ") for line in report["extras"])
+    plane = r"passed; a plane refined in [\d.]+ s, MAE ([\d.]+) m"
+    error = re.fullmatch(plane, report["self-test"])
+    assert error is not None
+    assert float(error[1]) < 0.02
+
+
+def test_doctor_names_what_is_missing_and_fails_with_the_self_test(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    required = ["torch>=2.4", 'no-such-package>=1; extra == "plot"', 'pytest; extra == "test"']
+    monkeypatch.setattr(metadata, "requires", lambda _: required)
+    monkeypatch.setattr(doctor, "_self_test", lambda: "FAILED: the depth is wrong")
+    report = doctor.examine()
+    assert report["packages"] == [f"torch {metadata.version('torch')}"]
+    assert report["extras"] == ["plot: not installed (no-such-package)"]
+    result = CliRunner().invoke(cli, ["doctor"])
+    assert result.exit_code == 1
+    assert "self-test   FAILED: the depth is wrong" in result.output
