@@ -113,7 +113,7 @@ def paint_signed(
     signed = np.asarray(strength, dtype=np.float32)[..., None]
     amount = np.clip(np.abs(signed), 0, 1)
     base = 255 * np.asarray(light, dtype=np.float32)[..., None]
-    hue = np.where(signed > 0, np.asarray(above), np.asarray(below)).astype(np.float32)
+    hue = np.where(signed > 0, np.asarray(above, np.float32), np.asarray(below, np.float32))
     return np.asarray(np.rint((1 - amount) * base + amount * hue), dtype=np.uint8)
 
 
