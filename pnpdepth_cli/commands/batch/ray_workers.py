@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import chosen_max_pixels, set_max_pixels
 from pnpdepth_cli.commands.batch.frames import task_of
-from pnpdepth_cli.commands.batch.records import Records, Row, remove_all_leftovers
+from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
 from pnpdepth_cli.commands.batch.request import LOCAL, BatchRequest, RayWorkers
+from pnpdepth_cli.commands.batch.summary import Row
 from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
 from pnpdepth_cli.io.dataset.frame import Frame
 from pnpdepth_cli.io.file_bytes import one_line

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from pnpdepth_cli.commands.batch.frames import Task, task_of
-from pnpdepth_cli.commands.batch.records import Records, Row
+from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.summary import Row
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.refine import load_refiner, write_refined
