@@ -13,7 +13,7 @@ from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain
 
-Row = Mapping[str, Any]
+Row = dict[str, Any]
 """What the summary says of a frame."""
 # a file name that is no UTF-8 has surrogates; JSON escapes them so
 TEXT: Any = {"encoding": "utf-8", "errors": "backslashreplace", "newline": "\n"}
