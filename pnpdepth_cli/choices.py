@@ -239,7 +239,7 @@ PREVIEWS = ("all", "worst", "none")
 """Which frames get images of their result; worst: those worse than linear interpolation."""
 
 FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")
-"""What of a frame the paper's experiments use: `pnpdepth_cli.io.dataset.protocols.PROTOCOLS`."""
+"""What of a frame the paper's experiments use: `pnpdepth_cli.io.dataset.PROTOCOLS`."""
 
 PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""

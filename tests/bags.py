@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pnpdepth_cli.io.bags.bag import message_types
+from pnpdepth_cli.io.bags import message_types
 
 HEIGHT, WIDTH, FOCAL_PX = 48, 64, 60.0
 IMAGES, POINTS = "/front/image_raw", "/lidar/points"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.io.colmap.model import MODELS
+from pnpdepth_cli.io.colmap import MODELS
 
 WIDTH, HEIGHT = 64, 48
 _COEFFICIENTS = {

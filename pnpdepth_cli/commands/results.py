@@ -10,7 +10,7 @@ from typing import Any
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset.find_files import find_files
+from pnpdepth_cli.io.dataset import find_files
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.record import read_json
 

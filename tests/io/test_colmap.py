@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError
-from pnpdepth_cli.io.colmap.model import MODELS
-from pnpdepth_cli.io.colmap.reading import name_in_model, read_model
+from pnpdepth_cli.io.colmap import MODELS, name_in_model, read_model
 from tests.colmap_models import CAMERAS, write_text_model
 
 PARTS = ("cameras", "images", "points3D")

@@ -51,14 +51,14 @@ assert "metres" in option.type.choices, option.type.choices
 """
 
 LAYOUT = """
-from pnpdepth_cli.io.dataset.frame import Frame, Listing
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.layouts import Layout
 
-def listing(root):
-    images = sorted((root / "camera").glob("*.png"))
-    return Listing(frames=[Frame(name=image.stem, image=image) for image in images])
+def frames(root):
+    for image in sorted((root / "camera").glob("*.png")):
+        yield Frame(name=image.stem, image=image)
 
-ENTRY = Layout(matches=lambda root: (root / "camera").is_dir(), listing=listing)
+ENTRY = Layout(matches=lambda root: (root / "camera").is_dir(), frames=frames)
 """
 
 USE_LAYOUT = """

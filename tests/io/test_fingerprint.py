@@ -9,6 +9,7 @@ import pytest
 
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.fingerprint import fingerprint, is_unchanged
+from pnpdepth_cli.io.remote import Listing
 
 
 def test_a_file_is_known_by_its_digest_and_a_new_time_alone_is_no_change(tmp_path: Path) -> None:
@@ -19,16 +20,16 @@ def test_a_file_is_known_by_its_digest_and_a_new_time_alone_is_no_change(tmp_pat
     assert (known.size, known.mtime_ns) == (3, 7)
     assert known.sha256 == hashlib.sha256(b"abc").hexdigest()
     os.utime(path, ns=(5, 8))
-    assert is_unchanged(path, known)
+    assert is_unchanged(path, known, Listing())
     for content in (b"abd", b"abcd"):
         path.write_bytes(content)
-        assert not is_unchanged(path, known)
+        assert not is_unchanged(path, known, Listing())
     path.unlink()
-    assert not is_unchanged(path, known)
+    assert not is_unchanged(path, known, Listing())
 
 
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="no such file"):
         fingerprint(tmp_path / "no")
 
 
@@ -39,4 +40,4 @@ def test_another_content_of_the_same_size_and_time_is_a_change(tmp_path: Path) -
     time.sleep(0.02)
     path.write_bytes(b"abd")
     os.utime(path, ns=(known.mtime_ns, known.mtime_ns))
-    assert not is_unchanged(path, known)
+    assert not is_unchanged(path, known, Listing())

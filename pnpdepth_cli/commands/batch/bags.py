@@ -8,7 +8,7 @@ from dataclasses import replace
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.bags.bag import is_bag
+from pnpdepth_cli.io.bags import is_bag
 
 
 def unpacked(

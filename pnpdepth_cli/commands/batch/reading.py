@@ -11,8 +11,7 @@ from pnpdepth_cli.commands.batch.frames import Task
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
-from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.io.remote.store import local_files, renamed
+from pnpdepth_cli.io.remote import RemotePath, local_files, renamed
 
 
 def read_task(task: Task) -> tuple[Inputs, dict[str, Fingerprint]]:

@@ -153,7 +153,7 @@ class BatchRequest(FrameSelection):
     """The Ray workers, if any."""
 
     def __post_init__(self) -> None:
-        from pnpdepth_cli.io.dataset.protocols import find_protocol
+        from pnpdepth_cli.io.dataset import find_protocol
 
         if self.html_3d and self.html is None:
             raise UsageError("--html-3d adds to the report; name its folder with --html")

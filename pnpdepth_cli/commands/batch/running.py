@@ -35,7 +35,7 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.frames.frame import Refined, WarmStart
 from pnpdepth_cli.frames.refiner import Refiner
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.fingerprint import Fingerprint
 
 _ROUNDING = 1e-3

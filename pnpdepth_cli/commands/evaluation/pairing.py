@@ -12,12 +12,12 @@ from typing import Any
 from pnpdepth_cli.commands.evaluation.dependence import groups_by_name
 from pnpdepth_cli.commands.evaluation.stacks import stack_size
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, file_of
+from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Source, file_of, find_protocol
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
-from pnpdepth_cli.io.layouts import Frame, Source, find_layout, find_protocol, list_frames
+from pnpdepth_cli.io.layouts import find_layout, list_frames
 from pnpdepth_cli.io.record import read_json
-from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote import RemotePath
 
 _POINTS = (*DEPTH_SUFFIXES, ".csv", ".txt")
 _DEPTH_MARKS = ("_depth", ".depth")

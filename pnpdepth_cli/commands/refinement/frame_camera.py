@@ -16,7 +16,7 @@ from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.commands.sparse.scans import camera_of, check_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.dataset.protocols import Protocol
+from pnpdepth_cli.io.dataset import Protocol
 from pnpdepth_cli.io.rgb import read_focal_length
 from pnpdepth_cli.sensors.camera import Camera
 

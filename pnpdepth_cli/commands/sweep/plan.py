@@ -15,10 +15,9 @@ from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.sweep.axes import Cell, values_of
 from pnpdepth_cli.commands.sweep.points import OWN, Sampling
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.io.remote.store import status_of
+from pnpdepth_cli.io.remote import RemotePath, status_of
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.settings import Settings
 

@@ -18,8 +18,7 @@ from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.commands.batch.batch import plan_batch
 from pnpdepth_cli.commands.batch.request import LOCAL, BatchRequest, ClusterOptions
 from pnpdepth_cli.errors import OutputError
-from pnpdepth_cli.io.remote.address import path_of
-from pnpdepth_cli.io.remote.store import forget_stores
+from pnpdepth_cli.io.remote import forget_stores, path_of
 from tests.commands.batches import (
     NAMES,
     RecordingListener,
@@ -138,7 +137,7 @@ def test_a_killed_run_is_resumed_from_the_store_alone(
 ) -> None:
     program = (
         "import sys; from pathlib import Path\n"
-        "from pnpdepth_cli.io.remote.address import path_of\n"
+        "from pnpdepth_cli.io.remote import path_of\n"
         "from tests.commands.batches import RecordingListener, batch\n"
         "class Telling(RecordingListener):\n"
         "    def frame(self, row):\n"

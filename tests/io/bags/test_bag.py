@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.bags import bag as bounds
-from pnpdepth_cli.io.bags.bag import Bag, open_bag
+from pnpdepth_cli.io import bags as bounds
+from pnpdepth_cli.io.bags import Bag, open_bag
 from tests.bags import write_bag
 
 pytest.importorskip("rosbags")

@@ -14,7 +14,7 @@ from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest, sample_pattern
 from pnpdepth_cli.errors import FileFormatError, SizeError
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.dataset.reading import masked, moved_to
 from pnpdepth_cli.io.layouts import list_frames, read_frames
 

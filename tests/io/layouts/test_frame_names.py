@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.dataset.frame import Hdf5Array, name_problem
+from pnpdepth_cli.io.dataset import Hdf5Array, name_problem
 from pnpdepth_cli.io.dataset.reading import depth_of, shape_of
 from pnpdepth_cli.io.layouts import LAYOUTS, read_frames
 
