@@ -66,7 +66,7 @@ def _frame(
     source: str,
     **fields: Any,
 ) -> Frame | Unmatched:
-    """The frame of an image; `row` has its size, and the motion leads from the scan to the camera."""
+    """The frame of an image of the size in `row`; the motion is from the scan to the camera."""
     if scan is None or not image.is_file() or not scan.is_file():
         return Unmatched(path=image, why="or its LiDAR scan does not exist; add it")
     if not (np.abs(intrinsics) < _LARGEST_PX).all() or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
