@@ -222,10 +222,12 @@ def local_files(paths: Iterable[Path]) -> Iterator[dict[Path, Path]]:
         yield {}
         return
     with tempfile.TemporaryDirectory(prefix="pnpdepth-") as folder:
-        copies = {path: Path(folder, str(n), path.name) for n, path in enumerate(wanted)}
+        copies: dict[Path, Path] = {
+            path: Path(folder, str(number), path.name) for number, path in enumerate(wanted)
+        }
         for path in wanted:
             _download(path, copies[path])
-        yield dict[Path, Path](copies)
+        yield copies
 
 
 def _download(path: RemotePath, copy: Path) -> None:
