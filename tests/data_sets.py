@@ -11,6 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.io.dataset import Frame, Hdf5Array
+from pnpdepth_cli.io.dataset.reading import depth_of
+from pnpdepth_cli.io.depth import read_depth
 from tests.colmap_models import write_text_model
 from tests.empty_files import touch, tree
 
@@ -243,6 +246,14 @@ def ddad_scene(
     calibration = {"names": ["LIDAR", "CAMERA_01"], "intrinsics": [{}, intrinsics or PINHOLE]}
     (folder / "calibration/k.json").write_text(json.dumps(calibration))
     (folder / "scene_0a.json").write_text(json.dumps({"data": data, "samples": rows}))
+
+
+def ground_truth(frame: Frame) -> np.ndarray:
+    """The ground truth (H, W) of a frame in metres, cut as its protocol says."""
+    assert frame.gt is not None
+    if isinstance(frame.gt, Hdf5Array):
+        return frame.protocol.apply(depth_of(frame.gt))
+    return frame.protocol.apply(read_depth(frame.gt, scale=frame.gt_scale).values)
 
 
 Maker = Callable[[Path], None]

@@ -176,7 +176,8 @@ def _read(states: tuple[tuple[Path, int, int], ...]) -> ColmapModel:
     else:
         read_cameras, read_images, read_points = _text_cameras, _text_images, _text_points
     cameras = {
-        number: _camera(camera_file, *described) for number, *described in read_cameras(camera_file)
+        number: _camera(camera_file, name, size, parameters)
+        for number, name, size, parameters in read_cameras(camera_file)
     }
     images: dict[str, ColmapImage] = {}
     for name, camera, pose, points in read_images(image_file):
@@ -244,11 +245,11 @@ def _parameter_count(path: Path, name: str) -> int:
 
 
 def _camera(
-    path: Path, name: str, width: int, height: int, parameters: Sequence[float]
+    path: Path, name: str, size: tuple[int, int], parameters: Sequence[float]
 ) -> ColmapCamera:
     """The camera of a model `name` with its parameters in COLMAP's order."""
     model = MODELS[name]
-    check_pixel_count(path, width, height)
+    check_pixel_count(path, size[1], size[0])
     fx, fy = parameters[0], parameters[model.focals - 1]
     cx, cy = parameters[model.focals : model.focals + 2]
     if not (np.abs(parameters) < _LARGEST).all() or min(fx, fy) <= 0:
@@ -261,7 +262,7 @@ def _camera(
         distortion = (*distortion, *[0.0] * (4 - len(distortion)))
     return ColmapCamera(
         model=name,
-        size=(height, width),
+        size=size,
         intrinsics=np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]),
         lens=model.lens,
         distortion=distortion,
@@ -328,8 +329,8 @@ class _Reader:
         return int(count)
 
 
-Described = tuple[int, str, int, int, Sequence[float]]
-"""Number, model, width, height and parameters of a camera."""
+Described = tuple[int, str, tuple[int, int], Sequence[float]]
+"""Number, model, (H, W) and parameters of a camera."""
 Registered = tuple[str, int, Sequence[float], Integers]
 """Name, camera, pose and points of an image."""
 Table = tuple[Integers, Floats, Integers]
@@ -342,7 +343,7 @@ def _binary_cameras(path: Path) -> Iterator[Described]:
         number, model, width, height = reader.unpack(_CAMERA)
         name = _NAMES.get(model, f"number {model}")
         parameters = reader.unpack(struct.Struct(f"<{_parameter_count(path, name)}d"))
-        yield number, name, width, height, parameters
+        yield number, name, (height, width), parameters
 
 
 def _binary_images(path: Path) -> Iterator[Registered]:
@@ -387,7 +388,7 @@ def _text_cameras(path: Path) -> Iterator[Described]:
             parameters = [float(word) for word in words[4:]]
         except ValueError as error:
             raise _invalid(path, line, text, "numbers of a camera") from error
-        yield number, words[1], width, height, parameters
+        yield number, words[1], (height, width), parameters
 
 
 def _text_images(path: Path) -> Iterator[Registered]:

@@ -127,6 +127,11 @@ Pose = tuple[tuple[float, ...], ...]
 """(3, 4): rotation and, in the last column, translation in metres."""
 
 
+def as_pose(matrix: NDArray[np.float64]) -> Pose:
+    """Returns a (3, 4) matrix as the pose of a frame."""
+    return tuple(map(tuple, matrix.tolist()))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Neighbour:
     """Another frame of the same sequence, whose points are moved into this one."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, SizeError, UsageError
 from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Hdf5Array
-from pnpdepth_cli.io.depth import known_metres, load_stored, read_depth
+from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import (
     check_value_count,
     damaged,
@@ -43,18 +43,6 @@ def read_frame_image(frame: Frame) -> NDArray[np.float32]:
     source = frame.image
     rgb = rgb_of(source) if isinstance(source, Hdf5Array) else read_rgb(source).values
     return np.ascontiguousarray(frame.protocol.apply(rgb))
-
-
-def read_frame_ground_truth(frame: Frame) -> NDArray[np.float32]:
-    """Returns (H, W) metres, 0 where unknown. Raises InputError if there is no ground truth."""
-    if frame.gt is None:
-        raise InputError(f"frame {frame.name} has no ground truth")
-    if isinstance(frame.gt, Hdf5Array):
-        depth = depth_of(frame.gt)
-    else:
-        depth = read_depth(frame.gt, scale=frame.gt_scale).values
-    depth = masked(depth, frame.masks)
-    return np.ascontiguousarray(frame.protocol.apply(depth))
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:

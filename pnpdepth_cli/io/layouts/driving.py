@@ -21,7 +21,7 @@ import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.calibration import Calibration, Floats
-from pnpdepth_cli.io.dataset import Frame, Unmatched
+from pnpdepth_cli.io.dataset import Frame, Unmatched, as_pose
 from pnpdepth_cli.io.extrinsics import Extrinsics, chained, inverse, pose_of_quaternion
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout
@@ -186,7 +186,7 @@ def _of_scene(path: Path) -> Iterator[tuple[str, Frame | Unmatched]]:
                     chained(inverse(camera), *of_scan),
                     "DDAD scene",
                     name=f"{folder.name}/{name}_{image.stem}",
-                    pose=tuple(map(tuple, np.column_stack(camera).tolist())),
+                    pose=as_pose(np.column_stack(camera)),
                     group=f"{folder.name}/{name}",
                 ),
             )

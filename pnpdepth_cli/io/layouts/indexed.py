@@ -19,7 +19,7 @@ import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.colmap import model_files, read_model
-from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Unmatched, find_files
+from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Unmatched, as_pose, find_files
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout
 from pnpdepth_cli.io.poses import read_trajectory
@@ -62,13 +62,13 @@ def _of_tum(root: Path) -> Iterator[Frame | Unmatched]:
                 if number not in used:
                     yield Unmatched(path=path, why=why, spare=True)
     for (time_s, image_path), (_, depth_path) in pairs:
-        pose = trajectory and trajectory.at(time_s, _LONGEST_POSE_GAP_S)
+        pose = None if trajectory is None else trajectory.at(time_s, _LONGEST_POSE_GAP_S)
         yield Frame(
             name=image_path.stem,
             image=image_path,
             gt=depth_path,
             gt_scale=5000.0,
-            pose=None if pose is None else tuple(map(tuple, pose.tolist())),
+            pose=None if pose is None else as_pose(pose),
         )
 
 
@@ -145,9 +145,9 @@ def _of_colmap(root: Path) -> Iterator[Frame | Unmatched]:
             why = f"is missing, but registered in {model.folder}; add it"
             yield Unmatched(path=path, why=why)
             continue
-        pose = np.column_stack([turn, -turn @ image.translation]).tolist()
+        pose = as_pose(np.column_stack([turn, -turn @ image.translation]))
         stem = Path(name).with_suffix("").as_posix()
-        yield Frame(name=stem, image=path, sparse=model.folder, pose=tuple(map(tuple, pose)))
+        yield Frame(name=stem, image=path, sparse=model.folder, pose=pose)
 
 
 COLMAP = Layout(matches=_colmap_models, frames=_of_colmap, needs=("images", "sparse/*/cameras.*"))

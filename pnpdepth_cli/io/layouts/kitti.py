@@ -21,15 +21,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset import PROTOCOLS, Pose, Unmatched
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.dataset import PROTOCOLS, Unmatched, as_pose
 from pnpdepth_cli.io.layouts.layout import Fields, Files, Layout, row
-from pnpdepth_cli.io.poses import PACKETS
+from pnpdepth_cli.io.poses import PACKETS, read_poses
 
 _CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
+_RAW = ("", "raw/", "kitti_raw/")
+"""Folders of the raw data's dates."""
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 """Names of the selection, without the kind of file in the middle."""
 _AS_PUBLISHED: dict[str, Any] = {
@@ -49,8 +48,7 @@ def _of_sequence(place: Path) -> Callable[[Files], Mapping[str, Any]]:
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():
         return lambda files: {"calib": place / "calib.txt"}
-    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
-    poses = [_pose(path, number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    poses = [as_pose(pose) for pose in read_poses(path)]
 
     def fields_of(files: Files) -> Mapping[str, Any]:
         image = files["image"]
@@ -62,18 +60,6 @@ def _of_sequence(place: Path) -> Callable[[Files], Mapping[str, Any]]:
         return {"calib": place / "calib.txt", "pose": poses[int(image.stem)]}
 
     return fields_of
-
-
-def _pose(path: Path, number: int, line: str) -> Pose:
-    try:
-        values = [float(word) for word in line.split()]
-    except ValueError:
-        values = []
-    if len(values) != 12 or not np.isfinite(values).all():
-        raise FileFormatError(
-            f"{path}, line {number}: {one_line(line)[:60]!r} is not 12 finite numbers"
-        )
-    return tuple(tuple(values[start : start + 4]) for start in (0, 4, 8))
 
 
 ODOMETRY = row(
@@ -92,20 +78,20 @@ def _name(root: Path, place: Path, stem: str) -> str:
     return f"{drive.name}_{stem}_{place.name}"
 
 
+def _of_drive(drive: Path, inside: Path, *beside: str) -> Path:
+    """The data of a drive, in it or in its namesake in a folder beside; it may not exist."""
+    drives = [drive, *(base / name / drive.name for base in drive.parents[:3] for name in beside)]
+    return next((path / inside for path in drives if (path / inside).is_dir()), drives[1] / inside)
+
+
 def _truth_of(drive: Path, camera: str) -> Path:
-    """The folder of the annotated depth, which may not exist."""
-    inside = Path("proj_depth/groundtruth", camera)
-    bases = (base / "data_depth_annotated" for base in drive.parents[:3])
-    drives = (drive, *(base / part / drive.name for base in bases for part in ("train", "val")))
-    return next((path / inside for path in drives if (path / inside).is_dir()), drive / inside)
+    beside = (f"data_depth_annotated/{part}" for part in ("train", "val"))
+    return _of_drive(drive, Path("proj_depth/groundtruth", camera), *beside)
 
 
 def _images_of(scans: Path) -> Path:
-    """The raw data's images of a drive and camera; where none exist, where they belong."""
-    drive, inside = scans.parents[2], Path(scans.name, "data")
-    bases = [base / raw for base in drive.parents[:3] for raw in ("", "raw", "kitti_raw")]
-    drives = [drive, *(base / drive.name[:10] / drive.name for base in bases)]
-    return next((path / inside for path in drives if (path / inside).is_dir()), drives[1] / inside)
+    drive, beside = scans.parents[2], (f"{raw}{scans.parents[2].name[:10]}" for raw in _RAW)
+    return _of_drive(drive, Path(scans.name, "data"), *beside)
 
 
 def _calibration_of(drive: Path) -> Path | None:
@@ -165,11 +151,11 @@ def _raw_cameras(root: Path) -> list[Path]:
 
 
 def _of_camera(camera: Path) -> Callable[[Files], Fields]:
-    fields: Fields = {"calib": _calibration_of(camera.parent), "camera": int(camera.name[-1])}
-    if fields["calib"] is None:
+    calibration = _calibration_of(camera.parent)
+    if calibration is None:
         why = f"has no {_CALIBRATION}; put KITTI's calibration into {camera.parents[1]}"
-        fields = Unmatched(path=camera.parent, why=why)
-    return lambda files: fields
+        return lambda files: Unmatched(path=camera.parent, why=why)
+    return lambda files: {"calib": calibration, "camera": int(camera.name[-1])}
 
 
 RAW = row(

@@ -21,7 +21,6 @@ from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, find_protocol
 from pnpdepth_cli.io.dataset.reading import (
     masked,
     moved_to,
-    read_frame_ground_truth,
     read_frame_image,
 )
 from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames, read_frames
@@ -39,6 +38,7 @@ from tests.data_sets import (
     WIDTH,
     arkitscenes,
     codes,
+    ground_truth,
     image,
     mask,
     tum,
@@ -206,18 +206,18 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("\n", "holds 0 poses"),
-        (_ROW[2:], "00.txt, line 1"),
-        (_ROW.replace("\n", " 0"), "00.txt, line 1"),
-        (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt, line 3"),
-        (_ROW.replace("1", "one"), "00.txt, line 1"),
+        ("\n", "has no poses"),
+        (_ROW, "000001.png has no pose: its sequence's file holds 1 poses"),
+        (_ROW[2:], "00.txt: line 1"),
+        (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt: line 3"),
+        (_ROW.replace("1", "one"), "00.txt: line 1"),
     ],
 )
 def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
     tmp_path: Path, text: str, message: str
 ) -> None:
-    tree(tmp_path, TREES["kitti-odometry"][0])
-    touch(tmp_path / "poses/00.txt")
+    tree(tmp_path, "sequences/00/image_2/00000{0,1}.png sequences/00/velodyne/00000{0,1}.bin")
+    touch(tmp_path / "sequences/00/calib.txt", tmp_path / "poses/00.txt")
     (tmp_path / "poses/00.txt").write_text(text)
     with pytest.raises(InputError, match=rf"\A.*{message}.*\Z"):
         read_frames(tmp_path)
@@ -311,7 +311,7 @@ def test_synthias_random_set_has_centimetres_in_either_folder(
     assert find_layout(tmp_path) == "synthia"
     (frame,) = read_frames(tmp_path)
     assert (frame.name, frame.gt) == ("0000000", tmp_path / folder / "0000000.png")
-    np.testing.assert_allclose(read_frame_ground_truth(frame), [[0, 1.5], [8.99, 0.01]], rtol=1e-6)
+    np.testing.assert_allclose(ground_truth(frame), [[0, 1.5], [8.99, 0.01]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -469,13 +469,13 @@ def test_the_shared_frames_are_recognised(shared_data: Path) -> None:
     assert [f.name for f in objects] == [f"00000{i}" for i in range(4)]
     completion = read_frames(shared_data / "kitti_dc")
     assert {frame.calib for frame in completion} == {shared_data / "kitti_dc"}
-    truth = read_frame_ground_truth(completion[0])
+    truth = ground_truth(completion[0])
     assert truth.shape == (375, 1242)
     assert 0.15 < np.mean(truth > 0) < 0.25
     scenes = read_frames(shared_data / "7scenes")
     assert len(scenes) == 50
     assert read_frame_image(scenes[0]).shape == (480, 640, 3)
-    assert 0.5 < np.median(read_frame_ground_truth(scenes[0])) < 4
+    assert 0.5 < np.median(ground_truth(scenes[0])) < 4
 
 
 def test_points_are_sampled_from_the_scan_that_is_the_ground_truth(tmp_path: Path) -> None:

@@ -15,13 +15,12 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.dataset.reading import (
     depth_of,
-    read_frame_ground_truth,
     read_frame_image,
     read_matlab_array,
     shape_of,
 )
 from pnpdepth_cli.io.layouts import list_frames, read_frames
-from tests.data_sets import nyu_h5, nyu_mat
+from tests.data_sets import ground_truth, nyu_h5, nyu_mat
 from tests.fuzz.mutations import mutated
 
 h5py = pytest.importorskip("h5py")
@@ -31,13 +30,13 @@ def test_nyu_frames_come_halved_and_cropped_to_228_by_304(tmp_path: Path) -> Non
     nyu_h5(tmp_path / "h5")
     frame = read_frames(tmp_path / "h5")[1]
     assert read_frame_image(frame).shape == (228, 304, 3)
-    assert read_frame_ground_truth(frame).tolist() == np.full((228, 304), 9.0).tolist()
+    assert ground_truth(frame).tolist() == np.full((228, 304), 9.0).tolist()
     nyu_mat(tmp_path / "mat")
     frame = read_frames(tmp_path / "mat")[2]
     np.testing.assert_array_equal(read_frame_image(frame), np.float32(2) / np.float32(255))
     # columns 8 … 311 of every second pixel, 1 3 5 …: column c holds 2 c + 2 metres
     want = 2 * np.arange(8, 312) + 2
-    assert (read_frame_ground_truth(frame) == want).all()
+    assert (ground_truth(frame) == want).all()
 
 
 def test_kitti_in_files_of_the_same_kind_is_cut_as_kitti_is(tmp_path: Path) -> None:
@@ -47,7 +46,7 @@ def test_kitti_in_files_of_the_same_kind_is_cut_as_kitti_is(tmp_path: Path) -> N
     (frame,) = read_frames(tmp_path)
     assert frame.protocol.name == "kitti-odometry"
     assert read_frame_image(frame).shape == (228, 912, 3)
-    np.testing.assert_array_equal(read_frame_ground_truth(frame), depth[148:, 164:1076])
+    np.testing.assert_array_equal(ground_truth(frame), depth[148:, 164:1076])
 
 
 @pytest.mark.parametrize("kind", ["txt", "mat"])
@@ -71,7 +70,7 @@ def test_an_hdf5_file_that_is_damaged_is_named(tmp_path: Path) -> None:
     frame = read_frames(tmp_path)[0]
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(FileFormatError, match="cannot be read as HDF5"):
-        read_frame_ground_truth(frame)
+        ground_truth(frame)
 
 
 @pytest.mark.parametrize(
