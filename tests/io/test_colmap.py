@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError
+from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.colmap import MODELS, name_in_model, read_model
 from tests.colmap_models import CAMERAS, write_binary_model, write_text_model
 
@@ -70,23 +67,6 @@ def test_a_count_that_lies_allocates_nothing(part: str, offset: int, tmp_path: P
     file.write_bytes(data)
     with pytest.raises(FileFormatError, match="cut short"):
         read_model(tmp_path)
-
-
-@settings(max_examples=150)
-@given(data=st.data())
-def test_a_damaged_model_raises_only_our_errors(
-    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    folder = tmp_path_factory.mktemp("model")
-    text = data.draw(st.booleans())
-    (write_text_model if text else write_binary_model)(folder)
-    file = folder / f"{data.draw(st.sampled_from(PARTS))}{'.txt' if text else '.bin'}"
-    content = bytearray(file.read_bytes())
-    for _ in range(data.draw(st.integers(1, 4))):
-        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
-    file.write_bytes(content)
-    with contextlib.suppress(PnpDepthError):
-        read_model(folder)
 
 
 def test_every_camera_model_of_pycolmap_but_panoramas_is_known() -> None:
