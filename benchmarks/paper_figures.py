@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, WHOLE, Protocol
+from pnpdepth_cli.io.dataset import PROTOCOLS, WHOLE, Protocol
 from pnpdepth_cli.settings import PAPER
 
 SETTING = PAPER

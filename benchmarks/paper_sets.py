@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
 from pnpdepth_cli.errors import NoPointsError, UsageError
-from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
+from pnpdepth_cli.io.dataset import PROTOCOLS, Protocol
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, as_depth_image, simulate_lidar
 

@@ -220,7 +220,7 @@ STORES = {
 
 COLORS = ("blue-orange", "paper")  # of better and worse; the paper's are red and green
 PREVIEWS = ("all", "worst", "none")  # which frames get images; worst: worse than linear
-FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")  # `io.dataset.protocols`
+FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")  # `io.dataset`
 PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
 

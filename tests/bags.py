@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pnpdepth_cli.io.bags.bag import message_types
+from pnpdepth_cli.io.bags import message_types
 
 HEIGHT, WIDTH, FOCAL_PX = 48, 64, 60.0
 IMAGES, POINTS = "/front/image_raw", "/lidar/points"
@@ -116,30 +116,29 @@ def _writer(path: Path) -> Any:
     return Writer2(path, version=9)
 
 
-def _vector(make: Make, x: float, y: float, z: float) -> Any:
-    return make("geometry_msgs/Vector3", x=x, y=y, z=z)
+def _link(make: Make, header: Any, child: str, shift: Sequence[float], xyzw: Any) -> Any:
+    """A transform: the pose of the child in the frame of the header."""
+    transform = make(
+        "geometry_msgs/Transform",
+        translation=make("geometry_msgs/Vector3", **dict(zip("xyz", shift, strict=True))),
+        rotation=make("geometry_msgs/Quaternion", **dict(zip("xyzw", xyzw, strict=True))),
+    )
+    return make(
+        "geometry_msgs/TransformStamped", header=header, child_frame_id=child, transform=transform
+    )
 
 
 def _moved(make: Make, header: Any, x: float, kind: str) -> tuple[str, int, Any]:
     """The pose of base, or for "pose" of the camera, at x metres."""
     time_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
-    turn = make("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    link = _link(make, header, "base", (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     if kind == "tf":
-        transform = make(
-            "geometry_msgs/Transform", translation=_vector(make, x, 0.0, 0.0), rotation=turn
-        )
-        link = make(
-            "geometry_msgs/TransformStamped",
-            header=header,
-            child_frame_id="base",
-            transform=transform,
-        )
         return "/tf", time_ns, make("tf2_msgs/TFMessage", transforms=[link])
     point = make("geometry_msgs/Point", x=x, y=0.0, z=0.0)
-    pose = make("geometry_msgs/Pose", position=point, orientation=turn)
+    pose = make("geometry_msgs/Pose", position=point, orientation=link.transform.rotation)
     if kind == "pose":
         return "/vio/pose", time_ns, make("geometry_msgs/PoseStamped", header=header, pose=pose)
-    still, unknown = _vector(make, 0.0, 0.0, 0.0), np.zeros(36)
+    still, unknown = make("geometry_msgs/Vector3", x=0.0, y=0.0, z=0.0), np.zeros(36)
     twist = make("geometry_msgs/Twist", linear=still, angular=still)
     message = make(
         "nav_msgs/Odometry",
@@ -153,21 +152,9 @@ def _moved(make: Make, header: Any, x: float, kind: str) -> tuple[str, int, Any]
 
 def _transforms(make: Make, header: Make) -> Any:
     """camera is in base, and so is lidar: x forward, y left, z up, 0.2 m above the camera."""
-
-    def link(child: str, shift: tuple[float, float, float], xyzw: tuple[float, ...]) -> Any:
-        turn = make("geometry_msgs/Quaternion", **dict(zip("xyzw", xyzw, strict=True)))
-        transform = make(
-            "geometry_msgs/Transform", translation=_vector(make, *shift), rotation=turn
-        )
-        return make(
-            "geometry_msgs/TransformStamped",
-            header=header(10**9, "base"),
-            child_frame_id=child,
-            transform=transform,
-        )
-
-    camera = link("camera", (1.0, 0.0, 0.0), (-0.5, 0.5, -0.5, 0.5))
-    lidar = link("lidar", (1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))
+    base = header(10**9, "base")
+    camera = _link(make, base, "camera", (1.0, 0.0, 0.0), (-0.5, 0.5, -0.5, 0.5))
+    lidar = _link(make, base, "lidar", (1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))
     return make("tf2_msgs/TFMessage", transforms=[camera, lidar])
 
 

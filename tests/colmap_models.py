@@ -1,12 +1,13 @@
-"""Small sparse models of COLMAP as text, for tests of every camera model."""
+"""Small sparse models of COLMAP, for tests of every camera model."""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.io.colmap.model import MODELS
+from pnpdepth_cli.io.colmap import MODELS
 
 WIDTH, HEIGHT = 64, 48
 _COEFFICIENTS = {
@@ -61,3 +62,23 @@ def write_text_model(
             for number, (x, y, z) in enumerate(xyz)
         )
     )
+
+
+def write_binary_model(folder: Path) -> None:
+    """Two images of one point each, and one point that both observe."""
+    folder.mkdir(parents=True, exist_ok=True)
+    camera = struct.pack("<IiQQ4d", 1, 2, 64, 48, 50.0, 32.0, 24.0, 0.1)
+    images = b"".join(
+        struct.pack("<I7dI", number, 1, 0, 0, 0, 0.1 * number, 0, 0, 1)
+        + f"dir/{number}.png".encode()
+        + b"\0"
+        + struct.pack("<Q", 2)
+        + struct.pack("<ddq", 10, 11, 7)
+        + struct.pack("<ddq", 12, 13, -1)
+        for number in (1, 2)
+    )
+    point = struct.pack("<Q3d3BdQ", 7, 0.5, -0.25, 4.0, 1, 2, 3, 0.75, 2)
+    track = struct.pack("<4I", 1, 0, 2, 0)
+    (folder / "cameras.bin").write_bytes(struct.pack("<Q", 1) + camera)
+    (folder / "images.bin").write_bytes(struct.pack("<Q", 2) + images)
+    (folder / "points3D.bin").write_bytes(struct.pack("<Q", 1) + point + track)

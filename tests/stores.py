@@ -23,7 +23,7 @@ def s3_server() -> Iterator[str]:
     """Yields the address of an S3 server on loopback; the environment names it until the end."""
     from moto.server import ThreadedMotoServer
 
-    from pnpdepth_cli.io.remote.store import forget_stores
+    from pnpdepth_cli.io.remote import forget_stores
 
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)

@@ -15,6 +15,7 @@ from pnpdepth_cli.core import losses, update_rules
 from pnpdepth_cli.core.update_rules import SCHEDULES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.models.precision import dtype_of
 from pnpdepth_cli.sensors import LIDARS, PATTERNS
 
@@ -77,3 +78,9 @@ def test_a_table_of_modules_leaves_out_subpackages() -> None:
     table = Table("", None, group="test_none", noun="package")
     assert table["points"].__name__ == "pnpdepth_cli.points"
     assert "core" not in table
+
+
+def test_every_format_has_a_file_name_made_of_its_own_name() -> None:
+    for name, depth_format in choices.FORMATS.items():
+        assert f".{name}" in depth_format.suffixes
+        assert set(depth_format.suffixes) <= set(DEPTH_SUFFIXES)

@@ -17,6 +17,7 @@ with the intrinsics of the raw image; a matrix T_camera_lidar there is the pose 
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
-from pnpdepth_cli.io.extrinsics import Extrinsics, checked_pose, numbers_in, pose_of_matrix
+from pnpdepth_cli.io.extrinsics import (
+    Extrinsics,
+    chained,
+    checked_pose,
+    numbers_in,
+    pose_of_matrix,
+)
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.yaml_file import parse_yaml
@@ -73,12 +80,11 @@ class Calibration:
 
     intrinsics: Floats
     """(3, 3), last row 0 0 1, in pixels."""
-    rotation: Floats
-    """(3, 3), from the scanner's frame to the camera's."""
-    translation: Floats
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
+    translation: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) metres, the scanner's origin in the camera's frame."""
-    distortion: tuple[float, ...]
-    size: tuple[int, int] | None
+    distortion: tuple[float, ...] = ()
+    size: tuple[int, int] | None = None
     """(H, W) of the images; None if the file does not give it."""
     has_pose: bool
     """False if the file has no pose of a scanner; rotation and translation are then identity."""
@@ -132,8 +138,8 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
 def read_rigid_motion(path: Path) -> Extrinsics:
     """Returns (rotation (3, 3), translation (3,) metres) of KITTI's raw files with R and T."""
     fields = _fields(path, _text(path))
-    rotation = _matrix(path, fields, "R", 9).reshape(3, 3)
-    return checked_pose(path, "R", rotation, _matrix(path, fields, "T", 3))
+    rotation = _matrix(path, fields, "R", (3, 3))
+    return checked_pose(path, "R", rotation, _matrix(path, fields, "T", (3,)))
 
 
 def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
@@ -144,17 +150,16 @@ def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
     if not isinstance(content, Mapping):
         raise FileFormatError(f"{path} is not a calibration; give OpenCV's, ROS's or Kalibr's YAML")
     chain = {str(k): v for k, v in content.items() if isinstance(v, Mapping) and "intrinsics" in v}
-    if not chain:
-        is_ros = content.get("distortion_model") is not None
-        kind = "ROS camera_info" if is_ros else "OpenCV calibration"
-        fields = {name: content[name] for name in content if name != "R"}  # the rectification
-        calibration = _single(path, fields, camera, kind)
-        calibration = replace(calibration, rectified=_rectified_cameras(path, content, calibration))
-    else:
+    if chain:
         name = f"cam{0 if camera is None else camera}"
         if name not in chain:
             raise UsageError(f"{path} has no {name}; --camera can be one of: {', '.join(chain)}")
         calibration = _kalibr(path, name, chain[name])
+    else:
+        kind = "ROS camera_info" if "distortion_model" in content else "OpenCV calibration"
+        fields = {name: content[name] for name in content if name != "R"}  # the rectification
+        calibration = _single(path, fields, camera, kind)
+        calibration = replace(calibration, rectified=_rectified_cameras(path, content, calibration))
     if not calibration.distortion:
         return calibration
     return replace(calibration, source=f"{calibration.source}, {calibration.lens} lens")
@@ -179,15 +184,9 @@ def _rectified_cameras(
     turn = r.reshape(3, 3) if r.size == 9 and r.any() else np.eye(3)
     if np.linalg.det(intrinsics):
         offset = np.linalg.solve(intrinsics, p.reshape(3, 4)[:, 3])
-    plain = replace(
-        raw,
-        intrinsics=intrinsics,
-        distortion=(),
-        lens="radial-tangential",
-        rotation=np.eye(3),
-        translation=np.zeros(3),
+    plain = Calibration(
+        intrinsics=intrinsics, size=raw.size, has_pose=raw.has_pose, source=raw.source
     )
-    same = np.allclose(intrinsics, raw.intrinsics, atol=1e-3) and not raw.distortion
     turned = not np.allclose(turn, np.eye(3), atol=1e-9)
     cameras = {"P": plain}
     if turned:
@@ -195,18 +194,18 @@ def _rectified_cameras(
     if np.abs(offset).max() > 1e-9:
         name = "P with its offset, and R" if turned else "P with its offset"
         cameras = {name: replace(plain, rotation=turn, translation=offset)} | cameras
-    return {} if same and len(cameras) == 1 else cameras
+    is_raw = np.allclose(intrinsics, raw.intrinsics, atol=1e-3) and not raw.distortion
+    return {} if is_raw and len(cameras) == 1 else cameras
 
 
 def _kitti(path: Path, fields: Mapping[str, Any], camera: int | None) -> Calibration:
     """KITTI's object set (R0_rect, Tr_velo_to_cam) and odometry set (Tr, already rectified)."""
     number = _camera(path, camera, [int(n[1:]) for n in fields if re.fullmatch(r"P\d", n)])
     odometry = "Tr" in fields
-    name = "Tr" if odometry else "Tr_velo_to_cam"
-    scanner = _matrix(path, fields, name, 12).reshape(3, 4)
+    scanner = _matrix(path, fields, "Tr" if odometry else "Tr_velo_to_cam", (3, 4))
     pose = checked_pose(path, "rotation of the scanner", scanner[:, :3], scanner[:, 3])
-    rectify = np.eye(3) if odometry else _matrix(path, fields, "R0_rect", 9).reshape(3, 3)
-    projection = _matrix(path, fields, f"P{number}", 12).reshape(3, 4)
+    rectify = np.eye(3) if odometry else _matrix(path, fields, "R0_rect", (3, 3))
+    projection = _matrix(path, fields, f"P{number}", (3, 4))
     return _rectified(path, projection, rectify, pose, f"KITTI calibration, camera {number}")
 
 
@@ -221,16 +220,15 @@ def _kitti_raw(folder: Path, camera: int | None) -> Calibration:
     fields = _fields(cameras, _text(cameras))
     numbers = [int(name[-2:]) for name in fields if re.fullmatch(r"P_rect_\d\d", name)]
     number = _camera(cameras, camera, numbers)
-    pose = read_rigid_motion(scanner) if scanner.is_file() else None
     # The raw data's development kit rotates every camera by camera 0's rectification.
     calibration = _rectified(
         cameras,
-        _matrix(cameras, fields, f"P_rect_{number:02}", 12).reshape(3, 4),
-        _matrix(cameras, fields, "R_rect_00", 9).reshape(3, 3),
-        pose,
+        _matrix(cameras, fields, f"P_rect_{number:02}", (3, 4)),
+        _matrix(cameras, fields, "R_rect_00", (3, 3)),
+        read_rigid_motion(scanner) if scanner.is_file() else None,
         f"KITTI raw calibration, camera {number}",
     )
-    size = _numbers(cameras, fields, f"S_rect_{number:02}", (2,))
+    size = _numbers(cameras, fields, f"S_rect_{number:02}", 2)
     return replace(calibration, size=_height_width(cameras, size))
 
 
@@ -240,16 +238,12 @@ def _rectified(
     """P · R_rect · [R t], with the camera's own offset in P's last column as a translation."""
     intrinsics = _checked_intrinsics(path, projection[:, :3])
     offset = np.asarray(np.linalg.solve(intrinsics, projection[:, 3]), np.float64)
-    rectify, offset = checked_pose(path, "rectification", rectify, offset)
-    rotation, translation = np.eye(3), np.zeros(3)
-    if scanner is not None:
-        rotation, translation = rectify @ scanner[0], rectify @ scanner[1] + offset
+    rectify_pose = checked_pose(path, "rectification", rectify, offset)
+    pose = chained() if scanner is None else chained(rectify_pose, scanner)
     return Calibration(
         intrinsics=intrinsics,
-        rotation=rotation,
-        translation=translation,
-        distortion=(),
-        size=None,
+        rotation=pose[0],
+        translation=pose[1],
         has_pose=scanner is not None,
         source=source,
     )
@@ -268,10 +262,10 @@ def _kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> Calibration:
             " pinhole (4) and eucm (6) are known, so calibrate it as one of them"
         )
     fx, fy, cx, cy = values
-    size: Any = fields.get("resolution")
     single = {name: fields[name] for name in _POSES if name in fields}
     single |= {"K": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "distortion": distortion, "lens": lens}
-    single |= {} if size is None else {"size": size}
+    if "resolution" in fields:
+        single["size"] = fields["resolution"]
     return _single(path, single, None, f"Kalibr camchain, {name}")
 
 
@@ -280,10 +274,10 @@ def _single(path: Path, fields: Mapping[str, Any], camera: int | None, source: s
     if camera is not None:
         raise UsageError(f"{path} describes one camera; leave out --camera {camera}")
     matrix = next((name for name in _MATRICES if name in fields), "K")
-    intrinsics = _checked_intrinsics(path, _matrix(path, fields, matrix, 9).reshape(3, 3))
+    intrinsics = _checked_intrinsics(path, _matrix(path, fields, matrix, (3, 3)))
     pose = _pose(path, fields)
     lens, distortion = _lens(path, fields)
-    rotation, translation = pose or (np.eye(3), np.zeros(3))
+    rotation, translation = pose or chained()
     return Calibration(
         intrinsics=intrinsics,
         rotation=rotation,
@@ -298,7 +292,8 @@ def _single(path: Path, fields: Mapping[str, Any], camera: int | None, source: s
 
 def _lens(path: Path, fields: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
     model = str(fields.get("lens", fields.get("distortion_model")) or "none").strip(" \"'")
-    if fields.get("fisheye_model") and "distortion_model" not in fields:  # of OpenCV
+    is_fisheye = str(fields.get("fisheye_model", "0")).lower() not in ("0", "false")
+    if is_fisheye and "distortion_model" not in fields:  # of OpenCV
         model = "fisheye"
     lens = "eucm" if model == "eucm" else _LENSES.get(model)
     if lens is None:
@@ -322,22 +317,23 @@ def _pose(path: Path, fields: Mapping[str, Any]) -> Extrinsics | None:
     name = next((name for name in _POSES if name in fields), None)
     if name is not None:
         return pose_of_matrix(path, name, _numbers(path, fields, name))
-    if "R" not in fields and "t" not in fields:
+    present = [name for name in ("R", "t") if name in fields]
+    if not present:
         return None
-    if "R" not in fields or "t" not in fields:
-        present, missing = ("R", "t") if "R" in fields else ("t", "R")
-        raise FileFormatError(f"{path} has {present} but no {missing}; give both")
-    rotation = _matrix(path, fields, "R", 9).reshape(3, 3)
-    return checked_pose(path, "R", rotation, _matrix(path, fields, "t", 3))
+    if len(present) == 1:
+        missing = "t" if present == ["R"] else "R"
+        raise FileFormatError(f"{path} has {present[0]} but no {missing}; give both")
+    rotation = _matrix(path, fields, "R", (3, 3))
+    return checked_pose(path, "R", rotation, _matrix(path, fields, "t", (3,)))
 
 
 def _size(path: Path, fields: Mapping[str, Any]) -> tuple[int, int] | None:
     if "size" in fields:
-        return _height_width(path, _numbers(path, fields, "size", (2,)))
+        return _height_width(path, _numbers(path, fields, "size", 2))
     names = [next((n for n in (f"image_{s}", s) if n in fields), "") for s in ("width", "height")]
     if not all(names):
         return None
-    return _height_width(path, [_numbers(path, fields, name, (1,))[0] for name in names])
+    return _height_width(path, [_numbers(path, fields, name, 1)[0] for name in names])
 
 
 def _text(path: Path) -> str:
@@ -375,9 +371,9 @@ def _fields(path: Path, text: str) -> dict[str, Any]:
 
 
 def _numbers(
-    path: Path, fields: Mapping[str, Any], name: str, counts: Sequence[int] = ()
+    path: Path, fields: Mapping[str, Any], name: str, count: int | None = None
 ) -> list[float]:
-    """The finite numbers of a field, as many as one of `counts` if there are any."""
+    """The finite numbers of a field; so many, if there is a count."""
     if name not in fields:
         raise FileFormatError(
             f"{path} has no {name}; this calibration is incomplete or of another kind"
@@ -389,14 +385,13 @@ def _numbers(
         raise FileFormatError(
             f"{path}: {name} holds {max(numbers, key=abs):g}, which no camera has; correct it"
         )
-    if counts and len(numbers) not in counts:
-        wanted = " or ".join(str(count) for count in counts)
-        raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers instead of {wanted}")
+    if count is not None and len(numbers) != count:
+        raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers instead of {count}")
     return numbers
 
 
-def _matrix(path: Path, fields: Mapping[str, Any], name: str, count: int) -> Floats:
-    return np.array(_numbers(path, fields, name, (count,)))
+def _matrix(path: Path, fields: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Floats:
+    return np.reshape(_numbers(path, fields, name, math.prod(shape)), shape)
 
 
 def _camera(path: Path, wanted: int | None, present: list[int]) -> int:

@@ -62,10 +62,10 @@ def numbers_in(value: Any) -> list[float] | None:
     if isinstance(value, str):
         value = [word for word in _SEPARATORS.split(value) if word not in ("", "-")]
     flat: list[Any] = []
-    for each in value if isinstance(value, list) else [value]:
-        flat += each if isinstance(each, list) else [each]
+    for item in value if isinstance(value, list) else [value]:
+        flat += item if isinstance(item, list) else [item]
     try:
-        return [float(each) for each in flat]
+        return [float(number) for number in flat]
     except (TypeError, ValueError, OverflowError):
         return None
 
@@ -93,8 +93,8 @@ def pose_of_quaternion(path: Path, translation: list[float], xyzw: list[float]) 
 
 def checked_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> Extrinsics:
     """Returns the pose. Raises FileFormatError if it holds no rotation, or is of no sensor."""
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not off <= _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+    if not is_rotation(rotation):
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
         raise FileFormatError(f"{path}: the {name} is no rotation (R·Rᵀ is off by {off:.2g})")
     if not (np.abs(translation) < _FARTHEST_M).all():
         raise FileFormatError(
@@ -103,10 +103,25 @@ def checked_pose(path: Path, name: str, rotation: Floats, translation: Floats) -
     return rotation, translation
 
 
+def is_rotation(matrix: Floats) -> bool:
+    """Returns whether a matrix (3, 3) turns without mirroring, to 0.1 %."""
+    off = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(off <= _ROTATION_TOLERANCE and np.linalg.det(matrix) > 0)
+
+
 def inverse(pose: Extrinsics) -> Extrinsics:
     """Returns the pose of the camera in the scanner's frame."""
     rotation, translation = pose
     return rotation.T, -rotation.T @ translation
+
+
+def chained(*poses: Extrinsics) -> Extrinsics:
+    """Returns the pose of the last frame in the first, from that of each in the one before it."""
+    rotation, translation = np.eye(3), np.zeros(3)
+    for turn, shift in poses:
+        translation = rotation @ shift + translation
+        rotation = rotation @ turn
+    return rotation, translation
 
 
 def square(pose: Extrinsics) -> Floats:

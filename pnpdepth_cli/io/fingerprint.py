@@ -8,18 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.io.file_bytes import cannot_read
 from pnpdepth_cli.io.record import sha256_of
-from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.io.remote.store import Listing, local_files, status_of
+from pnpdepth_cli.io.remote import Listing, RemotePath, local_files, status_of
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fingerprint:
-    """Size, times and digest of a file when it was read."""
+    """Size in bytes, times and digest of a file when it was read."""
 
     size: int
-    """Bytes."""
     sha256: str
     mtime_ns: int = 0
     """When the content was changed last, as programs may set it; 0 of an object in a store."""
@@ -45,44 +43,36 @@ def fingerprint(path: Path, copy: Path | None = None) -> Fingerprint:
         if copy is None or status is None:
             raise InputError(f"{path} is in a store; copy the file first")
         return Fingerprint(size=status.size, version=status.version, sha256=sha256_of(copy))
-    size, mtime_ns, ctime_ns = _status(path)
-    digest = _digest(path, size, mtime_ns, ctime_ns)
-    return Fingerprint(size=size, mtime_ns=mtime_ns, ctime_ns=ctime_ns, sha256=digest)
+    size, mtime_ns, ctime_ns = now = _size_and_times(path)
+    return Fingerprint(size=size, mtime_ns=mtime_ns, ctime_ns=ctime_ns, sha256=_digest(path, *now))
 
 
-def is_unchanged(path: Path, known: Fingerprint, listing: Listing | None = None) -> bool:
+def is_unchanged(path: Path, known: Fingerprint, listing: Listing) -> bool:
     """Returns whether the file is there with that content; it is read unless no time differs.
-
-    Args:
-        path: The file.
-        known: As it was.
-        listing: Of objects in a store; None asks the store.
 
     Raises:
         StorageError: The store cannot be reached.
     """
     try:
         if isinstance(path, RemotePath):
-            status = status_of(path) if listing is None else listing.status(path)
+            status = listing.status(path)
             if status is None or status.version:
                 return status is not None and status.version == known.version
             with local_files([path]) as copies:
                 return sha256_of(copies[path]) == known.sha256
-        now = _status(path)
+        now = _size_and_times(path)
         if now == (known.size, known.mtime_ns, known.ctime_ns):
             return True
-        same_size = now[0] == known.size
-        return same_size and _digest(path, *now) == known.sha256
+        return now[0] == known.size and _digest(path, *now) == known.sha256
     except InputError:
         return False
 
 
-def _status(path: Path) -> tuple[int, int, int]:
+def _size_and_times(path: Path) -> tuple[int, int, int]:
     try:
         status = path.stat()
     except (OSError, ValueError) as error:
-        reason = one_line(getattr(error, "strerror", None) or error).lower()
-        raise InputError(f"{path} cannot be read ({reason}); check the path") from error
+        raise cannot_read(path, error) from error
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 

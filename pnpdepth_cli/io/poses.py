@@ -9,7 +9,6 @@ the first packet.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,11 +17,10 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration, read_rigid_motion
-from pnpdepth_cli.io.extrinsics import rotation_of, square
+from pnpdepth_cli.io.extrinsics import is_rotation, rotation_of, square
 from pnpdepth_cli.io.file_bytes import read_bytes
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
-_ROTATION_TOLERANCE = 1e-3
 
 PACKETS = "oxts/data"
 """Folder of the packets in a drive."""
@@ -46,9 +44,7 @@ def read_poses(path: Path, count: int | None = None, what: str = "") -> Floats:
         FileFormatError: A row has other numbers, or its rotation is none.
         InputError: The file has another number of poses, or cannot be read.
     """
-    poses = [pose for _, _, pose in pose_rows(path)]
-    if not poses:
-        raise FileFormatError(f"{path} has no poses")
+    poses = [pose for _, _, pose in _rows(path)]
     if count is not None and len(poses) != count:
         raise InputError(
             f"{path} has {len(poses)} poses for {count} {what}; it needs one row for each, in"
@@ -57,33 +53,31 @@ def read_poses(path: Path, count: int | None = None, what: str = "") -> Floats:
     return np.stack(poses)
 
 
-def pose_rows(path: Path) -> Iterator[tuple[int, Floats, Floats]]:
-    """Yields (line, its numbers, the pose (3, 4)) of each row, as `read_poses` takes them."""
+def _rows(path: Path) -> list[tuple[int, Floats, Floats]]:
+    """(line, its numbers, the pose (3, 4)) of each row; at least one."""
+    rows = []
     for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
         words = line.partition("#")[0].split()
-        if words:
-            yield number, *_pose(path, number, words)
-
-
-def _pose(path: Path, number: int, words: list[str]) -> tuple[Floats, Floats]:
-    """The numbers of a row, and the pose (3, 4)."""
-    try:
-        values = np.array(words, np.float64)
-    except ValueError:
-        raise FileFormatError(f"{path}: line {number} is not made of numbers") from None
-    if len(values) == _KITTI_COLUMNS:
-        pose = values.reshape(3, 4)
-    elif len(values) == _TUM_COLUMNS:
-        pose = np.column_stack([rotation_of(np.roll(values[4:], 1)), values[1:4]])
-    else:
-        raise FileFormatError(
-            f"{path}: line {number} has {len(values)} numbers; a pose has 12 (KITTI) or 8 (TUM)"
-        )
-    rotation = pose[:, :3]
-    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE)
-    if not (np.isfinite(pose).all() and is_rotation and np.linalg.det(rotation) > 0):
-        raise FileFormatError(f"{path}: line {number} holds no rotation")
-    return values, pose
+        if not words:
+            continue
+        try:
+            values = np.array(words, np.float64)
+        except ValueError:
+            raise FileFormatError(f"{path}: line {number} is not made of numbers") from None
+        if len(values) == _KITTI_COLUMNS:
+            pose = values.reshape(3, 4)
+        elif len(values) == _TUM_COLUMNS:
+            pose = np.column_stack([rotation_of(np.roll(values[4:], 1)), values[1:4]])
+        else:
+            raise FileFormatError(
+                f"{path}: line {number} has {len(values)} numbers; a pose has 12 (KITTI) or 8 (TUM)"
+            )
+        if not np.isfinite(pose).all() or not is_rotation(pose[:, :3]):
+            raise FileFormatError(f"{path}: line {number} holds no rotation")
+        rows.append((number, values, pose))
+    if not rows:
+        raise FileFormatError(f"{path} has no poses")
+    return rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,17 +120,14 @@ def trajectory_of(times_s: Floats, poses: Floats) -> Trajectory:
 
 def read_trajectory(path: Path) -> Trajectory:
     """Returns the trajectory in a file with rows of time, position and quaternion x y z w."""
-    times, poses = [], []
-    for number, values, pose in pose_rows(path):
+    rows = _rows(path)
+    for number, values, _ in rows:
         if len(values) != _TUM_COLUMNS or not np.isfinite(values[0]):
             raise FileFormatError(
                 f"{path}: line {number} is not a time, a position and a quaternion x y z w"
             )
-        times.append(values[0])
-        poses.append(pose)
-    if not poses:
-        raise FileFormatError(f"{path} has no poses")
-    return trajectory_of(np.array(times), np.stack(poses))
+    times_s = np.array([values[0] for _, values, _ in rows])
+    return trajectory_of(times_s, np.stack([pose for _, _, pose in rows]))
 
 
 def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) -> Floats:
@@ -148,9 +139,9 @@ def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) 
     of_scanner = square((to_camera.rotation, to_camera.translation))
     of_imu = square(read_rigid_motion(calibration / IMU_CALIBRATION))
     from_camera = np.linalg.inv(of_scanner @ of_imu)
-    read = [_packet(path) for path in packets]
-    scale = math.cos(math.radians(read[0][0]))
-    return np.stack([(_pose_of_packet(packet, scale) @ from_camera)[:3] for packet in read])
+    rows = [_packet(path) for path in packets]
+    scale = math.cos(math.radians(rows[0][0]))
+    return np.stack([(_pose_of_packet(row, scale) @ from_camera)[:3] for row in rows])
 
 
 def _packet(path: Path) -> Floats:

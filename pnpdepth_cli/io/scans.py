@@ -6,10 +6,11 @@ header claims, and pypcd4 takes 0.7 s to import and decompresses to the size tha
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,10 +165,8 @@ def _points_of(path: Path, array: NDArray[Any]) -> Points:
         return np.ascontiguousarray(array[:, :3], np.float32)
 
 
-class _Column(NamedTuple):
-    name: str
-    kind: str
-    numbers: int = 1
+Column = tuple[str, str, int]
+"""Name, NumPy type and count of numbers of a field."""
 
 
 def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
@@ -177,16 +176,14 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
     missing = [k for k in ("FIELDS", "SIZE", "TYPE", "POINTS", "DATA") if not entries.get(k)]
     if missing:
         raise damaged(path, "PCD", f"has no {missing[0]} in its header")
-    names = entries["FIELDS"]
+    names, kinds, sizes = entries["FIELDS"], entries["TYPE"], entries["SIZE"]
     counts = entries.get("COUNT", ["1"] * len(names))
-    columns = [
-        _Column(name=name, kind=f"{_PCD_KINDS.get(kind, '?')}{size}", numbers=_whole(path, count))
-        for name, kind, size, count in zip(
-            names, entries["TYPE"], entries["SIZE"], counts, strict=False
-        )
-    ]
-    if not len(columns) == len(names) == len(entries["TYPE"]) == len(entries["SIZE"]):
+    if not len(names) == len(kinds) == len(sizes) == len(counts):
         raise damaged(path, "PCD", "names another number of fields than it describes")
+    columns = [
+        (name, f"{_PCD_KINDS.get(kind, '?')}{size}", _whole(path, count))
+        for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True)
+    ]
     number, stored = _whole(path, entries["POINTS"][0]), entries["DATA"][0].lower()
     if stored not in ("ascii", "binary"):
         raise FileFormatError(
@@ -207,24 +204,23 @@ def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
     header, body = _header(path, data, "PLY", b"end_header")
     if header[0] != ["ply"] or len(header) < 2 or header[1][0] != "format":
         raise damaged(path, "PLY", "does not begin with ply and its format")
-    first = next((i for i, words in enumerate(header) if words[0] == "element"), None)
-    if first is None or header[first][1:2] != ["vertex"] or len(header[first]) != 3:
+    elements = [i for i, words in enumerate(header) if words[0] == "element"]
+    if not elements or header[elements[0]][1:2] != ["vertex"] or len(header[elements[0]]) != 3:
         raise FileFormatError(f"{path}: its first element is not vertex; save points first")
-    number = _whole(path, header[first][2])
-    columns = []
-    for words in header[first + 1 :]:
-        if words[0] == "element":
-            break
-        if words[0] == "property":
-            if len(words) != 3 or words[1] not in _PLY_KINDS:
-                raise FileFormatError(
-                    f"{path}: property {' '.join(words[1:])!r} of a vertex is not one number;"
-                    " leave it out"
-                )
-            columns.append(_Column(name=words[2], kind=_PLY_KINDS[words[1]]))
+    columns: list[Column] = []
+    for words in header[slice(*[*elements, len(header)][:2])]:
+        if words[0] != "property":
+            continue
+        if len(words) != 3 or words[1] not in _PLY_KINDS:
+            raise FileFormatError(
+                f"{path}: property {' '.join(words[1:])!r} of a vertex is not one number; leave it"
+                " out"
+            )
+        columns.append((words[2], _PLY_KINDS[words[1]], 1))
     stored = header[1][1] if len(header[1]) > 1 else ""
     if stored not in _PLY_ORDERS:
         raise damaged(path, "PLY", f"has the unknown format {stored!r}")
+    number = _whole(path, header[elements[0]][2])
     points = _xyz(path, "PLY", columns, number, body, _PLY_ORDERS[stored])
     return points, "ascii PLY" if stored == "ascii" else "binary PLY"
 
@@ -232,53 +228,43 @@ def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
 def _header(path: Path, data: bytes, kind: str, last: bytes) -> tuple[list[list[str]], bytes]:
     """The words of each header line up to the one that begins with `last`, and what follows."""
     lines: list[list[str]] = []
-    position = 0
-    while position < min(len(data), _LONGEST_HEADER):
-        end = data.find(b"\n", position)
-        line = data[position : end if end >= 0 else len(data)]
-        position = end + 1 if end >= 0 else len(data)
+    stream = io.BytesIO(data)
+    while stream.tell() < min(len(data), _LONGEST_HEADER):
+        line = stream.readline()
         words = line.decode("latin-1").split()
         if words:
             lines.append(words)
         if line.lstrip().startswith(last):
-            return lines, data[position:]
+            return lines, data[stream.tell() :]
     raise damaged(path, kind, f"has no header that ends with {last.decode()}")
 
 
 def _xyz(
-    path: Path, kind: str, columns: list[_Column], number: int, body: bytes, order: str | None
+    path: Path, kind: str, columns: list[Column], number: int, body: bytes, order: str | None
 ) -> Points:
     """x y z of rows of these columns, in bytes of this order, or in text where it is None."""
-    names = [column.name.lower() for column in columns]
+    names = [name.lower() for name, _, _ in columns]
+    counts = [count for _, _, count in columns]
     for name in "xyz":
-        if names.count(name) != 1 or columns[names.index(name)].numbers != 1:
+        if names.count(name) != 1 or counts[names.index(name)] != 1:
             listing = one_line(", ".join(names))
             raise FileFormatError(f"{path}: a {kind} without one {name} ({listing}); add it")
     wanted = [names.index(name) for name in "xyz"]
     if order is None:
-        starts = np.cumsum([0, *(column.numbers for column in columns)])
-        table = _table(path, kind, number, body, int(starts[-1]))
-        values = [table[:, starts[index]] for index in wanted]
+        table = _table(path, kind, number, body, sum(counts))
+        values = [table[:, sum(counts[:index])] for index in wanted]
     else:
-        rows = _rows(path, kind, [(order + c.kind, c.numbers) for c in columns], number, body)
+        try:
+            layout = np.dtype([(f"f{i}", order + t, n) for i, (_, t, n) in enumerate(columns)])
+        except (TypeError, ValueError) as error:
+            raise damaged(path, kind, f"describes its fields wrongly ({error})") from error
+        if len(body) < number * layout.itemsize:
+            fact = f"is cut short: {len(body) // layout.itemsize:,} of {number:,} points"
+            raise damaged(path, kind, fact)
+        rows = np.frombuffer(body, layout, count=number)
         values = [rows[f"f{index}"] for index in wanted]
     with np.errstate(over="ignore"):
         return np.column_stack(values).astype(np.float32)
-
-
-def _rows(
-    path: Path, kind: str, columns: list[tuple[str, int]], number: int, body: bytes
-) -> NDArray[Any]:
-    """Rows of columns f0, f1, …, each of a type and a count."""
-    try:
-        layout = np.dtype([(f"f{i}", *column) for i, column in enumerate(columns)])
-    except (TypeError, ValueError) as error:
-        raise damaged(path, kind, f"describes its fields wrongly ({error})") from error
-    if len(body) < number * layout.itemsize:
-        raise damaged(
-            path, kind, f"is cut short: {len(body) // layout.itemsize:,} of {number:,} points"
-        )
-    return np.frombuffer(body, layout, count=number)
 
 
 def _table(path: Path, kind: str, number: int, body: bytes, width: int) -> NDArray[np.float64]:

@@ -12,7 +12,6 @@ dropout = 0.05
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -76,11 +75,8 @@ def _elevations(path: Path, table: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def _number(path: Path, key: str, value: Any) -> float:
-    try:
-        number = float(value) if type(value) in (int, float) else math.nan
-    except OverflowError:
-        number = math.nan
-    if math.isnan(number):
+    # TOML has true, nan, and whole numbers of any length
+    if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:
         fact = "is missing" if value is None else "is not a number"
         raise FileFormatError(f"{path}: {key} {fact}; write {key} = NUMBER")
-    return number
+    return float(value)

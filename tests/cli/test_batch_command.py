@@ -14,7 +14,7 @@ from pnpdepth_cli.choices import FRAME_PROTOCOLS
 from pnpdepth_cli.cli import batch as command
 from pnpdepth_cli.cli import progress
 from pnpdepth_cli.cli.progress import BatchProgress
-from pnpdepth_cli.io.layouts import PROTOCOLS
+from pnpdepth_cli.io.dataset import PROTOCOLS
 from tests.cli.test_commands import code_of
 from tests.commands.batches import add_frame
 

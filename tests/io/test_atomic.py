@@ -24,36 +24,31 @@ def no_room_on_disk() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_the_file_appears_whole_and_nothing_else_stays(tmp_path: Path) -> None:
-    target = tmp_path / "depth.png"
+@pytest.mark.parametrize("name", ["depth.png", "n" * 251 + ".npy"])
+def test_the_file_appears_whole_and_nothing_else_stays(name: str, tmp_path: Path) -> None:
+    target = tmp_path / name
     with atomic_path(target) as temporary:
-        assert temporary.parent == tmp_path
-        assert temporary.suffix == ".png"
+        assert (temporary.parent, temporary.suffix) == (tmp_path, target.suffix)
         temporary.write_bytes(b"new")
         assert not target.exists()
     assert target.read_bytes() == b"new"
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_a_failure_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [InputError("the frame was bad"), KeyboardInterrupt()])
+def test_a_failure_leaves_the_old_file_and_no_other(error: BaseException, tmp_path: Path) -> None:
     target = tmp_path / "depth.png"
     target.write_bytes(b"old")
 
     def fail() -> None:
         with atomic_path(target) as temporary:
             temporary.write_bytes(b"half")
-            raise InputError("the frame was bad")
+            raise error
 
-    with pytest.raises(InputError, match="the frame was bad"):
+    with pytest.raises(type(error)):
         fail()
     assert target.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [target]
-
-
-def test_an_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), atomic_path(tmp_path / "a.npy"):
-        raise KeyboardInterrupt
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_link_is_followed_and_kept(tmp_path: Path) -> None:
@@ -66,19 +61,14 @@ def test_a_link_is_followed_and_kept(tmp_path: Path) -> None:
     assert (tmp_path / "real" / "file.json").read_bytes() == b"x"
 
 
-def test_the_longest_file_name_can_be_written(tmp_path: Path) -> None:
-    target = tmp_path / ("n" * 251 + ".npy")
-    with atomic_path(target) as temporary:
-        temporary.write_bytes(b"x")
-    assert target.read_bytes() == b"x"
-
-
 @pytest.mark.parametrize(
     ("name", "fact"),
     [
         ("missing/out.png", "its folder does not exist"),
         ("file.txt/out.png", "not a directory"),
         ("folder", "is a folder"),
+        ("/proc/out.png", "cannot be written|its folder does not exist"),
+        ("/dev/null", "not a regular file"),
     ],
 )
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str, fact: str) -> None:
@@ -86,19 +76,8 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str, fact
     (tmp_path / "folder").mkdir()
     with pytest.raises(OutputError, match=fact) as caught, atomic_path(tmp_path / name):
         pytest.fail("must not get here")
-    assert str(tmp_path / name) in str(caught.value)
+    assert str(caught.value).startswith(str(tmp_path / name))
     assert "\n" not in str(caught.value)
-
-
-def test_a_folder_that_takes_no_files_is_an_output_error() -> None:
-    with pytest.raises(OutputError, match=r"^/proc/out\.png"), atomic_path(Path("/proc/out.png")):
-        pytest.fail("must not get here")
-
-
-def test_a_device_is_not_replaced_by_a_file() -> None:
-    with pytest.raises(OutputError, match="not a regular file"), atomic_path(Path("/dev/null")):
-        pytest.fail("must not get here")
-    assert not Path("/dev/null").is_file()
 
 
 @pytest.mark.parametrize("suffix", [".png", ".exr", ".npy", ".pfm", ".tiff"])

@@ -18,7 +18,7 @@ HOLDER = """
 import sys, time
 from pathlib import Path
 from pnpdepth_cli.io.lock import locked_folder
-with locked_folder(Path(sys.argv[1]), None, lambda: None):
+with locked_folder(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
 """

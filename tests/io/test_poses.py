@@ -7,27 +7,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.layouts import read_frames
-from pnpdepth_cli.io.poses import Trajectory, read_oxts_poses, read_poses, read_trajectory
+from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.poses import read_oxts_poses, read_poses, read_trajectory
 from tests.kitti_drives import write_calibrations, write_packet
 
 HALF = float(np.sqrt(0.5))
 
 
-def test_kitti_rows_are_matrices(tmp_path: Path) -> None:
-    (tmp_path / "poses.txt").write_text("1 0 0 4 0 1 0 5 0 0 1 6\n\n0 -1 0 1 1 0 0 2 0 0 1 3\n")
-    poses = read_poses(tmp_path / "poses.txt")
+def test_rows_of_kitti_are_matrices_and_rows_of_tum_quaternions(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text("1 0 0 4 0 1 0 5 0 0 1 6\n\n0 -1 0 1 1 0 0 2 0 0 1 3\n")
+    poses = read_poses(path)
     assert poses.shape == (2, 3, 4)
     assert poses[1].tolist() == [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
-
-
-def test_tum_rows_turn_as_their_quaternion_says(tmp_path: Path) -> None:
     # A quarter turn about y: x becomes -z, z becomes x.
-    (tmp_path / "p.txt").write_text(f"# time x y z q\n1305.5 1 2 3 0 {HALF} 0 {HALF}\n")
-    (pose,) = read_poses(tmp_path / "p.txt")
+    path.write_text(f"# time x y z q\n1305.5 1 2 3 0 {HALF} 0 {HALF}\n")
+    (pose,) = read_poses(path)
     assert pose[:, :3] @ [1, 0, 0] == pytest.approx([0, 0, -1])
     assert pose[:, 3].tolist() == [1, 2, 3]
+    with pytest.raises(InputError, match="has 1 poses for 2 frames; it needs one row for each"):
+        read_poses(path, 2, "frames")
 
 
 @pytest.mark.parametrize(
@@ -48,31 +47,20 @@ def test_a_broken_row_is_named(tmp_path: Path, text: str, message: str) -> None:
         read_poses(tmp_path / "p.txt")
 
 
-def quarter_turn(root: Path) -> Trajectory:
+def test_a_pose_between_two_is_interpolated_unless_they_are_far_apart(tmp_path: Path) -> None:
     """From 10 s to 10.1 s 1 m along x and a quarter turn about z; rows in any order."""
-    path = root / "groundtruth.txt"
+    path = tmp_path / "groundtruth.txt"
     path.write_text(f"# t x y z q\n10.1 1 0 0 0 0 {HALF} {HALF}\n10 0 0 0 0 0 0 1\n")
-    return read_trajectory(path)
-
-
-def test_a_pose_between_two_is_interpolated(tmp_path: Path) -> None:
-    pose = quarter_turn(tmp_path).at(10.05, 0.2)
+    trajectory = read_trajectory(path)
+    pose = trajectory.at(10.05, 0.2)
     assert pose is not None
     assert pose[:, 3] == pytest.approx([0.5, 0, 0])
     assert pose[:, 0] == pytest.approx([HALF, HALF, 0])
-
-
-def test_a_pose_at_the_time_of_a_row_is_that_row_whatever_the_gap(tmp_path: Path) -> None:
-    pose = quarter_turn(tmp_path).at(10.0, 0.0)
-    assert pose is not None
-    assert pose.tolist() == np.eye(4)[:3].tolist()
-
-
-def test_there_is_no_pose_outside_of_the_trajectory_or_in_a_gap(tmp_path: Path) -> None:
-    trajectory = quarter_turn(tmp_path)
-    assert trajectory.at(9.99, 1.0) is None
-    assert trajectory.at(10.11, 1.0) is None
-    assert trajectory.at(10.05, 0.05) is None
+    at_row = trajectory.at(10.0, 0.0)
+    assert at_row is not None
+    assert at_row.tolist() == np.eye(4)[:3].tolist()
+    outside = ((9.99, 1.0), (10.11, 1.0), (10.05, 0.05))
+    assert [trajectory.at(*time_and_gap) for time_and_gap in outside] == [None] * 3
 
 
 @pytest.mark.parametrize("row", ["1 0 0 0 0 1 0 0 0 0 1 0", "nan 0 0 0 0 0 0 1", "soon 0"])
@@ -82,25 +70,20 @@ def test_a_row_without_time_is_refused(row: str, tmp_path: Path) -> None:
         read_trajectory(tmp_path / "p.txt")
 
 
-def test_a_drive_to_the_east_moves_the_camera_forward(tmp_path: Path) -> None:
+def test_a_drive_to_the_east_moves_the_camera_forward_and_a_left_turn_turns_it(
+    tmp_path: Path,
+) -> None:
     write_calibrations(tmp_path)
     east = np.degrees(2.0 / (6378137 * np.cos(np.radians(49.0))))
-    packets = [tmp_path / f"{number}.txt" for number in range(2)]
+    packets = [tmp_path / f"{number}.txt" for number in range(3)]
     write_packet(packets[0], 49.0, 8.0, yaw=0.0)
     write_packet(packets[1], 49.0, 8.0 + east, yaw=0.0)
-    first, second = read_oxts_poses(packets, tmp_path, 2)
+    write_packet(packets[2], 49.0, 8.0, yaw=0.1)
+    first, second, third = read_oxts_poses(packets, tmp_path, 2)
     motion = first[:, :3].T @ (second[:, 3] - first[:, 3])  # in the first camera's frame
     np.testing.assert_allclose(motion, [0, 0, 2.0], atol=1e-6)
     np.testing.assert_allclose(second[:, :3], first[:, :3])
-
-
-def test_a_left_turn_turns_the_camera_about_its_own_y(tmp_path: Path) -> None:
-    write_calibrations(tmp_path)
-    packets = [tmp_path / f"{number}.txt" for number in range(2)]
-    write_packet(packets[0], 49.0, 8.0, yaw=0.0)
-    write_packet(packets[1], 49.0, 8.0, yaw=0.1)
-    first, second = read_oxts_poses(packets, tmp_path, 2)
-    forward = (first[:, :3].T @ second[:, :3])[:, 2]  # where the second camera looks
+    forward = (first[:, :3].T @ third[:, :3])[:, 2]  # where the third camera looks
     np.testing.assert_allclose(forward, [-np.sin(0.1), 0, np.cos(0.1)], atol=1e-9)
 
 
@@ -110,19 +93,6 @@ def test_a_damaged_packet_is_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "0.txt").write_text(text)
     with pytest.raises(FileFormatError, match="is no packet"):
         read_oxts_poses([tmp_path / "0.txt"], tmp_path, 2)
-
-
-def test_frames_of_a_raw_drive_name_their_packets(tmp_path: Path) -> None:
-    drive = tmp_path / "2011_09_26/2011_09_26_drive_0001_sync"
-    for path in ("image_02/data/0000000003.png", "velodyne_points/data/0000000003.bin"):
-        (drive / path).parent.mkdir(parents=True)
-        (drive / path).touch()
-    write_calibrations(drive.parent)
-    (frame,) = read_frames(tmp_path)
-    assert frame.oxts is None
-    write_packet(drive / "oxts/data/0000000003.txt", 49.0, 8.0, yaw=0.0)
-    (frame,) = read_frames(tmp_path)
-    assert frame.oxts == drive / "oxts/data/0000000003.txt"
 
 
 def test_poses_put_the_scans_of_a_real_drive_on_each_other(shared_data: Path) -> None:

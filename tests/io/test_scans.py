@@ -1,15 +1,14 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError
+from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.scans import read_scan
 
 POINTS = np.random.default_rng(3).normal(0, 20, (37, 3)).astype(np.float32)
@@ -68,65 +67,14 @@ FILES = {
 }
 
 
-@settings(deadline=None, max_examples=60)
-@given(
-    name=st.sampled_from(sorted(FILES)),
-    seed=st.integers(0, 2**32 - 1),
-    count=st.integers(1, 50),
-    scale=st.sampled_from([1e-3, 1.0, 1e4]),
-)
-def test_points_of_any_scan_survive_every_format(
-    tmp_path_factory: pytest.TempPathFactory, name: str, seed: int, count: int, scale: float
-) -> None:
-    points = np.random.default_rng(seed).uniform(-scale, scale, (count, 3)).astype(np.float32)
-    path = tmp_path_factory.mktemp("scan") / name
-    path.write_bytes(FILES[name](points))
-    got = read_scan(path).points
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_points_of_any_scan_survive_every_format(tmp_path: Path, name: str, scale: float) -> None:
+    points = (scale * np.tanh(POINTS)).astype(np.float32)
+    (tmp_path / name).write_bytes(FILES[name](points))
+    got = read_scan(tmp_path / name).points
     assert got.dtype == np.float32
     assert np.array_equal(got, points)
-
-
-@settings(deadline=None, max_examples=200)
-@given(data=st.data())
-def test_a_damaged_scan_raises_only_our_errors_of_one_line(
-    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    name = data.draw(st.sampled_from(sorted(FILES)))
-    content = bytearray(FILES[name](POINTS))
-    if data.draw(st.booleans()):
-        content = content[: data.draw(st.integers(0, len(content)))]
-    else:
-        at = data.draw(st.integers(0, min(len(content), 400) - 1))
-        content[at] = data.draw(st.integers(0, 255))
-    path = tmp_path_factory.mktemp("scan") / name
-    path.write_bytes(bytes(content))
-    message = name
-    try:
-        points = read_scan(path).points
-    except InputError as error:
-        message = str(error)
-    else:
-        assert np.isfinite(points).all()
-    assert len(message.splitlines()) == 1
-    assert name in message
-
-
-@pytest.mark.parametrize("lost", range(1, 16))
-def test_a_bin_that_ends_within_a_point_is_refused(tmp_path: Path, lost: int) -> None:
-    path = tmp_path / "cut.bin"
-    path.write_bytes(bin_bytes(POINTS)[:-lost])
-    with pytest.raises(FileFormatError, match="not a multiple of 16"):
-        read_scan(path)
-
-
-@pytest.mark.parametrize("name", sorted(set(FILES) - {"kitti.bin", "scan.npy"}))
-def test_a_scan_with_fewer_points_than_its_header_states_is_refused(
-    tmp_path: Path, name: str
-) -> None:
-    short = FILES[name](POINTS).replace(b" 37\n", b" 9037\n")
-    (tmp_path / name).write_bytes(short)
-    with pytest.raises(FileFormatError, match=r"cut short|lines for"):
-        read_scan(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -147,19 +95,39 @@ def test_a_beam_without_return_in_a_pcd_is_left_out_with_a_note(tmp_path: Path) 
     assert "2 beams without return" in got.source
 
 
+@pytest.mark.parametrize("name", sorted(set(FILES) - {"kitti.bin", "scan.npy"}))
+@pytest.mark.parametrize("count", ["9037", "9" * 5000, "9" * 12, "-1", "1e3"])
+def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
+    tmp_path: Path, name: str, count: str
+) -> None:
+    lie = FILES[name](POINTS)
+    for word in (b"POINTS", b"vertex"):
+        lie = lie.replace(word + b" 37\n", word + f" {count}\n".encode())
+    (tmp_path / name).write_bytes(lie)
+    message = r"\A.*(cut short|lines for|is no count).*\Z"
+    with pytest.raises(FileFormatError, match=message) as error:
+        read_scan(tmp_path / name)
+    assert len(str(error.value)) < 300
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("a.png", b"\x89PNG\r\n\x1a\n" + bytes(24), "not a scan; give a file of .bin"),
         ("a.bin", b"\x89PNG\r\n\x1a\n" + bytes(24), "is a PNG file"),
         ("a.bin", np.full((2, 4), 1e9, "<f4").tobytes(), "1e+09 m is none of a scan"),
+        ("a.bin", bin_bytes(POINTS)[:-1], "not a multiple of 16"),
+        ("a.bin", bin_bytes(POINTS)[:-15], "not a multiple of 16"),
+        ("a.bin", b"", "empty"),
         ("a.npy", npy_bytes(POINTS)[:-4], "cannot be read"),
         ("a.npy", b"text", "not an NPY file"),
         ("a.npy", npy_bytes(POINTS, np.int32), "int32 of shape 37×4"),
         ("a.pcd", b"VERSION 0.7\nPOINTS 3\n", "no header that ends with DATA"),
         ("a.pcd", b"FIELDS x y z\nDATA ascii\n", "has no SIZE"),
         ("a.pcd", pcd_bytes(POINTS).replace(b" y ", b" w "), "without one y"),
+        ("a.pcd", pcd_bytes(POINTS).replace(b"COUNT 1 1", b"COUNT 1"), "another number of fields"),
         ("a.pcd", pcd_bytes(POINTS).replace(b"DATA binary", b"DATA binary_compressed"), "convert"),
+        ("a.ply", ply_bytes(POINTS[:0]), "holds no point"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n", "not vertex"),
         ("a.ply", ply_bytes(POINTS).replace(b"uchar red", b"list uchar int red"), "not one number"),
     ],
@@ -168,19 +136,10 @@ def test_what_is_no_scan_is_an_error_of_one_line(
     tmp_path: Path, name: str, content: bytes, message: str
 ) -> None:
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(FileFormatError) as error:
+    with pytest.raises(InputError) as error:
         read_scan(tmp_path / name)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_a_scan_of_no_points_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.ply").write_bytes(ply_bytes(POINTS[:0]))
-    with pytest.raises(NoPointsError):
-        read_scan(tmp_path / "a.ply")
-    (tmp_path / "a.bin").write_bytes(b"")
-    with pytest.raises(FileFormatError, match="empty"):
-        read_scan(tmp_path / "a.bin")
 
 
 def test_the_points_of_an_npz_are_its_array_data(tmp_path: Path) -> None:
@@ -192,38 +151,34 @@ def test_the_points_of_an_npz_are_its_array_data(tmp_path: Path) -> None:
         read_scan(tmp_path / "a.bin")
 
 
-def test_kittis_scans_are_read_whole(shared_data: Path) -> None:
-    for path in sorted((shared_data / "kitti_object" / "velodyne").glob("*.bin")):
-        got = read_scan(path).points
-        assert len(got) == path.stat().st_size // 16
-        assert 100_000 < len(got) < 130_000
-        assert np.abs(got).max() < 125
-
-
 def nuscenes_bytes(points: NDArray[np.float32]) -> bytes:
     """x, y, z, intensity 0 to 255, and the index of one of 32 lasers."""
     numbers = np.arange(len(points))
     return np.column_stack([points, numbers % 256, numbers % 32]).astype("<f4").tobytes()
 
 
-@pytest.mark.parametrize("name", ["LIDAR_TOP__1532402927647951.pcd.bin", "renamed.bin"])
-@pytest.mark.parametrize("count", [37, 40])
-def test_a_nuscenes_scan_is_recognised_by_name_and_content(
-    tmp_path: Path, name: str, count: int
+@pytest.mark.parametrize(
+    ("name", "count", "encoded", "source"),
+    [
+        ("LIDAR_TOP__1532402927647951.pcd.bin", 37, nuscenes_bytes, "nuScenes scan"),
+        ("LIDAR_TOP__1532402927647951.pcd.bin", 40, nuscenes_bytes, "nuScenes scan"),
+        ("renamed.bin", 37, nuscenes_bytes, "nuScenes scan"),
+        ("renamed.bin", 40, nuscenes_bytes, "nuScenes scan"),
+        ("kitti.bin", 40, bin_bytes, "KITTI scan"),
+    ],
+)
+def test_a_bin_of_kitti_or_nuscenes_is_recognised_by_name_and_content(
+    name: str,
+    count: int,
+    encoded: Callable[[NDArray[np.float32]], bytes],
+    source: str,
+    tmp_path: Path,
 ) -> None:
     points = np.resize(POINTS, (count, 3))
-    (tmp_path / name).write_bytes(nuscenes_bytes(points))
+    (tmp_path / name).write_bytes(encoded(points))
     scan = read_scan(tmp_path / name)
     assert np.array_equal(scan.points, points)
-    assert scan.source == "nuScenes scan"
-
-
-def test_a_kitti_scan_whose_size_also_fits_nuscenes_stays_kittis(tmp_path: Path) -> None:
-    points = np.resize(POINTS, (40, 3))
-    (tmp_path / "kitti.bin").write_bytes(bin_bytes(points))
-    scan = read_scan(tmp_path / "kitti.bin")
-    assert np.array_equal(scan.points, points)
-    assert scan.source == "KITTI scan"
+    assert scan.source == source
 
 
 def test_an_ambiguous_scan_is_refused_until_the_number_of_fields_is_given(tmp_path: Path) -> None:
@@ -235,18 +190,3 @@ def test_an_ambiguous_scan_is_refused_until_the_number_of_fields_is_given(tmp_pa
     assert len(read_scan(path, 5).points) == 4
     with pytest.raises(FileFormatError, match="not a multiple of 24"):
         read_scan(path, 6)
-
-
-@pytest.mark.parametrize("count", ["9" * 5000, "9" * 12, "-1", "1e3"])
-@pytest.mark.parametrize("kind", ["pcd", "ply"])
-def test_a_count_of_points_beyond_the_file_is_refused_in_one_line(
-    tmp_path: Path, count: str, kind: str
-) -> None:
-    content = pcd_bytes(POINTS) if kind == "pcd" else ply_bytes(POINTS)
-    name = b"POINTS" if kind == "pcd" else b"vertex"
-    path = tmp_path / f"scan.{kind}"
-    path.write_bytes(content.replace(name + b" 37", name + b" " + count.encode()))
-    with pytest.raises(FileFormatError) as error:
-        read_scan(path)
-    assert "\n" not in str(error.value)
-    assert len(str(error.value)) < 300

@@ -37,11 +37,10 @@ from pnpdepth_cli.commands.batch.summary import (
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.io.remote.store import upload
+from pnpdepth_cli.io.remote import RemotePath, upload
 from pnpdepth_cli.io.report import remove_report_leftovers
 
 if TYPE_CHECKING:

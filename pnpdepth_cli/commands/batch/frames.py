@@ -21,20 +21,21 @@ from pnpdepth_cli.commands.refinement.output_files import Outputs
 from pnpdepth_cli.commands.refinement.request import FrameFiles, NeighbourFiles, RefineRequest
 from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.io.bags.bag import is_bag
-from pnpdepth_cli.io.colmap.reading import model_files
-from pnpdepth_cli.io.dataset.frame import (
+from pnpdepth_cli.io.bags import is_bag
+from pnpdepth_cli.io.colmap import model_files
+from pnpdepth_cli.io.dataset import (
     SCAN_ONLY_SUFFIXES,
     Frame,
     Source,
     Unmatched,
     file_of,
+    find_protocol,
     name_problem,
 )
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.layouts import LAYOUTS, find_protocol, list_frames
+from pnpdepth_cli.io.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.io.lock import LOCKS
-from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote import RemotePath
 
 _LISTS = (".csv", ".jsonl")
 _IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"

@@ -20,10 +20,10 @@ from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
 from pnpdepth_cli.commands.batch.request import LOCAL, BatchRequest, RayWorkers
 from pnpdepth_cli.commands.batch.summary import Row
 from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.lock import LOCKS
-from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote import RemotePath
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.running import OpenNetwork, References

@@ -28,8 +28,7 @@ from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
-from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.io.remote.store import Listing, read_object, remove, renamed, upload
+from pnpdepth_cli.io.remote import Listing, RemotePath, read_object, remove, renamed, upload
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.refinement.refine import RefineOutcome

@@ -154,6 +154,7 @@ class BatchRequest(FrameSelection):
     """The Ray workers, if any."""
 
     def __post_init__(self) -> None:
+
         if self.html_3d and self.html is None:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
 

@@ -35,10 +35,9 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.frames.frame import Refined, WarmStart
 from pnpdepth_cli.frames.refiner import Refiner
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
-from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.io.remote.store import local_files, renamed
+from pnpdepth_cli.io.remote import RemotePath, local_files, renamed
 
 Item = TypeVar("Item")
 REGISTERING = 16

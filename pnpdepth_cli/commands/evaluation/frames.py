@@ -17,6 +17,7 @@ from pnpdepth_cli.commands.evaluation.pairing import FramePair, load_stacked
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, crop_window
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_mask, rgb_of
 from pnpdepth_cli.io.depth import (
     DepthImage,
@@ -25,7 +26,6 @@ from pnpdepth_cli.io.depth import (
     known_metres,
     load_stored,
 )
-from pnpdepth_cli.io.layouts import Hdf5Array
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints, in_frame

@@ -18,13 +18,19 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.statistics import groups_by_name
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.dataset.find_files import find_files
-from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, file_of
+from pnpdepth_cli.io.dataset import (
+    IMAGE_SUFFIXES,
+    Frame,
+    Source,
+    file_of,
+    find_files,
+    find_protocol,
+)
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray
-from pnpdepth_cli.io.layouts import Frame, Source, find_layout, find_protocol, list_frames
+from pnpdepth_cli.io.layouts import find_layout, list_frames
 from pnpdepth_cli.io.record import read_json
-from pnpdepth_cli.io.remote.address import RemotePath
+from pnpdepth_cli.io.remote import RemotePath
 
 _DEPTH_MARKS = ("_depth", ".depth")
 _COMPANIONS = ("_preview", "_improvement", "_sigma", "_valid")

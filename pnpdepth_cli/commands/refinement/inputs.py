@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.sparse.options import METRES, ColmapOptions, ScanOpti
 from pnpdepth_cli.commands.sparse.scans import SparseDepth, read_scan_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame, Register, registration_to_make, tensor_of
-from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES, Hdf5Array, Source, file_of
+from pnpdepth_cli.io.dataset import SCAN_ONLY_SUFFIXES, Hdf5Array, Source, file_of
 from pnpdepth_cli.io.dataset.reading import check_same_view, depth_of, masked, moved_to, rgb_of
 from pnpdepth_cli.io.depth import (
     DepthImage,

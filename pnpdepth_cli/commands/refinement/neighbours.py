@@ -11,8 +11,7 @@ import numpy as np
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.commands.refinement.request import FrameFiles
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset.frame import Frame, Source, file_of
-from pnpdepth_cli.io.dataset.protocols import Protocol
+from pnpdepth_cli.io.dataset import Frame, Protocol, Source, file_of
 from pnpdepth_cli.io.dataset.reading import read_frame_image
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
+from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 
 _FILE_SUFFIXES = {

@@ -13,18 +13,17 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import choices
 from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.remote.address import path_of
+from pnpdepth_cli.io.remote import path_of
 from pnpdepth_cli.settings import Settings, option
 
 if TYPE_CHECKING:
     from pnpdepth_cli.io.calibration import Calibration
-    from pnpdepth_cli.io.dataset.frame import Pose, Source
-    from pnpdepth_cli.io.dataset.protocols import Protocol
+    from pnpdepth_cli.io.dataset import Pose, Protocol, Source
     from pnpdepth_cli.sensors import SamplePattern
 
 
 def _whole_frame() -> Protocol:
-    from pnpdepth_cli.io.dataset.protocols import WHOLE
+    from pnpdepth_cli.io.dataset import WHOLE
 
     return WHOLE
 

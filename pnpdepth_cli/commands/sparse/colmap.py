@@ -10,8 +10,14 @@ import numpy as np
 from pnpdepth_cli.commands.sparse.options import METRES, MODEL_UNITS, ColmapOptions
 from pnpdepth_cli.commands.sparse.scans import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
-from pnpdepth_cli.io.colmap.model import ColmapCamera, ColmapModel
-from pnpdepth_cli.io.colmap.reading import find_model, model_files, name_in_model, read_model
+from pnpdepth_cli.io.colmap import (
+    ColmapCamera,
+    ColmapModel,
+    find_model,
+    model_files,
+    name_in_model,
+    read_model,
+)
 from pnpdepth_cli.io.dataset.reading import check_same_view
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint

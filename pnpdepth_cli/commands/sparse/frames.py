@@ -16,7 +16,7 @@ from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.commands.sparse.scans import chosen_camera
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
-from pnpdepth_cli.io.bags.bag import (
+from pnpdepth_cli.io.bags import (
     CLOUDS,
     IMAGES,
     ODOMETRY,

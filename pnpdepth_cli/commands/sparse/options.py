@@ -62,7 +62,7 @@ class ScanOptions:
         Raises:
             UsageError: It is not, and an option is given that only a scan has.
         """
-        from pnpdepth_cli.io.dataset.frame import SCAN_ONLY_SUFFIXES
+        from pnpdepth_cli.io.dataset import SCAN_ONLY_SUFFIXES
 
         suffix = sparse.suffix.lower()
         if suffix in SCAN_ONLY_SUFFIXES or (suffix == ".npy" and self.calib is not None):

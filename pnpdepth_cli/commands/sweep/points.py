@@ -18,7 +18,7 @@ from pnpdepth_cli.commands.sparse.make import find_sensor
 from pnpdepth_cli.commands.sparse.scans import camera_of, check_size
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,

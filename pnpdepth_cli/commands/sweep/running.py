@@ -23,7 +23,7 @@ from pnpdepth_cli.errors import DeviceError, OutputError, PnpDepthError, Storage
 from pnpdepth_cli.frames.opened import SplitCache
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.io.atomic import cannot_write
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network

@@ -32,11 +32,10 @@ from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.io.remote.address import RemotePath
-from pnpdepth_cli.io.remote.store import status_of
+from pnpdepth_cli.io.remote import RemotePath, status_of
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.sensors import SamplePattern
 from pnpdepth_cli.settings import Settings

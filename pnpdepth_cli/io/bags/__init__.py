@@ -1,1 +1,227 @@
-"""Bags of ROS 1, ROS 2 and MCAP: topics, messages, and images and clouds of them."""
+"""Bags of ROS 1, ROS 2 and MCAP, read message by message.
+
+Messages are decoded as the released ROS message types define them. The definitions in the bag
+itself are not used, because rosbags makes Python code of them.
+
+rosbags decompresses whatever a chunk holds and runs what SQLite stores: a chunk of a few kilobytes
+can hold gigabytes, and a schema can hold views and generated columns, computed when they are read.
+"""
+
+from __future__ import annotations
+
+import bz2
+import functools
+import importlib
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from pnpdepth_cli.budget import budget
+from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes, size_of_regular_file
+from pnpdepth_cli.io.yaml_file import parse_yaml
+
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CLOUDS = ("sensor_msgs/msg/PointCloud2",)
+CAMERAS = ("sensor_msgs/msg/CameraInfo",)
+ODOMETRY = ("nav_msgs/msg/Odometry",)
+POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+TRANSFORMS = ("tf2_msgs/msg/TFMessage",)
+
+
+def is_bag(path: Path) -> bool:
+    """Returns whether this is a bag file, or a folder that ROS 2 recorded."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return path.suffix.lower() in BAG_SUFFIXES
+
+
+class Bag:
+    """An open bag; made by `open_bag`."""
+
+    def __init__(self, path: Path, reader: Any, typestore: Any, *, ros1: bool) -> None:
+        self.path = path
+        self._reader = reader
+        self._decode = typestore.deserialize_ros1 if ros1 else typestore.deserialize_cdr
+
+    def topics(self, kinds: Sequence[str]) -> dict[str, int]:
+        """Returns the topics of these message types with their number of messages."""
+        with _as_our_errors(self.path):
+            return {
+                name: int(info.msgcount)
+                for name, info in sorted(self._reader.topics.items())
+                if info.msgtype in kinds
+            }
+
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
+        """Yields (topic, nanoseconds at which it was logged, message) in the order of the log."""
+        wanted = [each for each in self._reader.connections if each.topic in topics]
+        if not wanted:
+            return
+        with _as_our_errors(self.path):
+            for connection, time_ns, data in self._reader.messages(connections=wanted):
+                yield connection.topic, int(time_ns), self._decode(data, connection.msgtype)
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Yields the bag in a file (.bag, .mcap, .db3) or in a folder with metadata.yaml.
+
+    Raises:
+        InputError: There is none.
+        FileFormatError: It is cut short, or no bag.
+        UsageError: rosbags is not installed.
+    """
+    try:
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+    except ImportError:
+        raise UsageError(f"reading {path} needs rosbags: pip install 'pnpdepth[ros]'") from None
+    if not path.exists():
+        raise InputError(f"{path}: no such file; check the path")
+    ros1 = path.suffix.lower() == ".bag"
+    bound_decompression()
+    with _as_our_errors(path):
+        check_bag(path)
+        reader: Any = Reader1(path) if ros1 else Reader2(path)
+        reader.open()
+    try:
+        yield Bag(path, reader, message_types(ros1=ros1), ros1=ros1)
+    finally:
+        reader.close()
+
+
+def message_types(*, ros1: bool) -> Any:
+    """Returns rosbags' type store of ROS 1 Noetic or ROS 2 Humble."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if not ros1:
+        return get_typestore(Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    transforms = "geometry_msgs/TransformStamped[] transforms"  # the store lacks tf2_msgs
+    store.register(get_types_from_msg(transforms, TRANSFORMS[0]))
+    return store
+
+
+def topic_of(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> str:
+    """Returns the topic of these message types that is named, or else the only one.
+
+    Raises:
+        UsageError: There are several or none.
+    """
+    topics = bag.topics(kinds)
+    # an image and its compressed copy are one camera
+    names = [n for n in topics if not (n.endswith("/compressed") and n[:-11] in topics)]
+    names = [n for n in wanted if n in topics] or names
+    if len(names) != 1:
+        listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
+        what = f"several topics of {kinds[0]}" if names else f"no topic of {kinds[0]}"
+        raise UsageError(f"{bag.path} has {what}; choose with --topics: {listing or 'none'}")
+    return names[0]
+
+
+def check_topics(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> None:
+    """Raises UsageError for a topic that is not there, or not of these message types."""
+    topics = bag.topics(kinds)
+    for name in wanted:
+        if name not in topics:
+            raise UsageError(
+                f"{bag.path} has no topic {name} of images, points or poses; there are"
+                f" {', '.join(topics) or 'none'}"
+            )
+
+
+@contextmanager
+def _as_our_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (PnpDepthError, GeneratorExit):
+        raise
+    except Exception as error:  # rosbags raises many kinds on damaged files
+        raise FileFormatError(
+            f"{path} cannot be read as a bag ({type(error).__name__}: {one_line(error)}); if it is"
+            " cut short, repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
+        ) from error
+
+
+_CHUNK_BYTES = 1 << 28
+"""Chunks are closed at 768 KiB by default, and a message of a sensor is far below this."""
+
+_COMPUTED = """
+    SELECT name FROM sqlite_master
+    WHERE type NOT IN ('table', 'index') OR sql LIKE 'CREATE VIRTUAL%'
+    UNION ALL
+    SELECT m.name FROM sqlite_master m JOIN pragma_table_xinfo(m.name) x
+    WHERE m.type = 'table' AND x.hidden
+"""
+"""Views, triggers, virtual tables, and tables with generated columns."""
+
+
+def check_bag(path: Path) -> None:
+    """Raises FileFormatError if a bag is compressed as a whole, or its database computes values."""
+    files = [path]
+    if path.is_dir():
+        files = sorted(path.glob("*.db3"))
+        _check_metadata(path / "metadata.yaml")
+    for file in files:
+        size_of_regular_file(file)
+        if file.suffix.lower() == ".db3":
+            _check_database(file)
+
+
+def _check_metadata(path: Path) -> None:
+    content = parse_yaml(path, read_bytes(path).decode("utf-8", "replace"))
+    fields = content.get("rosbag2_bagfile_information") if isinstance(content, Mapping) else None
+    if not isinstance(fields, Mapping):
+        raise FileFormatError(f"{path} is not the metadata of a bag; repair it: ros2 bag reindex")
+    mode = str(fields.get("compression_mode") or "none").lower()
+    if mode != "none":
+        raise FileFormatError(
+            f"{path}: bags of compression_mode {one_line(mode)[:20]!r} are not read; convert it"
+            " with `ros2 bag convert`, to MCAP with compressed chunks if it must be small"
+        )
+
+
+def _check_database(path: Path) -> None:
+    connection = sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)
+    try:
+        computed = connection.execute(_COMPUTED).fetchone()
+    finally:
+        connection.close()
+    if computed is not None:
+        raise FileFormatError(
+            f"{path}: {one_line(computed[0])[:40]!r} is no plain table, so this database was not"
+            " recorded by ROS; record the bag again"
+        )
+
+
+@functools.cache
+def bound_decompression() -> None:
+    """Makes rosbags decompress chunks within `budget()`, in the whole process."""
+    import lz4.frame
+
+    rosbag1: Any = importlib.import_module("rosbags.rosbag1.reader")
+    mcap: Any = importlib.import_module("rosbags.rosbag2.storage_mcap")
+    rosbag1.decompressors.update(bz2=_bounded(bz2.open), lz4=_bounded(lz4.frame.open))
+    mcap.DECOMPRESSORS.update(lz4=_bounded(lz4.frame.open), zstd=_bounded(mcap.zstd.open))
+
+
+def _bounded(open_stream: Callable[..., Any]) -> Callable[..., bytes]:
+    """Returns a function of compressed bytes and, for MCAP, the size that the chunk claims."""
+
+    def decompress(data: bytes, claimed: int | None = None) -> bytes:
+        limit = min(_CHUNK_BYTES, budget().max_file_bytes)
+        if claimed is not None:
+            limit = min(limit, claimed)
+        stream: BinaryIO
+        with open_stream(BytesIO(data)) as stream:
+            content = stream.read(limit + 1)
+        if len(content) > limit:
+            raise ValueError(f"a chunk of {len(data):,} bytes holds more than {limit:,}")
+        return content
+
+    return decompress

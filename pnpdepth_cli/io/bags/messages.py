@@ -92,19 +92,17 @@ def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
     missing = [name for name in "xyz" if name not in fields]
     if missing:
         raise FileFormatError(f"{topic}: a cloud without field {missing[0]}; name another topic")
+    unknown = [name for name in "xyz" if int(fields[name].datatype) not in _NUMBERS]
+    if unknown:
+        raise FileFormatError(f"{topic}: field {unknown[0]} of a cloud is of no known type")
     order = ">" if message.is_bigendian else "<"
-    height, width = int(message.height), int(message.width)
-    step, row = int(message.point_step), int(message.row_step)
-    formats, offsets = [], [int(fields[name].offset) for name in "xyz"]
-    for name in "xyz":
-        kind = _NUMBERS.get(int(fields[name].datatype))
-        if kind is None:
-            raise FileFormatError(f"{topic}: field {name} of a cloud is of no known type")
-        formats.append(order + kind)
-    ends = [o + np.dtype(f).itemsize for o, f in zip(offsets, formats, strict=True)]
+    formats = [order + _NUMBERS[int(fields[name].datatype)] for name in "xyz"]
+    offsets = [int(fields[name].offset) for name in "xyz"]
+    end = max(o + np.dtype(f).itemsize for o, f in zip(offsets, formats, strict=True))
+    height, width, step = int(message.height), int(message.width), int(message.point_step)
+    row = int(message.row_step) if height > 1 else width * step
     data = np.frombuffer(message.data, np.uint8)
-    row = row if height > 1 else width * step
-    if max(ends) > step or width * step > row or height * row > data.size:
+    if end > step or width * step > row or height * row > data.size:
         raise FileFormatError(
             f"{topic}: a cloud of {width}×{height} points of {step} bytes has {data.size:,} bytes;"
             " the bag is damaged"

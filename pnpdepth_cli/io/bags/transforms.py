@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.io.bags.bag import CAMERAS, ODOMETRY, POSES, TRANSFORMS, Bag
+from pnpdepth_cli.io.bags import CAMERAS, ODOMETRY, POSES, TRANSFORMS, Bag
 from pnpdepth_cli.io.bags.messages import seconds_of
 from pnpdepth_cli.io.calibration import Calibration, camera_in_yaml
-from pnpdepth_cli.io.extrinsics import Extrinsics, inverse, pose_of_quaternion, square
+from pnpdepth_cli.io.extrinsics import Extrinsics, chained, inverse, pose_of_quaternion, square
 from pnpdepth_cli.io.poses import Trajectory, trajectory_of
 
 _STATIC = "/tf_static"
@@ -160,13 +160,12 @@ def _add_link(links: Links, link: tuple[str, str], pose: Extrinsics) -> None:
 
 def _chained(links: Links, start: str, end: str) -> Extrinsics | None:
     """The pose x_start = pose · x_end along the shortest chain of links; None if none."""
-    poses: dict[str, Extrinsics] = {start: (np.eye(3), np.zeros(3))}
+    poses = {start: chained()}
     waiting = deque([start])
     while waiting and end not in poses:
         frame = waiting.popleft()
-        rotation, translation = poses[frame]
-        for other, (turn, shift) in links.get(frame, {}).items():
+        for other, pose in links.get(frame, {}).items():
             if other not in poses:
-                poses[other] = rotation @ turn, rotation @ shift + translation
+                poses[other] = chained(poses[frame], pose)
                 waiting.append(other)
     return poses.get(end)

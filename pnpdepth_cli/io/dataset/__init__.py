@@ -1,1 +1,291 @@
-"""A frame of a data set, and how its parts are read."""
+"""One frame of a data set: its files, what is needed to read them, its name, and its cut."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError, SizeError, UsageError
+from pnpdepth_cli.io.calibration import Calibration
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
+
+_LONGEST_PART = 255 - len("_improvement.png")
+"""Bytes of a part of a name, so that the longest file name of a result has 255."""
+
+_LEADS_OUT = "leads out of the output folder"
+_DRIVE = re.compile(r"[A-Za-z]:")
+_RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])\s*(\..*)?", re.IGNORECASE)
+"""Device names that Windows reserves in every folder, with any suffix."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol:
+    """The part of a frame that the paper's experiments use."""
+
+    name: str
+    halved: bool = False
+    """Every second pixel in both directions (nearest neighbour) is used."""
+    crop: tuple[int, int] | None = None
+    """(H, W) of the crop after halving; None for the whole image."""
+    anchor: Literal["centre", "bottom"] = "centre"
+    """Vertical position of the crop, which is centred horizontally."""
+
+    def apply(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Returns the part of an image (H, W) or (H, W, C). Raises SizeError if it is too small."""
+        top, left, height, width = self._window((image.shape[0], image.shape[1]))
+        # nearest neighbour at half the size: the pixel whose area holds the new pixel's centre
+        small = image[1::2, 1::2] if self.halved else image
+        return small[top : top + height, left : left + width]
+
+    def in_crop(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
+        """Returns pixel coordinates (N, 2) in that part, from those in the whole image."""
+        top, left, _, _ = self._window(size)
+        moved = (np.asarray(xy, np.float64) + 0.5) / 2 - 0.5 if self.halved else xy
+        return np.asarray(moved - np.array([left, top]), np.float32)
+
+    def intrinsics_in_crop(
+        self, intrinsics: NDArray[np.float64], size: tuple[int, int]
+    ) -> NDArray[np.float64]:
+        """Returns the (3, 3) intrinsics of that part, from those of the whole image of (H, W)."""
+        top, left, _, _ = self._window(size)
+        result = np.array(intrinsics, np.float64)
+        if self.halved:  # x becomes (x + 0.5) / 2 - 0.5
+            result[:2] /= 2
+            result[:2, 2] -= 0.25
+        result[:2, 2] -= (left, top)
+        return result
+
+    def _window(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
+        """(top, left, height, width) after halving."""
+        height, width = (side // 2 for side in size) if self.halved else size
+        if self.crop is None:
+            return 0, 0, height, width
+        rows, columns = self.crop
+        if rows > height or columns > width:
+            raise SizeError(
+                f"protocol {self.name!r} needs {columns}×{rows} pixels but the frame has"
+                f" {width}×{height}{' after halving' if self.halved else ''}"
+            )
+        top = height - rows if self.anchor == "bottom" else (height - rows) // 2
+        return top, (width - columns) // 2, rows, columns
+
+
+WHOLE = Protocol(name="whole")
+PROTOCOLS = {
+    "whole": WHOLE,
+    "nyu": Protocol(name="nyu", halved=True, crop=(228, 304)),
+    "kitti-odometry": Protocol(name="kitti-odometry", crop=(228, 912), anchor="bottom"),
+    # The benchmark scores all pixels with ground truth; its selection is cropped already.
+    "kitti-depth": Protocol(name="kitti-depth"),
+}
+"""The paper's protocols (Wang et al. 2019, section on data sets), and all of the frame."""
+
+
+def find_protocol(name: str) -> Protocol:
+    """Returns the protocol of this name. Raises UsageError if there is none."""
+    if name not in PROTOCOLS:
+        raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hdf5Array:
+    """An array in an HDF5 or MATLAB 7.3 file."""
+
+    path: Path
+    name: str
+    focal_px: float | None = None
+    """For depth that is the distance from the camera's centre: the focal length, with the principal
+    point in the middle, to get z. None for z itself."""
+    axes: tuple[int, ...]
+    """Order of the axes that makes the array, without its indexed axis, (H, W) or (H, W, 3)."""
+    index: int | None = None
+    """Which element of the first axis; None for the whole array."""
+
+    def __str__(self) -> str:
+        return f"{self.path}[{self.name}{'' if self.index is None else f', {self.index}'}]"
+
+
+Source = Path | Hdf5Array
+
+
+def file_of(source: Source) -> Path:
+    """Returns the file that a source lies in."""
+    return source if isinstance(source, Path) else source.path
+
+
+Pose = tuple[tuple[float, ...], ...]
+"""(3, 4): rotation and, in the last column, translation in metres."""
+
+
+def as_pose(matrix: NDArray[np.float64]) -> Pose:
+    """Returns a (3, 4) matrix as the pose of a frame."""
+    return tuple(map(tuple, matrix.tolist()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Neighbour:
+    """Another frame of the same sequence, whose points are moved into this one."""
+
+    frame: Frame
+    motion: Pose | None
+    """From the other camera's frame to this one's. None: to be estimated."""
+    poses: str
+    """Where the motion is from, for a person."""
+    apart: int
+    """Frames between the two, at least 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One frame; parts that it does not have are None."""
+
+    name: str
+    """Unique in its data set, and fit for a file name; slashes separate folders."""
+    image: Source | None = None
+    sparse: Path | None = None
+    """A depth file, a list of points, or a scan; None where points are sampled from `gt`."""
+    gt: Source | None = None
+    calib: Path | None = None
+    """The calibration, as `read_calibration` takes it."""
+    camera: int | None = None
+    """Which camera of the calibration."""
+    calibration: Calibration | None = None
+    """The calibration itself, of a data set that has one for each frame and no file of it."""
+    sparse_scale: float | None = None
+    """Codes per metre of integer sparse depth."""
+    gt_scale: float | None = None
+    """Codes per metre of integer ground truth."""
+    protocol: Protocol = WHOLE
+    pose: Pose | None = None
+    """x_world = pose · (x, 1) for points in the camera's frame; of KITTI odometry camera 0's."""
+    oxts: Path | None = None
+    """The packet of KITTI's inertial system that gives the pose."""
+    neighbours: tuple[Neighbour, ...] = ()
+    window: tuple[Frame, ...] = ()
+    """The frames of its window up to and with this one; empty outside of windows."""
+    masks: tuple[Path, ...] = ()
+    """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""
+    gt_other_size: bool = False
+    """Whether the ground truth may have another size than the image, of the same view."""
+    sparse_other_size: bool = False
+    group: str | None = None
+    """The sequence it belongs to; None derives it from the name."""
+
+    def __post_init__(self) -> None:
+        for source in (self.image, self.sparse, self.gt, self.calib, *self.masks):
+            if source is not None:
+                _check_no_nul(file_of(source))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unmatched:
+    """A file or folder that belongs to no frame."""
+
+    path: Path
+    why: str
+    """The reason, as the end of a sentence that begins with the path."""
+    spare: bool = False
+    """False for a file of a frame that lacks a part, or cannot be read."""
+
+    def __post_init__(self) -> None:
+        _check_no_nul(self.path)
+
+    def __str__(self) -> str:
+        return f"{self.path} {self.why}"
+
+
+def _check_no_nul(path: Path) -> None:
+    """Raises FileFormatError for a path that no file can have: an index file may hold any text."""
+    if "\0" in str(path):
+        name = str(path).replace("\0", "\\0")
+        raise FileFormatError(f"{name}: a file name holds a NUL character; correct the file's list")
+
+
+def find_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path], list[Unmatched]]:
+    """Returns the files with one of these suffixes, by relative path without suffix, and problems.
+
+    Links are followed, except into a folder that they lie in. Hidden files and folders are skipped.
+    Files are sorted by path. Problems are folders that cannot be read, and files that differ in
+    suffix only, which are left out. The folder need not exist.
+    """
+    problems: list[Unmatched] = []
+    paths = sorted(_walk(folder, frozenset(), problems)) if folder.is_dir() else []
+    files, ambiguous = one_of_each(
+        (path.relative_to(folder).with_suffix("").as_posix(), path)
+        for path in paths
+        if path.suffix.lower() in suffixes
+    )
+    return files, problems + ambiguous
+
+
+def one_of_each(
+    named: Iterable[tuple[str, Path]],
+) -> tuple[dict[str, Path], list[Unmatched]]:
+    """Returns the files whose name no other file has, by name, and the others."""
+    files: dict[str, list[Path]] = {}
+    for name, path in named:
+        files.setdefault(name, []).append(path)
+    ambiguous = [
+        Unmatched(path=path, why=f"and {paths[0].name} are one frame; keep one")
+        for paths in files.values()
+        for path in paths[1:]
+    ]
+    return {name: paths[0] for name, paths in files.items() if len(paths) == 1}, ambiguous
+
+
+def _walk(folder: Path, above: frozenset[str], problems: list[Unmatched]) -> Iterator[Path]:
+    real = os.path.realpath(folder)
+    if real in above:
+        return  # a link to a folder that it is in
+    try:
+        paths = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        why = f"cannot be read ({reason}); what is in it is left out"
+        problems.append(Unmatched(path=folder, why=why))
+        return
+    for path in paths:
+        if path.is_dir():
+            yield from _walk(path, above | {real}, problems)
+        elif path.is_file():
+            yield path
+
+
+def name_problem(name: str) -> str | None:
+    """Returns why no result can be stored under a frame's name on POSIX; None if it can.
+
+    The reason is a predicate, such as "holds a NUL character".
+    """
+    if "\0" in name:
+        return "holds a NUL character"
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts:
+        return _LEADS_OUT
+    if not path.parts:
+        return "names no file"
+    if any(len(part.encode("utf-8", "surrogateescape")) > _LONGEST_PART for part in path.parts):
+        return f"is longer than {_LONGEST_PART} bytes"
+    return None
+
+
+def portable_name_problem(name: str) -> str | None:
+    """Returns why a name is not fit for results on Linux, macOS or Windows; None if it is."""
+    if "\\" in name:
+        return "holds a backslash, which separates folders on Windows only; use /"
+    if _DRIVE.match(name):
+        return "begins with a drive letter"
+    for part in PurePosixPath(name).parts:
+        if _RESERVED.fullmatch(part):
+            return f"holds {part!r}, which Windows reserves"
+    problem = name_problem(name)
+    return None if problem == _LEADS_OUT else problem  # only what writes results minds

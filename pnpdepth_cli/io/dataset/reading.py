@@ -5,22 +5,17 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import (
-    FileFormatError,
-    InputError,
-    PnpDepthError,
-    SizeError,
-    UsageError,
-)
-from pnpdepth_cli.io.dataset.frame import IMAGE_SUFFIXES, Frame, Hdf5Array
-from pnpdepth_cli.io.depth import known_metres, load_stored, read_depth
+from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, SizeError, UsageError
+from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Hdf5Array
+from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import (
     check_value_count,
     damaged,
@@ -33,8 +28,7 @@ from pnpdepth_cli.io.rgb import read_rgb
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
 
-_HEADER_BYTES = 128
-_TYPES = {
+_MATLAB_TYPES = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
 }  # fmt: skip
 _MATRIX, _COMPRESSED = 14, 15
@@ -49,18 +43,6 @@ def read_frame_image(frame: Frame) -> NDArray[np.float32]:
     source = frame.image
     rgb = rgb_of(source) if isinstance(source, Hdf5Array) else read_rgb(source).values
     return np.ascontiguousarray(frame.protocol.apply(rgb))
-
-
-def read_frame_ground_truth(frame: Frame) -> NDArray[np.float32]:
-    """Returns (H, W) metres, 0 where unknown. Raises InputError if there is no ground truth."""
-    if frame.gt is None:
-        raise InputError(f"frame {frame.name} has no ground truth")
-    if isinstance(frame.gt, Hdf5Array):
-        depth = depth_of(frame.gt)
-    else:
-        depth = read_depth(frame.gt, scale=frame.gt_scale).values
-    depth = masked(depth, frame.masks)
-    return np.ascontiguousarray(frame.protocol.apply(depth))
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
@@ -125,7 +107,8 @@ def moved_to(path: Path, depth: NDArray[np.float32], size: tuple[int, int]) -> N
 
 def shape_of(path: Path, name: str) -> tuple[int, ...]:
     """Returns the shape of an array of the file. Raises InputError if it has none."""
-    return tuple(_with_array(path, name, lambda array: array.shape))
+    with _opened(path, name) as array:
+        return tuple(array.shape)
 
 
 def rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
@@ -151,22 +134,22 @@ def depth_of(source: Hdf5Array) -> NDArray[np.float32]:
 
 
 def _read(source: Hdf5Array) -> NDArray[Any]:
-    def pick(array: Any) -> NDArray[Any]:
+    with _opened(source.path, source.name) as array:
         if array.dtype.kind not in "fiu":
             raise FileFormatError(f"{source} holds {array.dtype} values, not numbers")
         one = array.shape if source.index is None else array.shape[1:]
         check_value_count(source.path, math.prod(one), size_of_regular_file(source.path))
         if source.index is not None and source.index >= array.shape[0]:
             raise FileFormatError(f"{source}: there are only {array.shape[0]}")
-        return np.asarray(array[()] if source.index is None else array[source.index])
-
-    values: NDArray[Any] = _with_array(source.path, source.name, pick)
+        values = np.asarray(array[()] if source.index is None else array[source.index])
     if values.ndim != len(source.axes):
         raise FileFormatError(f"{source} has {values.ndim} axes instead of {len(source.axes)}")
     return values.transpose(source.axes)
 
 
-def _with_array(path: Path, name: str, use: Callable[[Any], Any]) -> Any:
+@contextmanager
+def _opened(path: Path, name: str) -> Iterator[Any]:
+    """An array of an HDF5 file, which lies in the file itself."""
     try:
         import h5py
     except ImportError:
@@ -183,7 +166,7 @@ def _with_array(path: Path, name: str, use: Callable[[Any], Any]) -> Any:
                 raise FileFormatError(
                     f"{path}: {name} is stored outside the file; copy its values into this one"
                 )
-            return use(array)
+            yield array
     except PnpDepthError:
         raise
     except Exception as error:  # h5py raises many kinds for a damaged file
@@ -200,24 +183,30 @@ def read_matlab_array(path: Path, name: str) -> NDArray[np.int64]:
         FileFormatError: The file is damaged or not of versions 5 to 7, or lacks the variable.
     """
     data = read_bytes(path)
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:_HEADER_BYTES])
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         raise FileFormatError(f"{path} is no MATLAB 5 file; save it with -v7 or older")
     try:
-        for kind, content in _elements(data, _HEADER_BYTES, order):
+        for kind, content in _elements(data[128:], order):
             if kind == _COMPRESSED:
                 content = zlib.decompressobj().decompress(content, _MOST_BYTES)
-                kind, content = next(_elements(content, 0, order))
-            values = _numbers(content, name, order) if kind == _MATRIX else None
-            if values is not None:
-                return values
-    except (struct.error, zlib.error, StopIteration, ValueError, OverflowError) as error:
+                kind, content = next(_elements(content, order))
+            if kind != _MATRIX:
+                continue
+            _, _, (_, variable), (kind, content) = list(_elements(content, order))[:4]
+            if variable == name.encode():
+                values = np.frombuffer(content, order + _MATLAB_TYPES[kind])
+                if not (np.abs(values) < 2.0**53).all() or (values != np.rint(values)).any():
+                    raise ValueError(f"{name} is not made of whole numbers")
+                return values.astype(np.int64)
+    except (struct.error, zlib.error, StopIteration, LookupError, ValueError) as error:
         raise damaged(path, "MATLAB file", f"cannot be read ({error})") from error
     raise FileFormatError(f"{path} has no {name}; it is of another kind")
 
 
-def _elements(data: bytes, position: int, order: str) -> Iterator[tuple[int, bytes]]:
+def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
     """The type and the content of each element; short ones have both in one word."""
+    position = 0
     while position < len(data):
         kind, size = struct.unpack_from(f"{order}II", data, position)
         if kind >> 16:
@@ -229,16 +218,3 @@ def _elements(data: bytes, position: int, order: str) -> Iterator[tuple[int, byt
             raise ValueError(f"an element of {size:,} bytes goes beyond the end")
         yield kind, data[begin : begin + size]
         position = end
-
-
-def _numbers(matrix: bytes, name: str, order: str) -> NDArray[np.int64] | None:
-    """The values of a variable of this name; None for another."""
-    _, _, (_, variable), (kind, content) = list(_elements(matrix, 0, order))[:4]
-    if variable.decode("ascii", "replace") != name:
-        return None
-    if kind not in _TYPES:
-        raise ValueError(f"{name} is not made of numbers")
-    values = np.frombuffer(content, order + _TYPES[kind])
-    if not (np.isfinite(values) & (np.abs(values) < 2.0**53) & (values == np.rint(values))).all():
-        raise ValueError(f"{name} is not made of whole numbers")
-    return values.astype(np.int64)

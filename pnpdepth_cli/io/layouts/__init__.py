@@ -11,45 +11,41 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS
-from pnpdepth_cli.errors import InputError, UsageError
-from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing, Source
-from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, find_protocol
-from pnpdepth_cli.io.dataset.reading import read_frame_ground_truth, read_frame_image
-from pnpdepth_cli.io.layouts import colmap, driving, hdf5_files, kitti, manifest, rows, tum
-from pnpdepth_cli.io.layouts.layout import Layout, merged
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.dataset import Frame, Unmatched
+from pnpdepth_cli.io.layouts import driving, indexed, kitti, manifest, nyu, rows
+from pnpdepth_cli.io.layouts.layout import Layout
 
-__all__ = [
-    "LAYOUTS",
-    "PROTOCOLS",
-    "Frame",
-    "Hdf5Array",
-    "Layout",
-    "Source",
-    "find_layout",
-    "find_protocol",
-    "list_frames",
-    "read_frame_ground_truth",
-    "read_frame_image",
-    "read_frames",
-]
-
+__all__ = ["LAYOUTS", "Layout", "Listing", "find_layout", "list_frames", "read_frames"]
 
 TABLE: dict[str, Layout] = {
     **rows.ROWS,
     "manifest": manifest.MANIFEST,
-    "nyu-mat": hdf5_files.NYU_MAT,
+    "nyu-mat": nyu.MAT,
+    "nyu-h5": nyu.H5,
     "kitti-odometry": kitti.ODOMETRY,
     "kitti-depth": kitti.DEPTH,
     "kitti-raw": kitti.RAW,
-    "tum": tum.TUM,
-    "colmap": colmap.COLMAP,
+    "tum": indexed.TUM,
+    "colmap": indexed.COLMAP,
     "nuscenes": driving.NUSCENES,
     "ddad": driving.DDAD,
-    "nyu-h5": hdf5_files.NYU_H5,
 }
 """The layouts of this package, which `choices.LAYOUTS` lists in the order of guessing."""
+
+
+class Listing(NamedTuple):
+    """What a data set holds."""
+
+    frames: list[Frame]
+    """Complete frames, in a fixed order."""
+    broken: list[Unmatched]
+    """Files of frames that lack a part, or cannot be read."""
+    spare: list[Unmatched]
+    """Other files beside them."""
 
 
 def find_layout(root: Path, name: str | None = None) -> str:
@@ -63,8 +59,6 @@ def find_layout(root: Path, name: str | None = None) -> str:
         UsageError: There is no layout of this name.
         InputError: The folder does not exist, or matches no layout.
     """
-    if name is not None and name not in LAYOUTS:
-        raise UsageError(f"no layout {name!r}; there are {', '.join(LAYOUTS)}")
     if not root.exists():
         raise InputError(f"{root}: no such folder; check the path")
     found = _match(root, name)
@@ -78,19 +72,24 @@ def find_layout(root: Path, name: str | None = None) -> str:
     raise InputError(f"{root} does not look like any layout; {_nearest(root)}")
 
 
+def _match(root: Path, name: str | None) -> str | None:
+    names = LAYOUTS if name is None else (name,)
+    return next((layout for layout in names if LAYOUTS[layout].matches(root)), None)
+
+
 def _nearest(root: Path) -> str:
     """What the nearest layout lacks; what all need, if no layout is near."""
-    needs = {each: LAYOUTS[each].needs for each in LAYOUTS if LAYOUTS[each].needs}
+    needs = {name: layout.needs for name, layout in LAYOUTS.items() if layout.needs}
     present = {
-        each: [p for p in patterns if any(next(root.glob(s + p), None) for s in ("", "*/", "*/*/"))]
-        for each, patterns in needs.items()
+        name: [p for p in patterns if any(next(root.glob(s + p), None) for s in ("", "*/", "*/*/"))]
+        for name, patterns in needs.items()
     }
-    best = max(needs, key=lambda each: len(present[each]) / len(needs[each]))
+    best = max(needs, key=lambda name: len(present[name]) / len(needs[name]))
     if present[best]:
         lacking = [pattern for pattern in needs[best] if pattern not in present[best]]
         fact = f"lacks {', '.join(lacking)}" if lacking else "has them, but not in one place"
         return f"nearest is {best!r}, which needs {', '.join(needs[best])}; the folder {fact}"
-    listed = "; ".join(f"{each} {', '.join(patterns)}" for each, patterns in needs.items())
+    listed = "; ".join(f"{name} {', '.join(patterns)}" for name, patterns in needs.items())
     return f"layouts need: {listed}; without a fixed folder: manifest (a .csv or .jsonl file)"
 
 
@@ -98,25 +97,27 @@ def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
     """Returns the name of a data set's layout, its frames, and all that is in no frame.
 
     Args:
-        root: The data set.
+        root: The data set, or a folder with several of one layout.
         name: Its layout; None to guess.
 
     Raises:
         InputError: The folder matches no layout, or cannot be read.
     """
     try:
-        data_sets, layout = _data_sets(root, name)
-        if data_sets == [root]:
-            return layout, LAYOUTS[layout].listing(root)
-        listings = [LAYOUTS[layout].listing(folder) for folder in data_sets]
+        folders, layout = _data_sets(root, name)
+        found = [(folder, each) for folder in folders for each in LAYOUTS[layout].frames(folder)]
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{error.filename or root} cannot be read ({reason}); check it") from error
-    named = (
-        replace(one, frames=[replace(f, name=f"{folder.name}/{f.name}") for f in one.frames])
-        for folder, one in zip(data_sets, listings, strict=True)
+    frames = [
+        each if folder == root else replace(each, name=f"{folder.name}/{each.name}")
+        for folder, each in found
+        if isinstance(each, Frame)
+    ]
+    lost = dict.fromkeys(each for _, each in found if isinstance(each, Unmatched))
+    return layout, Listing(
+        frames, [each for each in lost if not each.spare], [each for each in lost if each.spare]
     )
-    return layout, merged(named)
 
 
 def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
@@ -142,11 +143,6 @@ def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
         return list(found), layouts[0]
 
 
-def _match(root: Path, name: str | None) -> str | None:
-    names = LAYOUTS if name is None else (name,)
-    return next((each for each in names if LAYOUTS[each].matches(root)), None)
-
-
 def read_frames(root: Path, name: str | None = None) -> list[Frame]:
     """Returns the frames of a data set, in a fixed order.
 
@@ -162,4 +158,4 @@ def read_frames(root: Path, name: str | None = None) -> list[Frame]:
         raise InputError(str(listing.broken[0]))
     if not listing.frames:
         raise InputError(f"{root} looks like {layout!r} but has no frame in it")
-    return list(listing.frames)
+    return listing.frames

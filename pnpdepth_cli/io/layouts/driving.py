@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +21,10 @@ import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.calibration import Calibration, Floats
-from pnpdepth_cli.io.dataset.frame import Frame, Listing, Unmatched
-from pnpdepth_cli.io.extrinsics import Extrinsics, inverse, pose_of_quaternion
+from pnpdepth_cli.io.dataset import Frame, Unmatched, as_pose
+from pnpdepth_cli.io.extrinsics import Extrinsics, chained, inverse, pose_of_quaternion
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout, listing_of
+from pnpdepth_cli.io.layouts.layout import Layout
 
 _TABLES = ("sample_data", "calibrated_sensor", "ego_pose", "sensor", "sample", "scene")
 _LARGEST_PX = 1e9
@@ -63,25 +62,21 @@ def _frame(
     scan: Path | None,
     row: Row,
     intrinsics: Floats,
-    poses: tuple[Extrinsics, ...],
+    motion: Extrinsics,
     source: str,
     **fields: Any,
 ) -> Frame | Unmatched:
-    """The frame of an image; `row` has its size, and the poses lead from the scan to the camera."""
+    """The frame of an image of the size in `row`; the motion is from the scan to the camera."""
     if scan is None or not image.is_file() or not scan.is_file():
         return Unmatched(path=image, why="or its LiDAR scan does not exist; add it")
     if not (np.abs(intrinsics) < _LARGEST_PX).all() or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
         raise ValueError("no pinhole camera")
     size = int(row["height"]), int(row["width"])
     check_pixel_count(image, size[1], size[0])
-    rotation, translation = np.eye(3), np.zeros(3)
-    for turn, shift in poses:
-        translation = rotation @ shift + translation
-        rotation = rotation @ turn
     calibration = Calibration(
         intrinsics=intrinsics,
-        rotation=rotation,
-        translation=translation,
+        rotation=motion[0],
+        translation=motion[1],
         distortion=(),
         size=size,
         has_pose=True,
@@ -95,7 +90,7 @@ def _version(root: Path) -> Path | None:
     return min((p.parent for p in root.glob("v1.0-*/sample_data.json")), default=None)
 
 
-def _nuscenes(root: Path) -> Listing:
+def _of_nuscenes(root: Path) -> list[Frame | Unmatched]:
     """One frame for each camera image of a key frame."""
     version = _version(root)
     assert version is not None
@@ -104,11 +99,17 @@ def _nuscenes(root: Path) -> Listing:
             name: {_text(row, "token"): row for row in _json(version / f"{name}.json")}
             for name in _TABLES
         }
-        listing = listing_of(_of_tables(root, tables))
-    return replace(listing, frames=sorted(listing.frames, key=lambda frame: frame.name))
+        found = list(_of_tables(root, tables))
+    return sorted(found, key=lambda each: each.name if isinstance(each, Frame) else "")
 
 
 def _of_tables(root: Path, tables: dict[str, dict[str, Row]]) -> Iterator[Frame | Unmatched]:
+    def in_parent(row: Row, table: str) -> Extrinsics:
+        """x_parent = R · x + t; nuScenes writes quaternions w x y z."""
+        pose = tables[table][row[f"{table}_token"]]
+        w, x, y, z = (float(value) for value in pose["rotation"])
+        return pose_of_quaternion(root, [float(v) for v in pose["translation"]], [x, y, z, w])
+
     samples: dict[str, dict[str, Row]] = {}
     for row in tables["sample_data"].values():
         if row["is_key_frame"]:
@@ -119,36 +120,27 @@ def _of_tables(root: Path, tables: dict[str, dict[str, Row]]) -> Iterator[Frame 
         scene = _text(tables["scene"][tables["sample"][sample]["scene_token"]], "name")
         scan = rows.get("LIDAR_TOP")
         for channel in sorted(name for name in rows if name.startswith("CAM_")):
-            row = rows[channel]
-            sensors, cars = (
-                [tables[table][each[f"{table}_token"]] for each in (row, scan or row)]
-                for table in ("calibrated_sensor", "ego_pose")
-            )
-            camera, car, car_at_scan, scanner = (
-                _car_pose(root, each) for each in (sensors[0], *cars, sensors[1])
-            )
-            image = root / _text(row, "filename")
+            row, image = rows[channel], root / _text(rows[channel], "filename")
+            camera = tables["calibrated_sensor"][row["calibrated_sensor_token"]]
+            to_camera = [
+                inverse(in_parent(row, table)) for table in ("calibrated_sensor", "ego_pose")
+            ]
+            of_scan = [in_parent(scan or row, table) for table in ("ego_pose", "calibrated_sensor")]
             yield _frame(
                 image,
                 None if scan is None else root / _text(scan, "filename"),
                 row,
-                np.array(sensors[0]["camera_intrinsic"], np.float64).reshape(3, 3),
-                (inverse(camera), inverse(car), car_at_scan, scanner),
+                np.array(camera["camera_intrinsic"], np.float64).reshape(3, 3),
+                chained(*to_camera, *of_scan),
                 "nuScenes tables",
                 name=f"{scene}/{image.stem}",
                 group=f"{scene}/{channel}",
             )
 
 
-def _car_pose(root: Path, row: Row) -> Extrinsics:
-    """x_parent = R · x + t; nuScenes writes quaternions w x y z."""
-    w, x, y, z = (float(value) for value in row["rotation"])
-    return pose_of_quaternion(root, [float(v) for v in row["translation"]], [x, y, z, w])
-
-
 NUSCENES = Layout(
     matches=lambda root: (root / "samples").is_dir() and _version(root) is not None,
-    listing=_nuscenes,
+    frames=_of_nuscenes,
     needs=("v1.0-*/sample_data.json", "samples"),
 )
 
@@ -160,52 +152,48 @@ def _scenes(root: Path) -> list[Path]:
     return [first[folder] for folder in sorted(first) if (folder / "calibration").is_dir()]
 
 
-def _ddad(root: Path) -> Listing:
+def _of_ddad(root: Path) -> Iterator[Frame | Unmatched]:
     """One frame for each camera of each sample, scene by scene and camera by camera."""
-    found: list[Frame | Unmatched] = []
     for path in _scenes(root):
         with _as_our_errors(path):
-            found += _of_scene(path)
-    return listing_of(found)
+            found = list(_of_scene(path))
+        yield from (frame for _, frame in sorted(found, key=lambda pair: pair[0]))
 
 
-def _of_scene(path: Path) -> list[Frame | Unmatched]:
+def _of_scene(path: Path) -> Iterator[tuple[str, Frame | Unmatched]]:
+    """Yields the camera and the frame, sample by sample."""
     folder, content = path.parent, _json(path)
     datums = {row["key"]: row for row in content["data"]}
     calibrations: dict[str, Row] = {}
-    by_camera: dict[str, list[Frame | Unmatched]] = {}
     for sample in content["samples"]:
         key = _text(sample, "calibration_key")
         if key not in calibrations:
             calibrations[key] = _json(folder / "calibration" / f"{key}.json")
         rows = {datums[k]["id"]["name"].upper(): datums[k]["datum"] for k in sample["datum_keys"]}
-        for name in sorted(each for each in rows if each.startswith("CAMERA_")):
-            frame = _of_sample(folder, name, rows, calibrations[key])
-            by_camera.setdefault(name, []).append(frame)
-    return [frame for name in sorted(by_camera) for frame in by_camera[name]]
-
-
-def _of_sample(
-    folder: Path, name: str, rows: dict[str, Row], calibration: Row
-) -> Frame | Unmatched:
-    image, scan = rows[name]["image"], rows.get("LIDAR", {}).get("point_cloud")
-    path = folder / _text(image, "filename")
-    camera = _sensor_pose(path, image["pose"])
-    return _frame(
-        path,
-        None if scan is None else folder / _text(scan, "filename"),
-        image,
-        _pinhole(name, calibration),
-        (inverse(camera), *([] if scan is None else [_sensor_pose(path, scan["pose"])])),
-        "DDAD scene",
-        name=f"{folder.name}/{name}_{path.stem}",
-        pose=tuple(map(tuple, np.column_stack(camera).tolist())),
-        group=f"{folder.name}/{name}",
-    )
+        scan = rows.get("LIDAR", {}).get("point_cloud")
+        for name in (each for each in rows if each.startswith("CAMERA_")):
+            row = rows[name]["image"]
+            image = folder / _text(row, "filename")
+            camera = _sensor_pose(image, row["pose"])
+            of_scan = [] if scan is None else [_sensor_pose(image, scan["pose"])]
+            yield (
+                name,
+                _frame(
+                    image,
+                    None if scan is None else folder / _text(scan, "filename"),
+                    row,
+                    _pinhole(name, calibrations[key]),
+                    chained(inverse(camera), *of_scan),
+                    "DDAD scene",
+                    name=f"{folder.name}/{name}_{image.stem}",
+                    pose=as_pose(np.column_stack(camera)),
+                    group=f"{folder.name}/{name}",
+                ),
+            )
 
 
 def _pinhole(name: str, calibration: Row) -> Floats:
-    number = [each.upper() for each in calibration["names"]].index(name)
+    number = [camera.upper() for camera in calibration["names"]].index(name)
     values = {key: float(value) for key, value in calibration["intrinsics"][number].items()}
     if any(value for key, value in values.items() if key not in ("fx", "fy", "cx", "cy")):
         raise ValueError(f"{name} is no pinhole camera")
@@ -223,7 +211,7 @@ def _sensor_pose(path: Path, row: Row) -> Extrinsics:
 
 
 DDAD = Layout(
-    matches=lambda root: bool(_scenes(root)),
-    listing=_ddad,
+    matches=_scenes,
+    frames=_of_ddad,
     needs=("*/scene_*.json", "*/calibration", "*/point_cloud"),
 )

@@ -17,63 +17,49 @@ folder data_depth_annotated/{train,val}/ beside the dates has it.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset.frame import Pose, Unmatched
-from pnpdepth_cli.io.dataset.protocols import PROTOCOLS
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Parts, either, row
-from pnpdepth_cli.io.poses import PACKETS
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.dataset import PROTOCOLS, Unmatched, as_pose
+from pnpdepth_cli.io.layouts.layout import Fields, Files, Layout, row
+from pnpdepth_cli.io.poses import PACKETS, read_poses
 
 _CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
+_RAW = ("", "raw/", "kitti_raw/")
+"""Folders of the raw data's dates."""
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 """Names of the selection, without the kind of file in the middle."""
-_SCALES = {"sparse_scale": 256.0, "gt_scale": 256.0}
-_AS_PUBLISHED: dict[str, Any] = {**_SCALES, "protocol": PROTOCOLS["kitti-depth"]}
+_AS_PUBLISHED: dict[str, Any] = {
+    "sparse_scale": 256.0,
+    "gt_scale": 256.0,
+    "protocol": PROTOCOLS["kitti-depth"],
+}
 
 
-def _of_sequence(place: Path, files: Parts) -> Mapping[str, Any]:
+def _of_sequence(place: Path) -> Callable[[Files], Mapping[str, Any]]:
     """Calibration and pose; poses belong to frames by number, so a part of a sequence has its own.
 
     Raises:
-        InputError: The frame has no row in an existing file of poses.
+        InputError: A frame has no row in an existing file of poses.
     """
-    fields: dict[str, Any] = {"calib": place / "calib.txt"}
-    folder, image = place.absolute(), files["image"]  # the parents of "." are in its absolute path
+    folder = place.absolute()  # the parents of "." are in its absolute path
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():
-        return fields
-    poses = _poses(path, path.stat().st_mtime_ns)
-    if not image.stem.isdecimal() or int(image.stem) >= len(poses):
-        raise InputError(
-            f"{image} has no pose: its sequence's file holds {len(poses):,} poses, by frame number"
-        )
-    return {**fields, "pose": poses[int(image.stem)]}
+        return lambda files: {"calib": place / "calib.txt"}
+    poses = [as_pose(pose) for pose in read_poses(path)]
 
+    def fields_of(files: Files) -> Mapping[str, Any]:
+        image = files["image"]
+        if not image.stem.isdecimal() or int(image.stem) >= len(poses):
+            raise InputError(
+                f"{image} has no pose: its sequence's file holds {len(poses):,} poses, by frame"
+                " number"
+            )
+        return {"calib": place / "calib.txt", "pose": poses[int(image.stem)]}
 
-@functools.lru_cache(maxsize=1)
-def _poses(path: Path, changed_ns: int) -> list[Pose]:
-    """The poses of a sequence by frame number; kept for its other frames."""
-    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
-    return [_pose(path, number, line) for number, line in enumerate(lines, 1) if line.strip()]
-
-
-def _pose(path: Path, number: int, line: str) -> Pose:
-    try:
-        values = [float(word) for word in line.split()]
-    except ValueError:
-        values = []
-    if len(values) != 12 or not np.isfinite(values).all():
-        raise FileFormatError(
-            f"{path}, line {number}: {one_line(line)[:60]!r} is not 12 finite numbers"
-        )
-    return tuple(tuple(values[start : start + 4]) for start in (0, 4, 8))
+    return fields_of
 
 
 ODOMETRY = row(
@@ -92,20 +78,20 @@ def _name(root: Path, place: Path, stem: str) -> str:
     return f"{drive.name}_{stem}_{place.name}"
 
 
+def _of_drive(drive: Path, inside: Path, *beside: str) -> Path:
+    """The data of a drive, in it or in its namesake in a folder beside; it may not exist."""
+    drives = [drive, *(base / name / drive.name for base in drive.parents[:3] for name in beside)]
+    return next((path / inside for path in drives if (path / inside).is_dir()), drives[1] / inside)
+
+
 def _truth_of(drive: Path, camera: str) -> Path:
-    """The folder of the annotated depth, which may not exist."""
-    inside = Path("proj_depth/groundtruth", camera)
-    bases = (base / "data_depth_annotated" for base in drive.parents[:3])
-    drives = (drive, *(base / part / drive.name for base in bases for part in ("train", "val")))
-    return next((path / inside for path in drives if (path / inside).is_dir()), drive / inside)
+    beside = (f"data_depth_annotated/{part}" for part in ("train", "val"))
+    return _of_drive(drive, Path("proj_depth/groundtruth", camera), *beside)
 
 
 def _images_of(scans: Path) -> Path:
-    """The raw data's images of a drive and camera, which may not exist."""
-    drive, inside = scans.parents[2], Path(scans.name, "data")
-    bases = (base / raw for base in drive.parents[:3] for raw in ("", "raw", "kitti_raw"))
-    drives = (drive, *(base / drive.name[:10] / drive.name for base in bases))
-    return next((path / inside for path in drives if (path / inside).is_dir()), drive / inside)
+    drive, beside = scans.parents[2], (f"{raw}{scans.parents[2].name[:10]}" for raw in _RAW)
+    return _of_drive(drive, Path(scans.name, "data"), *beside)
 
 
 def _calibration_of(drive: Path) -> Path | None:
@@ -118,6 +104,11 @@ def _scan_folders(root: Path) -> list[Path]:
     return sorted(path for path in found if path.is_dir())
 
 
+def _of_selection(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+    shared = {"calib": place} if (place / _CALIBRATION).is_file() else {}
+    return lambda files: {} if "calib" in files else shared
+
+
 _SELECTION = row(
     {
         "image": f"image/{_STEM}.IMAGE",
@@ -127,9 +118,7 @@ _SELECTION = row(
     },
     marks=("velodyne_raw",),
     name=lambda root, place, stem: stem,
-    more=lambda place, files: (
-        {"calib": place} if "calib" not in files and (place / _CALIBRATION).is_file() else {}
-    ),
+    more=_of_selection,
     **_AS_PUBLISHED,
 )
 _TREE = row(
@@ -139,19 +128,20 @@ _TREE = row(
         "image": _images_of,
         "gt": lambda scans: _truth_of(scans.parents[2], scans.name),
     },
-    needs=(f"proj_depth/velodyne_raw/{_CAMERAS}", f"{_CAMERAS}/data"),
-    absent=lambda scans: (
-        f"has no {scans.name}/data with images; put KITTI's raw drive {scans.parents[2].name} into"
-        f" {scans.parents[3] / scans.parents[2].name[:10]}"
-    ),
     name=_name,
-    more=lambda scans, files: {
-        "calib": _calibration_of(files["image"].parents[2]),
-        "camera": int(scans.name[-1]),
-    },
+    more=lambda scans: (
+        lambda files: {
+            "calib": _calibration_of(files["image"].parents[2]),
+            "camera": int(scans.name[-1]),
+        }
+    ),
     **_AS_PUBLISHED,
 )
-DEPTH = either(_SELECTION, _TREE)
+DEPTH = Layout(
+    matches=lambda root: _SELECTION.matches(root) or _TREE.matches(root),
+    frames=lambda root: (_SELECTION if _SELECTION.matches(root) else _TREE).frames(root),
+    needs=_SELECTION.needs,
+)
 
 
 def _raw_cameras(root: Path) -> list[Path]:
@@ -160,12 +150,12 @@ def _raw_cameras(root: Path) -> list[Path]:
     return sorted(p.parent for p in found if p.is_dir() and (p.parents[1] / _SCANS).is_dir())
 
 
-def _of_camera(camera: Path, files: Parts) -> Mapping[str, Any] | Unmatched:
+def _of_camera(camera: Path) -> Callable[[Files], Fields]:
     calibration = _calibration_of(camera.parent)
     if calibration is None:
         why = f"has no {_CALIBRATION}; put KITTI's calibration into {camera.parents[1]}"
-        return Unmatched(path=camera.parent, why=why)
-    return {"calib": calibration, "camera": int(camera.name[-1])}
+        return lambda files: Unmatched(path=camera.parent, why=why)
+    return lambda files: {"calib": calibration, "camera": int(camera.name[-1])}
 
 
 RAW = row(

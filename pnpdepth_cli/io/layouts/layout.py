@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset.find_files import find_files
-from pnpdepth_cli.io.dataset.frame import (
+from pnpdepth_cli.io.dataset import (
     IMAGE_SUFFIXES,
     SCAN_ONLY_SUFFIXES,
     Frame,
-    Listing,
     Unmatched,
+    find_files,
+    one_of_each,
 )
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 
@@ -27,17 +26,19 @@ _SUFFIXES = {
 }
 """What a pattern of file names may end with, for any of these."""
 
-Parts = dict[str, Any]
-"""Files of one frame by field of `Frame`."""
+Files = dict[str, Path]
+"""Of one frame, by field of `Frame`."""
+Fields = Mapping[str, Any] | Unmatched | None
+"""More fields of a frame, why it is none, or None for one that is not wanted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
     """How the files of a data set lie on disk."""
 
-    matches: Callable[[Path], bool]
-    """Whether a folder or file is of this layout."""
-    listing: Callable[[Path], Listing]
+    matches: Callable[[Path], Any]
+    """True for a folder or file of this layout."""
+    frames: Callable[[Path], Iterable[Frame | Unmatched]]
     """The frames of a folder or file that matches, and what is in no frame."""
     needs: tuple[str, ...] = ()
     """Patterns of what the folder or one in it holds, for the message of an unknown folder."""
@@ -48,8 +49,9 @@ class _Part:
 
     def __init__(self, text: str, find: Callable[[Path], Path] | None) -> None:
         self.optional = text.endswith("?")
-        folder, _, self.names = text.removesuffix("?").rpartition("/")
+        folder, _, names = text.removesuffix("?").rpartition("/")
         self.folders, self._find = folder.split("|"), find
+        self._stem, _, self._suffix = names.rpartition(".")
 
     def path(self, place: Path) -> Path:
         """Returns the first of the folders that exists."""
@@ -58,27 +60,21 @@ class _Part:
         paths = [place / name for name in self.folders]
         return next((path for path in paths if path.is_dir()), paths[0])
 
-    def files(self, place: Path) -> tuple[dict[str, Path], tuple[Unmatched, ...]]:
-        """Returns the files by stem, sorted by number, and what cannot be read.
-
-        Raises:
-            InputError: Two files have the same stem.
-        """
-        folder, (stem, _, suffix) = self.path(place), self.names.rpartition(".")
-        if stem == "**":
-            return find_files(folder, _SUFFIXES[suffix])
-        suffixes = "|".join(each[1:] for each in _SUFFIXES.get(suffix, (f".{suffix}",)))
-        groups = stem if "(" in stem else stem.replace(".", r"\.").replace("*", "(.+)")
-        pattern = re.compile(rf"{groups}\.(?:{suffixes})", re.IGNORECASE | re.DOTALL)
-        files: dict[str, Path] = {}
-        for path in sorted(folder.iterdir() if folder.is_dir() else ()):
-            match = pattern.fullmatch(path.name)
-            if match and path.is_file():
-                stem = "".join(match.groups(""))
-                if stem in files:
-                    raise InputError(f"{path} and {files[stem].name} are one frame; keep one")
-                files[stem] = path
-        return {stem: files[stem] for stem in sorted(files, key=_by_numbers)}, ()
+    def files(self, place: Path) -> tuple[dict[str, Path], list[Unmatched]]:
+        """Returns the files by stem, sorted by number, and what belongs to no frame."""
+        folder, suffixes = self.path(place), _SUFFIXES.get(self._suffix, (f".{self._suffix}",))
+        if self._stem == "**":
+            return find_files(folder, suffixes)
+        stem = self._stem if "(" in self._stem else re.escape(self._stem).replace(r"\*", "(.+)")
+        endings = "|".join(map(re.escape, suffixes))
+        pattern = re.compile(f"{stem}(?:{endings})", re.IGNORECASE | re.DOTALL)
+        paths = sorted(folder.iterdir()) if folder.is_dir() else []
+        files, ambiguous = one_of_each(
+            ("".join(match.groups("")), path)
+            for path in paths
+            if (match := pattern.fullmatch(path.name)) and path.is_file()
+        )
+        return {stem: files[stem] for stem in sorted(files, key=_by_numbers)}, ambiguous
 
 
 def _by_numbers(stem: str) -> list[tuple[int, str]]:
@@ -91,12 +87,11 @@ def row(
     name: Callable[[Path, Path, str], str],
     below: str = "",
     marks: tuple[str, ...] = (),
-    places: Callable[[Path], Iterable[Path]] | None = None,
+    places: Callable[[Path], list[Path]] | None = None,
     folders: Mapping[str, Callable[[Path], Path]] | None = None,
     needs: tuple[str, ...] = (),
-    absent: Callable[[Path], str] | None = None,
     gaps: bool = False,
-    more: Callable[[Path, Parts], Mapping[str, Any] | Unmatched | None] = lambda place, files: {},
+    more: Callable[[Path], Callable[[Files], Fields]] = lambda place: lambda files: {},
     **fields: Any,
 ) -> Layout:
     """Returns the layout of a data set whose parts lie in folders, with files of one stem.
@@ -113,19 +108,15 @@ def row(
         places: Returns the places below a root, instead of `below` and `marks`.
         folders: From the place to the folder, of parts that lie elsewhere.
         needs: As in `Layout`, if not the folders of the parts and `marks`.
-        absent: From a place that lacks a folder to the end of a sentence about it.
         gaps: Whether a file of the first part without a partner is spare, not broken.
-        more: From place and the frame's files to further fields; None leaves the frame out.
+        more: From a place to a function from a frame's files to its further fields.
         fields: Fields that all frames have.
     """
     kinds = {field: _Part(text, (folders or {}).get(field)) for field, text in parts.items()}
     wanted = [kind for kind in kinds.values() if not kind.optional]
     probe = marks[0] if marks else wanted[-1].folders[0]
-    missing = (*(kind.folders[0] for kind in wanted), *marks)
 
     def find(root: Path) -> list[Path]:
-        if places is not None:
-            return list(places(root))
         found = {path.parent for start in below.split("|") for path in root.glob(start + probe)}
         return sorted(
             place
@@ -134,86 +125,57 @@ def row(
             and all(next(place.glob(mark), None) for mark in marks)
         )
 
-    def of_place(root: Path, place: Path) -> Listing:
-        def make(stem: str, files: Parts) -> Frame | Unmatched | None:
-            extra = more(place, files)
-            if not isinstance(extra, Mapping):
-                return extra
-            values = {**files, **fields, **extra}
-            masks = tuple(values.pop(key) for key in list(values) if key.startswith("mask"))
-            return Frame(name=name(root, place, stem), masks=masks, **values)
+    find_places = places or find
 
-        if absent and not all(kind.path(place).is_dir() for kind in wanted):
-            return Listing(frames=[], broken=(Unmatched(path=place, why=absent(place)),))
-        return _joined(place, kinds, make, gaps)
+    def frames(root: Path) -> Iterator[Frame | Unmatched]:
+        for place in find_places(root):
+            fields_of = more(place)
+            for found in _joined(place, kinds, gaps):
+                if isinstance(found, Unmatched):
+                    yield found
+                    continue
+                stem, files = found
+                extra = fields_of(files)
+                if isinstance(extra, Unmatched):
+                    yield extra
+                elif extra is not None:
+                    values = {**files, **fields, **extra}
+                    masks = tuple(values.pop(key) for key in files if key.startswith("mask"))
+                    yield Frame(name=name(root, place, stem), masks=masks, **values)
 
+    missing = (*(kind.folders[0] for kind in wanted), *marks)
     return Layout(
-        matches=lambda root: bool(find(root)),
-        listing=lambda root: merged(of_place(root, place) for place in find(root)),
+        matches=find_places,
+        frames=frames,
         needs=needs or tuple(dict.fromkeys(filter(None, missing))),
     )
 
 
-def either(first: Layout, other: Layout) -> Layout:
-    """Returns the layout of a data set that comes in two ways; the first is looked for first."""
-    return Layout(
-        matches=lambda root: first.matches(root) or other.matches(root),
-        listing=lambda root: (first if first.matches(root) else other).listing(root),
-        needs=first.needs,
-    )
-
-
 def _joined(
-    place: Path,
-    kinds: Mapping[str, _Part],
-    make: Callable[[str, Parts], Frame | Unmatched | None],
-    gaps: bool,
-) -> Listing:
-    """A frame for each file of the first part with a partner in all others that are needed."""
-    found = {field: kind.files(place) for field, kind in kinds.items()}
-    files = {field: of for field, (of, _) in found.items()}
-    first, *others = files
+    place: Path, kinds: Mapping[str, _Part], gaps: bool
+) -> Iterator[tuple[str, Files] | Unmatched]:
+    """The stem and files of each frame, and the files that lack a partner."""
+    first, *others = kinds
     needed = [field for field in others if not kinds[field].optional]
-    made = [
-        make(stem, {field: of[stem] for field, of in files.items() if stem in of})
-        for stem in files[first]
-        if all(stem in files[field] for field in needed)
-    ]
+    absent = [path for field in needed if not (path := kinds[field].path(place)).is_dir()]
+    if absent:
+        yield Unmatched(path=place, why=f"has no {absent[0]}; add it")
+        return
+    files: dict[str, dict[str, Path]] = {}
+    for field, kind in kinds.items():
+        files[field], unreadable = kind.files(place)
+        yield from unreadable
 
-    def alone(field: str, other: str) -> list[Unmatched]:
-        why = f"has no partner {{}}.* in {kinds[other].path(place)}; add or remove one"
-        left = (each for each in files[field].items() if each[0] not in files[other])
-        return [Unmatched(path=path, why=why.format(stem)) for stem, path in left]
+    def alone(field: str, other: str, *, spare: bool) -> Iterator[Unmatched]:
+        for stem, path in files[field].items():
+            if stem not in files[other]:
+                why = f"has no partner {stem}.* in {kinds[other].path(place)}; add or remove one"
+                yield Unmatched(path=path, why=why, spare=spare)
 
-    lost = [each for field in needed for each in alone(first, field)]
-    spare = [each for field in others for each in alone(field, first)]
-    return listing_of(
-        made,
-        broken=(
-            *(each for _, unreadable in found.values() for each in unreadable),
-            *([] if gaps else lost),
-        ),
-        spare=(*(lost if gaps else []), *spare),
-    )
-
-
-def listing_of(
-    made: Iterable[Frame | Unmatched | None],
-    broken: tuple[Unmatched, ...] = (),
-    spare: tuple[Unmatched, ...] = (),
-) -> Listing:
-    """Returns the frames, and what could not become one after what is broken already."""
-    every = list(made)
-    lost = dict.fromkeys(each for each in every if isinstance(each, Unmatched))
-    frames = [each for each in every if isinstance(each, Frame)]
-    return Listing(frames=frames, broken=(*broken, *lost), spare=spare)
-
-
-def merged(listings: Iterable[Listing]) -> Listing:
-    """Returns all frames and other files of the listings."""
-    every = list(listings)
-    return Listing(
-        frames=[frame for one in every for frame in one.frames],
-        broken=tuple(each for one in every for each in one.broken),
-        spare=tuple(each for one in every for each in one.spare),
-    )
+    for field in needed:
+        yield from alone(first, field, spare=gaps)
+    for stem in files[first]:
+        if all(stem in files[field] for field in needed):
+            yield stem, {field: of[stem] for field, of in files.items() if stem in of}
+    for field in others:
+        yield from alone(field, first, spare=True)

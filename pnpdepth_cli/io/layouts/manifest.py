@@ -16,38 +16,46 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
-from pnpdepth_cli.io.dataset.frame import (
-    Frame,
-    Listing,
-    Unmatched,
-    normalised_name,
-    portable_name_problem,
-)
-from pnpdepth_cli.io.dataset.protocols import find_protocol
+from pnpdepth_cli.io.dataset import Frame, Unmatched, find_protocol, portable_name_problem
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout
-from pnpdepth_cli.io.remote.address import RemotePath, joined
-from pnpdepth_cli.io.remote.store import local_files
+from pnpdepth_cli.io.remote import RemotePath, joined, local_files
 
 _PATHS = ("image", "sparse", "gt", "calib", "mask")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
+
+
+def _flag(text: str) -> bool:
+    if text.lower() not in _FLAGS:
+        raise ValueError(f"gt_size_ok is {text[:20]!r}, not true or false")
+    return _FLAGS[text.lower()]
+
+
+def _name(text: str) -> str:
+    problem = portable_name_problem(text)
+    if problem is not None:
+        raise ValueError(f"name {one_line(text)[:60]!r} {problem}; choose another")
+    path = PurePosixPath(text)
+    return text if path.is_absolute() else path.as_posix()
+
+
 _VALUES: dict[str, Callable[[str], Any]] = {
     "camera": int,
     "sparse_scale": float,
     "gt_scale": float,
-    "gt_size_ok": lambda text: _flag(text),
-    "name": lambda text: _name(text),
+    "gt_size_ok": _flag,
+    "name": _name,
     "group": str,
     "protocol": find_protocol,
 }
 """What a text becomes, by column; ValueError and our errors say what is wrong."""
 
 
-def _listing(root: Path) -> Listing:
+def _frames(root: Path) -> list[Frame | Unmatched]:
     """A frame for each line of the file; missing files are broken.
 
     Raises:
@@ -60,21 +68,29 @@ def _listing(root: Path) -> Listing:
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{root} is not a text file; give CSV or JSON lines") from error
     rows = _csv_rows if root.suffix.lower() == ".csv" else _json_rows
-    frames, lines, broken = list[Frame](), list[int](), list[Unmatched]()
+    frames: dict[int, Frame] = {}
+    broken = []
     for number, row in rows(root, text):
-        where = f"{root}, line {number}"
-        files, values = _parts(root.parent, where, row)
-        other_size = values.pop("gt_size_ok", False)
-        lost = [path for path in files.values() if _is_missing(path)]
-        why = f"does not exist; correct line {number} of {root}"
-        broken += [Unmatched(path=path, why=why) for path in lost]
+        files, values = _parts(root.parent, f"{root}, line {number}", row)
+        for path in files.values():
+            # files of a store are looked at when they are read
+            if not isinstance(path, RemotePath) and not path.exists():
+                why = f"does not exist; correct line {number} of {root}"
+                broken.append(Unmatched(path=path, why=why))
         masks = (files.pop("mask"),) if "mask" in files else ()
-        frame = {"name": "", "masks": masks, "gt_other_size": other_size, **files, **values}
-        frames.append(Frame(**frame))
-        lines.append(number)
-    frames = _named(frames)
-    _check_names(root, frames, lines)
-    return Listing(frames=frames, broken=tuple(broken))
+        values["gt_other_size"] = values.pop("gt_size_ok", False)
+        frames[number] = Frame(**{"name": "", "masks": masks, **files, **values})
+    named = _named(list(frames.values()))
+    first: dict[str, Frame] = {}
+    for number, frame in zip(frames, named, strict=True):
+        other = first.setdefault(frame.name.casefold(), frame)
+        if other is not frame:
+            hint = "" if other.name == frame.name else f", which some disks take for {other.name!r}"
+            raise FileFormatError(
+                f"{root}, line {number}: a second frame {one_line(frame.name)!r}{hint}; give it a"
+                " name of its own"
+            )
+    return [*broken, *named]
 
 
 def _csv_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -120,24 +136,6 @@ def _parts(folder: Path, where: str, row: dict[str, Any]) -> tuple[dict[str, Pat
     return files, values
 
 
-def _flag(text: str) -> bool:
-    if text.lower() not in _FLAGS:
-        raise ValueError(f"gt_size_ok is {text[:20]!r}, not true or false")
-    return _FLAGS[text.lower()]
-
-
-def _name(text: str) -> str:
-    problem = portable_name_problem(text)
-    if problem is not None:
-        raise ValueError(f"name {one_line(text)[:60]!r} {problem}; choose another")
-    return normalised_name(text)
-
-
-def _is_missing(file: Path) -> bool:
-    """Whether it does not exist; files of a store are looked at when they are read."""
-    return not isinstance(file, RemotePath) and not file.exists()
-
-
 def _named(frames: list[Frame]) -> list[Frame]:
     """All with names: by the stem, or by the path if stems are not unique."""
     paths = [frame.image or frame.sparse for frame in frames if not frame.name]
@@ -151,21 +149,7 @@ def _named(frames: list[Frame]) -> list[Frame]:
     return [frame if frame.name else replace(frame, name=next(given)) for frame in frames]
 
 
-def _check_names(root: Path, frames: list[Frame], lines: list[int]) -> None:
-    """Raises FileFormatError if two frames would share the files of their results."""
-    first: dict[str, str] = {}
-    for frame, line in zip(frames, lines, strict=True):
-        other = first.get(frame.name.casefold())
-        if other is not None:
-            hint = "" if other == frame.name else f", which some disks take for {other!r}"
-            raise FileFormatError(
-                f"{root}, line {line}: a second frame {one_line(frame.name)!r}{hint}; give it a"
-                " name of its own"
-            )
-        first[frame.name.casefold()] = frame.name
-
-
 MANIFEST = Layout(
     matches=lambda root: root.is_file() and root.suffix.lower() in (".csv", ".jsonl"),
-    listing=_listing,
+    frames=_frames,
 )

@@ -26,16 +26,15 @@ density or the release; where test_image.txt lists the test split, only its fram
 
 from __future__ import annotations
 
-import functools
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.io.dataset.frame import Hdf5Array
+from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.file_bytes import read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout, Parts, row
+from pnpdepth_cli.io.layouts.layout import Files, Layout, row
 
 _SYNTHIA_HEADER = struct.pack(">II", 1280, 760)
 """Width and height in a PNG, from byte 16 on."""
@@ -43,7 +42,7 @@ _PREVIEW, _GEOMETRY = "_final_preview", "_geometry_hdf5"
 _HYPERSIM_FOCAL_PX = 886.81  # of images 1024 pixels wide
 
 
-def _joined(mark: str) -> Any:
+def _joined(mark: str) -> Callable[[Path, Path, str], str]:
     """A function that puts the place's name and a mark before the stem, if it is not the root."""
     return lambda root, place, stem: stem if place == root else f"{place.name}{mark}{stem}"
 
@@ -52,41 +51,38 @@ def _below(root: Path, place: Path, stem: str) -> str:
     return (place.relative_to(root) / stem).as_posix()
 
 
-def _shared(file: str) -> Any:
-    """A function that gives each frame its place's file, unless it has a calibration of its own."""
-    return lambda place, files: (
-        {"calib": place / file} if "calib" not in files and (place / file).is_file() else {}
-    )
+def _shared(file: str) -> Callable[[Path], Callable[[Files], Mapping[str, Any]]]:
+    """Gives each frame its place's file, unless it has a calibration of its own."""
+
+    def fields_of(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+        shared = {"calib": place / file} if (place / file).is_file() else {}
+        return lambda files: {} if "calib" in files else shared
+
+    return fields_of
 
 
-def _of_void(place: Path, files: Parts) -> Mapping[str, Any] | None:
+def _of_void(place: Path) -> Callable[[Files], Mapping[str, Any] | None]:
     """The calibration; None for a frame that is not of the test split, where that is listed."""
-    split = place.parent.parent / "test_image.txt"
-    if place.parent.name == "data" and split.is_file():
-        wanted = _test_split(split, split.stat().st_mtime_ns)
-        if (place.name, files["image"].stem) not in wanted:
-            return None
-    calibration: Mapping[str, Any] = _shared("K.txt")(place, files)
-    return calibration
+    shared, split = _shared("K.txt")(place), place.parent.parent / "test_image.txt"
+    if place.parent.name != "data" or not split.is_file():
+        return shared
+    words = read_bytes(split).decode("utf-8", "replace").split()
+    wanted = {path.stem for path in map(Path, words) if path.parts[-3:-2] == (place.name,)}
+    return lambda files: shared(files) if files["image"].stem in wanted else None
 
 
-@functools.lru_cache(maxsize=1)
-def _test_split(path: Path, changed_ns: int) -> set[tuple[str, str]]:
-    """(sequence, stem) of the frames of the test split; kept for the next frame."""
-    listed = (Path(line) for line in read_bytes(path).decode("utf-8", "replace").split())
-    return {(each.parts[-3], each.stem) for each in listed if len(each.parts) >= 3}
-
-
-def _synthia_cameras(root: Path) -> Iterator[Path]:
+def _synthia_cameras(root: Path) -> list[Path]:
     """The folders of images that have a folder of depth."""
+    cameras = []
     for rgb in sorted(p for pattern in ("RGB", "*/RGB") for p in root.glob(pattern)):
         if rgb.with_name("Depth").is_dir():
-            yield from sorted(p for p in rgb.glob("Stereo_*/Omni_*") if p.is_dir())
+            cameras += sorted(p for p in rgb.glob("Stereo_*/Omni_*") if p.is_dir())
             # RGB and Depth are common names: numbers and size distinguish SYNTHIA-RAND
             images = (p for p in sorted(rgb.glob("*.png")) if re.fullmatch(r"\d{7}", p.stem))
             first = next(images, None)
             if first is not None and _has_synthias_size(first):
-                yield rgb
+                cameras.append(rgb)
+    return cameras
 
 
 def _has_synthias_size(image: Path) -> bool:
@@ -120,10 +116,17 @@ def _hypersim_name(root: Path, previews: Path, stem: str) -> str:
     return f"{previews.parents[1].name}/{_camera_of(previews).removeprefix('scene_')}_{stem}"
 
 
-def _of_hypersim(previews: Path, files: Parts) -> Mapping[str, Any]:
+def _of_hypersim(previews: Path) -> Callable[[Files], Mapping[str, Any]]:
     """Depth from the array, and the group."""
-    depth = Hdf5Array(path=files["gt"], name="dataset", axes=(0, 1), focal_px=_HYPERSIM_FOCAL_PX)
-    return {"gt": depth, "group": f"{previews.parents[1].name}/{_camera_of(previews)}"}
+    group = f"{previews.parents[1].name}/{_camera_of(previews)}"
+
+    def fields_of(files: Files) -> Mapping[str, Any]:
+        depth = Hdf5Array(
+            path=files["gt"], name="dataset", axes=(0, 1), focal_px=_HYPERSIM_FOCAL_PX
+        )
+        return {"gt": depth, "group": group}
+
+    return fields_of
 
 
 ROWS: dict[str, Layout] = {

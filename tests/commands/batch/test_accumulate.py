@@ -15,7 +15,7 @@ from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.batch.request import SequenceOptions
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.sensors import SamplePattern
 from tests.commands.batches import RecordingListener, batch
 from tests.commands.drives import drive_on_disk, without_results

@@ -14,8 +14,7 @@ from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.commands.batch.batch import plan_batch
 from pnpdepth_cli.commands.batch.request import LOCAL, BatchRequest, ClusterOptions
 from pnpdepth_cli.errors import OutputError
-from pnpdepth_cli.io.remote.address import path_of
-from pnpdepth_cli.io.remote.store import forget_stores
+from pnpdepth_cli.io.remote import forget_stores, path_of
 from tests.commands.batches import (
     NAMES,
     RecordingListener,

@@ -14,7 +14,7 @@ from PIL import Image
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera, camera_of_fov
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.errors import SizeError, UsageError
-from pnpdepth_cli.io.dataset.protocols import Protocol
+from pnpdepth_cli.io.dataset import Protocol
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.camera import Camera

@@ -14,7 +14,7 @@ from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.bags.bag import open_bag
+from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.bags.transforms import camera_trajectory
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.record import read_json

@@ -12,7 +12,7 @@ from pnpdepth_cli.commands.sweep.axes import read_axis, studies_of
 from pnpdepth_cli.commands.sweep.points import read_sampling
 from pnpdepth_cli.commands.sweep.sweep import SweepRequest, run_sweep
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.remote.address import path_of
+from pnpdepth_cli.io.remote import path_of
 from tests.commands.batches import RecordingListener, pairs_on_disk, refinement
 from tests.stores import Bucket, s3_server
 

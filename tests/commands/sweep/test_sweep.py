@@ -32,7 +32,7 @@ from pnpdepth_cli.errors import (
     UsageError,
 )
 from pnpdepth_cli.frames import refiner as frame_refiner
-from pnpdepth_cli.io.dataset.frame import Frame
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.sensors import (

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from tests.fuzz.seeds.seed import HEIGHT, OUT, SIZE, WIDTH, Seed
-from tests.io.test_robot_calibration import POSES
+from tests.io.test_calibration import POSES
 
 _ROS = f"""image_width: {WIDTH}
 image_height: {HEIGHT}

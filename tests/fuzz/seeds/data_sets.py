@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.io.depth import write_depth
-from tests.colmap_models import write_text_model
+from tests.colmap_models import write_binary_model, write_text_model
+from tests.data_sets import ddad_scene, hypersim, nuscenes, tum, void
 from tests.fuzz.seeds.seed import DRY_RUN, Seed
-from tests.io.layouts import test_benchmark_layouts, test_ddad, test_nuscenes
-from tests.io.test_colmap import write_binary_model
 
 _SAMPLED = ("--sample", "20")
 """For layouts without sparse depth."""
@@ -77,9 +76,9 @@ def _colmap(folder: Path, image: bytes) -> list[Seed]:
 
 
 def _tum(folder: Path, image: bytes) -> list[Seed]:
-    _write_all(folder / "tum", image, "rgb/1.000.png", "rgb/1.033.png", "depth/1.015.png")
-    (folder / "tum/rgb.txt").write_text("# time file\n1.000 rgb/1.000.png\n1.033 rgb/1.033.png\n")
-    (folder / "tum/depth.txt").write_text("1.015 depth/1.015.png\n")
+    _write_all(folder / "tum", image, "rgb/1.000.png", "rgb/1.033.png")
+    _write_all(folder / "tum", image, "rgb/2.png", "depth/1.015.png", "depth/1.030.png")
+    tum(folder / "tum")
     _write_all(folder / "associated", image, "rgb/0.png", "depth/0.png")
     (folder / "associated/associations.txt").write_text("0 depth/0.png 0 rgb/0.png\n")
     files = ("tum/rgb.txt", "tum/depth.txt", "associated/associations.txt")
@@ -99,18 +98,18 @@ def _odometry(folder: Path, image: bytes) -> list[Seed]:
 
 
 def _void(folder: Path, image: bytes) -> list[Seed]:
-    test_benchmark_layouts.void(folder / "void")
+    void(folder / "void")
     return _indices("void/test_image.txt")
 
 
 def _nuscenes(folder: Path, image: bytes) -> list[Seed]:
-    test_nuscenes.write(folder / "nuscenes")
+    nuscenes(folder / "nuscenes")
     tables = sorted((folder / "nuscenes/v1.0-mini").iterdir())
     return _indices(*(path.relative_to(folder).as_posix() for path in tables))
 
 
 def _ddad(folder: Path, image: bytes) -> list[Seed]:
-    test_ddad.write_scene(folder / "ddad/000000")
+    ddad_scene(folder / "ddad/000000")
     return _indices("ddad/000000/scene_0a.json", "ddad/000000/calibration/k.json")
 
 
@@ -124,7 +123,7 @@ def _with_h5py(folder: Path, image: bytes, depth: np.ndarray) -> list[Seed]:
     seeds = []
     writers: tuple[tuple[str, str, Callable[[Path], None]], ...] = (
         ("h5", "00001", lambda root: _write_h5(h5py, root / "00001.h5")),
-        ("hypersim", "ai_001_001/cam_00_frame.0000", test_benchmark_layouts.hypersim),
+        ("hypersim", "ai_001_001/cam_00_frame.0000", hypersim),
         ("labeled", "0002", lambda root: _write_labeled(h5py, root)),
     )
     for name, frame, write in writers:

@@ -9,18 +9,16 @@ a test.txt with the numbers of its frames from 1, beside it names the test set, 
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.dataset.frame import Frame, Hdf5Array, Listing
-from pnpdepth_cli.io.dataset.protocols import PROTOCOLS, Protocol
+from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, Hdf5Array
 from pnpdepth_cli.io.dataset.reading import read_matlab_array, shape_of
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout, Parts, row
+from pnpdepth_cli.io.layouts.layout import Files, Layout, row
 
 _WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
 _LABELED = "nyu_depth_v2_labeled.mat"
@@ -28,32 +26,27 @@ _MOST_FRAMES = 100_000
 """The official file of NYU has 1,449."""
 
 
-@functools.lru_cache(maxsize=1)
-def _protocol_of(place: Path, changed_ns: int) -> Protocol:
-    """The protocol for the width of the first file that can be read; kept for the next frame."""
+def _of_folder(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+    """The arrays rgb (3, H, W) and depth (H, W); the protocol for the width of the first file."""
+    protocol = PROTOCOLS["nyu"]
     for path in sorted(place.glob("*.h5")):
         with suppress(FileFormatError):  # it is reported when the frame is read
-            wide = shape_of(path, "depth")[-1] > _WIDEST_KINECT
-            return PROTOCOLS["kitti-odometry" if wide else "nyu"]
-    return PROTOCOLS["nyu"]
-
-
-def _of_file(place: Path, files: Parts) -> Mapping[str, Any]:
-    """The arrays rgb (3, H, W) and depth (H, W) of a file."""
-    path = files["gt"]
-    return {
-        "image": Hdf5Array(path=path, name="rgb", axes=(1, 2, 0)),
-        "gt": Hdf5Array(path=path, name="depth", axes=(0, 1)),
-        "protocol": _protocol_of(place, place.stat().st_mtime_ns),
+            if shape_of(path, "depth")[-1] > _WIDEST_KINECT:
+                protocol = PROTOCOLS["kitti-odometry"]
+            break
+    return lambda files: {
+        "image": Hdf5Array(path=files["gt"], name="rgb", axes=(1, 2, 0)),
+        "gt": Hdf5Array(path=files["gt"], name="depth", axes=(0, 1)),
+        "protocol": protocol,
     }
 
 
-NYU_H5 = row(
+H5 = row(
     {"gt": "*.h5"},
     below="|*/|*/*/",
     marks=("*.h5",),
     name=lambda root, place, stem: "_".join((*place.relative_to(root).parts, stem)),
-    more=_of_file,
+    more=_of_folder,
 )
 
 
@@ -61,22 +54,19 @@ def _labeled(root: Path) -> Path:
     return root if root.name == _LABELED else root / _LABELED
 
 
-def _mat_listing(root: Path) -> Listing:
+def _of_mat(root: Path) -> Iterator[Frame]:
     """The frames of the test set, or all without a split; numbered from 1."""
     path = _labeled(root)
     count = shape_of(path, "depths")[0]
     if count > _MOST_FRAMES:
         raise FileFormatError(f"{path} claims {count:,} frames; the official file has 1,449")
-    frames = [
-        Frame(
+    for number in _split(path.parent, count) or range(1, count + 1):
+        yield Frame(
             name=f"{number:04}",
             image=Hdf5Array(path=path, name="images", axes=(2, 1, 0), index=number - 1),
             gt=Hdf5Array(path=path, name="depths", axes=(1, 0), index=number - 1),
             protocol=PROTOCOLS["nyu"],
         )
-        for number in _split(path.parent, count) or range(1, count + 1)
-    ]
-    return Listing(frames=frames)
 
 
 def _split(folder: Path, count: int) -> list[int]:
@@ -100,6 +90,4 @@ def _split(folder: Path, count: int) -> list[int]:
     return numbers
 
 
-NYU_MAT = Layout(
-    matches=lambda root: _labeled(root).is_file(), listing=_mat_listing, needs=(_LABELED,)
-)
+MAT = Layout(matches=lambda root: _labeled(root).is_file(), frames=_of_mat, needs=(_LABELED,))

@@ -1,0 +1,153 @@
+"""Sets whose index names the images and has their poses.
+
+`tum`: TUM RGB-D, rgb.txt and depth.txt with a time and a path per line, paired by time. An
+associations.txt (of TUM's associate.py, or of ICL-NUIM) pairs them itself: a time and a path twice
+per line. Poses are those of groundtruth.txt beside them, at the times of the images.
+
+`colmap`: a COLMAP project, images/ and sparse/0/, or sparse/, or a model beside images/. The images
+of dense/, which COLMAP undistorts, are a project of their own: dense/images/ and dense/sparse/. Of
+several models, sparse/0 to sparse/N, the one with the most images is used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.colmap import model_files, read_model
+from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Unmatched, as_pose, find_files
+from pnpdepth_cli.io.file_bytes import check_value_count, one_line, read_bytes
+from pnpdepth_cli.io.layouts.layout import Layout
+from pnpdepth_cli.io.poses import read_trajectory
+
+_ASSOCIATIONS = "associations.txt"
+_LONGEST_GAP_S = 0.02
+"""As TUM's own tool associates them."""
+_LONGEST_POSE_GAP_S = 0.1
+"""Between poses, which motion capture takes at 100 Hz."""
+
+Timed = tuple[float, Path]
+
+
+def _is_tum(root: Path) -> bool:
+    names = ("rgb.txt", "depth.txt")
+    return (root / _ASSOCIATIONS).is_file() or all((root / name).is_file() for name in names)
+
+
+def _of_tum(root: Path) -> Iterator[Frame | Unmatched]:
+    """One frame for each image with a depth image within 0.02 s; each is used once."""
+    poses = root / "groundtruth.txt"
+    trajectory = read_trajectory(poses) if poses.is_file() else None
+    if (root / _ASSOCIATIONS).is_file():
+        pairs = _timed_files(root / _ASSOCIATIONS, 2)
+    else:
+        images, depths = (
+            sorted(timed for (timed,) in _timed_files(root / name, 1))
+            for name in ("rgb.txt", "depth.txt")
+        )
+        partner_of: dict[int, int] = {}
+        taken: set[int] = set()
+        for image, depth in _close_pairs(root, images, depths):
+            if image not in partner_of and depth not in taken:
+                partner_of[image] = depth
+                taken.add(depth)
+        pairs = [[images[i], depths[partner_of[i]]] for i in sorted(partner_of)]
+        for timed, used, other in ((images, partner_of, "depth"), (depths, taken, "image")):
+            why = f"has no {other} within {_LONGEST_GAP_S} s that is not another's"
+            for number, (_, path) in enumerate(timed):
+                if number not in used:
+                    yield Unmatched(path=path, why=why, spare=True)
+    for (time_s, image_path), (_, depth_path) in pairs:
+        pose = None if trajectory is None else trajectory.at(time_s, _LONGEST_POSE_GAP_S)
+        yield Frame(
+            name=image_path.stem,
+            image=image_path,
+            gt=depth_path,
+            gt_scale=5000.0,
+            pose=None if pose is None else as_pose(pose),
+        )
+
+
+def _timed_files(path: Path, count: int) -> list[list[Timed]]:
+    """The times and paths of each line: one pair, or those of an image and of its depth."""
+    rows = []
+    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        try:
+            row = [(float(words[2 * i]), path.parent / words[2 * i + 1]) for i in range(count)]
+        except (ValueError, IndexError):
+            row = []
+        known = row and all(math.isfinite(time_s) for time_s, _ in row)
+        if not known or (count == 2 and (len(words) != 4 or sum(map(_is_depth, row)) != 1)):
+            both = " of rgb, and a time and a path of depth" if count == 2 else ""
+            raise FileFormatError(
+                f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path{both}"
+            )
+        rows.append(sorted(row, key=_is_depth) if count == 2 else row)
+    return rows
+
+
+def _is_depth(timed: Timed) -> bool:
+    return "depth" in timed[1].parts[-2:][0].lower()
+
+
+def _close_pairs(root: Path, images: list[Timed], depths: list[Timed]) -> list[list[int]]:
+    """Indices of images and depths at most 0.02 s apart, the closest first; times are sorted."""
+    image_times, depth_times = (np.array([time for time, _ in files]) for files in (images, depths))
+    first = np.searchsorted(depth_times, image_times - 2 * _LONGEST_GAP_S)
+    last = np.searchsorted(depth_times, image_times + 2 * _LONGEST_GAP_S, side="right")
+    count = last - first
+    check_value_count(root, int(count.sum()))
+    image = np.repeat(np.arange(len(images)), count)
+    depth = np.arange(len(image)) + np.repeat(last - np.cumsum(count), count)
+    gap = np.abs(image_times[image] - depth_times[depth])
+    pairs = np.column_stack([image, depth])[gap <= _LONGEST_GAP_S]
+    order = np.argsort(gap[gap <= _LONGEST_GAP_S], kind="stable")
+    closest: list[list[int]] = pairs[order].tolist()
+    return closest
+
+
+TUM = Layout(matches=_is_tum, frames=_of_tum, needs=("rgb.txt", "depth.txt"))
+
+
+def _colmap_models(root: Path) -> list[Path]:
+    """The folders of models, sparse/0 first; none without images."""
+    sparse = root / "sparse"
+    inside = [p for p in sparse.iterdir() if p.name.isdigit()] if sparse.is_dir() else []
+    numbered = sorted(inside, key=lambda p: int(p.name))
+    found = [folder for folder in (*numbered, sparse, root) if model_files(folder)]
+    return found if (root / "images").is_dir() else []
+
+
+def _of_colmap(root: Path) -> Iterator[Frame | Unmatched]:
+    """One frame for each registered image that exists."""
+    models = [read_model(folder) for folder in _colmap_models(root)]
+    model, photos = max(models, key=lambda other: len(other.images)), root / "images"
+    files, unreadable = find_files(photos, IMAGE_SUFFIXES)
+    yield from unreadable
+    for path in files.values():
+        if path.relative_to(photos).as_posix() not in model.images:
+            why = f"is not registered in {model.folder}"
+            yield Unmatched(path=path, why=why, spare=True)
+    for other in models:
+        if other is not model:
+            why = f"is another model, of {len(other.images):,} images, in a unit of its own"
+            yield Unmatched(path=other.folder, why=why, spare=True)
+    for name, image in sorted(model.images.items()):
+        path, turn = photos / name, image.rotation.T  # the pose is the inverse of COLMAP's
+        if not path.is_file():
+            why = f"is missing, but registered in {model.folder}; add it"
+            yield Unmatched(path=path, why=why)
+            continue
+        pose = as_pose(np.column_stack([turn, -turn @ image.translation]))
+        stem = Path(name).with_suffix("").as_posix()
+        yield Frame(name=stem, image=path, sparse=model.folder, pose=pose)
+
+
+COLMAP = Layout(matches=_colmap_models, frames=_of_colmap, needs=("images", "sparse/*/cameras.*"))

@@ -1,1 +1,0 @@
-"""Files in a store such as S3: addresses, copies of inputs, and outputs that are put whole."""

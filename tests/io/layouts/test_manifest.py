@@ -1,0 +1,139 @@
+"""Manifests, and the names of frames that cannot be, or must not be, file names of results."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, name_problem
+from pnpdepth_cli.io.layouts import read_frames
+from tests.empty_files import touch
+
+
+def frames_named(folder: Path, *names: str) -> list[Frame]:
+    (folder / "i.png").touch()
+    path = folder / "m.jsonl"
+    path.write_text("".join(json.dumps({"image": "i.png", "name": n}) + "\n" for n in names))
+    return read_frames(path)
+
+
+def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
+    touch(*(tmp_path / name for name in ("i.png", "s.bin", "c.txt", "deep/g.png", "m.png")))
+    row = {
+        "image": "i.png", "sparse": "s.bin", "gt": "deep/g.png", "calib": "c.txt", "camera": 3,
+        "sparse_scale": "", "gt_scale": 1000, "name": "first", "protocol": "kitti-odometry",
+        "mask": "m.png", "gt_size_ok": "yes", "group": "room",
+    }  # fmt: skip
+    (tmp_path / "m.jsonl").write_text(json.dumps(row) + "\n\n")
+    (tmp_path / "m.csv").write_text(f"{','.join(row)}\n{','.join(map(str, row.values()))}\n")
+    from_json, from_csv = (read_frames(tmp_path / name) for name in ("m.jsonl", "m.csv"))
+    assert from_json == from_csv
+    assert from_csv == [
+        Frame(
+            name="first",
+            image=tmp_path / "i.png",
+            sparse=tmp_path / "s.bin",
+            gt=tmp_path / "deep/g.png",
+            calib=tmp_path / "c.txt",
+            camera=3,
+            gt_scale=1000,
+            protocol=PROTOCOLS["kitti-odometry"],
+            masks=(tmp_path / "m.png",),
+            gt_other_size=True,
+            group="room",
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("image,sparse\nlost.png,s.png\n", "lost.png does not exist; correct line 2 of "),
+        ("image,depth\ni.png,s.png\n", "'depth' is not one of"),
+        ("image,camera\ni.png,left\n", "line 2"),
+        ("image\ni.png\ni.png\n", "line 3: a second frame 'i'"),
+        ("image,gt\n,i.png\n", "neither image nor sparse"),
+        ("image\ni.png,more\n", "more than the header has"),
+        ("image,gt_size_ok\ni.png,maybe\n", "gt_size_ok is 'maybe', not true or false"),
+        ("image\n" + "x" * 200_000 + "\n", "field larger than field limit"),
+        ("image\ni\0.png\n", "line 2: image holds a NUL"),
+    ],
+)
+def test_a_line_of_a_manifest_that_means_nothing_is_named(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    touch(tmp_path / "i.png")
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(InputError) as error:
+        read_frames(tmp_path / "m.csv")
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_frames_of_one_stem_are_named_by_their_folders(tmp_path: Path) -> None:
+    touch(*(tmp_path / "data" / name for name in ("one/x.png", "two/x.png", "y.png")))
+    (tmp_path / "m.csv").write_text(
+        "image,name\ndata/one/x.png,\ndata/two/x.png,\ndata/y.png,mine\n"
+    )
+    assert [f.name for f in read_frames(tmp_path / "m.csv")] == ["one/x", "two/x", "mine"]
+
+
+def test_a_manifest_may_name_files_with_new_lines(tmp_path: Path) -> None:
+    touch(tmp_path / "a\nb.png", tmp_path / "c\u2028d.png")
+    (tmp_path / "m.csv").write_text('image\n"a\nb.png"\nc\u2028d.png\n', encoding="utf-8")
+    (tmp_path / "m.jsonl").write_text(
+        '{"image": "a\\nb.png"}\n{"image": "c\u2028d.png"}\n', encoding="utf-8"
+    )
+    for name in ("m.csv", "m.jsonl"):
+        assert [f.name for f in read_frames(tmp_path / name)] == ["a\nb", "c\u2028d"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [("a", "./a"), ("x/y", "x//y"), ("x/y", "x/./y"), ("Frame", "frame"), ("ß", "SS")],
+)
+def test_two_names_of_one_file_are_refused(tmp_path: Path, first: str, second: str) -> None:
+    with pytest.raises(FileFormatError, match="line 2: a second frame"):
+        frames_named(tmp_path, first, second)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("a\0b", "NUL"),
+        ("a\\b", "backslash"),
+        ("C:/frames/a", "drive letter"),
+        ("con", "which Windows reserves"),
+        ("x/NUL.tar/y", "which Windows reserves"),
+        ("Com1", "which Windows reserves"),
+        (".", "names no file"),
+        ("n" * 240, "longer than 239 bytes"),
+        ("x/" + "é" * 120, "longer than 239 bytes"),
+    ],
+)
+def test_a_name_that_is_fit_for_no_file_is_refused(tmp_path: Path, name: str, why: str) -> None:
+    with pytest.raises(FileFormatError, match=rf"line 1: .*{why}"):
+        frames_named(tmp_path, name)
+
+
+def test_other_names_stay_but_for_dots_and_double_slashes(tmp_path: Path) -> None:
+    names = ["console", "nullable", "a.con", "n" * 239, "x/y", "é"]
+    assert [frame.name for frame in frames_named(tmp_path, *names)] == names
+    assert [frame.name for frame in frames_named(tmp_path, "./s", "x//y/.")] == ["s", "x/y"]
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        *((name, "leads out of the output folder") for name in ("../a", "/a", "x/../../a")),
+        ("n" * 240, "is longer than 239 bytes"),
+        ("C:con", None),  # a name that this system has
+    ],
+)
+def test_a_name_that_leads_elsewhere_or_is_too_long_has_no_results(
+    name: str, problem: str | None
+) -> None:
+    assert name_problem(name) == problem
