@@ -23,6 +23,7 @@ def open_bar(title: str, unit: str, **settings: Any) -> tqdm[Any]:
     """Returns a bar on stderr, which stays hidden where that is not a terminal."""
     from tqdm import tqdm
 
+    tqdm.monitor_interval = 0  # without a thread of its own, image libraries can be silenced
     return tqdm(desc=title, unit=unit, disable=None, dynamic_ncols=True, **settings)
 
 

@@ -88,7 +88,7 @@ EXITS: list[tuple[list[str], int, str]] = [
     (["--vary", "lr=1", "--vary", "loss=l1", "--vary", "points=9"], 2, "--one-by-one"),
     (["--vary", "lr=1", "--sample", "many"], 2, "no sensor 'many'"),
     (["--vary", "lr=1", "--seeds", "0"], 2, "--seeds must be >= 1"),
-    (["--vary", "lr=1", "--limit", "0"], 2, "1 or more"),
+    (["--vary", "lr=1", "--limit", "0"], 2, "in the range x>=1"),
     (["--vary", "lr=1", "--layout", "tum"], 3, "does not look like 'tum'"),
     (["--vary", "layer=encod,middle"], 4, "encode"),
     (["--vary", "lr=1", "--model", "compakt"], 4, "compact"),

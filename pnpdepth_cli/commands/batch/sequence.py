@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.evaluation.statistics import groups_by_name
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.dataset import Frame, Neighbour
+from pnpdepth_cli.io.dataset import Frame, Neighbour, groups_by_name
 from pnpdepth_cli.io.poses import read_oxts_poses, read_poses
 
 KnownPose = tuple[NDArray[np.float64], str]

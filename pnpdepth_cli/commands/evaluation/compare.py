@@ -21,7 +21,6 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     FrameTable,
     find_clusters,
     gain,
-    groups_by_name,
     holm,
     interval,
     swap_p_values,
@@ -29,6 +28,7 @@ from pnpdepth_cli.commands.evaluation.statistics import (
 from pnpdepth_cli.commands.tables import chosen_measures
 from pnpdepth_cli.core.metrics import MEASURES, Measure
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.io.dataset import groups_by_name
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import plain, read_json
 

@@ -16,7 +16,6 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.evaluation.statistics import groups_by_name
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.dataset import (
     IMAGE_SUFFIXES,
@@ -25,6 +24,7 @@ from pnpdepth_cli.io.dataset import (
     file_of,
     find_files,
     find_protocol,
+    groups_by_name,
 )
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray

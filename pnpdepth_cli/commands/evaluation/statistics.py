@@ -8,7 +8,6 @@ docs/guides/evaluation.md) and scipy.stats does not have.
 from __future__ import annotations
 
 import math
-import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -31,7 +30,6 @@ MAX_BLOCKS = 10
 """Most blocks of a single sequence. Few long blocks stay independent also where the correlation is
 not that of a first-order autoregression, at a small loss of power (Ibragimov and Müller 2010)."""
 
-_FRAME_NUMBER = re.compile(r"(?:^|[_\-/])\d+(?:_image_\d+)?$")
 _STEP = 1e-5
 """Of the numerical derivative, relative to the sums; its error is near 1e-10."""
 _CELLS = 1 << 21
@@ -55,18 +53,6 @@ class Clusters:
     def describe(self) -> str:
         """Returns text such as `12 groups of frames`."""
         return f"{self.count:,} {self.unit}"
-
-
-def groups_by_name(names: Sequence[str]) -> list[str]:
-    """Returns the sequence of each frame: its name before the frame number, or else its folder.
-
-    `drive_0002_sync_0000000008_image_02` is of `drive_0002_sync`, and `office/0012` of `office`.
-    Unless all names end in a number, only folders make groups.
-    """
-    stems = [_FRAME_NUMBER.sub("", name) for name in names]
-    if all(stem != name for stem, name in zip(stems, names, strict=True)):
-        return stems
-    return [name.rpartition("/")[0] for name in names]
 
 
 def find_clusters(groups: Sequence[str], series: Floats, *, grouped: bool = True) -> Clusters:

@@ -13,7 +13,6 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     FrameTable,
     find_clusters,
     gain,
-    groups_by_name,
     interval,
 )
 from pnpdepth_cli.commands.sweep.axes import PARAMETERS, Axis, Study
@@ -22,6 +21,7 @@ from pnpdepth_cli.commands.tables import Table, write_text
 from pnpdepth_cli.core.metrics import MEASURES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.dataset import groups_by_name
 from pnpdepth_cli.io.record import plain, write_json
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -289,3 +289,18 @@ def portable_name_problem(name: str) -> str | None:
             return f"holds {part!r}, which Windows reserves"
     problem = name_problem(name)
     return None if problem == _LEADS_OUT else problem  # only what writes results minds
+
+
+_FRAME_NUMBER = re.compile(r"(?:^|[_\-/])\d+(?:_image_\d+)?$")
+
+
+def groups_by_name(names: Sequence[str]) -> list[str]:
+    """Returns the sequence of each frame: its name before the frame number, or else its folder.
+
+    `drive_0002_sync_0000000008_image_02` is of `drive_0002_sync`, and `office/0012` of `office`.
+    Unless all names end in a number, only folders make groups.
+    """
+    stems = [_FRAME_NUMBER.sub("", name) for name in names]
+    if all(stem != name for stem, name in zip(stems, names, strict=True)):
+        return stems
+    return [name.rpartition("/")[0] for name in names]

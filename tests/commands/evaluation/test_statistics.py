@@ -19,11 +19,11 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     block_length,
     find_clusters,
     gain,
-    groups_by_name,
     holm,
     swap_p_values,
 )
 from pnpdepth_cli.core.metrics import SUMS, error_sums, score
+from pnpdepth_cli.io.dataset import groups_by_name
 
 
 def clusters_of(ids: list[int] | np.ndarray) -> Clusters:

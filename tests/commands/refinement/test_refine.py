@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from pnpdepth_cli.errors import (
     DivergedError,
@@ -68,13 +69,17 @@ def test_ground_truth_that_is_the_sparse_depth_is_warned_of(frame: FrameOnDisk) 
     assert not noted(record, "warning")
 
 
-@pytest.mark.parametrize("scale", [256.0, 1000 / 5, 1.0])
-def test_ground_truth_of_another_scale_in_use_stops_and_names_the_option(
+@pytest.mark.parametrize("scale", [1000.0, 5000.0, 1.0])
+def test_ground_truth_whose_assumed_scale_is_another_one_in_use_stops_and_names_the_option(
     frame: FrameOnDisk, scale: float
 ) -> None:
-    with pytest.raises(UsageError, match=r"times the sparse depth .* give --gt-scale"):
-        run(frame, gt=frame.gt, gt_scale=scale)
+    codes = np.rint(read_depth(frame.gt).values * scale).astype(np.uint16)
+    Image.fromarray(codes).save(frame.folder / "codes.png")  # 256 is assumed
+    with pytest.raises(InputError, match=r"a scale is probably wrong; --gt-scale [\d.]+ \(now 256"):
+        run(frame, gt=frame.folder / "codes.png")
     assert not (frame.folder / "out").exists()
+    if scale > 1:
+        run(frame, gt=frame.folder / "codes.png", gt_scale=scale, iterations=0)
 
 
 def test_ground_truth_that_no_two_scales_explain_is_warned_of(frame: FrameOnDisk) -> None:
