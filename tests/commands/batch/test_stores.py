@@ -120,7 +120,7 @@ def test_a_second_run_does_only_what_changed_in_the_store(root: Path, bucket: Bu
         source=path_of(f"{bucket.address}/drive/list.csv"),
         output=path_of(f"{bucket.address}/out"), refine=refinement(root),
     )  # fmt: skip
-    planned = [(p.name, p.why) for p in plan_batch(request, lambda text: None)]
+    planned = list(plan_batch(request, lambda text: None))
     assert planned == [("b", "input changed: image"), ("d", "result missing: d_depth.png")]
     in_store(root, bucket, listener)
     assert listener.names == ["b", "d"]

@@ -32,7 +32,8 @@ def _scores(folder: Path) -> list[Seed]:
 def _journals(folder: Path) -> list[Seed]:
     """A finished batch and a finished sweep, which go on where they ended."""
     batch = ("batch", "frames.csv", *_NETWORK, "--iterations", "1", "-o", "finished")
-    sweep = ("sweep", "frames.csv", *_NETWORK, "--vary", "iterations=0,1", "-o", "swept")
+    sweep = ("sweep", "frames.csv", "--model", "fcrn-tiny", "--set", "propagate=none")
+    sweep += ("--vary", "iterations=0,1", "-o", "swept")
     _output_of(batch)
     _output_of(sweep)
     (record,) = {*Path("finished").glob("*.json")} - {Path("finished/summary.json")}
@@ -49,7 +50,8 @@ def _journals(folder: Path) -> list[Seed]:
 def _output_of(arguments: Sequence[str]) -> str:
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.redirect_stderr(io.StringIO()):
-        run(list(arguments))
+        code = run(list(arguments))
+    assert code == 0, f"{arguments}: exit code {code}"
     return text.getvalue()
 
 
