@@ -129,6 +129,7 @@ def refine_from(
         BatchError: z or the output does not have one part per frame; refine them one at a time.
     """
     settings, count = settings.complete(), len(points)
+    scale = _LOSS_SCALE if split.in_half else 1.0  # of the loss, so that no gradient vanishes
     frames = [
         _FrameRefinement(settings, z0, at, read, keep_depths)
         for z0, at, read in zip(frame_parts(z, count), points, depth_of, strict=True)
@@ -139,10 +140,15 @@ def refine_from(
             losses = _losses(frames, split.rear(z))
             if not losses:
                 break
-            gradient = _gradient(torch.stack(losses).sum(), z, split)
+            gradient = gradient_at(z, torch.stack(losses).sum() * scale)
+        if gradient is None:
+            raise _no_gradient(split.layer)
         with torch.no_grad():
             parts = zip(
-                frames, frame_parts(z.detach(), count), frame_parts(gradient, count), strict=True
+                frames,
+                frame_parts(z.detach(), count),
+                frame_parts(gradient / scale, count),
+                strict=True,
             )
             moved = [frame.updated(*part) for frame, *part in parts]
             z = torch.cat(moved) if count > 1 else moved[0]
@@ -188,16 +194,12 @@ def _losses(frames: Sequence[_FrameRefinement], output: Any) -> list[Tensor]:
     return [loss for loss in losses if loss is not None]
 
 
-def _gradient(loss: Tensor, z: Tensor, split: Split) -> Tensor:
-    """∂L/∂z_k."""
-    gradient = gradient_at(z, loss * _LOSS_SCALE if split.in_half else loss)
-    if gradient is None:
-        raise LayerError(
-            f"layer {split.layer!r}: no gradient comes back from the prediction to it; either the"
-            " prediction does not depend on it or the network's forward runs under"
-            " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
-        )
-    return gradient / _LOSS_SCALE if split.in_half else gradient
+def _no_gradient(layer: str) -> LayerError:
+    return LayerError(
+        f"layer {layer!r}: no gradient comes back from the prediction to it; either the"
+        " prediction does not depend on it or the network's forward runs under"
+        " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
+    )
 
 
 class _FrameRefinement:
