@@ -48,7 +48,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
             *("--layout", "--protocol", "--sample", "--limit", "--shard"),
             *("--topics", "--tolerance"),
         ),
-        "Sequences": ("--accumulate", "--poses", "--warm-start"),
+        "Sequences": ("--accumulate", "--poses", "--warm-start", "--adapt"),
         "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
         "Network": grouped_help.NETWORK,
         "Method": grouped_help.METHOD,

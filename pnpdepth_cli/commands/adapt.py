@@ -14,7 +14,9 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors.torch import save_file
+from scipy.stats import ttest_1samp
 from torch import Tensor, nn
 
 from pnpdepth_cli import __version__
@@ -38,8 +40,6 @@ from pnpdepth_cli.io.layouts import list_frames
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.settings import Settings
 
-VALIDATED = 10
-"""One frame in this many is for validation; of fewer frames, the last."""
 MOST_VALIDATED = 16
 STEPS_A_VISIT = 4
 """Updates on a frame before the next is taken."""
@@ -73,6 +73,8 @@ class Adapted:
     """Fraction of the points that was hidden at every update."""
     losses: dict[int, float]
     """Loss at hidden points of the validation frames by the number of updates."""
+    p_value: float | None
+    """Of a one-sided paired t test that the loss fell. None with fewer than two frames."""
 
     @property
     def change(self) -> float:
@@ -97,6 +99,13 @@ def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) ->
         raise InputError(
             f"{request.source} ({layout}) gives {len(tasks)} frame; an adaptation needs 2 or more"
         )
+    return adapt_to(tasks, request, say, on_step)
+
+
+def adapt_to(
+    tasks: Sequence[Task], request: AdaptRequest, say: Callable[[str], None], on_step: OnStep
+) -> Adapted:
+    """Does what `adapt` does with these frames, whichever the request selects."""
     choice, seed = request.refine.network, request.refine.method.seed
     network = load_network(choice.model, choice.checkpoint, choice.device)
     first = read_inputs(tasks[0].request)
@@ -112,7 +121,7 @@ def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) ->
     settings = resolve_settings(network.definition, options, dense=is_dense(first.points))
     for note in (*first.notes, *network.notes):
         say(note)
-    adaptation = _Adaptation(network, settings, tasks)
+    adaptation = _Adaptation(network, settings, tasks, request.validated)
     training, validation = len(adaptation.training), len(adaptation.validation)
     say(f"frames to learn from: {training}; for validation: {validation}")
     with network.cut_at_points() as split:
@@ -131,6 +140,7 @@ def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) ->
         loss=settings.loss,
         hidden=settings.mask_fraction,
         losses=losses,
+        p_value=adaptation.p_value(),
     )
     _write(request, adapted, network.module, adaptation.best.values())
     return adapted
@@ -142,9 +152,11 @@ class _Adaptation:
     The iterations of the settings are those of all frames together.
     """
 
-    def __init__(self, network: Network, settings: Settings, tasks: Sequence[Task]) -> None:
+    def __init__(
+        self, network: Network, settings: Settings, tasks: Sequence[Task], validated: int
+    ) -> None:
         every = list(range(len(tasks)))
-        validation = every[VALIDATED - 1 :: VALIDATED] or every[-1:]
+        validation = every[validated - 1 :: validated] or every[-1:]
         chosen = np.linspace(0, len(validation) - 1, min(MOST_VALIDATED, len(validation)))
         self.validation = [validation[round(position)] for position in chosen]
         self.training = [index for index in every if index not in set(validation)]
@@ -155,12 +167,13 @@ class _Adaptation:
         self._rules: list[Update] = []
         self._alphas: list[float] = []
         self.best, self.kept = self._weights, 0
+        self._losses: dict[int, NDArray[np.float64]] = {}
 
     def run(self, split: InputSplit, on_step: OnStep) -> dict[int, float]:
         """Makes all updates. Returns the validation loss by the number of updates."""
         of, updates = self._settings.iterations, 0
-        losses = {0: self._validated(split)}
-        best = self._weights.theta
+        losses = {0: self._validated(split, 0)}
+        best: list[Tensor] | None = None
         for index in self._visits():
             visit = min(STEPS_A_VISIT, of - updates)
             loss = self._visited(split, index, updates, visit)
@@ -168,11 +181,19 @@ class _Adaptation:
             updates += visit
             on_step(updates, of, f"loss {loss:.4f}")
             if checked:
-                losses[updates] = self._validated(split)
+                losses[updates] = self._validated(split, updates)
                 if losses[updates] < losses[self.kept]:
                     best, self.kept = list(self._weights.theta), updates
-        self._weights.theta = list(best)
+        start = [parameter.detach().float() for parameter in self._weights.parameters()]
+        self._weights.theta = start if best is None else best
         return losses
+
+    def p_value(self) -> float | None:
+        """Returns that of a one-sided paired t test that the validation loss fell."""
+        ratios = np.log(self._losses[self.kept] / self._losses[0])
+        if len(ratios) < 2 or not self.kept:
+            return None
+        return float(ttest_1samp(ratios, 0, alternative="less").pvalue)
 
     def _visits(self) -> Iterator[int]:
         """The frames to learn from, shuffled anew when all were visited."""
@@ -213,7 +234,7 @@ class _Adaptation:
             value - factor * alpha * rule(gradient) for value, alpha, rule, gradient in moving
         ]
 
-    def _validated(self, split: InputSplit) -> float:
+    def _validated(self, split: InputSplit, updates: int) -> float:
         """The mean loss at hidden points of the validation frames, the same each time."""
         losses = []
         for index in self.validation:
@@ -221,6 +242,7 @@ class _Adaptation:
             with self._frame(split, index) as frame, torch.no_grad(), self._weights.in_place():
                 hidden = Masks(frame.inliers, self._settings, generator).next()
                 losses.append(float(self._loss(frame, hidden)))
+        self._losses[updates] = np.array(losses)
         return float(np.mean(losses))
 
     def _loss(self, frame: FrameOfPoints, hidden: Tensor) -> Tensor:

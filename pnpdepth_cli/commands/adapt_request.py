@@ -17,7 +17,10 @@ class AdaptRequest(FrameSelection):
     steps: int = option(
         200, "Number of updates of the weights.", metavar="N", least=1, show_default=True
     )
-    lr: float = option(2e-4, "Step size at the start.", metavar="NUMBER", show_default=True)
+    lr: float = option(4e-4, "Step size at the start.", metavar="NUMBER", show_default=True)
+
+    validated: int = 10
+    """One frame in this many is for validation; of fewer frames, the last."""
 
     def __post_init__(self) -> None:
         if self.output.suffix != ".safetensors":

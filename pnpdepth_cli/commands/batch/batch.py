@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import tempfile
@@ -11,7 +12,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 from pnpdepth_cli.commands.batch.frames import Task, find_frames, source_files, task_of
 from pnpdepth_cli.commands.batch.records import (
@@ -23,7 +24,7 @@ from pnpdepth_cli.commands.batch.records import (
     settings_of,
 )
 from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions, ray_workers_of
-from pnpdepth_cli.commands.batch.sequence import in_windows, note_of_poses
+from pnpdepth_cli.commands.batch.sequence import in_windows, note_of_poses, sequences_of
 from pnpdepth_cli.commands.batch.summary import (
     CSV,
     JSON,
@@ -98,6 +99,7 @@ def run_batch(
         batch.records.check_new(task_of(request, frame) for frame in batch.found.chosen)
     with ExitStack() as stack:
         local = batch.opened_output(stack)
+        batch.adapt(learn=True)
         to_do = [frame for frame, _ in batch.to_do()]
         batch.records.mark()
         if batch.report is not None:
@@ -121,7 +123,17 @@ def run_batch(
 
 def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[tuple[str, str]]:
     """Returns the names of the frames that `run_batch` would do, and why; nothing is written."""
-    return [(frame.name, why) for frame, why in _Batch(request, say).to_do()]
+    batch = _Batch(request, say)
+    batch.adapt(learn=False)
+    return [(frame.name, why) for frame, why in batch.to_do()]
+
+
+class _Part(NamedTuple):
+    """How some frames of a batch are refined, and what the output folder holds of them."""
+
+    request: BatchRequest
+    records: Records
+    frames: Sequence[Frame]
 
 
 class _Batch:
@@ -151,6 +163,28 @@ class _Batch:
         for note in self._notes():
             say(note)
         self.records = Records(request.output, self.model)
+        self._parts: dict[str, _Part] = {}  # by the name of the frame
+
+    def adapt(self, *, learn: bool) -> None:
+        """Lets weights learn from the points of each sequence, where that is asked for."""
+        if not self.request.adapt:
+            return
+        from pnpdepth_cli.commands.batch.adapted import with_adapted_weights
+
+        for name, indices in sequences_of(self.found.frames).items():
+            frames = [self.found.frames[index] for index in indices]
+            request = with_adapted_weights(self.request, name, frames, self._say, learn=learn)
+            records = Records(request.output, model_identity(request.refine))
+            self._parts |= dict.fromkeys(
+                [frame.name for frame in frames], _Part(request, records, frames)
+            )
+
+    def _part(self, frame: Frame) -> _Part:
+        whole = _Part(self.request, self.records, self.found.frames)
+        return self._parts.get(frame.name, whole)
+
+    def _task(self, frame: Frame) -> Task:
+        return task_of(self._part(frame).request, frame)
 
     def _report(self) -> BatchReport | None:
         """The report, if one is wanted. OutputError if it cannot or may not be written there."""
@@ -213,9 +247,9 @@ class _Batch:
 
     def to_do(self) -> list[tuple[Frame, str]]:
         """Returns the frames that are to be done, and why, and says how many."""
-        records, chosen = self.records, self.found.chosen
+        chosen = self.found.chosen
         reasons = _read_in_parts(
-            lambda frame: records.reason_to_refine(task_of(self.request, frame)), chosen
+            lambda frame: self._part(frame).records.reason_to_refine(self._task(frame)), chosen
         )
         to_do = [(frame, why) for frame, why in zip(chosen, reasons, strict=True) if why]
         kinds = Counter(why.split(":")[0] for _, why in to_do)
@@ -234,38 +268,49 @@ class _Batch:
         # these import torch, which a run with nothing to do does not need
         from pnpdepth_cli.commands.batch import running
 
-        request, say = self.request, listener.say
-        references = running.references_of(request, self.found.frames)
+        begin = functools.cache(lambda: listener.begin(len(to_do)))
         worked = len(to_do) < len(self.found.chosen)
-        if references is None:
-            listener.begin(len(to_do))
-            yield from running.rows_of_unreadable(self._tasks(to_do), self.records)
-        elif self.workers is not None:
-            from pnpdepth_cli.commands.batch.ray_workers import rows_of_workers
+        for (request, records, frames), wanted in self._by_part(to_do):
+            references = running.references_of(request, frames)
+            if stopped():
+                return
+            if references is None:
+                begin()
+                yield from running.rows_of_unreadable(self._tasks(wanted), records)
+            elif self.workers is not None:
+                from pnpdepth_cli.commands.batch.ray_workers import rows_of_workers
 
-            listener.begin(len(to_do))
-            yield from rows_of_workers(
-                request, self.workers, references, to_do, self.records,
-                settings_worked=worked, say=say, stopped=stopped,
-            )  # fmt: skip
-        else:
-            with running.opened_network(request, references, say) as network:
-                listener.begin(len(to_do))
-                yield from running.refine_tasks(
-                    self._tasks(to_do), network, self.records,
-                    threads=request.workers, settings_worked=worked, stopped=stopped,
+                begin()
+                yield from rows_of_workers(
+                    request, self.workers, references, wanted, records,
+                    settings_worked=worked, say=listener.say, stopped=stopped,
                 )  # fmt: skip
+            else:
+                with running.opened_network(request, references, listener.say) as network:
+                    begin()
+                    yield from running.refine_tasks(
+                        self._tasks(wanted), network, records,
+                        threads=request.workers, settings_worked=worked, stopped=stopped,
+                    )  # fmt: skip
+
+    def _by_part(self, to_do: list[Frame]) -> list[tuple[_Part, list[Frame]]]:
+        """The frames to refine, by how they are refined."""
+        parts: dict[int, tuple[_Part, list[Frame]]] = {}
+        for frame in to_do:
+            part = self._part(frame)
+            parts.setdefault(id(part.records), (part, []))[1].append(frame)
+        return list(parts.values())
 
     def _tasks(self, to_do: list[Frame]) -> Iterator[Task]:
         """The frames to refine in their order, and within windows those that they begin with."""
         if not self.request.sequence.warm_start:
-            yield from (task_of(self.request, frame) for frame in to_do)
+            yield from map(self._task, to_do)
             return
         by_name = {frame.name: frame for frame in self.found.frames}
         for wanted in in_windows(to_do):
             names = {frame.name for frame in wanted}
             for each in wanted[-1].window:
-                task = task_of(self.request, by_name[each.name])
+                task = self._task(by_name[each.name])
                 yield replace(task, written=task.name in names)
 
     def summarise(self, local: Path, profile: dict[str, Any]) -> dict[str, Any]:
@@ -273,7 +318,7 @@ class _Batch:
         request, tally = self.request, Tally()
         refused = (failed_row(frame.name, {}, why) for frame, why in self.found.refused)
         known = _read_in_parts(
-            lambda frame: self.records.row(task_of(request, frame)), self.found.frames
+            lambda frame: self._part(frame).records.row(self._task(frame)), self.found.frames
         )
         with tempfile.TemporaryFile("w+", dir=local, **TEXT) as file:
             for row in itertools.chain(refused, known):

@@ -147,6 +147,11 @@ class BatchRequest(FrameSelection):
     shard: tuple[int, int] | None = option(
         None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
     )
+    adapt: bool = option(
+        False,
+        "First let the weights learn from hidden points of each sequence (8 frames or more); its"
+        " frames are refined with them if they are better. The network must take points.",
+    )
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
     """What a frame takes over from its neighbours."""
     profile: bool = option(False, "Print the time spent in each stage.")
@@ -154,7 +159,8 @@ class BatchRequest(FrameSelection):
     """The Ray workers, if any."""
 
     def __post_init__(self) -> None:
-
+        if self.adapt and self.shard is not None:
+            raise UsageError("--adapt does not go with --shard; weights are learnt in one process")
         if self.html_3d and self.html is None:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
 

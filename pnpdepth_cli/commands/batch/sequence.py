@@ -19,20 +19,23 @@ KnownPose = tuple[NDArray[np.float64], str]
 """(3, 4) from the camera's frame to the world's in metres, and where it is from."""
 
 
-def _sequences_of(frames: Sequence[Frame]) -> list[list[int]]:
-    """The indices of the frames of each sequence, which one camera took, in order."""
+def sequences_of(frames: Sequence[Frame]) -> dict[str, list[int]]:
+    """Returns the indices of the frames of each sequence, which one camera took, in order."""
     by_name = groups_by_name([frame.name for frame in frames])
     sequences: dict[tuple[str, int | None], list[int]] = {}
     for index, (frame, name) in enumerate(zip(frames, by_name, strict=True)):
         group = name if frame.group is None else frame.group
         sequences.setdefault((group, frame.camera), []).append(index)
-    return list(sequences.values())
+    return {
+        group if camera is None else f"{group}_{camera}": indices
+        for (group, camera), indices in sequences.items()
+    }
 
 
 def with_windows(frames: Sequence[Frame], length: int) -> list[Frame]:
     """Returns the frames, each with its window: so many frames of its sequence in a row."""
     result = list(frames)
-    for sequence in _sequences_of(frames):
+    for sequence in sequences_of(frames).values():
         for number, index in enumerate(sequence):
             first = number - number % length
             window = tuple(frames[other] for other in sequence[first : number + 1])
@@ -74,7 +77,7 @@ def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> 
         UsageError: A frame has no points, or its points are those of all images already.
     """
     known, result = _poses(frames, poses), list(frames)
-    for sequence in _sequences_of(frames):
+    for sequence in sequences_of(frames).values():
         for number, index in enumerate(sequence):
             near = range(max(0, number - reach), min(len(sequence), number + reach + 1))
             neighbours = (
@@ -119,7 +122,7 @@ def _poses(frames: Sequence[Frame], path: Path | None) -> list[KnownPose | None]
     if path is not None:
         return [(row, str(path)) for row in read_poses(path, len(frames), "frames")]
     poses = [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
-    for sequence in _sequences_of(frames):
+    for sequence in sequences_of(frames).values():
         packets = [frames[index].oxts for index in sequence]
         first = frames[sequence[0]]
         if first.calib is not None and None not in packets:
