@@ -24,6 +24,7 @@ from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network
 
 MULTIPLES = (1, 2, 3, 4)
+LARGE_ERROR = 0.25  # of the depth
 FRAMES = {"kitti_dc": (1, 3, 5), "7scenes": (5, 25, 45), "icl_nuim": (1, 9, 17)}
 CASES = (
     ("kitti_dc", "compact", None),
@@ -37,14 +38,20 @@ CASES = (
 
 
 def coverage(network: Network, frame: EvalFrame, count: int | None) -> list[float]:
-    """Fractions of the ground truth within ± 1, 2, 3 and 4 σ."""
+    """Fractions of the ground truth within ± 1, 2, 3 and 4 σ, of large errors masked, and kept."""
     if count is None:
         frame = without_occluded(frame)
     result = by_default(network, drawn_inputs(frame, count, 0))
-    sigma = with_uncertainty(result).sigma
+    result = with_uncertainty(result)
+    sigma, valid = result.sigma, result.valid
+    assert sigma is not None
+    assert valid is not None
     known = frame.gt > 0
     ratio = np.abs(frame.gt - result.after)[known] / sigma[known]
-    return [float((ratio <= multiple).mean()) for multiple in MULTIPLES]
+    wrong = known & (np.abs(frame.gt - result.after) > LARGE_ERROR * frame.gt)
+    caught = float((~valid[wrong]).mean()) if wrong.any() else 1.0
+    within = [float((ratio <= multiple).mean()) for multiple in MULTIPLES]
+    return [*within, caught, float(valid[known].mean())]
 
 
 def main() -> None:
@@ -53,7 +60,7 @@ def main() -> None:
     parser.add_argument("data", type=Path, help="folder with kitti_dc, 7scenes, icl_nuim")
     data = parser.parse_args().data
     within = (f"within ± {multiple} σ" for multiple in MULTIPLES)
-    print_row("set", "points", "network", *within, head=True)
+    print_row("set", "points", "network", *within, "errors masked", "kept", head=True)
     for name, network_name, count in CASES:
         network, frames = opened(network_name, data), list(SETS[name](data))
         means = np.mean([coverage(network, frames[n], count) for n in FRAMES[name]], axis=0)

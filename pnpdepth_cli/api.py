@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, Scores
 from pnpdepth_cli.core.metrics import score as score_tensors
-from pnpdepth_cli.errors import SizeError
+from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.frames.frame import Refined, Registration, Unit, in_metres
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.models import network as networks
@@ -19,7 +19,7 @@ from pnpdepth_cli.settings import Settings
 
 
 def load_network(
-    spec: str = "compact",
+    spec: str | Path = "compact",
     checkpoint: str | Path | None = None,
     *,
     device: str = "cpu",
@@ -39,8 +39,11 @@ def load_network(
         CheckpointError: The weights cannot be read or do not fit.
         DeviceError: The device cannot be used.
     """
+    for name, value in (("spec", spec), ("checkpoint", checkpoint)):
+        if not isinstance(value, str | Path) and (name == "spec" or value is not None):
+            raise UsageError(f"{name} must be a name or a path, not {type(value).__name__}")
     path = None if checkpoint is None else Path(checkpoint)
-    return networks.load_network(spec, path, device, precision=precision)
+    return networks.load_network(str(spec), path, device, precision=precision)
 
 
 def refine(

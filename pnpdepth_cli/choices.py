@@ -34,6 +34,7 @@ class Table(Mapping[str, Any]):
         names: All names in the module's table, in the order of their listing.
         first: Names listed before the others, which follow in alphabetical order.
         package: The package that `path` belongs to.
+        in_file: Name of the object in a user's Python file, whose path is then a name too.
     """
 
     def __init__(
@@ -46,7 +47,9 @@ class Table(Mapping[str, Any]):
         names: tuple[str, ...] = (),
         first: tuple[str, ...] = (),
         package: str = "pnpdepth_cli",
+        in_file: str | None = None,
     ) -> None:
+        self._in_file = in_file
         self.group, self.noun = group, noun
         self._path, self._attribute, self._package = path, attribute, package
         self._names, self._first = names, names or first
@@ -60,12 +63,15 @@ class Table(Mapping[str, Any]):
             return module if self._attribute is None else getattr(module, self._attribute)
         if name in self._entry_points:
             return self._entry_points[name].load()
+        if name in self:
+            return _from_file(name, str(self._in_file), self.noun)
         near = difflib.get_close_matches(name, list(self), n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"choose from {', '.join(self)}"
         raise UsageError(f"unknown {self.noun} {name!r}; {hint}")
 
     def __contains__(self, name: object) -> bool:
-        return name in self._modules or name in self._entry_points
+        is_file = self._in_file is not None and str(name).endswith(".py")
+        return is_file or name in self._modules or name in self._entry_points
 
     def __iter__(self) -> Iterator[str]:
         names = {**self._modules, **self._entry_points}
@@ -93,8 +99,23 @@ class Table(Mapping[str, Any]):
         return {point.name: point for point in entry_points(group=f"pnpdepth.{self.group}")}
 
 
+@functools.cache
+def _from_file(path: str, attribute: str, noun: str) -> Any:
+    """The object in a Python file, which is run. UsageError if there is none."""
+    values: dict[str, Any] = {"__name__": Path(path).stem, "__file__": path}
+    try:
+        exec(compile(Path(path).read_bytes(), path, "exec"), values)
+    except Exception as error:
+        fact = f"{type(error).__name__}: {error}"
+        raise UsageError(f"{noun} file {path} cannot be run: {fact}") from None
+    if not callable(values.get(attribute)):
+        raise UsageError(f"{noun} file {path} defines no function {attribute!r}")
+    return values[attribute]
+
+
 LOSSES = Table(
     "core/losses",
+    in_file="loss",
     group="losses",
     noun="loss",
     names=("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"),
@@ -103,6 +124,7 @@ LOSSES = Table(
 
 UPDATES = Table(
     "core/update_rules",
+    in_file="update_rule",
     group="updates",
     noun="update rule",
     names=("sign", "sgd", "normalised", "momentum", "adam", "adam-short", "lbfgs"),

@@ -337,6 +337,8 @@ _CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
     "mask_fraction": (lambda value: _is_number(value) and 0 < value < 1, "between 0 and 1"),
     "mask_scale": (lambda value: _is_number(value) and 0 < value <= 1, "above 0 and at most 1"),
     "proximity": (_is_weight, ">= 0"),
+    "tile": (lambda value: _is_whole(value) and value >= 64, "a whole number >= 64"),
+    "time_budget_s": (lambda value: _is_number(value) and value > 0, "seconds above 0"),
     "seed": (_is_whole, "a whole number >= 0"),
 }
 """Whether a value of the field is valid, and what it must be."""

@@ -57,6 +57,20 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     assert record["settings"]["propagate"] == "median"
     assert record["baselines"]["farthest"]["held_out_mae"] > 0
     assert record["loss"][-1] < record["loss"][0]
+    files_of = [f"my_package/{name}.py" for name in ("charbonnier", "rmsprop")]
+    by_file = [
+        "--loss",
+        files_of[0],
+        "--update",
+        files_of[1],
+        "--lr",
+        "1%",
+        "--propagate",
+        "median",
+    ]
+    output[-2] = "by_file"
+    again = json.loads(run(["refine", *files, *network, *by_file, *output], package))
+    assert again["loss"] == record["loss"]
     scores = run(["eval", "out/rgb_depth.raw", "indoor/gt.png", "--json"], package)
     measured = {each["key"]: each for each in json.loads(scores)["measures"]}
     assert {"rmse", "mae"} <= set(measured)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 import pnpdepth_cli as pnp
+from pnpdepth_cli.choices import LOSSES
+from pnpdepth_cli.frames.frame import frame_of_arrays
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 
@@ -116,8 +119,10 @@ def test_depth_that_may_be_in_another_unit_needs_one(
 @pytest.mark.parametrize(
     ("image", "sparse", "error", "message"),
     [
-        (np.zeros((4, 4)), np.ones((4, 4)), pnp.InputError, r"shape \(H, W, 3\)"),
-        (np.full((4, 4, 3), 200.0), np.ones((4, 4)), pnp.InputError, "float in 0..1"),
+        (np.zeros((6, 6, 2)), np.ones((6, 6)), pnp.InputError, r"\(C, H, W\) with 1, 3 or 4"),
+        (np.full((4, 4, 3), 1.5), np.ones((4, 4)), pnp.InputError, "0..1 or 0..255; this one is"),
+        ("photo.png", np.ones((4, 4)), pnp.InputError, "array of numbers, not str"),
+        (np.zeros((4, 4, 3)), [[1, 2], [3]], pnp.InputError, "cannot be made an array"),
         (np.zeros((4, 4, 3)), np.ones((5, 4)), pnp.SizeError, "but the image is"),
         (np.zeros((4, 4, 3)), np.zeros((4, 4)), pnp.NoPointsError, "no value above 0"),
         (np.zeros((4, 4, 3)), np.array([[9.0, 9, 1]]), pnp.NoPointsError, "lies in the image"),
@@ -133,6 +138,50 @@ def test_arrays_that_cannot_be_used_are_named(
 ) -> None:
     with pytest.raises(error, match=message):
         pnp.refine(network, image, sparse)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda rgb: np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)]),
+        lambda rgb: rgb.transpose(2, 0, 1),
+        lambda rgb: rgb.transpose(2, 0, 1)[None],
+        lambda rgb: rgb.astype(np.float32),
+        lambda rgb: torch.from_numpy(rgb),
+        lambda rgb: rgb[:, :, 0],
+    ],
+    ids=["RGBA", "CHW", "NCHW", "float 0..255", "tensor", "grey"],
+)
+def test_every_unambiguous_form_of_an_image_is_read_alike(
+    form: Callable[[NDArray[Any]], Any],
+) -> None:
+    grey = np.random.default_rng(0).integers(0, 256, (6, 8, 1), np.uint8)
+    rgb = grey.repeat(3, axis=2)
+    rows = [[1.0, 2, 3]]
+    expected = frame_of_arrays(rgb, rows).rgb
+    given = frame_of_arrays(form(rgb), rows).rgb
+    assert expected is not None
+    assert given is not None
+    assert torch.equal(given, expected)
+    depth = np.zeros((6, 8, 1))
+    depth[2, 1] = 3
+    assert torch.equal(frame_of_arrays(rgb, depth).points.xy, torch.tensor([[1.0, 2.0]]))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: pnp.load_network(3), "spec must be a name or a path, not int"),  # type: ignore[arg-type]
+        (lambda: pnp.Refiner("compact"), "must be from load_network"),  # type: ignore[arg-type]
+        (lambda: pnp.Refiner([]), "must be from load_network"),
+        (lambda: pnp.Settings(tile=7), "tile must be a whole number >= 64"),
+        (lambda: pnp.Settings(time_budget_s=-1), "must be seconds above 0"),
+        (lambda: LOSSES["no_such.py"], "loss file no_such.py cannot be run: FileNotFoundError"),
+    ],
+)
+def test_wrong_arguments_are_usage_errors(wrong: Callable[[], Any], message: str) -> None:
+    with pytest.raises(pnp.UsageError, match=message):
+        wrong()
 
 
 def test_scores_of_different_shapes_are_refused() -> None:

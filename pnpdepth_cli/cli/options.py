@@ -97,10 +97,23 @@ def _form(member: OptionField) -> str:
     return member.name_within if member.type == "bool" else f"{member.name_within}={value}"
 
 
+class _Names(click.Choice):  # type: ignore[type-arg]
+    """One of the names, or the Python file of an entry of the user's own."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        super().__init__(list(names))
+        self._names = names
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        if str(value).endswith(".py") and value in self._names:
+            return value
+        return super().convert(value, param, ctx)
+
+
 def _type_of(declared: OptionField) -> Any:
     option = declared.option
     if option.choices is not None:
-        return click.Choice(list(option.choices))
+        return _Names(option.choices)
     if option.parse is not None:
         return option.parse
     if option.least is not None or option.most is not None:

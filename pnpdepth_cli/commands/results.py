@@ -102,7 +102,7 @@ def _frame(name: str, depth: Path) -> ResultFrame:
     return ResultFrame(
         name=name,
         depth=depth,
-        sigma=_beside(depth, "_sigma.exr"),
+        sigma=_beside(depth, f"_sigma{depth.suffix}"),
         valid=_beside(depth, "_valid.png"),
         record={} if record is None else read_json(record),
     )

@@ -26,6 +26,7 @@ from pnpdepth_cli.core.losses import Loss, proximity_loss
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
 from pnpdepth_cli.core.update_rules import SCHEDULES, Channels, Update, blurred, step_size
+from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, ModelError, PnpDepthError
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -239,7 +240,8 @@ class _FrameRefinement:
             self.error = error
             return None
         at_points = self._points.sample(depth)
-        loss = self._loss(at_points, self._points.depth)
+        with wrap_user_errors(f"loss {self._settings.loss!r}"):
+            loss = self._loss(at_points, self._points.depth)
         if self._settings.proximity and self._first is not None:
             loss = loss + self._settings.proximity * proximity_loss(depth, self._first)
         if self._settings.iterations and not bool(loss.isfinite()):
@@ -269,11 +271,11 @@ class _FrameRefinement:
             z, direction = self._best
         else:
             gradient = blurred(gradient, self._points, self._settings.blur)
-            if self._channels is None:
-                direction = self._update(gradient)
-            else:
-                moved = self._update(self._channels.gradient(gradient))
-                direction = self._channels.change_of_z(moved)
+            of_z = gradient if self._channels is None else self._channels.gradient(gradient)
+            with wrap_user_errors(f"update rule {self._settings.update!r}"):
+                direction = self._update(of_z)
+            if self._channels is not None:
+                direction = self._channels.change_of_z(direction)
             if self._settings.line_search:
                 self._best = z, direction
         alpha = self._step * SCHEDULES[self._settings.schedule](updates / self._settings.iterations)

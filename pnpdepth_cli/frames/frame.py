@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -242,7 +242,7 @@ def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[
         InputError: The unit is needed.
         UsageError: There is no such unit.
     """
-    values = np.asarray(depth)
+    values = _numbers(depth, what)
     if unit is not None:
         if unit not in UNITS:
             raise UsageError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
@@ -255,6 +255,17 @@ def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[
     else:
         return values.astype(np.float32)
     raise InputError(f'{what} is {fact}; give its unit, such as unit="mm" or unit="m"')
+
+
+def _numbers(values: ArrayLike, what: str) -> NDArray[Any]:
+    """The array, of real numbers. InputError if it is none."""
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError, RuntimeError) as error:  # ragged rows, a tensor on a GPU
+        raise InputError(f"{what} cannot be made an array: {error}") from None
+    if array.dtype.kind not in "buif":
+        raise InputError(f"{what} must be an array of numbers, not {type(values).__name__}")
+    return array
 
 
 def frame_of_arrays(
@@ -278,15 +289,33 @@ def frame_of_arrays(
     return Frame(rgb=None if rgb is None else tensor_of(rgb), points=inside, register=register)
 
 
+_CHANNELS = (1, 3, 4)  # grey, RGB, RGBA
+_OVERSHOOT = 2.0
+"""An image in 0..1 that was resized may exceed 1, but not this; one in 0..255 does."""
+
+
 def _rgb(image: ArrayLike) -> NDArray[np.float32]:
-    values = np.asarray(image)
-    if values.ndim != 3 or values.shape[2] != 3:
-        raise InputError(f"an image has shape (H, W, 3), not {values.shape}")
+    values = _numbers(image, "an image")
+    shape = values.shape
+    if values.ndim == 4 and shape[0] == 1:
+        values = values[0]
+    if values.ndim == 2:
+        values = values[:, :, None]
+    if values.ndim == 3 and values.shape[2] not in _CHANNELS and values.shape[0] in _CHANNELS:
+        values = values.transpose(1, 2, 0)
+    if values.ndim != 3 or values.shape[2] not in _CHANNELS or not values.size:
+        raise InputError(
+            "an image has shape (H, W), (H, W, C) or (C, H, W) with 1, 3 or 4 channels, not"
+            f" {shape}"
+        )
+    values = values[:, :, :3].repeat(3 if values.shape[2] == 1 else 1, axis=2)
     if values.dtype in FULL_SCALE:
         return (values / FULL_SCALE[values.dtype]).astype(np.float32)
+    if values.min() >= 0 and _OVERSHOOT < values.max() <= 255:
+        return (values / 255).astype(np.float32)
     if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
         raise InputError(
-            f"an image is uint8, uint16 or float in 0..1; this one is {values.dtype} in"
+            f"an image is uint8, uint16, or in 0..1 or 0..255; this one is {values.dtype} in"
             f" {values.min()}..{values.max()}"
         )
     return values.astype(np.float32)
@@ -298,9 +327,12 @@ def _points(
     """The points in their own frame, which is the image's for rows of x, y, depth."""
     if isinstance(sparse, SparsePoints):
         return sparse.tensors()
-    values = np.asarray(sparse)
+    values = _numbers(sparse, "sparse depth")
+    shape = values.shape
+    if values.ndim in (3, 4):
+        values = values.reshape([side for side in shape if side != 1])
     if values.ndim != 2:
-        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
+        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {shape}")
     if values.shape[1] == 3 and values.shape != size:
         if size is None:
             raise SizeError("rows of x, y and depth need an image for the size of the frame")

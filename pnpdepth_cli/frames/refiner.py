@@ -86,7 +86,11 @@ class Refiner:
         check: bool = False,
         registration: Registration = "auto",
     ) -> None:
-        self._networks = (network,) if isinstance(network, Network) else tuple(network)
+        self._networks = tuple(network) if isinstance(network, Sequence) else (network,)
+        if not self._networks or not all(isinstance(each, Network) for each in self._networks):
+            raise UsageError("network must be from load_network, or several in a list")
+        if not isinstance(settings, Settings | None):
+            raise UsageError(f"settings must be Settings, not {type(settings).__name__}")
         self.asked = settings or Settings()
         self.is_default = not self.asked.fixed_by
         self._uncertainty, self._check = uncertainty, check or uncertainty
@@ -153,8 +157,8 @@ class Refiner:
         """Returns one frame of arrays refined.
 
         Args:
-            image: RGB (H, W, 3), uint8, uint16, or float in 0..1. None for a network that takes
-                sparse depth only.
+            image: RGB (H, W, 3), uint8, uint16, or in 0..1 or 0..255; also grey (H, W), with alpha,
+                or channels first. None for a network that takes sparse depth only.
             sparse: Depth map (H, W) in metres with 0 for unknown, rows (N, 3) of x, y and depth
                 (pixel centres at whole numbers), or SparsePoints.
             unit: Of the depth of an array, "m" or "mm"; needed for integers, and where half of the

@@ -72,7 +72,7 @@ def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image
     """Yields the image of a file, not yet decoded; errors inside the block become ours.
 
     The checksums of a PNG and the size that the header claims are checked. The kind is "PNG",
-    "JPEG", "TIFF" or "WEBP".
+    "JPEG", "TIFF", "WEBP" or "HEIF".
 
     Raises:
         FileFormatError: The file is damaged or cut short, or exceeds the budget.

@@ -1,7 +1,8 @@
-"""RGB images from PNG, JPEG, TIFF, WebP and EXR files, and the focal length in their EXIF."""
+"""RGB images from PNG, JPEG, TIFF, WebP, HEIC and EXR files, and the focal length in their EXIF."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -56,12 +57,14 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     kind = kind_of(data)
     if kind == "EXR":
         return _from_linear_light(path, data)
-    if kind not in ("PNG", "JPEG", "TIFF", "WEBP"):
-        if data[4:8] == b"ftyp":
+    if data[4:8] == b"ftyp":
+        if data[8:12] in (b"avif", b"avis") or not _reads_heic():
             raise FileFormatError(
-                f"{path} is a HEIC or AVIF photo; save it as JPEG, such as with ImageMagick:"
-                f" magick {path.name} {path.stem}.jpg"
+                f"{path} is a HEIC or AVIF photo; pip install 'pnpdepth[heic]' reads HEIC, or save"
+                f" it as JPEG, such as with ImageMagick: magick {path.name} {path.stem}.jpg"
             )
+        kind = "HEIF"
+    if kind not in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF"):
         raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
     if kind == "TIFF":
         facts = read_tiff_facts(path, data)
@@ -92,6 +95,17 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     elif orientation in range(2, 9):
         note = "EXIF rotation not applied, as COLMAP reads the photo"
     return RgbImage(values=np.ascontiguousarray(values), note=note)
+
+
+@functools.cache
+def _reads_heic() -> bool:
+    """Whether pillow-heif is installed; if so, Pillow reads HEIC, upright, from now on."""
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return False
+    register_heif_opener()
+    return True
 
 
 def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -134,7 +134,7 @@ def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> N
     cv2.imwrite(str(tmp_path / "a_valid.png"), valid)
     sigma = np.full((HEIGHT, WIDTH), 0.05, np.float32)
     sigma[:, :8] = 0.5
-    write_depth(tmp_path / "a_sigma.exr", sigma)
+    write_depth(tmp_path / f"a_sigma{path.suffix}", sigma)
     assert written(path, tmp_path / "a.ply")["points"] == (HEIGHT - 4) * WIDTH
     record = written(path, tmp_path / "b.ply", max_sigma=0.1)
     assert record["points"] == (HEIGHT - 4) * (WIDTH - 8)

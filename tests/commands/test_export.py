@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,21 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     factor = world[2] / expected[2]
     assert np.log2(factor) == pytest.approx(0 if unit_scale else round(np.log2(factor)), abs=1e-3)
     assert world[:3] == pytest.approx(expected * factor, rel=1e-3)
+
+
+def test_a_copy_of_the_project_takes_the_export_and_the_original_is_as_before(root: Path) -> None:
+    folder, copy = results(root), root.parent / "copy"
+    shutil.copytree(root, copy)
+    before = {path: path.stat() for path in sorted(root.rglob("*"))}
+    export(folder, "nerfstudio", copy)
+    assert {path: path.stat() for path in sorted(root.rglob("*"))} == before
+    content = json.loads((copy / "transforms.json").read_text())
+    assert [each["file_path"] for each in content["frames"]] == [f"images/{n}.png" for n in NAMES]
+    (copy / "images/b.png").write_bytes(b"another")
+    for path in (copy / "transforms.json", copy / "export_nerfstudio.json"):
+        path.unlink()
+    with pytest.raises(OutputError, match=r"b\.png exists"):
+        export(folder, "nerfstudio", copy)
 
 
 def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path: Path) -> None:

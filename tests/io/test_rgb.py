@@ -123,7 +123,8 @@ def test_only_the_first_page_is_read_with_a_note(tmp_path: Path) -> None:
         (b"", "is empty"),
         (b"hello, world", "is not an image"),
         (b"\x93NUMPY\x01\x00", "not an im"),
-        (b"\0\0\0\x18ftypheic\0\0\0\0", "is a HEIC or AVIF photo; save it as JPEG"),
+        (b"\0\0\0\x18ftypavif\0\0\0\0", "AVIF photo; .* save it as JPEG"),
+        (b"\0\0\0\x18ftypheic\0\0\0\0", "cannot be decoded|reads HEIC, or save it as JPEG"),
     ],
 )
 def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes, fact: str) -> None:
@@ -132,6 +133,25 @@ def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes, fact: str) 
     with pytest.raises(FileFormatError, match=fact) as caught:
         read_rgb(path)
     assert str(caught.value).startswith(str(path))
+
+
+def test_a_heic_photo_is_read_upright_and_without_the_extra_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heif = pytest.importorskip("pillow_heif", reason="needs the extra [heic]")
+    path = tmp_path / "a.heic"
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    photo = Image.fromarray(
+        np.repeat(np.uint8([[[200, 0, 0]], [[0, 0, 200]]]), 32, 0).repeat(32, 1)
+    )
+    heif.from_pillow(photo).save(path, exif=exif.tobytes(), quality=100)
+    values = read_rgb(path).values
+    assert values.shape == (32, 64, 3)  # turned by a quarter
+    assert values[16, 16, 2] > 0.7 > 0.1 > values[16, 48, 2]
+    monkeypatch.setattr("pnpdepth_cli.io.rgb._reads_heic", lambda: False)
+    with pytest.raises(FileFormatError, match=r"pip install 'pnpdepth\[heic\]'"):
+        read_rgb(path)
 
 
 def test_files_that_hold_no_image_are_named(tmp_path: Path) -> None:

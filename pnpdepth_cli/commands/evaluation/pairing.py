@@ -197,7 +197,8 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
     record, sigma = {}, None
     if prediction is not None:
         name = _base(prediction.stem, _DEPTH_MARKS) or prediction.stem
-        sigmas = (prediction.with_name(f"{name}_sigma{suffix}") for suffix in (".exr", ".npy"))
+        suffixes = (prediction.suffix, ".exr", ".npy")
+        sigmas = (prediction.with_name(f"{name}_sigma{suffix}") for suffix in suffixes)
         sigma = next((file for file in sigmas if file.is_file()), None)
         with contextlib.suppress(PnpDepthError):
             record = read_json(prediction.with_name(f"{name}.json"))

@@ -7,6 +7,7 @@ poses. Instant-NGP reads the same file; it takes that factor from `integer_depth
 
 from __future__ import annotations
 
+import filecmp
 import math
 import shutil
 from collections.abc import Sequence
@@ -42,8 +43,14 @@ def _image(folder: Path, frame: ExportFrame) -> Path:
     return frame.image if inside else folder / "images" / frame.image_name
 
 
+def _is_there(folder: Path, frame: ExportFrame) -> bool:
+    """Whether the image lies in the folder already, itself or, as in a copied project, a copy."""
+    path = _image(folder, frame)
+    return path == frame.image or (path.is_file() and filecmp.cmp(path, frame.image, shallow=False))
+
+
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
-    copies = [path for f in frames if (path := _image(folder, f)) != f.image]
+    copies = [_image(folder, frame) for frame in frames if not _is_there(folder, frame)]
     return [*copies, *(_depth_image(folder, f) for f in frames), folder / "transforms.json"]
 
 
@@ -64,9 +71,8 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
         path = _depth_image(folder, frame)
         make_folder(path.parent)
         write_depth(path, np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
-        copy = _image(folder, frame)
-        if copy != frame.image:
-            with new_file(copy) as temporary:
+        if not _is_there(folder, frame):
+            with new_file(_image(folder, frame)) as temporary:
                 shutil.copyfile(frame.image, temporary)
     content = {
         "camera_model": _MODELS[lenses[0]],

@@ -48,7 +48,7 @@ class Outputs:
         sigma = request.hold_out.uncertainty
         return cls(
             depth=folder / f"{name}_depth.{request.outputs.format}",
-            sigma=folder / f"{name}_sigma.exr" if sigma else None,
+            sigma=folder / f"{name}_sigma.{request.outputs.format}" if sigma else None,
             valid=folder / f"{name}_valid.png" if sigma else None,
             sigma_preview=folder / f"{name}_sigma_preview.png" if sigma else None,
             preview=folder / f"{name}_preview.png",

@@ -99,7 +99,7 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str,
     make_folder(outputs.depth.parent)
     write_depth(outputs.depth, frame.after, scale=output_scale(outputs, inputs))
     if outputs.sigma is not None and frame.sigma is not None:
-        write_depth(outputs.sigma, frame.sigma)
+        _write_sigma(outputs.sigma, frame.sigma)
     if outputs.sigma_preview is not None and frame.sigma is not None:
         sigma_preview(frame.sigma, frame.valid, outputs.sigma_preview, inputs.unit)
     if outputs.valid is not None and frame.valid is not None:
@@ -134,6 +134,16 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str,
     written = outputs.by_kind()
     record["outputs"] = {kind: str(written[kind]) if kind in written else None for kind in kinds}
     return record
+
+
+def _write_sigma(path: Path, sigma: Image) -> None:
+    """Writes σ; a PNG has the largest power of ten of codes per metre that holds the largest σ."""
+    largest = max(float(sigma.max()), 1e-9)
+    scale = 10.0 ** math.floor(math.log10(LARGEST_CODE / largest))
+    depth_format = format_of_suffix(path.suffix)
+    if depth_format is not None and depth_format.integer:
+        sigma = np.where(sigma > 0, np.maximum(sigma, np.float32(1 / scale)), np.float32(0))
+    write_depth(path, sigma, scale=scale)
 
 
 def _write_improvement(

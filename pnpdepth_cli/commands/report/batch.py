@@ -48,10 +48,11 @@ _LABELS = {
     "sparse": "Sparse depth",
     "gt": "Ground truth",
 }
-_GT, _HELD_OUT, _USED = "scores", "held_out_error", "sparse_error"
+_GT, _HELD_OUT, _HIDDEN, _USED = "scores", "held_out_error", "check", "sparse_error"
 _BASES = {
     _GT: "against ground truth",
     _HELD_OUT: "at held-out points",
+    _HIDDEN: "at points hidden for the check",
     _USED: "at the points used",
 }
 """What errors are measured on, the best first. A gain at the points used means nothing."""
@@ -98,7 +99,8 @@ class BatchReport:
                 bases.add(_basis(row))
             else:
                 failed.append((row["name"], row["message"]))
-        head, mixed = _head(summary, first, failed, self.colors), len(bases - {None}) > 1
+        bases.discard(None)
+        head, mixed = _head(summary, first, failed, self.colors), len(bases) > 1
         entries = (self._entry(row, head.columns, mixed) for row in rows() if row["outputs"])
         write_report(self.folder, head, entries, viewer=self.view_3d)
 
@@ -156,29 +158,46 @@ def _holds_results(path: Path, output: Path, folder: Path) -> bool:
 
 
 def _basis(row: Row) -> str | None:
-    return next((basis for basis in _BASES if row[basis]), None)
+    return next((basis for basis in _BASES if _errors(row, basis)), None)
 
 
-def _columns(measured: bool, unit: str) -> list[Column]:
-    """Errors before and after; with gains if any frame has ground truth or held-out points."""
+def _errors(row: Row, basis: str) -> Mapping[str, Any] | None:
+    """The errors of a row before and after, measured on that basis."""
+    if basis != _HIDDEN:
+        errors: Mapping[str, Any] | None = row[basis]
+        return errors
+    check = (row["linear"] or {}).get("check")
+    return check and {
+        stage: {"mae": check[name], "points": check["points"]}
+        for stage, name in (("before", "aligned"), ("after", "result"))
+    }
+
+
+def _columns(best: str, unit: str) -> list[Column]:
+    """Errors before and after on the best basis; with gains unless it is the points used."""
     columns = []
     percent: dict[str, Any] = {"decimals": 1, "percent": True, "higher_is_better": True}
-    for key, measure in _ERRORS.items():
-        if measured:
+    for measure in _measures(best):
+        key = measure.key
+        if best != _USED:
             title = f"{measure.title} gain"
             columns.append(Column(key=f"{key}_gain", title=title, signed=True, **percent))
         for stage in ("before", "after"):
             title, name = f"{measure.title} {stage}", f"{key}_{stage}"
             columns.append(column_of(in_unit(measure, unit), title=title, key=name, listed=True))
-    return [*columns, Column(key="improved", title="Improved", **percent)]
+    if best != _HIDDEN:  # the map is then of the points used
+        columns.append(Column(key="improved", title="Improved", **percent))
+    return columns
 
 
 def _values(row: Row, basis: str | None) -> dict[str, float | None]:
     if basis is None:
         return {}
+    errors = _errors(row, basis)
+    assert errors is not None
     values: dict[str, float | None] = {"improved": row.get("improved_fraction")}
     for key in _ERRORS:
-        before, after = (row[basis][stage].get(key) for stage in ("before", "after"))
+        before, after = (errors[stage].get(key) for stage in ("before", "after"))
         values |= {f"{key}_before": before, f"{key}_after": after}
         values[f"{key}_gain"] = _gain(before, after)
     return values
@@ -192,7 +211,9 @@ def _notes(row: Row, basis: str | None) -> Iterator[str]:
     if row["message"]:
         yield row["message"]
     if basis is not None:
-        after = row[basis]["after"]
+        errors = _errors(row, basis)
+        assert errors is not None
+        after = errors["after"]
         count = f"{after['pixels']:,} pixels" if basis == _GT else f"{after['points']:,} points"
         yield f"Errors are {_BASES[basis]}, {count}."
     if basis == _USED:
@@ -204,16 +225,17 @@ def _head(
     summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str, str]], colors: str
 ) -> Head:
     unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), []
-    means = {basis: summary["mean"][basis] for basis in _BASES if summary["mean"][basis]}
-    measured = bool(means.keys() - {_USED})
+    means = _mean_errors(summary)
+    best = next(iter(means), _USED)
     if unmatched:
         notes = [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
-    if means and not measured:
+    if means and best == _USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
+    columns = _columns(best, unit)
     return Head(
         kind="Batch refinement",
         title=summary["output"],
-        tiles=_tiles(summary),
+        tiles=_tiles(summary, means),
         facts=_facts(summary, first),
         notes=notes,
         tables=[
@@ -222,8 +244,8 @@ def _head(
         ],
         without_title=f"Not refined: {len(failed):,}",
         without=failed,
-        columns=_columns(measured, unit),
-        sort_by="rmse_gain" if measured else "rmse_after",
+        columns=columns,
+        sort_by="rmse_after" if best == _USED else columns[0].key,
         labels=_LABELS,
         thumb="second",
         map_colours=hex_colours(signed_bar(colors, 9)),
@@ -231,7 +253,19 @@ def _head(
     )
 
 
-def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def _mean_errors(summary: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The mean errors before and after by basis, the best first; hidden points if nothing else."""
+    means: dict[str, Any] = {basis: summary["mean"].get(basis) for basis in _BASES}
+    check = summary["linear"]["check"]
+    if check and not (means[_GT] or means[_HELD_OUT]):
+        stages = {stage: {"mae": check[stage]} for stage in ("before", "after")}
+        means[_HIDDEN] = {"frames": check["frames"], **stages}
+    return {basis: mean for basis, mean in means.items() if mean}
+
+
+def _tiles(
+    summary: Mapping[str, Any], means: Mapping[str, Mapping[str, Any]]
+) -> list[tuple[str, str, str]]:
     """The number of frames, and errors that were not measured at the points used."""
     counts = summary["counts"]
     refined = counts["done"] + counts["diverged"]
@@ -239,9 +273,8 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
     tiles = [("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
-    for basis in (_GT, _HELD_OUT):
-        mean = summary["mean"][basis]
-        for measure in _ERRORS.values() if mean else ():
+    for basis, mean in means.items():
+        for measure in _measures(basis) if basis != _USED else ():
             before, after, gain = _changed(measure, mean)
             label = f"{measure.title} [{summary['unit']}]"
             tiles.append((label, f"{before} → {after}", f"gain {gain} {_BASES[basis]}"))
@@ -275,7 +308,7 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str
 
 
 def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
-    measures: Iterable[Measure] = MEASURES if basis == _GT else _ERRORS.values()
+    measures = MEASURES if basis == _GT else _measures(basis)
     rows = [[column_title(in_unit(each, unit)), *_changed(each, mean)] for each in measures]
     if basis == _GT:
         coverage = [mean[stage].get("coverage") for stage in ("before", "after")]
@@ -286,6 +319,10 @@ def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
         header=["", "before", "after", "gain"][:shown],
         rows=[row[:shown] for row in rows],
     )
+
+
+def _measures(basis: str) -> list[Measure]:
+    return [_ERRORS["mae"]] if basis == _HIDDEN else [*_ERRORS.values()]
 
 
 def _changed(measure: Measure, mean: Mapping[str, Any]) -> tuple[str, str, str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import Calibration
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".exr")
 SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
 
 _LONGEST_PART = 255 - len("_improvement.png")

@@ -232,20 +232,13 @@ def _check_operators(nodes: Sequence[Any], path: Path) -> None:
     unknown: Counter[str] = Counter()
     for proto in nodes:
         standard = proto.domain in _STANDARD
-        if not standard or proto.op_type not in {*OPERATORS, "QuantizeLinear"}:
+        if not standard or proto.op_type not in OPERATORS:
             unknown[proto.op_type if standard else f"{proto.domain}.{proto.op_type}"] += 1
     if unknown:
         listed = ", ".join(f"{op} ({count} ×)" for op, count in unknown.items())
         raise ModelError(
             f"ONNX file {path} uses operators that are not covered: {listed}; export the network"
             " with others, or bring it as a Python file"
-        )
-    quantised = sum(proto.op_type == "QuantizeLinear" for proto in nodes)
-    if quantised:
-        raise ModelError(
-            f"ONNX file {path}: it quantises activations (QuantizeLinear, {quantised} ×), and"
-            " rounding has no gradient; use the file with float weights, or one where only weights"
-            " are quantised"
         )
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import graphlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
 from pnpdepth_cli.models.onnx.limits import inlined
+from pnpdepth_cli.models.onnx.quantised import Quantised, outputs_of, quantises, session_of
 
 MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
@@ -41,13 +43,15 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         ModelError: The file cannot be read, or the network cannot be run.
     """
     model = inlined(_read(file), file)
-    input_shape = _image_input_shape(model, file)
+    input_name, input_shape = _image_input(model, file)
     chosen = _chosen_output(model, output, file)
     channels_last = _channels_last(input_shape)
     height, width = input_shape[1:3] if channels_last else input_shape[2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
     is_part = _pruned(model, chosen, file)
-    return undescribed(
+    # From the file, onnxruntime reads weights that lie beside it.
+    source = model.SerializeToString() if is_part else str(file)
+    definition = undescribed(
         name=file.stem,
         size=Fixed(int(height), int(width))
         if fixed
@@ -58,8 +62,18 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         checkpoint=file,
         arguments=lambda rgb, _: (_as_input(rgb, channels_last),),
         output=_as_map,
-        # From the file, onnxruntime reads weights that lie beside it.
-        verify=_FirstImageCheck(model.SerializeToString() if is_part else str(file), file),
+        verify=_FirstImageCheck(source, file),
+    )
+    if not quantises(model):
+        return definition
+    return replace(
+        definition,
+        build=lambda: Quantised(source, file, input_name),
+        verify=None,
+        layers=("output",),
+        defaults=replace(definition.defaults, iterations=0),
+        assumed="its activations are quantised, which leaves no gradient; onnxruntime predicts, and"
+        " z is not updated",
     )
 
 
@@ -145,8 +159,8 @@ def _opset(model: Any) -> int:
     return max((o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), default=1)
 
 
-def _image_input_shape(model: Any, file: Path) -> list[int | str]:
-    """The shape of the only input. ModelError unless it is a batch of one rgb image."""
+def _image_input(model: Any, file: Path) -> tuple[str, list[int | str]]:
+    """Name and shape of the only input. ModelError unless it is a batch of one rgb image."""
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
     listed = ", ".join(f"{name} {'×'.join(map(str, shape))}" for name, shape in inputs.items())
@@ -155,14 +169,14 @@ def _image_input_shape(model: Any, file: Path) -> list[int | str]:
             f"ONNX file {file} has {len(inputs)} inputs ({listed}); only networks with one, an rgb"
             " image, can be run"
         )
-    shape = next(iter(inputs.values()))
+    ((name, shape),) = inputs.items()
     channels = shape[-1] if len(shape) == 4 and _channels_last(shape) else shape[1:2] == [3]
     batch = not shape or not isinstance(shape[0], int) or shape[0] == 1
     if len(shape) != 4 or not channels or not batch:
         raise ModelError(
             f"ONNX file {file} takes {listed}; one rgb image 1×3×H×W or 1×H×W×3 is expected"
         )
-    return shape
+    return name, shape
 
 
 def _channels_last(shape: Sequence[int | str]) -> bool:
@@ -218,7 +232,7 @@ class _FirstImageCheck:
         inputs = {n: a.detach().cpu() for n, a in zip(module.input_names, arguments, strict=True)}
         with torch.no_grad():
             actual = module(*arguments).cpu()  # first, since it allocates no more than it should
-        expected = self._expected(inputs)
+        expected = outputs_of(session_of(self._source, self._file), inputs, self._file)
         deviation = _deviation(actual, expected)
         if not deviation <= (_HALF_MISMATCH if module.is_half else MISMATCH):
             raise ModelError(
@@ -227,28 +241,6 @@ class _FirstImageCheck:
             )
         self._note = f"ONNX: agrees with onnxruntime on this image to {deviation:.1g} of its range"
         return self._note
-
-    def _expected(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        """The output from onnxruntime."""
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = 4
-        options.intra_op_num_threads = torch.get_num_threads()
-        try:
-            session = onnxruntime.InferenceSession(
-                self._source, options, providers=["CPUExecutionProvider"]
-            )
-            halves = {i.name for i in session.get_inputs() if i.type == "tensor(float16)"}
-            feed = {
-                name: value.half().numpy() if name in halves else value.numpy()
-                for name, value in inputs.items()
-            }
-            return torch.from_numpy(session.run(None, feed)[0]).float()
-        except Exception as error:  # onnxruntime has a type for each of its status codes
-            raise ModelError(
-                f"ONNX file {self._file} does not run in onnxruntime: {describe(error)}"
-            ) from None
 
 
 def _deviation(actual: Tensor, expected: Tensor) -> float:

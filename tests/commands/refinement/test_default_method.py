@@ -113,8 +113,10 @@ def test_the_standard_deviation_is_positive_and_the_same_twice(frame: FrameOnDis
     assert sigma.shape == valid.shape == frame.depth.shape
     assert (sigma > 0).all()
     assert set(np.unique(valid)) <= {0, 255}
+    exact = run(frame, uncertainty=True, propagate=None, format="npy", output=frame.folder / "c")
+    assert np.abs(np.load(exact.record["outputs"]["sigma"]) - sigma).max() < 0.00051
     assert any("calibrated with 12 hidden points" in note for note in records[0]["notes"])
-    for name in ("img_depth.png", "img_sigma.exr", "img_sigma_preview.png"):
+    for name in ("img_depth.png", "img_sigma.png", "img_sigma_preview.png"):
         first, again = (frame.folder / folder / name for folder in ("a", "b"))
         assert first.read_bytes() == again.read_bytes()
     with pytest.raises(UsageError, match="--uncertainty writes a second file"):

@@ -23,6 +23,7 @@ from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 from tests.commands.batches import RecordingListener, batch, pairs_on_disk
 from tests.commands.frames import FrameOnDisk, frame_on_disk, run
 from tests.commands.scan_frames import FOCAL_PX, scan_on_disk
+from tests.kitti_drives import write_calibrations
 
 
 def points_of(path: Path) -> np.ndarray:
@@ -53,6 +54,15 @@ def test_a_calibration_beside_a_depth_map_is_that_of_the_camera(frame: FrameOnDi
     calib.write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\nsize: [64, 48]\n")
     with pytest.raises(SizeError, match="64×48"):
         run(frame, ply=True, scan=ScanOptions(calib=calib), overwrite=True)
+
+
+def test_kittis_camera_is_known_without_a_calibration_of_the_scanner(frame: FrameOnDisk) -> None:
+    write_calibrations(frame.folder / "calib", size=frame.depth.shape)
+    (frame.folder / "calib/calib_velo_to_cam.txt").unlink()
+    calib = frame.folder / "calib/calib_cam_to_cam.txt"
+    record = run(frame, ply=True, scan=ScanOptions(calib=calib)).record
+    assert record["camera"]["intrinsics"][0][0] == 60
+    assert record["cloud"]["points"] > 100
 
 
 def test_exif_is_used_where_nothing_else_gives_the_camera(frame: FrameOnDisk) -> None:

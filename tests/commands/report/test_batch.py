@@ -18,6 +18,7 @@ from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.colours import paint_signed
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.figure import figure_content
+from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.report import link_image
 from tests.commands.batches import (
     NAMES,
@@ -166,6 +167,21 @@ def test_with_neither_ground_truth_nor_held_out_points_there_is_no_gain(
     assert [label for label, *_ in data["tiles"]] == ["Frames refined"]
     assert "no error is measured" in data["notes"][0]
     assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
+
+
+def test_the_default_method_without_ground_truth_headlines_its_hidden_points(
+    root: Path, report: Path
+) -> None:
+    shutil.rmtree(root / "gt")
+    batch(root, html=report, refine={"propagate": None, "iterations": None})
+    data, summary = page_data(report), read_json(root / "out/summary.json")
+    check = summary["linear"]["check"]
+    assert [label for label, *_ in data["tiles"]] == ["Frames refined", "MAE [m]"]
+    assert data["tiles"][1][1] == f"{check['before']:.4f} → {check['after']:.4f}"
+    assert [column["key"] for column in data["columns"]] == ["mae_gain", "mae_before", "mae_after"]
+    frame = frames_of(report)["a"]
+    assert frame["values"]["mae_after"] == summary["frames"][0]["linear"]["check"]["result"]
+    assert frame["notes"][0].startswith("Errors are at points hidden for the check")
 
 
 def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(

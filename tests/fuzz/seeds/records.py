@@ -59,13 +59,13 @@ def _clouds(folder: Path, depth: np.ndarray) -> list[Seed]:
     """A depth map with all that `refine` writes beside it, and poses for it."""
     (folder / "refined_before").mkdir()
     write_depth(folder / "refined_before/a_depth.png", depth)
-    write_depth(folder / "refined_before/a_sigma.exr", depth / 100)
+    write_depth(folder / "refined_before/a_sigma.png", depth / 100, scale=1000)
     cv2.imwrite(str(folder / "refined_before/a_valid.png"), np.full(depth.shape, 255, np.uint8))
     (folder / "refined_before/a.json").write_text('{"inputs": {"image": {"path": "rgb.png"}}}\n')
     (folder / "poses_kitti.txt").write_text("1 0 0 0.5 0 1 0 0 0 0 1 0\n")
     (folder / "poses_tum.txt").write_text("# time x y z qx qy qz qw\n1.5 0.5 0 0 0 0 0 1\n")
     cloud = ("cloud", "refined_before", "--fov", "60", "-o", "out.ply", "--overwrite")
-    beside = ("a_depth.png", "a_sigma.exr", "a_valid.png", "a.json")
+    beside = ("a_depth.png", "a_sigma.png", "a_valid.png", "a.json")
     return [
         *(
             Seed(file=f"refined_before/{name}", command=(*cloud, "--max-sigma", "0.1"))

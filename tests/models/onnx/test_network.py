@@ -18,7 +18,7 @@ from onnx import helper, numpy_helper
 
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import ModelError, UsageError
+from pnpdepth_cli.errors import LayerError, ModelError, UsageError
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.onnx import graph
@@ -139,14 +139,41 @@ def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
     assert "NonZero (1 ×)" in refused(write_network(path, nodes=(node,), outputs=("where",)))
     assert "com.microsoft.Add" in refused(write_network(path, domain="com.microsoft"))
     assert "opset 99" in refused(write_network(path, opset=99))
-    nodes = (
-        helper.make_node("QuantizeLinear", ["depth", "one"], ["q"]),
-        helper.make_node("DequantizeLinear", ["q", "one"], ["out"]),
-    )
-    message = refused(write_network(path, nodes=nodes, outputs=("out",)))
-    assert "quantises activations (QuantizeLinear, 1 ×)" in message
     for shape in ((1, 4, 32, 48), (2, 3, 32, 48), (1, 3, 32)):
         assert "×".join(map(str, shape)) in refused(write_network(path, shape=shape))
+
+
+@pytest.mark.parametrize("kind", ["QuantizeLinear", "DynamicQuantizeLinear"])
+def test_a_quantised_network_predicts_by_onnxruntime_and_z_is_not_updated(
+    tmp_path: Path, kind: str
+) -> None:
+    after = {
+        "QuantizeLinear": [
+            helper.make_node("QuantizeLinear", ["depth", "one"], ["q"]),
+            helper.make_node("DequantizeLinear", ["q", "one"], ["out"]),
+        ],
+        "DynamicQuantizeLinear": [
+            helper.make_node("DynamicQuantizeLinear", ["depth"], ["q", "scale", "zero"]),
+            helper.make_node("DequantizeLinear", ["q", "scale", "zero"], ["out"]),
+        ],
+    }
+    path = write_network(tmp_path / "net.onnx", nodes=tuple(after[kind]), outputs=("out",))
+    network = load_network(str(path), None)
+    assert "z is not updated" in network.notes[0]
+    rgb = torch.cat([image(1, 3, 32, 48), image(1, 3, 32, 48).flip(3)])
+    predicted = network.module(rgb)  # two frames, of a graph for one
+    expected = load_network(str(write_network(tmp_path / "float.onnx")), None).module(rgb[1:])
+    step = 0.5 if kind == "QuantizeLinear" else float(expected.max()) / 510
+    assert float((predicted[1:] - expected).abs().max()) < 1.02 * step
+    points = SparsePoints(
+        xy=torch.tensor([[1.0, 2.0], [40.0, 20.0]]), depth=torch.tensor([1.0, 2.0]), size=(32, 48)
+    )
+    with Split(network.module, network.definition.layers[0]) as split:
+        settings = network.definition.defaults
+        result = refine(split, (rgb[:1],), points, settings, depth_of=network.depth_of)
+        assert torch.equal(result.after, predicted[:1])
+        with pytest.raises(LayerError, match="no gradient"):
+            refine(split, (rgb[:1],), points, Settings(iterations=1), depth_of=network.depth_of)
 
 
 def test_several_outputs_are_listed_and_one_can_be_named(tmp_path: Path) -> None:
