@@ -210,7 +210,7 @@ def main() -> None:
         ("--only", "", "a file or folder, from the root of the tree"),
         ("--jobs", 1, "mutants at once"),
         ("--limit", 120.0, "seconds of tests for a mutant"),
-        ("--marked", "not shared_data", "pytest's -m"),
+        ("--marked", "not slow", "pytest's -m"),
     ):
         parser.add_argument(name, type=type(default), default=default, help=text)
     arguments = parser.parse_args()
