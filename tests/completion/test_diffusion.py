@@ -95,3 +95,16 @@ def test_the_grid_is_finer_where_points_are_many(
     positions = torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * 199
     diffuse(field([(x, y) for x, y in positions.tolist()], [0.1] * count, step((200, 300))))
     assert solved[0] == pytest.approx(nodes, rel=0.02)
+
+
+def test_the_nodes_are_read_bilinearly_between_them() -> None:
+    residuals = field([(1.25, 2.5), (6.75, 0.125), (3.0, 4.0)], [0.0] * 3, step())
+    y, x = np.mgrid[:6, :8].astype(float)
+    readings = diffusion._readings(residuals, *SIZE)
+    for node_values, expected in [
+        (np.ones(SIZE), [1.0, 1.0, 1.0]),
+        (x, [1.25, 6.75, 3.0]),
+        (y, [2.5, 0.125, 4.0]),
+        (x * y, [1.25 * 2.5, 6.75 * 0.125, 12.0]),
+    ]:
+        assert (readings @ node_values.ravel()).tolist() == expected
