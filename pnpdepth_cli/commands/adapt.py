@@ -43,8 +43,6 @@ from pnpdepth_cli.settings import Settings
 MOST_VALIDATED = 16
 STEPS_A_VISIT = 4
 """Updates on a frame before the next is taken."""
-CHECKS = 5
-"""How often the validation frames are looked at, besides before the first update."""
 _IN_MEMORY = 64
 """Frames that are kept in memory."""
 
@@ -121,7 +119,7 @@ def adapt_to(
     settings = resolve_settings(network.definition, options, dense=is_dense(first.points))
     for note in (*first.notes, *network.notes):
         say(note)
-    adaptation = _Adaptation(network, settings, tasks, request.validated)
+    adaptation = _Adaptation(network, settings, tasks, request)
     training, validation = len(adaptation.training), len(adaptation.validation)
     say(f"frames to learn from: {training}; for validation: {validation}")
     with network.cut_at_points() as split:
@@ -153,14 +151,14 @@ class _Adaptation:
     """
 
     def __init__(
-        self, network: Network, settings: Settings, tasks: Sequence[Task], validated: int
+        self, network: Network, settings: Settings, tasks: Sequence[Task], request: AdaptRequest
     ) -> None:
         every = list(range(len(tasks)))
-        validation = every[validated - 1 :: validated] or every[-1:]
+        validation = every[request.validated - 1 :: request.validated] or every[-1:]
         chosen = np.linspace(0, len(validation) - 1, min(MOST_VALIDATED, len(validation)))
         self.validation = [validation[round(position)] for position in chosen]
         self.training = [index for index in every if index not in set(validation)]
-        self._network, self._settings = network, settings
+        self._network, self._settings, self._checks = network, settings, request.checks
         self._prepared = lru_cache(_IN_MEMORY)(lambda index: _prepared(network, tasks[index]))
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._weights = MovingWeights(network.module, "weights")
@@ -177,7 +175,7 @@ class _Adaptation:
         for index in self._visits():
             visit = min(STEPS_A_VISIT, of - updates)
             loss = self._visited(split, index, updates, visit)
-            checked = (updates + visit) * CHECKS // of > updates * CHECKS // of
+            checked = (updates + visit) * self._checks // of > updates * self._checks // of
             updates += visit
             on_step(updates, of, f"loss {loss:.4f}")
             if checked:

@@ -22,6 +22,9 @@ class AdaptRequest(FrameSelection):
     validated: int = 10
     """One frame in this many is for validation; of fewer frames, the last."""
 
+    checks: int = 5
+    """How often the validation frames are looked at, besides before the first update."""
+
     def __post_init__(self) -> None:
         if self.output.suffix != ".safetensors":
             raise UsageError(f"{self.output}: name the file of the weights NAME.safetensors")

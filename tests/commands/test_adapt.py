@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.models.network import load_network
@@ -88,3 +89,13 @@ def test_existing_files_are_not_replaced(
     assert adapted(root, "--steps", "1") == 2
     assert "adapted.md exists; --overwrite" in capsys.readouterr().err
     assert (root / "adapted.md").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_weights_of_the_start_are_written_under_their_own_names(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path, frames=2)
+    command = ["adapt", str(root), "-o", str(root / "adapted.safetensors")]
+    assert run([*command, "--steps", "4", "--lr", "0.5"]) == 0  # compact; its encoder does not move
+    written = read_checkpoint(root / "adapted.safetensors")
+    for name, value in load_network("compact", None).module.state_dict().items():
+        assert torch.equal(written[name], value), name

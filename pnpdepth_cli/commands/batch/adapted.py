@@ -6,26 +6,26 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.commands.batch.frames import task_of
+from pnpdepth_cli.commands.batch.frames import Task, task_of
 from pnpdepth_cli.commands.batch.records import model_identity, settings_of
 from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.errors import DivergedError, InputError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.io.record import plain, read_json, write_json
+from pnpdepth_cli.io.record import read_json, write_json
 from pnpdepth_cli.io.remote import RemotePath
 
 LEAST_FRAMES = 8
 """Of a sequence; fewer teach too little."""
 MOST_FRAMES = 64
 """Frames of a sequence that are learnt from, spread over it."""
-STEPS, STEPS_A_FRAME = 100, 4
-"""Updates at most, and for each frame that is learnt from."""
+STEPS = 100
 SIGNIFICANT = 0.05
 """Of the one-sided paired t test over the frames for validation."""
 
@@ -35,8 +35,7 @@ def with_adapted_weights(
     sequence: str,
     frames: Sequence[Frame],
     say: Callable[[str], None],
-    *,
-    learn: bool = True,
+    stopped: Callable[[], bool] | None = None,
 ) -> BatchRequest:
     """Returns the request for the frames of a sequence, with adapted weights where they help.
 
@@ -48,7 +47,7 @@ def with_adapted_weights(
         sequence: Name of the sequence.
         frames: Its frames.
         say: Receives what was decided.
-        learn: False uses only weights that exist.
+        stopped: True ends the adaptation by KeyboardInterrupt. None uses only weights that exist.
 
     Raises:
         UsageError: The network takes no points, or the output folder lies in a store.
@@ -56,45 +55,81 @@ def with_adapted_weights(
     if isinstance(request.output, RemotePath):
         raise UsageError("--adapt needs a local output folder; give a local -o")
     name = re.sub(r"[^\w.-]+", "_", sequence) or "frames"
-    if len(frames) < LEAST_FRAMES:
-        say(f"adapt: {name}: {len(frames)} frames; at least {LEAST_FRAMES} are needed")
-        return request
+    if name != sequence:
+        name += f"-{hashlib.sha256(sequence.encode()).hexdigest()[:8]}"
     spread = np.linspace(0, len(frames) - 1, min(len(frames), MOST_FRAMES)).round().astype(int)
     tasks = [task_of(request, frames[index]) for index in spread]
-    files = [{part: fingerprint(p).sha256 for part, p in task.inputs.items()} for task in tasks]
-    settings = settings_of(request.refine, model_identity(request.refine))
-    learnt_from = json.dumps([settings, files, STEPS, STEPS_A_FRAME], sort_keys=True)
-    digest = hashlib.sha256(learnt_from.encode()).hexdigest()
     folder = request.output / "adapted"
     weights, file = folder / f"{name}.safetensors", folder / f"{name}.json"
-    record = read_json(file) if file.exists() else {}
-    if record.get("digest") != digest or (record.get("better") and not weights.exists()):
-        if not learn:
+    try:
+        digest = _digest(request, tasks)
+        record = read_json(file) if file.exists() else {}
+        known = record.get("digest") == digest and (record.get("why") or weights.exists())
+        if not known and stopped is None:
             return request
-        from pnpdepth_cli.commands.adapt import adapt_to
-        from pnpdepth_cli.commands.adapt_request import AdaptRequest
-        from pnpdepth_cli.commands.refinement.inputs import read_inputs
-        from pnpdepth_cli.frames.frame import is_dense
-
-        if is_dense(read_inputs(tasks[0].request).points):
-            say(f"adapt: {name}: points as dense as a LiDAR's teach nothing; not adapted")
-            return request
-        validated = max(2, min(5, len(tasks) // 3))
-        make_folder(folder)
-        asked = AdaptRequest(
-            source=request.source,
-            output=weights,
-            refine=request.refine.with_fields(overwrite=True),
-            steps=min(STEPS, STEPS_A_FRAME * (len(tasks) - len(tasks) // validated)),
-            validated=validated,
-        )
-        adapted = adapt_to(tasks, asked, say, lambda done, of, text: None)
-        better = adapted.p_value is not None and adapted.p_value < SIGNIFICANT
-        record = {"digest": digest, "better": better, "change": adapted.change}
-        write_json(file, plain(record | asdict(adapted)))
-    change = f"{record['change']:+.1%} loss at hidden points of frames for validation"
-    if not record["better"]:
-        say(f"adapt: {name}: {change}, not beyond chance; the network's own weights are used")
+        if not known:
+            why = _learn(request, tasks, weights, say, stopped or (lambda: False))
+            record = {"digest": digest, "why": why}
+            make_folder(folder)
+            write_json(file, record)
+    except (InputError, DivergedError) as error:
+        record = {"why": str(error)}
+    if record["why"]:
+        say(f"adapt: {sequence}: the network's own weights are used: {record['why']}")
         return request
-    say(f"adapt: {name}: {change}; its frames are refined with {weights}")
+    say(f"adapt: {sequence}: {len(frames):,} frames are refined with {weights}")
     return replace(request, refine=request.refine.with_fields(checkpoint=weights))
+
+
+def _learn(
+    request: BatchRequest,
+    tasks: Sequence[Task],
+    weights: Path,
+    say: Callable[[str], None],
+    stopped: Callable[[], bool],
+) -> str | None:
+    """Writes adapted weights if they are better beyond chance; returns why they are not."""
+    if len(tasks) < LEAST_FRAMES:
+        return f"{len(tasks)} frames; at least {LEAST_FRAMES} are needed"
+    from pnpdepth_cli.commands.adapt import adapt_to  # these import torch
+    from pnpdepth_cli.commands.adapt_request import AdaptRequest
+    from pnpdepth_cli.commands.refinement.inputs import read_inputs
+    from pnpdepth_cli.frames.frame import is_dense
+
+    if is_dense(read_inputs(tasks[0].request).points):
+        return "points as dense as a LiDAR's teach nothing"
+
+    def on_step(done: int, of: int, text: str) -> None:
+        if stopped():
+            raise KeyboardInterrupt
+
+    make_folder(weights.parent)
+    asked = AdaptRequest(
+        source=request.source,
+        output=weights,
+        refine=request.refine.with_fields(overwrite=True),
+        steps=STEPS,
+        validated=max(2, min(5, len(tasks) // 3)),
+        checks=1,
+    )
+    try:
+        adapted = adapt_to(tasks, asked, say, on_step)
+    except UsageError as error:
+        raise UsageError(
+            "--adapt needs a network that takes points, such as compact, as the first --model"
+        ) from error
+    change = f"{adapted.change:+.1%} loss at hidden points of {adapted.validation_frames} frames"
+    if adapted.p_value is not None and adapted.p_value < SIGNIFICANT:
+        say(f"adapt: {change}")
+        return None
+    for path in (weights, asked.card):
+        path.unlink()
+    return f"{change} is not beyond chance"
+
+
+def _digest(request: BatchRequest, tasks: Sequence[Task]) -> str:
+    """The SHA-256 of the settings and files that the weights are learnt from."""
+    settings = settings_of(request.refine, model_identity(request.refine))
+    files = [{part: fingerprint(p).sha256 for part, p in task.inputs.items()} for task in tasks]
+    text = json.dumps([settings, files, STEPS], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -99,7 +99,7 @@ def run_batch(
         batch.records.check_new(task_of(request, frame) for frame in batch.found.chosen)
     with ExitStack() as stack:
         local = batch.opened_output(stack)
-        batch.adapt(learn=True)
+        batch.adapt(stopped)
         to_do = [frame for frame, _ in batch.to_do()]
         batch.records.mark()
         if batch.report is not None:
@@ -124,7 +124,7 @@ def run_batch(
 def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[tuple[str, str]]:
     """Returns the names of the frames that `run_batch` would do, and why; nothing is written."""
     batch = _Batch(request, say)
-    batch.adapt(learn=False)
+    batch.adapt(None)
     return [(frame.name, why) for frame, why in batch.to_do()]
 
 
@@ -165,7 +165,7 @@ class _Batch:
         self.records = Records(request.output, self.model)
         self._parts: dict[str, _Part] = {}  # by the name of the frame
 
-    def adapt(self, *, learn: bool) -> None:
+    def adapt(self, stopped: Callable[[], bool] | None) -> None:
         """Lets weights learn from the points of each sequence, where that is asked for."""
         if not self.request.adapt:
             return
@@ -173,7 +173,7 @@ class _Batch:
 
         for name, indices in sequences_of(self.found.frames).items():
             frames = [self.found.frames[index] for index in indices]
-            request = with_adapted_weights(self.request, name, frames, self._say, learn=learn)
+            request = with_adapted_weights(self.request, name, frames, self._say, stopped)
             records = Records(request.output, model_identity(request.refine))
             self._parts |= dict.fromkeys(
                 [frame.name for frame in frames], _Part(request, records, frames)

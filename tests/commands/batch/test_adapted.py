@@ -1,0 +1,102 @@
+"""`batch --adapt`: weights that learn from each sequence first, and when they are not used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from pnpdepth_cli.cli.main import run
+from pnpdepth_cli.commands import adapt as adapting
+from pnpdepth_cli.commands.batch import adapted
+from pnpdepth_cli.frames import frame as frames
+from tests.commands.drives import drive_on_disk
+
+NETWORK = ("--model", "sparse2dense-tiny", "--iterations", "0")
+
+
+@pytest.fixture
+def drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Eight frames whose points do not count as dense."""
+    monkeypatch.setattr(frames, "is_dense", lambda points: False)
+    monkeypatch.setattr(adapted, "STEPS", 4)
+    return drive_on_disk(tmp_path / "drive", frames=8)
+
+
+def batch(drive: Path, *more: str) -> int:
+    return run(["batch", str(drive), "-o", str(drive.parent / "out"), *NETWORK, "--adapt", *more])
+
+
+def test_better_weights_are_used_for_every_frame_and_found_again(
+    drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(adapting, "ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.01))
+    monkeypatch.setattr(
+        adapting._Adaptation, "_validated", falling(adapting._Adaptation._validated)
+    )
+    assert batch(drive) == 0
+    weights = drive.parent / "out/adapted/drive.safetensors"
+    for number in range(8):
+        record = json.loads((drive.parent / f"out/drive_{number:03}.json").read_text())
+        assert record["model"]["checkpoint"] == str(weights)
+    before = weights.stat().st_mtime_ns
+    capsys.readouterr()
+    assert batch(drive) == 0
+    assert "8 frames, all of them done already" in capsys.readouterr().err
+    assert batch(drive, "--dry-run") == 0
+    assert capsys.readouterr().out == ""
+    assert weights.stat().st_mtime_ns == before
+
+
+def falling(validated):  # type: ignore[no-untyped-def]
+    """The validation loss, halved after the first look."""
+
+    def halved(self, split, updates):  # type: ignore[no-untyped-def]
+        loss = validated(self, split, updates)
+        self._losses[updates] /= 1 + 99 * bool(updates)
+        return loss / (1 + 99 * bool(updates))
+
+    return halved
+
+
+def test_weights_that_are_not_better_are_neither_kept_nor_used(
+    drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(adapting, "ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.2))
+    assert batch(drive) == 0
+    assert "the network's own weights are used: " in capsys.readouterr().err
+    assert [path.name for path in (drive.parent / "out/adapted").iterdir()] == ["drive.json"]
+    record = json.loads((drive.parent / "out/drive_000.json").read_text())
+    assert record["model"]["checkpoint"] != str(drive.parent / "out/adapted/drive.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--shard", "1/2"), "--adapt does not go with --shard"),
+        (("--model", "fcrn-tiny"), "--adapt needs a network that takes points"),
+    ],
+)
+def test_what_cannot_be_adapted_is_said(
+    drive: Path, more: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["batch", str(drive), "-o", str(drive.parent / "out"), "--adapt", *more]
+    if "--model" not in more:
+        command += NETWORK
+    assert run(command) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("count", "said"),
+    [(7, "7 frames; at least 8 are needed"), (8, "points as dense as a LiDAR's teach nothing")],
+)
+def test_few_frames_and_dense_points_are_not_learnt_from(
+    count: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive = drive_on_disk(tmp_path / "drive", frames=count)
+    assert batch(drive) == 0, capsys.readouterr().err
+    assert said in capsys.readouterr().err
+    assert json.loads((tmp_path / "out/adapted/drive.json").read_text())["why"] == said
