@@ -16,9 +16,8 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     interval,
 )
 from pnpdepth_cli.commands.sweep.axes import PARAMETERS, Axis, Study
-from pnpdepth_cli.commands.sweep.running import METHODS
+from pnpdepth_cli.commands.sweep.running import METHODS, SWEPT
 from pnpdepth_cli.commands.tables import Table, write_text
-from pnpdepth_cli.core.metrics import MEASURES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.dataset import groups_by_name
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 
 Row = Mapping[str, Any]
 
-SWEPT = tuple(m for m in MEASURES if m.key in ("mae", "rmse", "mre", "delta1"))
 """The measures of a sweep."""
 SCORES = tuple(f"{measure.key}_{method}" for measure in SWEPT for method in METHODS)
 """Columns of a row."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -18,7 +19,7 @@ from pnpdepth_cli.commands.batch.running import read_frame
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.sweep.points import Sampling, frame_points
 from pnpdepth_cli.completion.interpolation import linear
-from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.core.metrics import MEASURES, score
 from pnpdepth_cli.errors import DeviceError, OutputError, PnpDepthError, StorageError
 from pnpdepth_cli.frames.opened import SplitCache
 from pnpdepth_cli.frames.refine import refine_frame
@@ -34,6 +35,7 @@ Result = dict[str, Any]
 """What the journal has of a run: `points`, the `scores` by METHODS, `time_s`, why it `diverged`."""
 
 METHODS = ("plain", "linear", "refined")
+SWEPT = tuple(m for m in MEASURES if m.key in ("mae", "rmse", "mre", "delta1"))
 RESULTS = ("sweep.csv", "sweep.json", "sweep.tex", "sweep_frames.csv")
 
 
@@ -137,8 +139,11 @@ class Journal:
         if self._path.exists():
             text = self._path.read_bytes().decode("ascii", "replace")
             for line in text.splitlines():
-                with contextlib.suppress(ValueError):
+                with contextlib.suppress(
+                    ValueError, TypeError, KeyError, IndexError, OverflowError
+                ):
                     content = json.loads(line)
+                    _check_result(content)
                     self.results[content["run"]] = content
             if not text.endswith("\n"):
                 self._append("\n")
@@ -160,3 +165,13 @@ class Journal:
                 file.write(text)
         except OSError as error:
             raise cannot_write(self._path, error) from error
+
+
+def _check_result(content: Any) -> None:
+    """Raises an error of any kind if a line of the journal lacks what tables need of it."""
+    values = [content["scores"][of][m.key] for of in METHODS for m in SWEPT]
+    values += [content["time_s"], content["points"]]
+    if not all(math.isfinite(value) for value in values if value is not None):
+        raise ValueError
+    if not isinstance(content["run"], str) or not isinstance(content["diverged"], str | None):
+        raise TypeError

@@ -248,7 +248,8 @@ def test_a_sweep_that_was_killed_goes_on_and_ends_the_same(root: Path) -> None:
         sweep(root, *vary, listener=Killed(3))
     path = root / "out/sweep.jsonl"
     first, *others = path.read_text().splitlines(keepends=True)
-    path.write_text("".join(["damaged\n", *others, first[:40]]))
+    strange = ["[]", "{}", first.replace('"mae"', '"mea"').strip(), '{"run": 1}', "1e999"]
+    path.write_text("".join(["damaged\n", *(f"{text}\n" for text in strange), *others, first[:40]]))
     for left in (6, 0):
         listener = RecordingListener()
         resumed = sweep(root, *vary, listener=listener)
