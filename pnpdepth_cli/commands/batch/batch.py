@@ -270,10 +270,10 @@ class _Batch:
 
         begin = functools.cache(lambda: listener.begin(len(to_do)))
         worked = len(to_do) < len(self.found.chosen)
-        for (request, records, frames), wanted in self._by_part(to_do):
-            references = running.references_of(request, frames)
-            if stopped():
+        for number, ((request, records, frames), wanted) in enumerate(self._by_part(to_do)):
+            if number and stopped():
                 return
+            references = running.references_of(request, frames)
             if references is None:
                 begin()
                 yield from running.rows_of_unreadable(self._tasks(wanted), records)
