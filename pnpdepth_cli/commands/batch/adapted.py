@@ -8,11 +8,12 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pnpdepth_cli.commands.batch.frames import Task, task_of
-from pnpdepth_cli.commands.batch.records import model_identity, settings_of
+from pnpdepth_cli.commands.batch.records import settings_of
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.errors import DivergedError, InputError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
@@ -32,6 +33,7 @@ SIGNIFICANT = 0.05
 
 def with_adapted_weights(
     request: BatchRequest,
+    model: dict[str, Any],
     sequence: str,
     frames: Sequence[Frame],
     say: Callable[[str], None],
@@ -44,6 +46,7 @@ def with_adapted_weights(
 
     Args:
         request: The batch.
+        model: Its `model_identity`.
         sequence: Name of the sequence.
         frames: Its frames.
         say: Receives what was decided.
@@ -62,7 +65,7 @@ def with_adapted_weights(
     folder = request.output / "adapted"
     weights, file = folder / f"{name}.safetensors", folder / f"{name}.json"
     try:
-        digest = _digest(request, tasks)
+        digest = _digest(settings_of(request.refine, model), tasks)
         record = read_json(file) if file.exists() else {}
         known = record.get("digest") == digest and (record.get("why") or weights.exists())
         if not known and stopped is None:
@@ -127,9 +130,8 @@ def _learn(
     return f"{change} is not beyond chance"
 
 
-def _digest(request: BatchRequest, tasks: Sequence[Task]) -> str:
+def _digest(settings: dict[str, Any], tasks: Sequence[Task]) -> str:
     """The SHA-256 of the settings and files that the weights are learnt from."""
-    settings = settings_of(request.refine, model_identity(request.refine))
     files = [{part: fingerprint(p).sha256 for part, p in task.inputs.items()} for task in tasks]
     text = json.dumps([settings, files, STEPS], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -163,7 +163,8 @@ class _Batch:
         for note in self._notes():
             say(note)
         self.records = Records(request.output, self.model)
-        self._parts: dict[str, _Part] = {}  # by the name of the frame
+        self._whole = _Part(request, self.records, self.found.frames)
+        self._parts: dict[str, _Part] = {}  # of frames with adapted weights, by name
 
     def adapt(self, stopped: Callable[[], bool] | None) -> None:
         """Lets weights learn from the points of each sequence, where that is asked for."""
@@ -173,15 +174,16 @@ class _Batch:
 
         for name, indices in sequences_of(self.found.frames).items():
             frames = [self.found.frames[index] for index in indices]
-            request = with_adapted_weights(self.request, name, frames, self._say, stopped)
-            records = Records(request.output, model_identity(request.refine))
-            self._parts |= dict.fromkeys(
-                [frame.name for frame in frames], _Part(request, records, frames)
+            request = with_adapted_weights(
+                self.request, self.model, name, frames, self._say, stopped
             )
+            if request is not self.request:
+                records = Records(request.output, model_identity(request.refine))
+                part = _Part(request, records, frames)
+                self._parts |= dict.fromkeys([frame.name for frame in frames], part)
 
     def _part(self, frame: Frame) -> _Part:
-        whole = _Part(self.request, self.records, self.found.frames)
-        return self._parts.get(frame.name, whole)
+        return self._parts.get(frame.name, self._whole)
 
     def _task(self, frame: Frame) -> Task:
         return task_of(self._part(frame).request, frame)
