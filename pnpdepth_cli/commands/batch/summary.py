@@ -32,7 +32,8 @@ _MEASURED = {
 }
 _OF_LINEAR = ("scores", "held_out_error")
 _RUN_STAGES = ("read", "refine", "write")
-_CHECKED = {"before": "aligned", "after": "result", "linear": "linear"}
+_CHECKED = ("aligned", "result", "linear")
+"""Stages whose errors at hidden points are averaged."""
 _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 
 
@@ -129,7 +130,7 @@ class Tally:
             self._compared += 1
             self._worse += linear["worse"]
             if check := linear.get("check"):
-                self._means["check", ""].add({key: check[name] for key, name in _CHECKED.items()})
+                self._means["check", ""].add({name: check[name] for name in _CHECKED})
         for name, entry in (row.get("baselines") or {}).items():
             self.baselines[name].add(_of_baseline(entry))
 

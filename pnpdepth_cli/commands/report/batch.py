@@ -8,14 +8,24 @@ the frames of earlier runs.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.commands.report.evaluation import column_of, frames_text
-from pnpdepth_cli.commands.tables import Table, column_title, format_value
-from pnpdepth_cli.core.metrics import MEASURES, Measure
+from pnpdepth_cli.commands.error_tables import (
+    BASES,
+    GT,
+    HIDDEN,
+    USED,
+    baselines_table,
+    change,
+    errors_by_basis,
+    format_error,
+    frames_of,
+    means_table,
+)
+from pnpdepth_cli.commands.report.evaluation import frames_text
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.colours import hex_colours, signed_bar
 from pnpdepth_cli.io.figure import figure_content
@@ -48,15 +58,6 @@ _LABELS = {
     "sparse": "Sparse depth",
     "gt": "Ground truth",
 }
-_GT, _HELD_OUT, _HIDDEN, _USED = "scores", "held_out_error", "check", "sparse_error"
-_BASES = {
-    _GT: "against ground truth",
-    _HELD_OUT: "at held-out points",
-    _HIDDEN: "at points hidden for the check",
-    _USED: "at the points used",
-}
-"""What errors are measured on, the best first. A gain at the points used means nothing."""
-_ERRORS = {measure.key: measure for measure in MEASURES if measure.key in ("rmse", "mae")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,9 +112,9 @@ class BatchReport:
     def _entry(self, row: Row, columns: Sequence[Column], mixed: bool) -> dict[str, Any]:
         basis = _basis(row)
         values = _values(row, basis)
-        if basis == _USED and columns[0].signed:
+        if basis == USED and columns[0].signed:
             values = {}  # others have a gain that means something
-        tag = _BASES[basis] if mixed and basis else ""
+        tag = BASES[basis] if mixed and basis else ""
         try:
             views = self._views(row)
         except InputError:  # a result has gone or changed; the next run refines it again
@@ -121,7 +122,7 @@ class BatchReport:
         return {
             "name": row["name"],
             "values": [values.get(column.key) for column in columns],
-            "notes": list(_notes(row, basis)),
+            "notes": _notes(row, basis),
             "tag": "diverged" if row["status"] == "diverged" else tag,
             **views,
         }
@@ -158,34 +159,27 @@ def _holds_results(path: Path, output: Path, folder: Path) -> bool:
 
 
 def _basis(row: Row) -> str | None:
-    return next((basis for basis in _BASES if _errors(row, basis)), None)
+    """What the errors of a row are measured on."""
+    return next(iter(errors_by_basis(row)), None)
 
 
-def _errors(row: Row, basis: str) -> Mapping[str, Any] | None:
-    """The errors of a row before and after, measured on that basis."""
-    if basis != _HIDDEN:
-        errors: Mapping[str, Any] | None = row[basis]
-        return errors
-    check = (row["linear"] or {}).get("check")
-    return check and {
-        stage: {"mae": check[name], "points": check["points"]}
-        for stage, name in (("before", "aligned"), ("after", "result"))
-    }
+def _measures(basis: str) -> tuple[str, ...]:
+    return ("mae",) if basis == HIDDEN else ("rmse", "mae")
 
 
 def _columns(best: str, unit: str) -> list[Column]:
     """Errors before and after on the best basis; with gains unless it is the points used."""
     columns = []
     percent: dict[str, Any] = {"decimals": 1, "percent": True, "higher_is_better": True}
-    for measure in _measures(best):
-        key = measure.key
-        if best != _USED:
-            title = f"{measure.title} gain"
-            columns.append(Column(key=f"{key}_gain", title=title, signed=True, **percent))
-        for stage in ("before", "after"):
-            title, name = f"{measure.title} {stage}", f"{key}_{stage}"
-            columns.append(column_of(in_unit(measure, unit), title=title, key=name, listed=True))
-    if best != _HIDDEN:  # the map is then of the points used
+    for key in _measures(best):
+        title = key.upper()
+        if best != USED:
+            columns.append(Column(key=f"{key}_gain", title=f"{title} gain", signed=True, **percent))
+        columns += [
+            Column(key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
+            for stage in ("before", "after")
+        ]
+    if best != HIDDEN:  # the map is then of the points used
         columns.append(Column(key="improved", title="Improved", **percent))
     return columns
 
@@ -193,59 +187,51 @@ def _columns(best: str, unit: str) -> list[Column]:
 def _values(row: Row, basis: str | None) -> dict[str, float | None]:
     if basis is None:
         return {}
-    errors = _errors(row, basis)
-    assert errors is not None
+    errors = errors_by_basis(row)[basis]
     values: dict[str, float | None] = {"improved": row.get("improved_fraction")}
-    for key in _ERRORS:
+    for key in ("rmse", "mae"):
         before, after = (errors[stage].get(key) for stage in ("before", "after"))
-        values |= {f"{key}_before": before, f"{key}_after": after}
-        values[f"{key}_gain"] = _gain(before, after)
+        gain = 1 - after / before if before and after is not None else None
+        values |= {f"{key}_before": before, f"{key}_after": after, f"{key}_gain": gain}
     return values
 
 
-def _gain(before: float | None, after: float | None) -> float | None:
-    return 1 - after / before if before and after is not None else None
-
-
-def _notes(row: Row, basis: str | None) -> Iterator[str]:
-    if row["message"]:
-        yield row["message"]
+def _notes(row: Row, basis: str | None) -> list[str]:
+    notes = [row["message"]] if row["message"] else []
     if basis is not None:
-        errors = _errors(row, basis)
-        assert errors is not None
-        after = errors["after"]
-        count = f"{after['pixels']:,} pixels" if basis == _GT else f"{after['points']:,} points"
-        yield f"Errors are {_BASES[basis]}, {count}."
-    if basis == _USED:
-        yield "Refinement fits these points, so its gain there proves nothing."
-    yield from row["warnings"]
+        after = errors_by_basis(row)[basis]["after"]
+        count = f"{after['pixels']:,} pixels" if basis == GT else f"{after['points']:,} points"
+        notes.append(f"Errors are {BASES[basis]}, {count}.")
+    if basis == USED:
+        notes.append("Refinement fits these points, so its gain there proves nothing.")
+    return [*notes, *row["warnings"]]
 
 
 def _head(
     summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str, str]], colors: str
 ) -> Head:
     unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), []
-    means = _mean_errors(summary)
-    best = next(iter(means), _USED)
+    means = summary["mean"] | {"linear": summary["linear"]}
+    best = next(iter(errors_by_basis(means)), USED)
     if unmatched:
         notes = [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
-    if means and best == _USED:
+    if first is not None and best == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
     columns = _columns(best, unit)
+    tables = [means_table(summary)] if first is not None else []
+    if summary.get("baselines"):
+        tables.append(baselines_table(summary["baselines"], unit))
     return Head(
         kind="Batch refinement",
         title=summary["output"],
         tiles=_tiles(summary, means),
         facts=_facts(summary, first),
         notes=notes,
-        tables=[
-            *(_means(basis, mean, unit) for basis, mean in means.items()),
-            *_baselines(summary.get("baselines"), unit),
-        ],
+        tables=tables,
         without_title=f"Not refined: {len(failed):,}",
         without=failed,
         columns=columns,
-        sort_by="rmse_after" if best == _USED else columns[0].key,
+        sort_by="rmse_after" if best == USED else columns[0].key,
         labels=_LABELS,
         thumb="second",
         map_colours=hex_colours(signed_bar(colors, 9)),
@@ -253,31 +239,21 @@ def _head(
     )
 
 
-def _mean_errors(summary: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """The mean errors before and after by basis, the best first; hidden points if nothing else."""
-    means: dict[str, Any] = {basis: summary["mean"].get(basis) for basis in _BASES}
-    check = summary["linear"]["check"]
-    if check and not (means[_GT] or means[_HELD_OUT]):
-        stages = {stage: {"mae": check[stage]} for stage in ("before", "after")}
-        means[_HIDDEN] = {"frames": check["frames"], **stages}
-    return {basis: mean for basis, mean in means.items() if mean}
-
-
-def _tiles(
-    summary: Mapping[str, Any], means: Mapping[str, Mapping[str, Any]]
-) -> list[tuple[str, str, str]]:
+def _tiles(summary: Mapping[str, Any], means: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """The number of frames, and errors that were not measured at the points used."""
-    counts = summary["counts"]
+    counts, unit = summary["counts"], summary["unit"]
     refined = counts["done"] + counts["diverged"]
     others = [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
     tiles = [("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
-    for basis, mean in means.items():
-        for measure in _measures(basis) if basis != _USED else ():
-            before, after, gain = _changed(measure, mean)
-            label = f"{measure.title} [{summary['unit']}]"
-            tiles.append((label, f"{before} → {after}", f"gain {gain} {_BASES[basis]}"))
+    for basis, errors in errors_by_basis(means).items():
+        frames = frames_text(frames_of(errors))
+        for key in _measures(basis) if basis != USED else ():
+            before, after = errors["before"].get(key), errors["after"].get(key)
+            shown = " → ".join(format_error(key, value, "").strip() for value in (before, after))
+            remark = f"{change(key, before, after)} {BASES[basis]}, {frames}"
+            tiles.append((f"{key.upper()} [{unit}]", shown, remark))
     return tiles
 
 
@@ -305,52 +281,3 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str
     if summary["counts"]["with_warnings"]:
         facts.append(("Warnings", f"in {frames_text(summary['counts']['with_warnings'])}"))
     return facts
-
-
-def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
-    measures = MEASURES if basis == _GT else _measures(basis)
-    rows = [[column_title(in_unit(each, unit)), *_changed(each, mean)] for each in measures]
-    if basis == _GT:
-        coverage = [mean[stage].get("coverage") for stage in ("before", "after")]
-        rows.append(["coverage", *("–" if c is None else f"{c:.2%}" for c in coverage), ""])
-    shown = 3 if basis == _USED else 4  # a gain at the points used means nothing
-    return Table(
-        caption=f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}",
-        header=["", "before", "after", "gain"][:shown],
-        rows=[row[:shown] for row in rows],
-    )
-
-
-def _measures(basis: str) -> list[Measure]:
-    return [_ERRORS["mae"]] if basis == _HIDDEN else [*_ERRORS.values()]
-
-
-def _changed(measure: Measure, mean: Mapping[str, Any]) -> tuple[str, str, str]:
-    """The mean before and after, and its gain; a gain without sign is rounded to zero."""
-    before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
-    gain, decimals, unit = _gain(before, after), 1, "%"
-    if measure.percent and before is not None and after is not None:
-        gain, decimals, unit = after - before, 2, " pt"
-    text = "–"
-    if gain is not None:
-        size = f"{100 * abs(gain):.{decimals}f}"
-        text = f"{'' if float(size) == 0 else '+' if gain > 0 else '−'}{size}{unit}"
-    return format_value(measure, before), format_value(measure, after), text
-
-
-def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[Table]:
-    """A table of the simple baselines, the network and the result; empty without --baselines."""
-    if not mean:
-        return []
-    places = {"held_out_mae": "MAE at held-out points", "mae": "MAE", "rmse": "RMSE"}
-    rows = [
-        [name, *(format_value(_ERRORS["mae"], row[key]) for key in places), f"{row['frames']:,}"]
-        for name, row in mean.items()
-    ]
-    header = ["", *(f"{title} [{unit}]" for title in places.values()), "frames"]
-    return [Table(caption="Simple baselines: means over frames", header=header, rows=rows)]
-
-
-def in_unit(measure: Measure, unit: str) -> Measure:
-    """Returns the measure of depths whose unit is not the metre, such as a model's."""
-    return replace(measure, unit=unit) if measure.unit == "m" else measure

@@ -14,7 +14,6 @@ from pnpdepth_cli.commands.evaluation.scoring import FrameScores, filled
 from pnpdepth_cli.commands.evaluation.tables import calibration_tables, means_by_measure
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.tables import format_value, unit_of
-from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
@@ -72,20 +71,6 @@ def write_eval_report(
         write_report(temporary, _head(evaluation, columns), entries(images))
 
 
-def column_of(measure: Measure, *, title: str = "", key: str = "", listed: bool) -> Column:
-    """Returns the column of a measure, with its own title and key or other ones."""
-    return Column(
-        key=key or measure.key,
-        title=title or measure.title,
-        unit=unit_of(measure),
-        decimals=measure.decimals,
-        factor=measure.shown_factor,
-        percent=measure.percent,
-        higher_is_better=measure.higher_is_better,
-        listed=listed,
-    )
-
-
 def frames_text(count: int) -> str:
     """Returns text such as `12 frames`."""
     return f"{count:,} frame{'' if count == 1 else 's'}"
@@ -96,7 +81,19 @@ def _columns(evaluation: Evaluation) -> list[Column]:
     keys = {measure.key for measure in measures}
     listed = _LISTED if keys.issuperset(_LISTED) else tuple(keys)
     return [
-        *(column_of(measure, listed=measure.key in listed) for measure in measures),
+        *(
+            Column(
+                key=measure.key,
+                title=measure.title,
+                unit=unit_of(measure),
+                decimals=measure.decimals,
+                factor=measure.shown_factor,
+                percent=measure.percent,
+                higher_is_better=measure.higher_is_better,
+                listed=measure.key in listed,
+            )
+            for measure in measures
+        ),
         Column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
     ]
 
