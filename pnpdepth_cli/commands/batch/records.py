@@ -13,7 +13,6 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.batch.frames import Task
 from pnpdepth_cli.commands.batch.summary import CSV, JSON, Row, failed_row, row_of
-from pnpdepth_cli.commands.refinement.output_files import Outputs
+from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
@@ -61,7 +60,7 @@ class Records:
             return
         if JSON in names and (_content(self.output / JSON) or b"").startswith(_OWN_SUMMARY):
             return
-        results = (path for task in tasks for path in task.outputs.paths())
+        results = (path for task in tasks for path in task.outputs.values())
         for path in (self.output / CSV, self.output / JSON, *results):
             if path.name in names_in(path.parent):
                 raise OutputError(
@@ -80,7 +79,7 @@ class Records:
 
         The reason is a word or two, with details after a colon.
         """
-        names, files = self._listing.names(task.record.parent), task.outputs.by_kind()
+        names, files = self._listing.names(task.record.parent), task.outputs
         if task.record.name not in names:
             return "interrupted" if any(path.name in names for path in files.values()) else "new"
         entry, digest = _entry(_record(task.record)), self._digest(task)
@@ -95,9 +94,9 @@ class Records:
                 known = Fingerprint(**entry["inputs"][part])
                 if not is_unchanged(path, known, self._listing):
                     return f"input changed: {part}"
-            may_lack = task.outputs.optional()
+            may_lack = IMAGES if task.request.outputs.previews != "all" else ()
             for kind, path in files.items():
-                wanted = kind in entry["outputs"] or path not in may_lack
+                wanted = kind in entry["outputs"] or kind not in may_lack
                 if wanted and path.name not in names:
                     return f"result missing: {path.name}"
         except DAMAGED:
@@ -132,12 +131,11 @@ class Records:
             inputs: What identifies its files, by part.
             write: Writes all but the record to the paths that it is given.
         """
-        planned = task.outputs.by_kind()
-        with _staged(task.outputs, self.output) as stage:
+        planned = task.outputs
+        with _staged(planned, self.output) as staged:
             _remove(task.record)
-            outcome = write(replace(stage, record=None))
-            staged = stage.by_kind()
-            written = [*outcome.outputs.by_kind(), "record"]
+            outcome = write({kind: path for kind, path in staged.items() if kind != "record"})
+            written = [*outcome.outputs, "record"]
             entry = {
                 "settings": self._digest(task),
                 "inputs": {part: known.as_record() for part, known in inputs.items()},
@@ -146,8 +144,8 @@ class Records:
             record = {_ENTRY: entry} | outcome.record
             if isinstance(self.output, RemotePath):
                 record = renamed(record, {str(staged[k]): str(planned[k]) for k in planned})
-                for path in task.outputs.optional():
-                    _remove(path)
+                for kind in planned.keys() - written:
+                    _remove(planned[kind])
             write_json(staged["record"], record)
             for kind in written:
                 _put(staged[kind], planned[kind])
@@ -156,8 +154,8 @@ class Records:
     def fail(self, task: Task, message: str) -> Row:
         """Writes a record that says why a frame failed; returns the summary's row."""
         entry = {"settings": self._digest(task), "failed": message}
-        with _staged(task.outputs, self.output) as stage:
-            file = stage.by_kind()["record"]
+        with _staged(task.outputs, self.output) as staged:
+            file = staged["record"]
             make_folder(file.parent)
             write_json(file, {_ENTRY: entry})
             _put(file, task.record)
@@ -293,6 +291,4 @@ def _staged(outputs: Outputs, output: Path) -> Iterator[Outputs]:
         yield outputs
         return
     with tempfile.TemporaryDirectory(prefix="pnpdepth-") as folder:
-        planned = outputs.by_kind().items()
-        paths: Any = {kind: Path(folder) / path.relative_to(output) for kind, path in planned}
-        yield replace(outputs, **paths)
+        yield {kind: Path(folder) / path.relative_to(output) for kind, path in outputs.items()}
