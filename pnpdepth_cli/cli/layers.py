@@ -36,7 +36,7 @@ def layers(
     For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
     every update repeats), and the influential field of one sparse point in z and in the depth map.
     """
-    from pnpdepth_cli.commands.networks.layers import list_layers
+    from pnpdepth_cli.commands.networks.describe import list_layers
 
     choice = NetworkChoice(**values)
     with progress_bar("layers", "layer") as show:

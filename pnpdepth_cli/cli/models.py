@@ -39,7 +39,7 @@ def models() -> None:
 @options.as_json
 def list_command(every: bool, as_json: bool) -> None:
     """List the networks that --model takes by name, with their inputs, outputs and defaults."""
-    from pnpdepth_cli.commands.networks.list_models import list_models
+    from pnpdepth_cli.commands.networks.describe import list_models
 
     listed = list_models()
     hidden = Counter(model["family"] for model in listed if model["variant"] and not every)
@@ -83,7 +83,7 @@ def check(
 
     A .py file is Python code and is run.
     """
-    from pnpdepth_cli.commands.networks.check import check_model
+    from pnpdepth_cli.commands.networks.describe import check_model
 
     _print(check_model(network, checkpoint, image, device), as_json)
 
@@ -95,7 +95,7 @@ def check(
 @options.as_json
 def convert(source: Path, target: Path, overwrite: bool, as_json: bool) -> None:
     """Write the tensors of the checkpoint IN to OUT.safetensors. No code in IN is run."""
-    from pnpdepth_cli.commands.networks.convert import convert_checkpoint
+    from pnpdepth_cli.commands.networks.weights import convert_checkpoint
 
     _print(convert_checkpoint(source, target, overwrite=overwrite), as_json)
 
@@ -107,7 +107,7 @@ def convert(source: Path, target: Path, overwrite: bool, as_json: bool) -> None:
 @options.as_json
 def fetch(repository: str, revision: str | None, output: Path | None, as_json: bool) -> None:
     """Download a network from Hugging Face. No other command uses the internet."""
-    from pnpdepth_cli.commands.networks.fetch import fetch_model
+    from pnpdepth_cli.commands.networks.weights import fetch_model
 
     _print(fetch_model(repository, revision, output), as_json)
 
