@@ -88,11 +88,11 @@ def compare(
         all_measures=all_measures,
         columns=columns,
     )
-    print_notes(comparison.notes)
+    print_notes(comparison["notes"])
     table = comparison_table(comparison)
     to_stdout = files.write(csv=table, markdown=table, latex=methods_table(comparison))
     if files.as_json:
-        click.echo(json.dumps(comparison.as_record(), indent=2))
+        click.echo(json.dumps(comparison, indent=2))
     elif not to_stdout:
         # a long label would make the table wider than a terminal
         rows = [[title, _short(label), *cells] for title, label, *cells in table.rows]

@@ -17,7 +17,6 @@ from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, som
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, choose_protocol
 from pnpdepth_cli.commands.evaluation.scoring import (
     FrameScores,
-    Uncertainty,
     score_pair,
     summarise_uncertainty,
 )
@@ -94,7 +93,7 @@ class Evaluation:
     """The ends of the 95 % interval of each mean; None with too few independent frames."""
     clusters: Clusters
     """What the bootstrap resamples as a whole."""
-    uncertainty: Uncertainty | None
+    uncertainty: dict[str, Any] | None
     """Whether predicted standard deviations are right; None without any."""
     notes: tuple[str, ...]
     """What was assumed, and warnings; one line each."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -177,28 +177,6 @@ def filled(depth: Depth) -> Depth:
     return np.maximum(fill_background(depth), np.float32(0))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Uncertainty:
-    """Calibration over the pixels of all frames, and the mean sparsification of the frames."""
-
-    frames: int
-    pixels: int
-    within_1_sigma: float
-    """Fraction of errors within one standard deviation; 0.683 if calibrated."""
-    within_2_sigma: float
-    """Within two; 0.954 if calibrated."""
-    ause: float
-    """Area between sparsification and oracle, in units of the error of all pixels; 0 is best."""
-    expected: tuple[float, ...]
-    """LEVELS, the calibration curve's."""
-    observed: tuple[float, ...]
-    """Fraction of errors within the interval of each."""
-    removed: tuple[float, ...]
-    """REMOVED, the sparsification curve's."""
-    sparsification: tuple[float, ...]
-    oracle: tuple[float, ...]
-
-
 def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty | None:
     """Returns what a frame contributes; None if no pixel has all three.
 
@@ -226,23 +204,29 @@ def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty
     )
 
 
-def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> Uncertainty | None:
-    """Returns the calibration and sparsification of all frames; None without any."""
+def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> dict[str, Any] | None:
+    """Returns the calibration and sparsification of all frames; None without any.
+
+    Calibration is over the pixels of all frames: `observed` is the fraction of errors within the
+    interval of each probability `expected`. Sparsification is the mean of the frames by fraction of
+    pixels `removed`; `ause` is the area between `sparsification` and `oracle` in units of the error
+    of all pixels, 0 is best.
+    """
     if not frames:
         return None
     pixels, within, by_sigma, by_error = zip(*frames, strict=True)
     observed = np.sum(within, axis=0) / sum(pixels)
     sparsification, oracle = np.mean(by_sigma, axis=0), np.mean(by_error, axis=0)
     area = float(np.trapezoid(sparsification - oracle, REMOVED))
-    return Uncertainty(
-        frames=len(frames),
-        pixels=sum(pixels),
-        within_1_sigma=float(observed[LEVELS.index(ONE_SIGMA)]),
-        within_2_sigma=float(observed[LEVELS.index(TWO_SIGMA)]),
-        ause=area / float(sparsification[0]) if sparsification[0] else 0.0,
-        expected=LEVELS,
-        observed=tuple(observed.tolist()),
-        removed=REMOVED,
-        sparsification=tuple(sparsification.tolist()),
-        oracle=tuple(oracle.tolist()),
-    )
+    return {
+        "frames": len(frames),
+        "pixels": sum(pixels),
+        "within_1_sigma": float(observed[LEVELS.index(ONE_SIGMA)]),
+        "within_2_sigma": float(observed[LEVELS.index(TWO_SIGMA)]),
+        "ause": area / float(sparsification[0]) if sparsification[0] else 0.0,
+        "expected": LEVELS,
+        "observed": observed.tolist(),
+        "removed": REMOVED,
+        "sparsification": sparsification.tolist(),
+        "oracle": oracle.tolist(),
+    }

@@ -151,21 +151,21 @@ def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
     found = evaluation.uncertainty
     if found is None:
         return []
-    frames = frames_text(found.frames)
-    observed = list(zip(found.expected, found.observed, strict=True))
+    frames = frames_text(found["frames"])
+    observed = list(zip(found["expected"], found["observed"], strict=True))
     charts: list[dict[str, Any]] = [{
         "caption": f"Calibration, {frames}",
         "x_title": "errors within the interval if normal",
         "y_title": "observed",
         "lines": {"observed": observed, "normal": [(0, 0), (1, 1)]},
     }]  # fmt: skip
-    if whole := found.sparsification[0]:
+    if whole := found["sparsification"][0]:
         by_sigma, by_error = (
-            [(part, mae / whole) for part, mae in zip(found.removed, curve, strict=True)]
-            for curve in (found.sparsification, found.oracle)
+            [(part, mae / whole) for part, mae in zip(found["removed"], curve, strict=True)]
+            for curve in (found["sparsification"], found["oracle"])
         )
         charts.append({
-            "caption": f"Sparsification, {frames}: AUSE {found.ause:.4f}",
+            "caption": f"Sparsification, {frames}: AUSE {found['ause']:.4f}",
             "x_title": "pixels removed",
             "y_title": "MAE of the others",
             "lines": {"by σ": by_sigma, "by error (oracle)": by_error},
