@@ -13,6 +13,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.remote import Listing, RemotePath, read_object, remove, renamed, upload
+from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.refinement.refine import RefineOutcome
@@ -188,23 +190,23 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
         model: The `model_identity` of the request.
         *groups: Names of the request's groups. None: all of them.
     """
-    fields = {
+    values = {
         name: value
         for name, value in request.settings(*groups).items()
         if name != "more_models" and (value or name not in _ONLY_IF_SET)
     }
-    if "neighbours" in fields:
-        fields["neighbours"] = [(other.motion, other.apart) for other in fields["neighbours"]]
-    if "device" in fields:  # devices of one kind give equal results, so shards may use one each
-        fields["device"] = fields["device"].split(":")[0]
-    settings: dict[str, Any] = plain(fields | model)
+    if "neighbours" in values:
+        values["neighbours"] = [(other.motion, other.apart) for other in values["neighbours"]]
+    if "device" in values:  # devices of one kind give equal results, so shards may use one each
+        values["device"] = values["device"].split(":")[0]
+    settings: dict[str, Any] = plain(values | model)
     for name in ("calib", "extrinsics"):
         settings.get("scan", {}).pop(name, None)
     return settings
 
 
 def model_identity(request: RefineRequest) -> dict[str, Any]:
-    """Returns the program's version and the digests of the network's files.
+    """Returns the program's version and the digests of the network's files and of code.
 
     A file's name with its :ATTRIBUTE or :OUTPUT counts; its folder does not.
     """
@@ -214,8 +216,16 @@ def model_identity(request: RefineRequest) -> dict[str, Any]:
         **_identity(network.model),
         "checkpoint": None if network.checkpoint is None else sha256_of(network.checkpoint),
     }
-    more = [_identity(spec) for spec in network.more_models]
-    return identity | ({"more_models": more} if more else {})
+    more, code = [_identity(spec) for spec in network.more_models], code_digests(request.method)
+    identity |= {"more_models": more} if more else {}
+    return identity | ({"code": code} if code else {})
+
+
+def code_digests(method: Settings) -> dict[str, str]:
+    """Returns the SHA-256 of the user's Python files among the settings, such as of --loss."""
+    values = (getattr(method, field.name) for field in fields(method))
+    files = {value for value in values if isinstance(value, str) and value.endswith(".py")}
+    return {file: sha256_of(Path(file)) for file in sorted(files)}
 
 
 def _identity(spec: str) -> dict[str, Any]:

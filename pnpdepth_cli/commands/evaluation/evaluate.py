@@ -29,6 +29,7 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     interval,
 )
 from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.depth import DepthKind, scale_warning
@@ -351,6 +352,11 @@ def _warnings(rows: Sequence[FrameScores], protocol: EvalProtocol) -> list[str]:
         lines.append(
             f"scale-by {protocol.scale_by}: factor {median:.4g} (median of {len(factors):,}"
             f" images), standard deviation / median {spread:.3f}"
+        )
+    if protocol.scale_by == "none" and (unscaled := [r for r in scored if r.pair.unit != METRES]):
+        lines.append(
+            f"warning: {len(unscaled):,} predictions are in {unscaled[0].pair.unit}, not in metres,"
+            " so errors against the ground truth show nothing; --scale-by median scales each image"
         )
     kinds = {side: found[0][0] for side, found in kinds_of(rows).items() if found}
     for side, what, ratios in (

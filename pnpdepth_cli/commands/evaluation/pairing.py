@@ -16,6 +16,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.dataset import (
     IMAGE_SUFFIXES,
@@ -69,6 +70,8 @@ class FramePair:
     """How the sparse input was sampled from the ground truth, by the run's record."""
     sampled: int = 0
     """Points of the ground truth that were the sparse input, by the run's record."""
+    unit: str = METRES
+    """Of the prediction, by the run's record."""
     image: Source | None = None
     mask: Path | None = None
 
@@ -218,6 +221,7 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
         sampling=sampling if is_sampled else None,
         sampled=used if is_sampled and isinstance(used, int) else 0,
         image=_input(inputs, "image") or frame.image,
+        unit=str(record.get("unit", METRES)),
     )
 
 

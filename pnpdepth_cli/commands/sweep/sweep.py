@@ -12,7 +12,7 @@ from typing import Any
 
 from pnpdepth_cli.commands.batch.batch import Listener
 from pnpdepth_cli.commands.batch.frames import Task, find_frames, task_of
-from pnpdepth_cli.commands.batch.records import model_identity, settings_of
+from pnpdepth_cli.commands.batch.records import code_digests, model_identity, settings_of
 from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.running import read_frame, reference_frames
 from pnpdepth_cli.commands.refinement.inputs import Inputs
@@ -131,6 +131,8 @@ class _Network:
                 drawn = {"seed": seed, "sampling": sampling.record(), "files": files}
                 for settings in several:
                     decides = plain(read | drawn | {"settings": settings})
+                    if code := code_digests(settings):
+                        decides["code"] = code
                     text = json.dumps(decides, sort_keys=True)
                     runs[frame.name, seed, sampling, settings] = Run(
                         task=task, frame=frame, seed=seed, sampling=sampling, settings=settings,

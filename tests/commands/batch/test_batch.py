@@ -107,16 +107,21 @@ def test_only_what_is_missing_or_changed_is_done_again(
     assert redone == results(root / "out")
 
 
-def test_other_settings_or_another_network_in_the_same_file_do_all_again(root: Path) -> None:
-    batch(root)
-    for settings in ({"holdout": 0.2}, {"format": "exr"}, {"align": "scale"}):
+def test_other_settings_or_other_code_in_the_same_file_do_all_again(root: Path) -> None:
+    loss = root / "mine.py"
+    loss.write_text(
+        "def loss(predicted, measured):\n    return (predicted - measured).abs().mean()"
+    )
+    batch(root, limit=2)
+    for settings in ({"holdout": 0.2}, {"format": "exr"}, {"loss": str(loss)}):
         listener = RecordingListener()
-        batch(root, listener, refine=settings)
-        assert listener.names == list(NAMES)
-        assert "4 to do (4 other settings)" in listener.messages[1]
-    model = root / "net/my_net.py"
-    model.write_text(model.read_text().replace("2 + 3", "2.5 + 3"))
-    assert done(root, refine=settings) == list(NAMES)
+        batch(root, listener, limit=2, refine=settings)
+        assert listener.names == ["a", "b"]
+        assert "2 to do (2 other settings)" in listener.messages[2]
+    for code, old, new in ((root / "net/my_net.py", "2 + 3", "2.5 + 3"), (loss, ".abs()", "**2")):
+        code.write_text(code.read_text().replace(old, new))
+        assert done(root, limit=2, refine=settings) == ["a", "b"]
+    assert done(root, limit=2, refine=settings) == []
 
 
 def test_a_bad_frame_is_reported_counted_skipped_and_done_when_it_is_mended(root: Path) -> None:

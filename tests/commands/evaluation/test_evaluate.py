@@ -332,6 +332,14 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
         scored(two, exclude_sparse=True)
 
 
+def test_a_prediction_in_model_units_is_warned_of_unless_it_is_scaled(two: Path) -> None:
+    (two / "out" / "a.json").write_text('{"unit": "model units"}')
+    warning = "warning: 1 predictions are in model units, not in metres"
+    assert any(note.startswith(warning) for note in scored(two).notes)
+    depth_file(two / "out" / "ü b_depth.npy", [[8, 9]])
+    assert not any("model units" in note for note in scored(two, scale_by="median").notes)
+
+
 def test_a_smaller_prediction_is_resized_only_on_request(tmp_path: Path) -> None:
     depth_file(tmp_path / "gt" / "a.npy", [[1, 1, 3, 3], [1, 1, 3, 3]])
     depth_file(tmp_path / "out" / "a.npy", [[1, 3]])
