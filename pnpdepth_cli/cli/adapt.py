@@ -11,7 +11,7 @@ import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.commands.adapt_request import AdaptRequest
+from pnpdepth_cli.commands.batch.request import AdaptRequest
 from pnpdepth_cli.commands.refinement.request import parse_sample
 
 

@@ -11,7 +11,9 @@ import click
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.commands.refinement.request import NetworkChoice
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.bench import Bench
@@ -22,8 +24,8 @@ if TYPE_CHECKING:
     cls=grouped_help.GroupedCommand,
     groups={
         "Input": ("--size", "--points"),
-        "Network": grouped_help.NETWORK,
-        "Method": grouped_help.METHOD,
+        "Network": (NetworkChoice, "--precision"),
+        "Method": (Settings,),
         "Run": ("--repeats", "--table"),
         "Output": ("--json",),
     },

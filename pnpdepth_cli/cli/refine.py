@@ -9,6 +9,14 @@ import click
 
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.commands.refinement.request import (
+    FrameFiles,
+    HoldOut,
+    NetworkChoice,
+    OutputOptions,
+)
+from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.settings import Settings
 
 
 @click.command(
@@ -16,16 +24,10 @@ from pnpdepth_cli.cli.progress import progress_bar
     cls=grouped_help.GroupedCommand,
     common=grouped_help.COMMON,
     groups={
-        "Input": (
-            "--sparse",
-            "--gt",
-            *grouped_help.LIDAR,
-            *grouped_help.COLMAP,
-            *grouped_help.FILE_READING,
-        ),
-        "Network": grouped_help.NETWORK,
-        "Method": grouped_help.METHOD,
-        "Output": grouped_help.OUTPUT,
+        "Input": ("--sparse", "--gt", ScanOptions, ColmapOptions, FrameFiles),
+        "Network": (NetworkChoice,),
+        "Method": (Settings, "--set", HoldOut),
+        "Output": ("--output", OutputOptions, "--json"),
     },
 )
 @click.argument("image", type=options.FILE, required=False)

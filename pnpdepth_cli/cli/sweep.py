@@ -33,9 +33,9 @@ _RARE = ("output_kind", "normalise", "precision", "sparse_size_ok", "channel")
     ),
     groups={
         "Sweep": ("--vary", "--set", "--one-by-one", "--sample", "--seeds"),
-        "Frames": ("--layout", "--protocol", "--limit"),
-        "Input": (*grouped_help.LIDAR, *grouped_help.FILE_READING),
-        "Network": grouped_help.NETWORK,
+        "Frames": (FrameSelection,),
+        "Input": (ScanOptions, FrameFiles),
+        "Network": (NetworkChoice, "--output-kind", "--normalise"),
         "Output": ("--output", "--plots", "--cost", "--json"),
     },
 )

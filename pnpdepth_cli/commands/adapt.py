@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.commands.adapt_request import AdaptRequest
 from pnpdepth_cli.commands.batch.frames import Task, task_of
+from pnpdepth_cli.commands.batch.request import AdaptRequest
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.masks import Masks

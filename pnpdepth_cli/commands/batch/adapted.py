@@ -95,7 +95,7 @@ def _learn(
     if len(tasks) < LEAST_FRAMES:
         return f"{len(tasks)} frames; at least {LEAST_FRAMES} are needed"
     from pnpdepth_cli.commands.adapt import adapt_to  # these import torch
-    from pnpdepth_cli.commands.adapt_request import AdaptRequest
+    from pnpdepth_cli.commands.batch.request import AdaptRequest
     from pnpdepth_cli.commands.refinement.inputs import read_inputs
     from pnpdepth_cli.frames.frame import is_dense
 

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
@@ -69,14 +69,11 @@ class Listener(Protocol):
         """Called with the summary's row of each frame that is done or has failed."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class BatchOutcome:
-    """How a batch ended."""
+class BatchOutcome(NamedTuple):
+    """The contents of summary.json without its frames, and whether the batch was stopped early."""
 
     summary: dict[str, Any]
-    """The contents of summary.json without its frames."""
     stopped: bool
-    """True if it was stopped before all frames were done."""
 
 
 def run_batch(
@@ -338,7 +335,7 @@ class _Batch:
                 file.seek(0)
                 return map(json.loads, file)
 
-            write_summaries(local, summary, file, list(tally.baselines))
+            write_summaries(local, summary, file, tally.baselines)
             if self.report is not None:
                 self.report.write(summary, rows)
         if isinstance(request.output, RemotePath):
