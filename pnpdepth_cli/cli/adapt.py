@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +49,11 @@ def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **value
     with progress_bar("adapt", "update") as show:
         adapted = adapt_network(request, lambda text: click.echo(printable(text), err=True), show)
     if as_json:
-        click.echo(json.dumps(asdict(adapted), indent=2))
+        click.echo(json.dumps(adapted, indent=2))
         return
-    before, after = adapted.losses[0], adapted.losses[adapted.kept]
+    before, after = adapted["losses"][0], adapted["losses"][adapted["kept"]]
     click.echo(
-        f"loss at hidden points of the frames for validation ({adapted.validation_frames}):"
-        f" {before:.5f} → {after:.5f} ({adapted.change:+.1%}), after {adapted.kept} updates"
+        f"loss at hidden points of the frames for validation ({adapted['validation_frames']}):"
+        f" {before:.5f} → {after:.5f} ({adapted['change']:+.1%}), after {adapted['kept']} updates"
     )
     click.echo(printable(f"wrote {request.output} and {request.card}"), err=True)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -14,9 +13,6 @@ from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.commands.refinement.request import NetworkChoice
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import Settings
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.commands.bench import Bench
 
 
 @click.command(
@@ -77,65 +73,65 @@ def bench(size: str | None, table: bool, as_json: bool, **values: Any) -> None:
             )
         _table(as_json, **values)
         return
-    from pnpdepth_cli.commands.bench import BenchRequest, run_bench
+    from pnpdepth_cli.commands.bench import run_bench
 
-    request = BenchRequest(size=options.height_and_width(size) if size else None, **values)
+    values["size"] = options.height_and_width(size) if size else None
     with progress_bar("bench", "round") as show:
-        result = run_bench(request, on_round=show)
+        result = run_bench(**values, on_round=show)
     if as_json:
-        click.echo(json.dumps(asdict(result), indent=2))
+        click.echo(json.dumps(result, indent=2))
     else:
         _print(result)
 
 
-def _print(result: Bench) -> None:
+def _print(result: dict[str, Any]) -> None:
     from pnpdepth_cli.cli.tables import print_rows
 
-    threads = f"{result.threads} thread{'' if result.threads == 1 else 's'}"
-    click.echo(f"{result.device}, {threads}, torch {result.versions['torch']}", err=True)
-    for note in result.notes:
+    threads = f"{result['threads']} thread{'' if result['threads'] == 1 else 's'}"
+    click.echo(f"{result['device']}, {threads}, torch {result['versions']['torch']}", err=True)
+    for note in result["notes"]:
         click.echo(printable(note), err=True)
-    height, width = result.size
+    height, width = result["size"]
     print_rows(
-        f"{result.model} cut at {result.layer}, {width}×{height}, {result.points:,} points,"
-        f" K = {result.iterations}, {result.precision}",
+        f"{result['model']} cut at {result['layer']}, {width}×{height}, {result['points']:,}"
+        f" points, K = {result['iterations']}, {result['precision']}",
         ("", "median", "quartiles", "× forward", "memory"),
         [
             (
-                part.name,
-                _ms(part.median_s),
-                f"{1000 * part.lower_s:,.1f}–{_ms(part.upper_s)}",
-                f"{part.forwards:.2f}",
-                "" if part.peak_mb is None else f"{part.peak_mb:,.0f} MB",
+                name,
+                _ms(part["median_s"]),
+                f"{1000 * part['lower_s']:,.1f}–{_ms(part['upper_s'])}",
+                f"{part['forwards']:.2f}",
+                "" if part["peak_mb"] is None else f"{part['peak_mb']:,.0f} MB",
             )
-            for part in result.parts
+            for name, part in result["parts"].items()
         ],
     )
     click.echo(
-        f"a refinement takes {result.part('refinement').forwards:.2f} forward passes; the limit is"
-        f" {result.limit:.2f}"
+        f"a refinement takes {result['parts']['refinement']['forwards']:.2f} forward passes; the"
+        f" limit is {result['limit']:.2f}"
     )
 
 
 def _table(as_json: bool, **values: Any) -> None:
     """Prints the times of the paper's networks: full size, random weights, K = 5."""
     from pnpdepth_cli.cli.tables import print_rows
-    from pnpdepth_cli.commands.bench import PAPER_TIMES, BenchRequest, run_bench
+    from pnpdepth_cli.commands.bench import PAPER_TIMES, run_bench
 
     results = []
     with progress_bar("bench", "network") as show:
         for number, paper in enumerate(PAPER_TIMES):
             show(number, len(PAPER_TIMES), paper.model)
             each = {**values, "model": paper.model, "size": paper.size, "iterations": 5}
-            results.append((paper, run_bench(BenchRequest(**each))))
+            results.append((paper, run_bench(**each)))
     if as_json:
-        records = [{"paper": paper._asdict(), "bench": asdict(ours)} for paper, ours in results]
+        records = [{"paper": paper._asdict(), "bench": ours} for paper, ours in results]
         click.echo(json.dumps(records, indent=2))
         return
     rows = []
     for paper, ours in results:
-        forward, refinement = ours.part("forward"), ours.part("refinement")
-        memory = refinement.peak_mb
+        forward, refinement = ours["parts"]["forward"], ours["parts"]["refinement"]
+        memory = refinement["peak_mb"]
         printed = ["–"] * 3
         if paper.before is not None and paper.after is not None:
             ratio = f"{paper.after / paper.before:.2f}"
@@ -145,17 +141,17 @@ def _table(as_json: bool, **values: Any) -> None:
                 paper.model,
                 f"{paper.name}, {paper.data}",
                 f"{paper.size[1]}×{paper.size[0]}",
-                _ms(forward.median_s),
-                _ms(refinement.median_s),
-                f"{refinement.forwards:.2f}",
-                f"{ours.limit:.2f}",
+                _ms(forward["median_s"]),
+                _ms(refinement["median_s"]),
+                f"{refinement['forwards']:.2f}",
+                f"{ours['limit']:.2f}",
                 "–" if memory is None else f"{memory:,.0f} MB",
                 *printed,
             ]
         )
     print_rows(
         f"Table IV: random weights, K = 5, {values['precision']}, {values['device']},"
-        f" {results[0][1].threads} threads, medians of {values['repeats']}; beside the paper's"
+        f" {results[0][1]['threads']} threads, medians of {values['repeats']}; beside the paper's"
         " figures",
         (
             *("network", "paper's\nname", "size", "forward", "refinement", "×", "limit", "memory"),

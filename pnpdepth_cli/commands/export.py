@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -20,50 +19,44 @@ _LONGEST_NAME = 200
 """Bytes of a name of a record that becomes a path."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExportRequest:
-    """What the user asks of an export."""
-
-    results: Path
-    """A folder that `refine` or `batch` wrote, or a depth file in it."""
-    to: str
-    """One of `choices.EXPORTS`."""
-    output: Path
-    """The folder to write to; it may hold the images and the model already."""
-    overwrite: bool = False
-    """Whether existing files are replaced."""
-
-
-def export_results(request: ExportRequest) -> dict[str, Any]:
+def export_results(
+    results: Path, output: Path, *, to: str, overwrite: bool = False
+) -> dict[str, Any]:
     """Writes the files and `export_NAME.json`, and returns what that holds.
+
+    Args:
+        results: A folder that `refine` or `batch` wrote, or a depth file in it.
+        output: The folder to write to; it may hold the images and the model already.
+        to: One of `choices.EXPORTS`.
+        overwrite: Whether existing files are replaced.
 
     Raises:
         PnpDepthError: An input or output is at fault; then nothing is written.
     """
-    export: Export = EXPORTS[request.to]
-    if request.output.exists() and not request.output.is_dir():
-        raise OutputError(f"{request.output} is a file; name a folder")
-    frames = [_frame(result, export) for result in result_frames(request.results)]
+    export: Export = EXPORTS[to]
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output} is a file; name a folder")
+    frames = [_frame(result, export) for result in result_frames(results)]
     units = sorted({f"{f.result.unit} (unit-scale {f.unit_scale:g})" for f in frames})
     if len(units) > 1:
         raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
-    written = [*export.files(request.output, frames), request.output / f"export_{request.to}.json"]
+    written = [*export.files(output, frames), output / f"export_{to}.json"]
     if len(set(written)) < len(written):
-        raise InputError(f"{request.results}: two frames have one image name; refine them again")
+        raise InputError(f"{results}: two frames have one image name; refine them again")
     for path in written:
-        if path.exists() and not request.overwrite:
+        if path.exists() and not overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another folder")
-    make_folder(request.output)
+    make_folder(output)
     record: dict[str, Any] = {
         "command": "export",
         "version": __version__,
-        "to": request.to,
-        "results": str(request.results),
+        "to": to,
+        "results": str(results),
         "frames": len(frames),
         "unit": frames[0].result.unit,
     }
     with all_or_none(written):
-        record["notes"] = export.write(request.output, frames)
+        record["notes"] = export.write(output, frames)
         record["files"] = [path.as_posix() for path in written[:-1]]
         write_json(written[-1], record)
     return record

@@ -33,7 +33,7 @@ def test_json_is_all_that_goes_to_stdout(
 ) -> None:
     assert code_of(bench(frame, "--json")) == 0
     record = json.loads(capsys.readouterr().out)
-    assert record["parts"][0]["forwards"] == 1
+    assert record["parts"]["forward"]["forwards"] == 1
     assert record["limit"] > 1
 
 

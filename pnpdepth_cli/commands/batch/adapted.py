@@ -121,8 +121,10 @@ def _learn(
         raise UsageError(
             "--adapt needs a network that takes points, such as compact, as the first --model"
         ) from error
-    change = f"{adapted.change:+.1%} loss at hidden points of {adapted.validation_frames} frames"
-    if adapted.p_value is not None and adapted.p_value < SIGNIFICANT:
+    change = (
+        f"{adapted['change']:+.1%} loss at hidden points of {adapted['validation_frames']} frames"
+    )
+    if adapted["p_value"] is not None and adapted["p_value"] < SIGNIFICANT:
         say(f"adapt: {change}")
         return None
     for path in (weights, asked.card):

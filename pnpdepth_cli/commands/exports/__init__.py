@@ -51,8 +51,6 @@ class ExportFrame:
 class Export:
     """How depth is written for a program."""
 
-    title: str
-    """What is written, for a person."""
     needs_pose: bool
     files: Callable[[Path, Sequence[ExportFrame]], list[Path]]
     """The files that `write` writes into a folder."""
