@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.commands.batch.request import AdaptRequest
 from pnpdepth_cli.commands.refinement.request import parse_sample
 

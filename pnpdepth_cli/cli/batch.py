@@ -15,8 +15,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.cli.streams import INTERRUPTED
+from pnpdepth_cli.cli.streams import INTERRUPTED, printable
 from pnpdepth_cli.commands.batch.request import (
     BatchRequest,
     ClusterOptions,

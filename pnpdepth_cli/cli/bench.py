@@ -8,8 +8,8 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.commands.refinement.request import NetworkChoice
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import Settings

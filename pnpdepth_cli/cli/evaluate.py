@@ -22,8 +22,8 @@ from pnpdepth_cli.choices import (
 )
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.compare import columns, names_in
-from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.errors import FramesFailedError, UsageError
 
 

@@ -33,7 +33,7 @@ def export(as_json: bool, **values: Any) -> None:
     Camera and pose come from the records, so RESULTS are best those of a COLMAP project
     (`pnpdepth batch --layout colmap`). OUTPUT may be the project itself.
     """
-    from pnpdepth_cli.commands.export import export_results
+    from pnpdepth_cli.commands.exports import export_results
 
     record = export_results(**values)
     if as_json:

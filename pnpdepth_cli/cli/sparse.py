@@ -11,7 +11,7 @@ import click
 
 from pnpdepth_cli.choices import PATTERNS, SENSORS
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.commands.refinement.request import sample_pattern
 from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
 

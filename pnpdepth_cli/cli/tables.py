@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.commands.error_tables import baselines_table, means_table, refinement_table
 from pnpdepth_cli.commands.tables import Cell, Table, write_text
 from pnpdepth_cli.errors import OutputError, UsageError

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.export import export_results
+from pnpdepth_cli.commands.exports import export_results
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
 from pnpdepth_cli.commands.sparse.options import ColmapOptions
