@@ -10,18 +10,14 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.commands.evaluation.request import parse_names
 
 _LABEL_LETTERS = 36
 
 
-def names_in(text: str) -> tuple[str, ...]:
-    """Returns the names in a text such as `rmse,mae`."""
-    return tuple(dict.fromkeys(text.split(",")))
-
-
 columns = click.option(
     "--columns",
-    type=names_in,
+    type=parse_names,
     metavar="KEY,…",
     help="Measures of the tables, in this order, such as rmse,mae,delta1.",
 )

@@ -87,7 +87,7 @@ def long_name(option: click.Option) -> str:
 
 def _flags(request: type) -> list[str]:
     flags = (field.option.within or field.flag for field in options_of(request))
-    return list(dict.fromkeys(flags))
+    return list(dict.fromkeys(flag.partition("/")[0] for flag in flags))
 
 
 _NAME_COLUMN = 22

@@ -15,6 +15,7 @@ import numpy as np
 from pnpdepth_cli.commands.evaluation.measures import Depth, Floats, Mask, MeasuredFrame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, load_stacked
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, crop_window
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset import Hdf5Array
@@ -34,18 +35,6 @@ from pnpdepth_cli.sensors.sparse import as_depth_image
 
 Size = tuple[int, ...]
 Window = tuple[slice, slice]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scales:
-    """How the user says that stored numbers are to be read; None leaves it to the files."""
-
-    prediction: float | None = None
-    """Codes per metre of integers, here and in the next two."""
-    truth: float | None = None
-    sparse: float | None = None
-    channel: str | None = None
-    """Which EXR channel or NPZ array holds the depth."""
 
 
 class Fit(NamedTuple):
@@ -75,7 +64,7 @@ class LoadedFrame(MeasuredFrame):
         return sum(0.5 / scale for scale in {k.scale for k in kinds if k and k.scale})
 
 
-def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> LoadedFrame:
+def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) -> LoadedFrame:
     """Returns the frame's depths as the protocol scores them.
 
     Raises:
@@ -88,11 +77,11 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
         whole = DepthImage(values=depth_of(frame.gt), source=source, assumed_scale=False)
     else:
         assert frame.gt is not None
-        scale = scales.truth if scales.truth is not None else frame.gt_scale
-        whole = _read(frame.gt, scale, scales.channel, protocol, pair.index)
+        scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
+        whole = _read(frame.gt, scale, request.channel, protocol, pair.index)
     gt = np.ascontiguousarray(frame.protocol.apply(masked(whole.values, frame.masks)))
     kinds = {"gt": whole.kind}
-    sparse, kind = _known_sparse(pair, protocol, scales, gt.shape)
+    sparse, kind = _known_sparse(pair, protocol, request, gt.shape)
     if kind is not None:
         kinds["sparse"] = kind
     mask = _scored_mask(pair, gt, protocol)
@@ -111,16 +100,16 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
         intrinsics=_intrinsics(pair, protocol, (whole.values.shape[0], whole.values.shape[1])),
         kinds=kinds,
     )
-    return loaded if pair.prediction is None else _with_prediction(loaded, pair, protocol, scales)
+    return loaded if pair.prediction is None else _with_prediction(loaded, pair, protocol, request)
 
 
 def _with_prediction(
-    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, scales: Scales
+    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, request: EvalRequest
 ) -> LoadedFrame:
     """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
     assert pair.prediction is not None
     size = frame.gt.shape
-    image = _read(pair.prediction, scales.prediction, scales.channel, protocol, pair.index)
+    image = _read(pair.prediction, request.pred_scale, request.channel, protocol, pair.index)
     window = crop_window(protocol.prediction_crop or "none", size, "--pred-crop")
     values = _to_size(pair, image.values, size, window, protocol.resize)
     depth, fit = scaled(values, frame.gt, protocol.prediction_kind, protocol.scale_by)
@@ -188,7 +177,7 @@ def _read(
 
 
 def _known_sparse(
-    pair: FramePair, protocol: EvalProtocol, scales: Scales, size: Size
+    pair: FramePair, protocol: EvalProtocol, request: EvalRequest, size: Size
 ) -> tuple[Depth | None, DepthKind | None]:
     """(H, W) metres of the points on their pixels, 0 elsewhere, and the kind of file.
 
@@ -198,7 +187,9 @@ def _known_sparse(
         return None, None
     height, width = size
     try:
-        scale = scales.sparse if scales.sparse is not None else pair.frame.sparse_scale
+        scale = (
+            request.sparse_scale if request.sparse_scale is not None else pair.frame.sparse_scale
+        )
         sparse = read_sparse(pair.sparse, size=(height, width), scale=scale)
         assumed = sparse.assumed_scale
         if assumed and protocol.scale != sparse.scale:

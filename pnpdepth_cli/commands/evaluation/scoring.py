@@ -18,11 +18,12 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from pnpdepth_cli.commands.evaluation.frames import Fit, LoadedFrame, Scales, load_frame
+from pnpdepth_cli.commands.evaluation.frames import Fit, LoadedFrame, load_frame
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
 from pnpdepth_cli.commands.evaluation.measures import Depth, Floats
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.core.metrics import MEASURES, error_sums, measures_of
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import DepthKind
@@ -95,14 +96,14 @@ class FrameScores:
         return self.predicted / self.known if self.known else math.nan
 
 
-def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> FrameScores:
+def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) -> FrameScores:
     """Returns the scores of a frame's files; a missing or empty prediction has a row without any.
 
     Raises:
         InputError: For a file that cannot be read, or no ground truth where the protocol scores.
         SizeError: Where sizes differ.
     """
-    frame = load_frame(pair, protocol, scales)
+    frame = load_frame(pair, protocol, request)
     depth, gt, both = frame.depth, frame.gt, frame.both
     known, pixels = int(np.count_nonzero(gt)), int(both.sum())
     if not known:
@@ -128,7 +129,7 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Frame
     else:
         keys = (measure.key for measure in MEASURES)
         values = dict(zip(keys, measures_of(sums).tolist(), strict=True))
-        values |= _additional(frame, pair, protocol, scales)
+        values |= _additional(frame, pair, protocol, request)
     leaked, sparse_ratio = min(pair.sampled, pixels) or None, math.nan
     if frame.sparse is not None:
         equal = np.abs(frame.sparse - gt) <= frame.tolerance + 1e-6 * gt
@@ -151,7 +152,7 @@ def _median_ratio(depth: Depth, gt: Depth) -> float:
 
 
 def _additional(
-    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, scales: Scales
+    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, request: EvalRequest
 ) -> dict[str, float]:
     """The measures of the protocol's additional groups."""
     values: dict[str, float] = {}
@@ -166,7 +167,7 @@ def _additional(
             )
         previous = None
         if group.in_sequences and pair.previous is not None and pair.previous.prediction:
-            previous = load_frame(pair.previous, protocol, scales)
+            previous = load_frame(pair.previous, protocol, request)
         found = group.values(replace(frame, previous=previous))
         values |= zip((measure.key for measure in group.measures), found, strict=True)
     return values

@@ -198,7 +198,7 @@ def _entry(
 def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str, Any]:
     """Writes the images of a frame and returns the page's entry of them."""
     protocol, pair = evaluation.protocol, frame.pair
-    loaded = load_frame(pair, protocol, evaluation.request.scales)
+    loaded = load_frame(pair, protocol, evaluation.request)
     gt, depth = loaded.gt, loaded.depth
     if protocol.is_devkit:
         depth = filled(depth)

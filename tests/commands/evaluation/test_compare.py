@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.evaluation.compare import compare
-from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, evaluate
+from pnpdepth_cli.commands.evaluation.evaluate import evaluate
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.record import write_json
@@ -77,7 +78,7 @@ def test_one_frame_has_a_gain_but_nothing_to_resample(tmp_path: Path) -> None:
 
 
 def test_pooled_runs_are_compared_over_their_pixels(tmp_path: Path) -> None:
-    pooled: dict[str, Any] = {"changes": {"average": "pooled"}}
+    pooled: dict[str, Any] = {"average": "pooled"}
     one = run(tmp_path, "one", {"a": [2.0], "b": [4.0, 4.0, 4.0]}, **pooled)
     two = run(tmp_path, "two", {"a": [1.0], "b": [4.0, 4.0, 4.0]}, **pooled)
     comparison = compare([one, two])
@@ -114,7 +115,7 @@ def test_six_frames_have_an_interval_around_the_gain_and_p_is_adjusted(tmp_path:
     ]
 
 
-FLICKER = {"changes": {"groups": ("flicker",)}}
+FLICKER = {"groups": ("flicker",)}
 
 
 def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path: Path) -> None:
@@ -159,7 +160,7 @@ def test_frames_of_one_group_are_swapped_together(tmp_path: Path) -> None:
 
 def test_different_rules_are_refused_and_named(tmp_path: Path) -> None:
     one = run(tmp_path, "one", FIRST)
-    two = run(tmp_path, "two", FIRST, changes={"max_depth": 50.0})
+    two = run(tmp_path, "two", FIRST, max_depth=50.0)
     with pytest.raises(InputError) as error:
         compare([one, two])
     assert str(error.value) == (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, Evaluation, evaluate
-from pnpdepth_cli.commands.evaluation.frames import Scales
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.tables import worst
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.depth import write_depth
@@ -27,14 +27,7 @@ def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
 
 
 def scored(root: Path, **options: Any) -> Evaluation:
-    changes = {
-        name: options.pop(name)
-        for name in list(options)
-        if name not in {each.name for each in fields(EvalRequest)}
-    }
-    return evaluate(
-        EvalRequest(prediction=root / "out", ground_truth=root / "gt", changes=changes, **options)
-    )
+    return evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **options))
 
 
 @pytest.fixture
@@ -238,7 +231,7 @@ def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
         (tmp_path / folder).mkdir()
         cv2.imwrite(str(tmp_path / folder / "a.png"), codes)
     assert scored(tmp_path).mean["rmse"] == 0
-    by_option = scored(tmp_path, scales=Scales(prediction=1000.0, truth=1000.0))
+    by_option = scored(tmp_path, pred_scale=1000.0, gt_scale=1000.0)
     assert by_option.mean["mae"] == 0
     assert by_option.frames[0].kinds["gt"].scale == 1000
     nyu = scored(tmp_path, protocol="nyu-eigen", crop="none")
@@ -278,17 +271,17 @@ def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(
         else:
             depth_file(tmp_path / folder / "a.npy", depth)
     option, field = {
-        "gt": ("--gt-scale", "truth"),
-        "out": ("--pred-scale", "prediction"),
-        "sparse": ("--sparse-scale", "sparse"),
+        "gt": ("--gt-scale", "gt_scale"),
+        "out": ("--pred-scale", "pred_scale"),
+        "sparse": ("--sparse-scale", "sparse_scale"),
     }[side]
     inputs = {"sparse": tmp_path / "sparse"} if side == "sparse" else {}
     with pytest.raises(InputError) as error:
         scored(tmp_path, **inputs)
     assert f"{option} {codes} (now 256) would remove it, {option} 256 keeps it" in str(error.value)
-    right = scored(tmp_path, scales=Scales(**{field: float(codes)}), **inputs)
+    right = scored(tmp_path, **{field: float(codes)}, **inputs)
     assert right.mean["rmse"] == 0
-    wrong = scored(tmp_path, scales=Scales(**{field: 256.0}), **inputs)
+    wrong = scored(tmp_path, **{field: 256.0}, **inputs)
     assert any("a scale is probably wrong" in note for note in wrong.notes)
 
 
@@ -422,13 +415,11 @@ def test_predictions_of_kittis_benchmark_crop_are_aligned_with_the_frame(tmp_pat
 
 REFUSED = [
     ({"layout_protocol": "whole"}, "--layout-protocol whole is for data sets"),
-    ({"scales": Scales(truth=0.0)}, "--gt-scale"),
-    ({"scales": Scales(prediction=math.nan)}, "--pred-scale"),
-    ({"workers": 0}, "--workers"),
+    ({"gt_scale": 0.0}, "--gt-scale"),
+    ({"pred_scale": math.nan}, "--pred-scale"),
     ({"groups": ("edge",)}, "unknown group of measures 'edge'; did you mean 'edges'"),
     ({"groups": ("area",), "average": "pooled"}, "--average pooled does not apply"),
     ({"groups": ("area",), "protocol": "kitti-devkit"}, "--measures does not apply to kitti-"),
-    ({"resamples": -1}, "--bootstrap"),
 ]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, evaluate
+from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.pairing import (
     FramePair,
     frame_name,
@@ -18,6 +18,7 @@ from pnpdepth_cli.commands.evaluation.pairing import (
     pair_frames,
     stack_size,
 )
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 
@@ -183,7 +184,8 @@ def test_stacked_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> No
         prediction=tmp_path / "disps.npy",
         ground_truth=tmp_path / "gt_depths.npz",
         protocol="garg",
-        changes={"prediction_kind": "disparity", "scale_by": "median"},
+        prediction_kind="disparity",
+        scale_by="median",
     )
     result = evaluate(request)
     errors, ratios = [], []

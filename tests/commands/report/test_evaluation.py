@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.report.evaluation import _charts, write_eval_report
 from pnpdepth_cli.errors import StorageError
 from pnpdepth_cli.io.depth import write_depth
