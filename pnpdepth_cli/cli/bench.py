@@ -22,7 +22,7 @@ from pnpdepth_cli.settings import Settings
         "Input": ("--size", "--points"),
         "Network": (NetworkChoice, "--precision"),
         "Method": (Settings,),
-        "Run": ("--repeats", "--table"),
+        "Run": ("--repeats",),
         "Output": ("--json",),
     },
 )
@@ -41,20 +41,14 @@ from pnpdepth_cli.settings import Settings
 @click.option(
     "--repeats", type=int, default=10, show_default=True, metavar="N", help="Runs of each part."
 )
-@click.option(
-    "--table",
-    is_flag=True,
-    help="Measure the paper's seven networks, beside its Table IV.",
-)
 @options.as_json
-def bench(size: str | None, table: bool, as_json: bool, **values: Any) -> None:
+def bench(size: str | None, as_json: bool, **values: Any) -> None:
     """Measure the run time of a refinement on this machine, by part and in forward passes.
 
     \b
     pnpdepth bench
     pnpdepth bench --model net.onnx --layer Relu_315 --size 480x640
     pnpdepth bench --precision bf16
-    pnpdepth bench --table --repeats 5
 
     The frame is synthetic; a network without weights gets random ones. The parts run alternately.
     The table has median, quartiles, and median in forward passes. The limit is the least cost of K
@@ -63,16 +57,6 @@ def bench(size: str | None, table: bool, as_json: bool, **values: Any) -> None:
     """
     if values["repeats"] < 1:
         raise UsageError(f"--repeats must be >= 1, got {values['repeats']}")
-    if table:
-        refused = {"--size": size} | {
-            f"--{name}": values.pop(name) for name in ("checkpoint", "layer", "iterations")
-        }
-        if clash := [name for name, value in refused.items() if value is not None]:
-            raise UsageError(
-                f"--table measures the paper's networks and cannot be combined with {clash[0]}"
-            )
-        _table(as_json, **values)
-        return
     from pnpdepth_cli.commands.bench import run_bench
 
     values["size"] = options.height_and_width(size) if size else None
@@ -110,54 +94,6 @@ def _print(result: dict[str, Any]) -> None:
     click.echo(
         f"a refinement takes {result['parts']['refinement']['forwards']:.2f} forward passes; the"
         f" limit is {result['limit']:.2f}"
-    )
-
-
-def _table(as_json: bool, **values: Any) -> None:
-    """Prints the times of the paper's networks: full size, random weights, K = 5."""
-    from pnpdepth_cli.cli.tables import print_rows
-    from pnpdepth_cli.commands.bench import PAPER_TIMES, run_bench
-
-    results = []
-    with progress_bar("bench", "network") as show:
-        for number, paper in enumerate(PAPER_TIMES):
-            show(number, len(PAPER_TIMES), paper.model)
-            each = {**values, "model": paper.model, "size": paper.size, "iterations": 5}
-            results.append((paper, run_bench(**each)))
-    if as_json:
-        records = [{"paper": paper._asdict(), "bench": ours} for paper, ours in results]
-        click.echo(json.dumps(records, indent=2))
-        return
-    rows = []
-    for paper, ours in results:
-        forward, refinement = ours["parts"]["forward"], ours["parts"]["refinement"]
-        memory = refinement["peak_mb"]
-        printed = ["–"] * 3
-        if paper.before is not None and paper.after is not None:
-            ratio = f"{paper.after / paper.before:.2f}"
-            printed = [_ms(paper.before), _ms(paper.after), ratio]
-        rows.append(
-            [
-                paper.model,
-                f"{paper.name}, {paper.data}",
-                f"{paper.size[1]}×{paper.size[0]}",
-                _ms(forward["median_s"]),
-                _ms(refinement["median_s"]),
-                f"{refinement['forwards']:.2f}",
-                f"{ours['limit']:.2f}",
-                "–" if memory is None else f"{memory:,.0f} MB",
-                *printed,
-            ]
-        )
-    print_rows(
-        f"Table IV: random weights, K = 5, {values['precision']}, {values['device']},"
-        f" {results[0][1]['threads']} threads, medians of {values['repeats']}; beside the paper's"
-        " figures",
-        (
-            *("network", "paper's\nname", "size", "forward", "refinement", "×", "limit", "memory"),
-            *("paper,\nforward", "paper,\nrefinement", "paper,\n×"),
-        ),
-        rows,
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -208,30 +208,3 @@ def peak_mb(run: Callable[[], object], device: torch.device) -> float | None:
 def _kilobytes(name: str) -> int:
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
-
-
-class PaperTime(NamedTuple):
-    """A network of the paper's Table IV, and the seconds that the paper prints."""
-
-    name: str
-    """The paper's name of it."""
-    model: str
-    """Ours."""
-    data: str
-    size: tuple[int, int]
-    """(H, W) of its frames."""
-    before: float | None = None
-    """The network alone, on a GPU that the paper does not name; None if not printed."""
-    after: float | None = None
-
-
-PAPER_TIMES = (
-    PaperTime("Eigen", "eigen", "NYU", (228, 304)),
-    PaperTime("FCRN", "fcrn", "NYU", (228, 304)),
-    PaperTime("Zhou", "sfmlearner", "KITTI", (128, 416)),
-    PaperTime("Uhrig", "sparseconv", "KITTI", (352, 1216), 0.0311, 0.1614),
-    PaperTime("Chodosh", "adnn", "KITTI", (352, 1216), 0.0320, 0.0447),
-    PaperTime("Ma", "sparse2dense-r18-deconv3", "NYU", (228, 304), 0.0046, 0.0233),
-    PaperTime("Jaritz", "latefusion", "NYU", (224, 320), 0.0484, 0.1593),
-)
-"""Wang et al. (ICRA 2019), Table IV, and the three networks that it leaves out."""

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.commands import bench
-from pnpdepth_cli.commands.bench import FIRST_FRAME, PAPER_TIMES, in_turn, run_bench
+from pnpdepth_cli.commands.bench import FIRST_FRAME, in_turn, run_bench
 from pnpdepth_cli.errors import LayerError, UsageError
 from tests.commands.frames import FrameOnDisk, frame_on_disk
 
@@ -61,13 +61,6 @@ def test_a_missing_layer_and_no_points_are_errors(frame: FrameOnDisk) -> None:
         measured(frame, layer="midle")
     with pytest.raises(UsageError, match="at least one"):
         measured(frame, points=0)
-
-
-def test_the_papers_table_has_its_seven_networks_and_its_four_ratios() -> None:
-    assert len({paper.name for paper in PAPER_TIMES}) == 7
-    printed = [(p.name, p.before, p.after) for p in PAPER_TIMES]
-    ratios = {name: round(after / before, 1) for name, before, after in printed if before and after}
-    assert ratios == {"Ma": 5.1, "Jaritz": 3.3, "Uhrig": 5.2, "Chodosh": 1.4}
 
 
 def test_parts_run_in_turn_and_the_first_round_does_not_count() -> None:
