@@ -11,7 +11,6 @@ from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.commands.refinement.request import NetworkChoice
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import Settings
 
 
@@ -33,13 +32,23 @@ from pnpdepth_cli.settings import Settings
     "--size", metavar="HxW", help="Size of the frame.  [default: 480x640, or the network's]"
 )
 @click.option(
-    "--points", type=int, default=500, show_default=True, metavar="N", help="Number of points."
+    "--points",
+    type=click.IntRange(1),
+    default=500,
+    show_default=True,
+    metavar="N",
+    help="Number of points.",
 )
 @click.option("--iterations", type=int, metavar="K", help="Number of updates of z.")
 @options.precision
 @options.device
 @click.option(
-    "--repeats", type=int, default=10, show_default=True, metavar="N", help="Runs of each part."
+    "--repeats",
+    type=click.IntRange(1),
+    default=10,
+    show_default=True,
+    metavar="N",
+    help="Runs of each part.",
 )
 @options.as_json
 def bench(size: str | None, as_json: bool, **values: Any) -> None:
@@ -55,8 +64,6 @@ def bench(size: str | None, as_json: bool, **values: Any) -> None:
     updates: (front + (2K+1) rear) / (front + rear). Memory is the peak of a part beyond the memory
     in use before it.
     """
-    if values["repeats"] < 1:
-        raise UsageError(f"--repeats must be >= 1, got {values['repeats']}")
     from pnpdepth_cli.commands.bench import run_bench
 
     values["size"] = options.height_and_width(size) if size else None

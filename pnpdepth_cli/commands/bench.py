@@ -18,7 +18,7 @@ from pnpdepth_cli.choices import LOSSES
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
@@ -62,8 +62,6 @@ def run_bench(
         repeats: Measured runs, after one warm-up.
         on_round: Called with (done, of) after every round, in which each part runs once.
     """
-    if repeats < 1 or points < 1:
-        raise UsageError(f"repeats {repeats}, points {points}: there must be at least one")
     torch.manual_seed(0)  # the same random weights each time
     network = load_network(model, checkpoint, device, precision=precision, untrained=True)
     policy = network.definition.size

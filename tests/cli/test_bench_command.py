@@ -28,7 +28,8 @@ def test_the_table_goes_to_stdout_and_what_it_was_measured_with_to_stderr(
 @pytest.mark.parametrize(
     ("more", "code", "message"),
     [
-        (["--repeats", "0"], 2, "--repeats must be >= 1"),
+        (["--repeats", "0"], 2, "0 is not in the range x>=1"),
+        (["--layer", "encod"], 4, "did you mean encode"),
         (["--size", "big"], 2, "HxW"),
     ],
 )

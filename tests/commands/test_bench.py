@@ -12,7 +12,6 @@ import torch
 
 from pnpdepth_cli.commands import bench
 from pnpdepth_cli.commands.bench import FIRST_FRAME, in_turn, run_bench
-from pnpdepth_cli.errors import LayerError, UsageError
 from tests.commands.frames import FrameOnDisk, frame_on_disk
 
 
@@ -54,13 +53,6 @@ def test_where_no_layer_is_named_the_cut_is_that_of_refine(
 ) -> None:
     monkeypatch.setattr(bench, "default_layer", lambda network, size, count: "encode")
     assert measured(frame)["layer"] == "encode"
-
-
-def test_a_missing_layer_and_no_points_are_errors(frame: FrameOnDisk) -> None:
-    with pytest.raises(LayerError, match="midle"):
-        measured(frame, layer="midle")
-    with pytest.raises(UsageError, match="at least one"):
-        measured(frame, points=0)
 
 
 def test_parts_run_in_turn_and_the_first_round_does_not_count() -> None:

@@ -16,6 +16,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.dataset import (
@@ -30,7 +31,6 @@ from pnpdepth_cli.io.dataset import (
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray
 from pnpdepth_cli.io.layouts import find_layout, list_frames
-from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.remote import RemotePath
 
 _DEPTH_MARKS = ("_depth", ".depth")
@@ -197,14 +197,12 @@ def _by_frame(
 
 def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePair:
     """The frame with what the record of a refinement, beside its depth, says of its inputs."""
-    record, sigma = {}, None
+    record: Mapping[str, Any] = {}
+    sigma: Path | None = None
     if prediction is not None:
-        name = _base(prediction.stem, _DEPTH_MARKS) or prediction.stem
-        suffixes = (prediction.suffix, ".exr", ".npy")
-        sigmas = (prediction.with_name(f"{name}_sigma{suffix}") for suffix in suffixes)
-        sigma = next((file for file in sigmas if file.is_file()), None)
         with contextlib.suppress(PnpDepthError):
-            record = read_json(prediction.with_name(f"{name}.json"))
+            (result,) = result_frames(prediction)
+            record, sigma = result.record, result.sigma
     inputs = _dict(record.get("inputs"))
     used, sampling = _dict(record.get("points")).get("used"), _dict(inputs.get("sparse"))
     is_sampled = "sampled_from" in sampling

@@ -117,7 +117,7 @@ def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
     write_depth(tmp_path / "gt" / "a.npy", GT)
     write_depth(tmp_path / "out" / "a_depth.npy", (GT + RNG.normal(0, 0.1, GT.shape)).astype("f4"))
-    write_depth(tmp_path / "out" / "a_sigma.exr", np.full(GT.shape, 0.1, np.float32))
+    write_depth(tmp_path / "out" / "a_sigma.npy", np.full(GT.shape, 0.1, np.float32))
     result = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "gt"))
     assert result.uncertainty is not None
     assert result.uncertainty["within_1_sigma"] == pytest.approx(0.683, abs=0.03)
