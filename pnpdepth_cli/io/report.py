@@ -112,7 +112,8 @@ def check_report_folder(
         if read.is_relative_to(resolved):
             raise OutputError(f"{folder} holds {source}, which is read; name another folder")
     try:
-        empty = not folder.exists() or next(folder.iterdir(), None) is None
+        # hidden files are of a writer that was killed
+        empty = not folder.exists() or all(path.name[0] == "." for path in folder.iterdir())
     except OSError as error:
         raise cannot_write(folder, error) from error
     if not (empty or overwrite or _is_of(folder, made_of)):
@@ -132,19 +133,12 @@ def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
 @contextmanager
 def whole_report(folder: Path) -> Iterator[Path]:
     """Yields a folder for a report that replaces the one in `folder`, which stays if it fails."""
-    remove_report_leftovers(folder)
+    remove_leftovers(folder)  # of a writer that was killed
     with atomic_folder(folder) as temporary:
         yield temporary
         images = {path.name for path in (temporary / IMAGES).iterdir()}
+        images |= {VIEWER} if (temporary / VIEWER).exists() else set()
     _remove_unused(folder, images)
-
-
-def remove_report_leftovers(folder: Path) -> int:
-    """Removes what killed writers left, while nobody writes; returns how many there were."""
-    try:
-        return sum(remove_leftovers(path) for path in (folder, folder / IMAGES) if path.is_dir())
-    except OSError as error:
-        raise cannot_write(folder, error) from error
 
 
 def image_key(name: str) -> str:
@@ -225,19 +219,11 @@ def save_views(images: Path, key: str, views: Mapping[str, Pixels]) -> dict[str,
 
 
 def link_image(source: Path, target: Path) -> None:
-    """Makes `target` the same file as `source`, or a copy of it on another file system."""
+    """Makes the new file `target` the same as `source`, or a copy of it on another disk."""
     try:
-        old, new = (target.stat() if target.exists() else None), source.stat()
-    except OSError as error:
-        raise cannot_write(target, error) from error
-    if old and (old.st_mtime_ns, old.st_size) == (new.st_mtime_ns, new.st_size):
-        return
-    with atomic_path(target) as temporary:
-        temporary.unlink()
-        try:
-            os.link(source, temporary)
-        except OSError:
-            shutil.copy2(source, temporary)
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def save_view_3d(source: Path, target: Path) -> float:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.error_tables import (
     BASES,
     GT,
@@ -38,6 +38,7 @@ from pnpdepth_cli.io.report import (
     image_key,
     link_image,
     save_view_3d,
+    whole_report,
     write_report,
 )
 
@@ -60,97 +61,107 @@ _LABELS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class BatchReport:
-    """Writes the report of a batch."""
+def check_batch_report(request: BatchRequest, folder: Path, files: Iterable[Path]) -> None:
+    """Raises OutputError for a folder that the report cannot or may not be written to.
 
-    folder: Path
-    output: Path
-    """The folder of the results."""
-    view_3d: bool = False
-    colors: str = "blue-orange"
-    """Colours of the improvement maps."""
+    Args:
+        request: Of the batch.
+        folder: Of the report.
+        files: Those that the batch reads.
+    """
+    inside, output = folder.resolve(), request.output.resolve()
+    if output.is_relative_to(inside):
+        raise OutputError(
+            f"{folder} holds the results; name a folder of its own for the report, such as"
+            f" {request.output / 'report'}"
+        )
+    inputs = [request.source, *(files if folder.exists() else ())]
+    others = [path for path in inputs if not _holds_results(path, output, inside)]
+    overwrite = request.refine.outputs.overwrite
+    check_report_folder(folder, others, made_of=_source(request, folder), overwrite=overwrite)
 
-    def check(self, inputs: Sequence[Path], *, overwrite: bool) -> None:
-        """Raises OutputError for a folder that the report cannot or may not be written to."""
-        folder, output = self.folder.resolve(), self.output.resolve()
-        if output.is_relative_to(folder):
-            raise OutputError(
-                f"{self.folder} holds the results; name a folder of its own for the report, such as"
-                f" {self.output / 'report'}"
-            )
-        others = [path for path in inputs if not _holds_results(path, output, folder)]
-        check_report_folder(self.folder, others, made_of=self._source(), overwrite=overwrite)
 
-    def begin(self) -> None:
-        """Creates the folder, marked so that the next run may replace it."""
-        begin_report(self.folder, self._source())
+def write_batch_report(
+    request: BatchRequest,
+    folder: Path,
+    summary: Mapping[str, Any],
+    rows: Callable[[], Iterable[Row]],
+) -> None:
+    """Writes the page, and links the images of all frames.
 
-    def write(self, summary: Mapping[str, Any], rows: Callable[[], Iterable[Row]]) -> None:
-        """Writes the page, and links the images of all frames.
+    Args:
+        request: Of the batch.
+        folder: Of the report.
+        summary: The batch's summary without its frames.
+        rows: Gives the summary's rows, each time anew.
+    """
+    bases, failed, first = set[str | None](), [], None
+    for row in rows():
+        if row["outputs"]:
+            first = first or row
+            bases.add(_basis(row))
+        else:
+            failed.append((row["name"], row["message"]))
+    mixed = len(bases - {None}) > 1
+    head = _head(summary, first, failed, request.refine.outputs.colors)
+    with whole_report(folder) as temporary:
+        begin_report(temporary, _source(request, folder))
+        entries = (
+            _entry(row, head.columns, mixed) | _views(row, request, temporary)
+            for row in rows()
+            if row["outputs"]
+        )
+        write_report(temporary, head, entries, viewer=request.html_3d)
 
-        Args:
-            summary: The batch's summary without its frames.
-            rows: Gives the summary's rows, each time anew.
-        """
-        bases, failed, first = set[str | None](), [], None
-        for row in rows():
-            if row["outputs"]:
-                first = first or row
-                bases.add(_basis(row))
-            else:
-                failed.append((row["name"], row["message"]))
-        bases.discard(None)
-        head, mixed = _head(summary, first, failed, self.colors), len(bases) > 1
-        entries = (self._entry(row, head.columns, mixed) for row in rows() if row["outputs"])
-        write_report(self.folder, head, entries, viewer=self.view_3d)
 
-    def _source(self) -> dict[str, Any]:
-        folder, output = self.folder.resolve(), self.output.resolve()
-        return {"command": "batch", "output": os.path.relpath(output, folder)}
+def _source(request: BatchRequest, folder: Path) -> dict[str, Any]:
+    """What the report is made of."""
+    output = os.path.relpath(request.output.resolve(), folder.resolve())
+    return {"command": "batch", "output": output}
 
-    def _entry(self, row: Row, columns: Sequence[Column], mixed: bool) -> dict[str, Any]:
-        basis = _basis(row)
-        values = _values(row, basis)
-        if basis == USED and columns[0].signed:
-            values = {}  # others have a gain that means something
-        tag = BASES[basis] if mixed and basis else ""
-        try:
-            views = self._views(row)
-        except InputError:  # a result has gone or changed; the next run refines it again
-            views = {"key": None}
-        return {
-            "name": row["name"],
-            "values": [values.get(column.key) for column in columns],
-            "notes": _notes(row, basis),
-            "tag": "diverged" if row["status"] == "diverged" else tag,
-            **views,
-        }
 
-    def _views(self, row: Row) -> dict[str, Any]:
-        """Links the images of the row's frame; returns the page's entry of them."""
-        files = {kind: self.output / path for kind, path in row["outputs"].items()}
-        if not ("preview" in files and "improvement" in files):
-            return {"key": None}
-        key, views, figures = image_key(row["name"]), {}, {}
-        for kind in ("preview", "improvement"):
-            figure = figures[kind] = figure_content(files[kind])
-            name = f"{IMAGES}/{key}_{kind}.png"
-            link_image(files[kind], self.folder / name)
-            for panel in figure["panels"]:
-                if panel["title"] in _PANELS:
-                    place = {"src": name, "box": panel["box"], "size": figure["size"]}
-                    views[_PANELS[panel["title"]]] = place
-        view_mb = None
-        if self.view_3d and "view" in files:
-            view_mb = save_view_3d(files["view"], self.folder / IMAGES / f"{key}_view.js")
-        return {
-            "key": key,
-            "views": views,
-            "view_mb": view_mb,
-            "scale_m": [figures["preview"][end] for end in ("low_m", "high_m")],
-            "map": {name: figures["improvement"][name] for name in ("ends", "unknown", "footer")},
-        }
+def _entry(row: Row, columns: Sequence[Column], mixed: bool) -> dict[str, Any]:
+    basis = _basis(row)
+    values = _values(row, basis)
+    if basis == USED and columns[0].signed:
+        values = {}  # others have a gain that means something
+    tag = BASES[basis] if mixed and basis else ""
+    return {
+        "name": row["name"],
+        "values": [values.get(column.key) for column in columns],
+        "notes": _notes(row, basis),
+        "tag": "diverged" if row["status"] == "diverged" else tag,
+    }
+
+
+def _views(row: Row, request: BatchRequest, folder: Path) -> dict[str, Any]:
+    """Links the images of the row's frame; returns the page's entry of them.
+
+    There are none of a result that has gone or changed; the next run refines it again.
+    """
+    files = {kind: request.output / path for kind, path in row["outputs"].items()}
+    key, views = image_key(row["name"]), dict[str, Any]()
+    try:
+        figures = {kind: figure_content(files[kind]) for kind in ("preview", "improvement")}
+    except (KeyError, InputError):
+        return {"key": None}
+    for kind, figure in figures.items():
+        name = f"{IMAGES}/{key}_{kind}.png"
+        link_image(files[kind], folder / name)
+        for panel in figure["panels"]:
+            if panel["title"] in _PANELS:
+                place = {"src": name, "box": panel["box"], "size": figure["size"]}
+                views[_PANELS[panel["title"]]] = place
+    view_mb = None
+    if request.html_3d and "view" in files:
+        view_mb = save_view_3d(files["view"], folder / IMAGES / f"{key}_view.js")
+    return {
+        "key": key,
+        "views": views,
+        "view_mb": view_mb,
+        "scale_m": [figures["preview"][end] for end in ("low_m", "high_m")],
+        "map": {name: figures["improvement"][name] for name in ("ends", "unknown", "footer")},
+    }
 
 
 def _holds_results(path: Path, output: Path, folder: Path) -> bool:

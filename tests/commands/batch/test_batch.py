@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.batch.batch import plan_batch, run_batch
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import _SCORES, Tally
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
-from pnpdepth_cli.commands.report.batch import BatchReport
+from pnpdepth_cli.commands.report.batch import write_batch_report
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
@@ -471,8 +471,8 @@ def test_a_plain_prediction_without_scores_ends_no_batch(
     assert means["mean"]["scores"]["after"]["rmse"] > 0
     print_batch(content | means)
     assert "–" in capsys.readouterr().err
-    report = BatchReport(folder=tmp_path / "report", output=root / "out")
-    report.write(content | means, lambda: content["frames"])
+    request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
+    write_batch_report(request, tmp_path / "report", content | means, lambda: content["frames"])
     assert frames_of(tmp_path / "report")["a"]["values"]["rmse_before"] is None
 
 
