@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from pnpdepth_cli.commands.tables import Cell, Table
+from pnpdepth_cli.commands.tables import Cell, Style, Table
 
 GT, HELD_OUT, HIDDEN, USED = "scores", "held_out_error", "check", "sparse_error"
 BASES = {
@@ -75,9 +75,9 @@ def error_table(caption: str, errors: Mapping[str, Any], unit: str) -> Table:
                 continue
             values = [side.get(key) for side in (before, after, sides["linear"])]
             shown = [format_error(key, value, unit) for value in values]
-            changes = [change(key, beside, values[1]) for beside in (values[0], values[2])]
-            if basis == USED:
-                changes = ["", ""]
+            changes = ["", ""]
+            if basis != USED:
+                changes = [change(key, beside, values[1]) for beside in (values[0], values[2])]
             if basis != GT:
                 title = f"error {BASES[basis].replace('at ', f'at {count}')}, {title}"
             rows.append([title, *shown[:2], changes[0], shown[2], changes[1]])
@@ -126,7 +126,7 @@ def _stages_table(record: Mapping[str, Any]) -> Table:
     last = [name for name in rows if name != "linear"][-1:]
     lines = []
     for name, scores in rows.items():
-        style = "bold" if [name] == last else ""
+        style: Style = "bold" if [name] == last else ""
         against = "" if name == "linear" else change("mae", rows["linear"]["mae"], scores["mae"])
         cells = [format_error(key, scores[key], record["unit"]) for key in keys]
         title = _STAGES[name].format(name=record["model"]["name"])
@@ -152,7 +152,7 @@ def baselines_table(baselines: Mapping[str, Mapping[str, Any]], unit: str) -> Ta
     known = {name: row for name, row in rows.items() if row["held_out"] is not None}
     lines = []
     for name in sorted(known, key=lambda name: known[name]["held_out"]) or list(rows):
-        style = "bold" if name == "result" else ""
+        style: Style = "bold" if name == "result" else ""
         cells = [format_error("mae", rows[name].get(key), unit) for key in titles]
         lines.append([Cell(text, style) for text in (name, *cells)])
     header = ["", *titles.values()]
