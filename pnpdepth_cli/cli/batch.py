@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import threading
@@ -15,7 +14,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.streams import INTERRUPTED, printable
+from pnpdepth_cli.cli.streams import INTERRUPTED, print_json, printable, say
 from pnpdepth_cli.commands.batch.request import (
     BatchRequest,
     ClusterOptions,
@@ -99,13 +98,13 @@ def batch(
     request = unpacked(
         request,
         bag_options,
-        lambda text: click.echo(printable(text), err=True),
+        say,
         may_write=not dry_run,
     )
     if dry_run:
-        planned = plan_batch(request, lambda text: click.echo(printable(text), err=True))
+        planned = plan_batch(request, say)
         if as_json:
-            click.echo(json.dumps([{"name": name, "why": why} for name, why in planned], indent=2))
+            print_json([{"name": name, "why": why} for name, why in planned])
         else:
             for name, why in planned:
                 click.echo(f"{printable(name)}  ({printable(why)})")
@@ -129,13 +128,13 @@ def _run(request: BatchRequest, as_json: bool) -> int:
             return INTERRUPTED
     counts = outcome.summary["counts"]
     if as_json:
-        click.echo(json.dumps(outcome.summary, indent=2))
+        print_json(outcome.summary)
     else:
         print_batch(outcome.summary)
     if request.profile:
         print_profile(outcome.summary["profile"])
     if request.html is not None:
-        click.echo(printable(f"wrote {request.html / 'index.html'}"), err=True)
+        say(f"wrote {request.html / 'index.html'}")
     if outcome.stopped:
         click.echo(
             f"stopped after {progress.done:,} of {progress.to_do:,} frames; run the same command"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import progress_bar
-from pnpdepth_cli.cli.streams import printable
+from pnpdepth_cli.cli.streams import print_json, say
 from pnpdepth_cli.commands.refinement.request import NetworkChoice
 from pnpdepth_cli.settings import Settings
 
@@ -70,7 +69,7 @@ def bench(size: str | None, as_json: bool, **values: Any) -> None:
     with progress_bar("bench", "round") as show:
         result = run_bench(**values, on_round=show)
     if as_json:
-        click.echo(json.dumps(result, indent=2))
+        print_json(result)
     else:
         _print(result)
 
@@ -81,7 +80,7 @@ def _print(result: dict[str, Any]) -> None:
     threads = f"{result['threads']} thread{'' if result['threads'] == 1 else 's'}"
     click.echo(f"{result['device']}, {threads}, torch {result['versions']['torch']}", err=True)
     for note in result["notes"]:
-        click.echo(printable(note), err=True)
+        say(note)
     height, width = result["size"]
     print_rows(
         f"{result['model']} cut at {result['layer']}, {width}×{height}, {result['points']:,}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.streams import print_json
 from pnpdepth_cli.commands.evaluation.request import parse_names
 
 _LABEL_LETTERS = 36
@@ -88,7 +88,7 @@ def compare(
     table = comparison_table(comparison)
     to_stdout = files.write(csv=table, markdown=table, latex=methods_table(comparison))
     if files.as_json:
-        click.echo(json.dumps(comparison, indent=2))
+        print_json(comparison)
     elif not to_stdout:
         # a long label would make the table wider than a terminal
         rows = [[title, _short(label), *cells] for title, label, *cells in table.rows]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import click
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.compare import columns
 from pnpdepth_cli.cli.progress import progress_bar
-from pnpdepth_cli.cli.streams import printable
+from pnpdepth_cli.cli.streams import print_json, say
 from pnpdepth_cli.commands.evaluation.request import EvalRequest, ScoringRules
 from pnpdepth_cli.errors import FramesFailedError
 
@@ -102,14 +101,14 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     means = tables.means_row(evaluation, name, keys)
     to_stdout = files.write(csv=tables.frames_csv(evaluation), markdown=means, latex=means)
     if files.as_json:
-        click.echo(json.dumps(evaluation.as_record(), indent=2))
+        print_json(evaluation.as_record())
     elif not to_stdout:
         for table in tables.text_tables(evaluation, keys):
             print_table(table)
     if html is not None:
         with progress_bar("report", "frame") as show:
             report_eval.write_eval_report(html, evaluation, on_frame=show)
-        click.echo(printable(f"wrote {html / 'index.html'}"), err=True)
+        say(f"wrote {html / 'index.html'}")
     unscored = evaluation.unscored()
     if unscored is not None:
         raise FramesFailedError(unscored)

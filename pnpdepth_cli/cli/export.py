@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import click
 
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.streams import print_json
 
 
 @click.command(short_help="Write depth for COLMAP, Nerfstudio or 3DGS.")
@@ -37,7 +37,7 @@ def export(as_json: bool, **values: Any) -> None:
 
     record = export_results(**values)
     if as_json:
-        click.echo(json.dumps(record, indent=2))
+        print_json(record)
         return
     for note in record["notes"]:
         click.echo(note, err=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -13,7 +12,7 @@ import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.progress import progress_bar
-from pnpdepth_cli.cli.streams import printable
+from pnpdepth_cli.cli.streams import print_json, say
 from pnpdepth_cli.commands.refinement.request import NetworkChoice
 
 
@@ -47,7 +46,7 @@ def list_command(every: bool, as_json: bool) -> None:
     listed = list_models()
     hidden = Counter(model["family"] for model in listed if model["variant"] and not every)
     if as_json:
-        click.echo(json.dumps(listed, indent=2))
+        print_json(listed)
         return
     from pnpdepth_cli.cli.tables import print_rows
 
@@ -118,12 +117,12 @@ def fetch(repository: str, revision: str | None, output: Path | None, as_json: b
 def _print(record: Mapping[str, Any], as_json: bool) -> None:
     """Prints the record to stdout; as text, its `notes` go to stderr."""
     if as_json:
-        click.echo(json.dumps(record, indent=2))
+        print_json(record)
         return
     for key, value in record.items():
         if key == "notes":
             for note in value:
-                click.echo(printable(note), err=True)
+                say(note)
         elif isinstance(value, dict):
             click.echo(f"{key}:")
             for name, text in value.items():
@@ -168,7 +167,7 @@ def layers(
             on_layer=show,
         )
     if as_json:
-        click.echo(json.dumps([asdict(row) for row in result.rows], indent=2))
+        print_json([asdict(row) for row in result.rows])
         return
     from pnpdepth_cli.cli.tables import print_rows
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.cli.streams import print_json
 from pnpdepth_cli.commands.refinement.request import (
     FrameFiles,
     HoldOut,
@@ -71,7 +71,7 @@ def refine(as_json: bool, **values: Any) -> None:
 
         outcome = refine_image(request, on_iteration=show_update)
     if as_json:
-        click.echo(json.dumps(outcome.record, indent=2))
+        print_json(outcome.record)
     else:
         print_refinement(outcome.record)
     if outcome.diverged is not None:

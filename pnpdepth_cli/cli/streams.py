@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import json
 import os
 import signal
 import sys
 from typing import Any, TextIO
+
+import click
 
 INTERRUPTED = 128 + signal.SIGINT
 """The exit code after Ctrl-C."""
@@ -20,6 +23,16 @@ def printable(text: object) -> str:
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text)
     )
+
+
+def say(text: object) -> None:
+    """Prints a line on stderr."""
+    click.echo(printable(text), err=True)
+
+
+def print_json(value: Any) -> None:
+    """Prints a value of JSON's own types on stdout."""
+    click.echo(json.dumps(value, indent=2))
 
 
 def shortened(text: str) -> str:

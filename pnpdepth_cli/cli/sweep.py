@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import click
@@ -10,7 +9,7 @@ import click
 from pnpdepth_cli.choices import PLOT_FORMATS
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import BatchProgress
-from pnpdepth_cli.cli.streams import INTERRUPTED
+from pnpdepth_cli.cli.streams import INTERRUPTED, print_json
 from pnpdepth_cli.commands.batch.request import FrameSelection
 from pnpdepth_cli.commands.refinement.request import FrameFiles, NetworkChoice
 from pnpdepth_cli.commands.sparse.options import ScanOptions
@@ -152,7 +151,7 @@ def sweep(
             progress.say("stopped; run the same command to continue")
             raise click.exceptions.Exit(INTERRUPTED) from None
     if as_json:
-        click.echo(json.dumps(record, indent=2))
+        print_json(record)
     else:
         for study in record["studies"]:
             print_table(study_table(study, record))

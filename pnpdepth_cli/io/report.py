@@ -10,7 +10,7 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -43,22 +43,19 @@ _SMALL = 480  # smaller views are enlarged by a whole number, so that their pixe
 _QUALITY = 85
 
 
-@dataclass(frozen=True, kw_only=True)
-class Column:
-    """A value of each frame, and how the page shows it."""
+def column(key: str, title: str, **shown: Any) -> dict[str, Any]:
+    """Returns a value of each frame, and how the page shows it.
 
-    key: str
-    title: str
-    unit: str = ""
-    """Unit of value × factor."""
-    decimals: int = 4
-    factor: float = 1.0
-    percent: bool = False
-    higher_is_better: bool = False
-    signed: bool = False
-    """True if values above 0 are better and below 0 worse."""
-    listed: bool = True
-    """True to show it in the list of frames, not only in a frame's own view."""
+    Args:
+        key: Of the value.
+        title: Without the unit.
+        **shown: `unit` of value × `factor`; `decimals`; `percent`; `higher_is_better`; `signed` if
+            values above 0 are better and below 0 worse; `listed` in the list of frames, not only in
+            a frame's own view.
+    """
+    defaults = {"unit": "", "decimals": 4, "factor": 1.0, "percent": False, "signed": False}
+    defaults |= {"higher_is_better": False, "listed": True}
+    return {"key": key, "title": title, **defaults, **shown}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +76,8 @@ class Head:
     without_title: str = ""
     without: Sequence[tuple[str, str]] = ()
     """Name and reason of each frame that has no result."""
-    columns: Sequence[Column] = ()
+    columns: Sequence[Mapping[str, Any]] = ()
+    """As `column` returns them."""
     sort_by: str = ""
     """Key of the column that the page is sorted by at first."""
     labels: Mapping[str, str]
@@ -173,8 +171,8 @@ def write_report(
 
     style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
     data = {
-        "columns": [asdict(column) for column in head.columns],
-        "sort_by": next((n for n, c in enumerate(head.columns) if c.key == head.sort_by), 0),
+        "columns": head.columns,
+        "sort_by": next((n for n, c in enumerate(head.columns) if c["key"] == head.sort_by), 0),
         "labels": head.labels,
         "thumb": head.thumb,
         "unit": head.unit,

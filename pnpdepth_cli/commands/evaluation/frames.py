@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset import Hdf5Array
-from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_mask, rgb_of
+from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image, read_mask
 from pnpdepth_cli.io.depth import (
     DepthImage,
     DepthKind,
@@ -27,7 +27,6 @@ from pnpdepth_cli.io.depth import (
     known_metres,
     load_stored,
 )
-from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors import SamplePattern, sample_points
@@ -239,7 +238,7 @@ def image_of(pair: FramePair, size: Size) -> Depth | None:
     """
     if pair.image is None:
         return None
-    rgb = rgb_of(pair.image) if isinstance(pair.image, Hdf5Array) else read_rgb(pair.image).values
+    rgb = read_image(pair.image)
     if rgb.shape[:2] != size:
         rgb = pair.frame.protocol.apply(rgb)
     return rgb if rgb.shape[:2] == size else None

@@ -31,10 +31,10 @@ from pnpdepth_cli.io.colours import hex_colours, signed_bar
 from pnpdepth_cli.io.figure import figure_content
 from pnpdepth_cli.io.report import (
     IMAGES,
-    Column,
     Head,
     begin_report,
     check_report_folder,
+    column,
     image_key,
     link_image,
     save_view_3d,
@@ -120,15 +120,15 @@ def _source(request: BatchRequest, folder: Path) -> dict[str, Any]:
     return {"command": "batch", "output": output}
 
 
-def _entry(row: Row, columns: Sequence[Column], mixed: bool) -> dict[str, Any]:
+def _entry(row: Row, columns: Sequence[Mapping[str, Any]], mixed: bool) -> dict[str, Any]:
     basis = _basis(row)
     values = _values(row, basis)
-    if basis == USED and columns[0].signed:
+    if basis == USED and columns[0]["signed"]:
         values = {}  # others have a gain that means something
     tag = BASES[basis] if mixed and basis else ""
     return {
         "name": row["name"],
-        "values": [values.get(column.key) for column in columns],
+        "values": [values.get(shown["key"]) for shown in columns],
         "notes": _notes(row, basis),
         "tag": "diverged" if row["status"] == "diverged" else tag,
     }
@@ -178,20 +178,20 @@ def _measures(basis: str) -> tuple[str, ...]:
     return ("mae",) if basis == HIDDEN else ("rmse", "mae")
 
 
-def _columns(best: str, unit: str) -> list[Column]:
+def _columns(best: str, unit: str) -> list[dict[str, Any]]:
     """Errors before and after on the best basis; with gains unless it is the points used."""
     columns = []
     percent: dict[str, Any] = {"decimals": 1, "percent": True, "higher_is_better": True}
     for key in _measures(best):
         title = key.upper()
         if best != USED:
-            columns.append(Column(key=f"{key}_gain", title=f"{title} gain", signed=True, **percent))
+            columns.append(column(key=f"{key}_gain", title=f"{title} gain", signed=True, **percent))
         columns += [
-            Column(key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
+            column(key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
             for stage in ("before", "after")
         ]
     if best != HIDDEN:  # the map is then of the points used
-        columns.append(Column(key="improved", title="Improved", **percent))
+        columns.append(column(key="improved", title="Improved", **percent))
     return columns
 
 
@@ -242,7 +242,7 @@ def _head(
         without_title=f"Not refined: {len(failed):,}",
         without=failed,
         columns=columns,
-        sort_by="rmse_after" if best == USED else columns[0].key,
+        sort_by="rmse_after" if best == USED else columns[0]["key"],
         labels=_LABELS,
         thumb="second",
         map_colours=hex_colours(signed_bar(colors, 9)),

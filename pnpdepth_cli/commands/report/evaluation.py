@@ -17,10 +17,10 @@ from pnpdepth_cli.commands.tables import format_value, unit_of
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
-    Column,
     Head,
     begin_report,
     check_report_folder,
+    column,
     image_key,
     save_views,
     whole_report,
@@ -76,13 +76,13 @@ def frames_text(count: int) -> str:
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
-def _columns(evaluation: Evaluation) -> list[Column]:
+def _columns(evaluation: Evaluation) -> list[dict[str, Any]]:
     measures = evaluation.protocol.measures
     keys = {measure.key for measure in measures}
     listed = _LISTED if keys.issuperset(_LISTED) else tuple(keys)
     return [
         *(
-            Column(
+            column(
                 key=measure.key,
                 title=measure.title,
                 unit=unit_of(measure),
@@ -94,11 +94,11 @@ def _columns(evaluation: Evaluation) -> list[Column]:
             )
             for measure in measures
         ),
-        Column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
+        column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
     ]
 
 
-def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
+def _head(evaluation: Evaluation, columns: list[dict[str, Any]]) -> Head:
     request = evaluation.request
     without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
     fill = " (filled in)" if evaluation.protocol.is_devkit else ""
@@ -174,7 +174,7 @@ def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def _entry(
-    frame: FrameScores, evaluation: Evaluation, columns: list[Column], images: Path
+    frame: FrameScores, evaluation: Evaluation, columns: list[dict[str, Any]], images: Path
 ) -> dict[str, Any]:
     values = frame.values | {"coverage": frame.coverage}
     notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
@@ -188,7 +188,7 @@ def _entry(
         drawn = {"key": None}
     return {
         "name": frame.name,
-        "values": [values.get(column.key) for column in columns],
+        "values": [values.get(shown["key"]) for shown in columns],
         "notes": notes,
         "tag": "",
         **drawn,
