@@ -29,9 +29,7 @@ class TableFiles:
     markdown: Path | None
     latex: Path | None
     overwrite: bool
-    """Whether existing files are replaced."""
     as_json: bool
-    """Whether the result goes to stdout as JSON."""
 
     def check(self, inputs: Sequence[Path]) -> None:
         """Checks the files before the work.

@@ -75,7 +75,6 @@ class Head:
     (x, y) by the name of the line."""
     without_title: str = ""
     without: Sequence[tuple[str, str]] = ()
-    """Name and reason of each frame that has no result."""
     columns: Sequence[Mapping[str, Any]] = ()
     """As `column` returns them."""
     sort_by: str = ""
@@ -86,7 +85,6 @@ class Head:
     """The view in the list of a frame that has no `image`."""
     map_colours: Sequence[str] = ()
     unit: str = "m"
-    """Unit of depth."""
 
 
 def check_report_folder(

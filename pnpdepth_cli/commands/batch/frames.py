@@ -53,7 +53,6 @@ class BatchFrames:
     refused: Sequence[tuple[Frame, str]]
     """Frames whose results would have no files of their own, and why."""
     unmatched: tuple[Unmatched, ...]
-    """Files that are in no frame, and why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +61,6 @@ class Task:
 
     name: str
     request: RefineRequest
-    """With the frame's files."""
     inputs: dict[str, Path]
     """The files that are read for it, by their part."""
     outputs: Outputs

@@ -32,7 +32,6 @@ class FrameSelection:
     source: Path
     """A folder or a list of frames."""
     output: Path
-    """The folder for the results."""
     refine: RefineRequest
     """How a frame is refined; its files, output and protocol are set for each frame."""
     layout: str | None = option(
@@ -154,10 +153,8 @@ class BatchRequest(FrameSelection):
         " frames are refined with them if they are better. The network must take points.",
     )
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
-    """What a frame takes over from its neighbours."""
     profile: bool = option(False, "Print the time spent in each stage.")
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
-    """The Ray workers, if any."""
 
     def __post_init__(self) -> None:
         if self.adapt and self.shard is not None:

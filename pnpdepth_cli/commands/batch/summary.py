@@ -14,10 +14,8 @@ from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain
 
 Row = dict[str, Any]
-"""What the summary says of a frame."""
 # a file name that is no UTF-8 has surrogates; JSON escapes them so
 TEXT: Any = {"encoding": "utf-8", "errors": "backslashreplace", "newline": "\n"}
-"""How files of the summary are opened."""
 CSV, JSON = "summary.csv", "summary.json"
 
 _POINT_ERRORS = ("mae", "rmse")

@@ -45,11 +45,8 @@ class Run(NamedTuple):
     label: str
     """The file's name without its folder."""
     path: str
-    """As the user gave it."""
     measures: Sequence[Measure]
-    """Those of all frames."""
     scoring: dict[str, Any]
-    """The rules that decide the figures."""
     frames: dict[str, dict[str, Any]]
     """`values` by measure (NaN for null), scored `pixels`, `known` pixels of the ground truth (None
     where the file does not say), `group`, and `sums` of a pooled run."""

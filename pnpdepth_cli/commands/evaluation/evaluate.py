@@ -50,15 +50,11 @@ class Evaluation:
     frames: tuple[FrameScores, ...]
     """A row for each frame of the ground truth, in its order."""
     mean: dict[str, float]
-    """Over the scored frames, by the measure's key."""
     interval: dict[str, tuple[float, float]] | None
     """The ends of the 95 % interval of each mean; None with too few independent frames."""
     clusters: Clusters
-    """What the bootstrap resamples as a whole."""
     uncertainty: dict[str, Any] | None
-    """Whether predicted standard deviations are right; None without any."""
     notes: tuple[str, ...]
-    """What was assumed, and warnings; one line each."""
 
     @property
     def scored(self) -> tuple[FrameScores, ...]:

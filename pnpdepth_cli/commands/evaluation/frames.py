@@ -52,7 +52,6 @@ class LoadedFrame(MeasuredFrame):
     predicted: Mask | None = None
     """(H, W) true where the file has a prediction; None without a file."""
     fit: Fit | None = None
-    """How the prediction was scaled to the ground truth, if it was."""
     sigma: Depth | None = None
     """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
 

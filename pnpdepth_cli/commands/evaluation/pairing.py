@@ -59,19 +59,15 @@ class FramePair:
     sparse: Path | None = None
     """The network's sparse input: the user's, the run's record's or the data set's."""
     sparse_named: bool = False
-    """Whether the user named the sparse input."""
     sigma: Path | None = None
-    """The standard deviation that a refinement wrote beside its depth."""
     index: int | None = None
     """Of the frame, in files of several frames."""
     previous: FramePair | None = None
-    """The frame before in the same sequence."""
     sampling: dict[str, Any] | None = None
     """How the sparse input was sampled from the ground truth, by the run's record."""
     sampled: int = 0
     """Points of the ground truth that were the sparse input, by the run's record."""
     unit: str = METRES
-    """Of the prediction, by the run's record."""
     image: Source | None = None
     mask: Path | None = None
 

@@ -42,7 +42,6 @@ class EvalProtocol:
     """Ground truth is scored above it, and below `max_depth`."""
     max_depth: float | None = None
     clip: bool = False
-    """Whether predictions are clipped to these bounds."""
     crop: str = "none"
     """One of _CROPS, or X,Y,WIDTH,HEIGHT in pixels."""
     mask: Path | None = None
@@ -57,7 +56,6 @@ class EvalProtocol:
     """Part of the ground truth's frame that predictions show: "kb", or X,Y,WIDTH,HEIGHT; None for
     all of it. The rest counts as empty."""
     groups: tuple[str, ...] = ()
-    """Additional measures, names of MEASURE_GROUPS."""
     resize: str | None = None
     """How a prediction of another size is resized to the ground truth's; None refuses it."""
 

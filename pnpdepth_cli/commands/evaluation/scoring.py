@@ -55,9 +55,7 @@ class FrameScores:
     values: dict[str, float] = field(default_factory=dict)
     """Each measure by its key; empty where the frame was not scored."""
     error: str | None = None
-    """Why the frame was not scored; None if it was."""
     pixels: int = 0
-    """Scored pixels."""
     known: int = 0
     """Pixels with ground truth that the protocol scores."""
     predicted: int = 0

@@ -44,7 +44,6 @@ class ExportFrame:
     unit_scale: float
     """Units of the depth per unit of the COLMAP model; 1 without a model."""
     farthest: float
-    """Depth of the farthest sparse point."""
 
     @property
     def stem(self) -> str:
@@ -63,7 +62,6 @@ class Export:
 
     needs_pose: bool
     files: Callable[[Path, Sequence[ExportFrame]], list[Path]]
-    """The files that `write` writes into a folder."""
     write: Callable[[Path, Sequence[ExportFrame]], list[str]]
     """Writes them and returns notes. Raises PnpDepthError."""
 

@@ -56,11 +56,9 @@ class Inputs(Frame):
     record: dict[str, Any] = field(default_factory=dict)
     """Files and digests, for a record."""
     notes: tuple[str, ...] = ()
-    """What was assumed, and warnings."""
     camera: FrameCamera | None = None
     """The camera in pixels of the image frame. None: unknown."""
     has_neighbours: bool = False
-    """Whether `points` have those of other frames of the sequence."""
 
     @property
     def window(self) -> tuple[str, ...]:

@@ -53,7 +53,6 @@ class SweepRequest(FrameSelection):
     """What to vary, over which frames."""
 
     studies: Sequence[Study]
-    """As `studies_of` returns them."""
     sampling: Sampling | None = None
     """Where points come from unless that is varied; None for the frames' own, or else the ground
     truth."""
@@ -62,11 +61,8 @@ class SweepRequest(FrameSelection):
     seeds: int = 1
     """Draws of the points, with consecutive seeds."""
     plots: str = "png"
-    """One of PLOT_FORMATS, or "none"."""
     cost: bool = False
-    """True to report the time of the refinement beside its error."""
     resamples: int = 2000
-    """Bootstrap samples behind the intervals."""
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -83,7 +79,6 @@ class _Network:
     """A network of the sweep, and how its cells are computed."""
 
     spec: str
-    """What the user called it."""
     refiner: Refiner
     definition: ModelDefinition
     base: RefineRequest
