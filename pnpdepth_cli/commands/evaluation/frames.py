@@ -5,9 +5,9 @@ Predictions of relative networks are scaled to the ground truth of each image (`
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from pnpdepth_cli.commands.evaluation.measures import Depth, Floats, Mask, Measu
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, load_stacked
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, crop_window
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.errors import InputError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, SizeError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image, read_mask
@@ -29,7 +29,6 @@ from pnpdepth_cli.io.depth import (
 )
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors import SamplePattern, sample_points
 from pnpdepth_cli.sensors.sparse import as_depth_image
 
 Size = tuple[int, ...]
@@ -84,11 +83,10 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
         kinds["sparse"] = kind
     mask = _scored_mask(pair, gt, protocol)
     if protocol.exclude_sparse:
-        if sparse is None and pair.sampling is not None:
-            sparse = _sampled_again(pair, pair.sampling, gt)
         if sparse is None:
             raise InputError(
                 f"frame {pair.name} has no sparse depth file to exclude; give it with --sparse"
+                + ("; `pnpdepth sample` draws the same points again" if pair.sampled else "")
             )
         mask &= sparse == 0
     loaded = LoadedFrame(
@@ -205,28 +203,6 @@ def _known_sparse(
     depth = sparse.points.depth[inside]
     points = SparsePoints(xy=xy[inside], depth=depth, size=(height, width))
     return as_depth_image(points), DepthKind(sparse.source, sparse.scale, assumed)
-
-
-def _sampled_again(pair: FramePair, sampling: dict[str, Any], ground_truth: Depth) -> Depth:
-    """(H, W) the points that a run sampled from this ground truth, drawn again by its record."""
-    pattern: dict[str, Any] = {each.name: sampling.get(each.name) for each in fields(SamplePattern)}
-    image = image_of(pair, ground_truth.shape) if isinstance(pair.image, Path) else None
-    try:
-        if pattern["region"] is not None:
-            pattern["region"] = tuple(pattern["region"])
-        drawn = SamplePattern(**pattern)
-        points = sample_points(ground_truth, drawn, int(sampling["seed"]), image=image)
-    except (KeyError, TypeError, ValueError, UsageError) as error:
-        raise InputError(
-            f"the points of frame {pair.name} cannot be sampled again as its record says"
-            f" ({error}); give them with --sparse"
-        ) from error
-    if len(points.depth) < pair.sampled:
-        raise InputError(
-            f"the record of frame {pair.name} has {pair.sampled:,} points, but sampling again gives"
-            f" {len(points.depth):,}: it is of another ground truth; give them with --sparse"
-        )
-    return as_depth_image(points)
 
 
 def image_of(pair: FramePair, size: Size) -> Depth | None:

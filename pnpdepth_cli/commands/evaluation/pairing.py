@@ -63,8 +63,6 @@ class FramePair:
     index: int | None = None
     """Of the frame, in files of several frames."""
     previous: FramePair | None = None
-    sampling: dict[str, Any] | None = None
-    """How the sparse input was sampled from the ground truth, by the run's record."""
     sampled: int = 0
     """Points of the ground truth that were the sparse input, by the run's record."""
     unit: str = METRES
@@ -200,8 +198,8 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
             (result,) = result_frames(prediction)
             record, sigma = result.record, result.sigma
     inputs = _dict(record.get("inputs"))
-    used, sampling = _dict(record.get("points")).get("used"), _dict(inputs.get("sparse"))
-    is_sampled = "sampled_from" in sampling
+    used = _dict(record.get("points")).get("used")
+    is_sampled = "sampled_from" in _dict(inputs.get("sparse"))
     known = frame.sparse
     if known is not None and known.suffix.lower() not in DEPTH_SUFFIXES:
         known = None
@@ -212,7 +210,6 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
         sparse=sparse or _input(inputs, "sparse") or known,
         sparse_named=sparse is not None,
         sigma=sigma,
-        sampling=sampling if is_sampled else None,
         sampled=used if is_sampled and isinstance(used, int) else 0,
         image=_input(inputs, "image") or frame.image,
         unit=str(record.get("unit", METRES)),

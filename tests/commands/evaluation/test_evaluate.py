@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.tables import worst
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.sensors import SamplePattern, sample_points
 
 
 def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
@@ -319,9 +317,7 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
     (two / "out" / "a.json").write_text(json.dumps(record))
     assert scored(two).frames[0].leaked is None
     (two / "out" / "a.json").write_text(json.dumps(sampled))
-    with pytest.raises(
-        InputError, match=r"cannot be sampled again as its record says .*; give them with --sparse"
-    ):
+    with pytest.raises(InputError, match="give it with --sparse; `pnpdepth sample` draws"):
         scored(two, exclude_sparse=True)
 
 
@@ -470,26 +466,3 @@ def test_measures_of_the_scene_need_intrinsics(sequences: Path) -> None:
     assert 0 < result.mean["normal_angle"] < 90
     with pytest.raises(InputError, match="--measures distance needs the sparse depth of frame"):
         scored(sequences, groups=("distance",))
-
-
-def test_points_sampled_from_the_ground_truth_are_excluded_as_they_were_drawn(
-    tmp_path: Path,
-) -> None:
-    gt = np.random.default_rng(0).uniform(2, 9, (20, 30)).astype(np.float32)
-    points = sample_points(gt, SamplePattern(count=50), seed=7)
-    x, y = np.rint(points.xy).astype(int).T
-    depth = gt + 1
-    depth[y, x] = gt[y, x]  # copies the points
-    depth_file(tmp_path / "gt" / "a.npy", gt)
-    depth_file(tmp_path / "out" / "a_depth.npy", depth)
-    sampling = {"sampled_from": "gt/a.npy", **asdict(SamplePattern(count=50)), "seed": 7}
-    record = {"inputs": {"sparse": sampling}, "points": {"used": 50}}
-    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
-    assert scored(tmp_path).mean["mae"] == pytest.approx(1 - 50 / 600, rel=1e-5)
-    result = scored(tmp_path, exclude_sparse=True)
-    assert result.frames[0].pixels == 550
-    assert result.mean["mae"] == pytest.approx(1, rel=1e-5)
-    record["points"]["used"] = 51
-    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
-    with pytest.raises(InputError, match="it is of another ground truth; give them with --sparse"):
-        scored(tmp_path, exclude_sparse=True)
