@@ -52,9 +52,13 @@ class GroupedCommand(click.Command):
         for title, members in groups.items():
             flags: list[str] = []
             for member in members:
-                own = [member] if isinstance(member, str) else _flags(member)
-                flags += [flag for flag in own if flag is member or flag not in grouped]
-                grouped |= {*own}
+                if isinstance(member, str):
+                    flags.append(member)
+                    continue
+                own = (field.option.within or field.flag for field in options_of(member))
+                names = dict.fromkeys(flag.partition("/")[0] for flag in own)
+                flags += [name for name in names if name not in grouped]
+                grouped |= {*names}
             self.groups[title] = tuple(flags)
         if common is not None:
             self.params.append(_help_all())
@@ -83,11 +87,6 @@ class GroupedCommand(click.Command):
 def long_name(option: click.Option) -> str:
     """Returns the first of the option's names that starts with two dashes."""
     return next((name for name in option.opts if name.startswith("--")), option.opts[0])
-
-
-def _flags(request: type) -> list[str]:
-    flags = (field.option.within or field.flag for field in options_of(request))
-    return list(dict.fromkeys(flag.partition("/")[0] for flag in flags))
 
 
 _NAME_COLUMN = 22

@@ -65,11 +65,6 @@ class Inputs(Frame):
         """Names of the frames of its window up to this one; empty outside of windows."""
         return self.request.files.window
 
-    @property
-    def own_used(self) -> int:
-        """Number of its own points that are used."""
-        return len(self.own) - (0 if self.held_out is None else len(self.held_out))
-
 
 def read_inputs(request: RefineRequest) -> Inputs:
     """Returns the frame that is asked for.

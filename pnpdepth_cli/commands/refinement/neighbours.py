@@ -61,7 +61,11 @@ def read_neighbours(
     own, scans, notes = _in_numpy(used), list[NeighbourScan](), list[str]()
     record: list[dict[str, Any]] = []
     for neighbour in files.neighbours:
-        points, source = _in_numpy(points_of(neighbour.files)), _source_of(neighbour.files)
+        points, source = (
+            _in_numpy(points_of(neighbour.files)),
+            neighbour.files.sparse or neighbour.files.gt,
+        )
+        assert source is not None
         known = neighbour.motion
         if known is None:
             estimate = _estimated(files, neighbour.files, own, points, camera.camera)
@@ -108,12 +112,6 @@ def _estimated(
 def _keypoints(image: Source, protocol: Protocol, digest: str) -> Keypoints:
     """The keypoints of an image whose file has this digest."""
     return keypoints_of(np.ascontiguousarray(protocol.apply(read_image(image))))
-
-
-def _source_of(files: FrameFiles) -> Source:
-    source = files.sparse or files.gt
-    assert source is not None
-    return source
 
 
 def _name_of(files: FrameFiles) -> str:

@@ -121,7 +121,8 @@ def write_refined(
 def record_of(refiner: Refiner, inputs: Inputs, frame: Refined) -> dict[str, Any]:
     """Returns what the record says of a refined frame, apart from its files and times."""
     request, network, gt = inputs.request, refiner.network, inputs.gt
-    moved = {"moved": len(frame.used) - inputs.own_used} if inputs.has_neighbours else {}
+    own_used = len(inputs.own) - len(frame.held_out)
+    moved = {"moved": len(frame.used) - own_used} if inputs.has_neighbours else {}
     of_networks = [note for member in refiner.members for note in member.network.notes]
     stages = None if gt is None else frame.stages  # of the default method
     return {
