@@ -239,7 +239,7 @@ def _head(
         facts=_facts(summary, first),
         notes=notes,
         tables=[
-            *(_means(basis, mean, unit) for basis, mean in means.items()),
+            *(_means(basis, mean, unit, _linear(summary, basis)) for basis, mean in means.items()),
             *_baselines(summary.get("baselines"), unit),
         ],
         without_title=f"Not refined: {len(failed):,}",
@@ -263,6 +263,12 @@ def _mean_errors(summary: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return {basis: mean for basis, mean in means.items() if mean}
 
 
+def _linear(summary: Mapping[str, Any], basis: str) -> Mapping[str, Any]:
+    """The mean errors of linear interpolation of the points; empty at the points themselves."""
+    found = summary["linear"].get(basis) or {}
+    return {"mae": found["linear"]} if basis == _HIDDEN and found else found
+
+
 def _tiles(
     summary: Mapping[str, Any], means: Mapping[str, Mapping[str, Any]]
 ) -> list[tuple[str, str, str]]:
@@ -277,7 +283,9 @@ def _tiles(
         for measure in _measures(basis) if basis != _USED else ():
             before, after, gain = _changed(measure, mean)
             label = f"{measure.title} [{summary['unit']}]"
-            tiles.append((label, f"{before} → {after}", f"gain {gain} {_BASES[basis]}"))
+            linear = _linear(summary, basis).get(measure.key)
+            beside = "" if linear is None else f"; linear {format_value(measure, linear)}"
+            tiles.append((label, f"{before} → {after}", f"gain {gain} {_BASES[basis]}{beside}"))
     return tiles
 
 
@@ -307,16 +315,26 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str
     return facts
 
 
-def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
+def _means(basis: str, mean: Mapping[str, Any], unit: str, linear: Mapping[str, Any]) -> Table:
     measures = MEASURES if basis == _GT else _measures(basis)
-    rows = [[column_title(in_unit(each, unit)), *_changed(each, mean)] for each in measures]
+    rows = [
+        [
+            column_title(in_unit(each, unit)),
+            *_changed(each, mean),
+            format_value(each, linear.get(each.key)),
+        ]
+        for each in measures
+    ]
     if basis == _GT:
-        coverage = [mean[stage].get("coverage") for stage in ("before", "after")]
-        rows.append(["coverage", *("–" if c is None else f"{c:.2%}" for c in coverage), ""])
-    shown = 3 if basis == _USED else 4  # a gain at the points used means nothing
+        before, after, beside = (
+            "–" if errors.get("coverage") is None else f"{errors['coverage']:.2%}"
+            for errors in (mean["before"], mean["after"], linear)
+        )
+        rows.append(["coverage", before, after, "", beside])
+    shown = 3 if basis == _USED else 5  # neither gain nor linear means anything at the points used
     return Table(
         caption=f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}",
-        header=["", "before", "after", "gain"][:shown],
+        header=["", "before", "after", "gain", "linear"][:shown],
         rows=[row[:shown] for row in rows],
     )
 

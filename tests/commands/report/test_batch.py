@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -82,8 +83,11 @@ def test_every_frame_is_on_the_page_which_links_the_panels_of_its_files_on_disk(
     assert values["mae_gain"] != 0
     assert 0 < values["improved"] < 1
     (table, _) = page_data(report)["tables"]
-    assert table["header"] == ["", "before", "after", "gain"]
+    linear = json.loads((root / "out/summary.json").read_text())["linear"]["scores"]["mae"]
+    assert table["header"] == ["", "before", "after", "gain", "linear"]
     assert [row[0] for row in table["rows"]][:2] == ["RMSE [m] ↓", "MAE [m] ↓"]
+    assert table["rows"][1][4] == f"{linear:.4f}"
+    assert page_data(report)["tiles"][2][2].endswith(f"linear {linear:.4f}")
 
 
 def test_what_runs_before_and_what_was_lost_is_in_the_next_report_without_being_drawn_again(
