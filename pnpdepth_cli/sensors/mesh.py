@@ -53,9 +53,9 @@ class MeshVolume:
         if self.voxel is None:
             median = float(np.median(view.depth.ravel()[view.known]))
             self.voxel = _VOXEL_PX * median / float(view.camera.intrinsics[0, 0])
-        core, grid = self._open3d.core, self._grid or self._empty_grid(self.voxel)
-        self._grid = grid
-        image = self._open3d.t.geometry.Image
+        if self._grid is None:
+            self._grid = self._empty_grid(self.voxel)
+        core, image, grid = self._open3d.core, self._open3d.t.geometry.Image, self._grid
         depth = image(core.Tensor(_without_lens(view.depth, view.camera)[..., None]))
         colours = np.zeros((*view.depth.shape, 3), np.float32) if rgb is None else rgb
         # Open3D rounds pixel coordinates down; here whole numbers are the centres of pixels.
@@ -104,7 +104,10 @@ def _without_lens(values: NDArray[Any], camera: Camera) -> NDArray[Any]:
     if not camera.has_lens:
         return np.ascontiguousarray(values)
     height, width = values.shape[:2]
-    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
+    xy = np.stack(np.meshgrid(np.arange(float(width)), np.arange(float(height))), axis=-1).reshape(
+        -1, 2
+    )
     rays = replace(camera, lens="radial-tangential", distortion=()).unproject(xy, np.ones(len(xy)))
     seen = np.nan_to_num(camera.pixels_of(rays), nan=-1).astype(np.float32)
-    return np.asarray(cv2.remap(values, seen.reshape(height, width, 2), None, cv2.INTER_NEAREST))
+    columns, rows = (axis.reshape(height, width) for axis in seen.T)
+    return np.asarray(cv2.remap(values, columns, rows, cv2.INTER_NEAREST))
