@@ -99,7 +99,7 @@ class _Commands(click.Group):
     "--max-pixels",
     type=click.IntRange(1),
     metavar="N",
-    help="Largest image to read; files may have 4 N bytes.  [default: memory / 64, at most 2^28]",
+    help="Largest image to read; files may have 4 N bytes.  [default: memory / 64, at most 64e6]",
 )
 def cli(max_pixels: int | None) -> None:
     """Refine the depth of any depth network with sparse depth, without training."""

@@ -38,7 +38,7 @@ def test_an_unknown_name_suggests_a_near_one() -> None:
         find_definition("fcrn-tyni")
     with pytest.raises(ModelError, match="did you mean 'sparse2dense-r50-upproj'"):
         find_definition("sparse2dense-r50-upprj")
-    with pytest.raises(ModelError, match="known: compact"):
+    with pytest.raises(ModelError, match="`pnpdepth models` lists all"):
         find_definition("zzz")
 
 

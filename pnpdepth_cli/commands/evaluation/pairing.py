@@ -34,7 +34,7 @@ from pnpdepth_cli.io.layouts import find_layout, list_frames
 from pnpdepth_cli.io.remote import RemotePath
 
 _DEPTH_MARKS = ("_depth", ".depth")
-_COMPANIONS = ("_preview", "_improvement", "_sigma", "_valid")
+_COMPANIONS = ("_sigma_preview", "_preview", "_improvement", "_sigma", "_valid")
 # KITTI's selection names the kind of file in the middle.
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5

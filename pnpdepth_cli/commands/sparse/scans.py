@@ -92,7 +92,7 @@ def read_scan_points(
         calibration = _with_pose(calibration, *pose)
     size = size or calibration.size
     if size is None:
-        raise SizeError(f"{named} does not give the image's size; give the image too")
+        raise SizeError(f"{named} does not give the image's size; give --image or --size")
     warnings = check_size(named, calibration, size, image)
     scan = read_scan(path, options.point_fields)
     if calibration.rectified:

@@ -78,7 +78,7 @@ def _match(root: Path, name: str | None) -> str | None:
 
 
 def _nearest(root: Path) -> str:
-    """What the nearest layout lacks; what all need, if no layout is near."""
+    """What the nearest layout lacks; how to make the simplest, if no layout is near."""
     needs = {name: layout.needs for name, layout in LAYOUTS.items() if layout.needs}
     present = {
         name: [p for p in patterns if any(next(root.glob(s + p), None) for s in ("", "*/", "*/*/"))]
@@ -89,8 +89,10 @@ def _nearest(root: Path) -> str:
         lacking = [pattern for pattern in needs[best] if pattern not in present[best]]
         fact = f"lacks {', '.join(lacking)}" if lacking else "has them, but not in one place"
         return f"nearest is {best!r}, which needs {', '.join(needs[best])}; the folder {fact}"
-    listed = "; ".join(f"{name} {', '.join(patterns)}" for name, patterns in needs.items())
-    return f"layouts need: {listed}; without a fixed folder: manifest (a .csv or .jsonl file)"
+    return (
+        "put images into rgb/ and their sparse depth into sparse/, with equal names, or give a"
+        f" CSV list with the columns image and sparse; known layouts: {', '.join(LAYOUTS)}"
+    )
 
 
 def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:

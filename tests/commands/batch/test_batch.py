@@ -391,7 +391,7 @@ def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
 
 def test_an_empty_folder_is_an_error_that_names_the_layouts(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"any layout; layouts need: nyu-mat .*; pairs rgb, sparse"
+        InputError, match=r"any layout; put images into rgb/ .* known layouts: .*nyu-mat"
     ):
         batch(tmp_path)
     for part in ("rgb", "sparse"):
