@@ -23,7 +23,7 @@ from pnpdepth_cli.io.decoding import (
 )
 from pnpdepth_cli.io.file_bytes import read_bytes
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.tiff import read_tiff_facts
+from pnpdepth_cli.io.formats.images import read_exr_channels, read_tiff_facts
 
 _EXIF_FOLDER = 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
@@ -150,8 +150,6 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
 
 
 def _from_linear_light(path: Path, data: bytes) -> RgbImage:
-    from pnpdepth_cli.io.formats.exr import read_exr_channels
-
     linear = _colour_of(path, read_exr_channels(path, data)).astype(np.float32)
     linear = np.nan_to_num(linear, nan=0.0, posinf=1e9, neginf=0.0)
     outside = float(((linear > 1) | (linear < 0)).any(axis=2).mean())

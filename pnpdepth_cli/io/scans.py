@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, NoPointsError
 from pnpdepth_cli.io.file_bytes import damaged, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.npy import parse_npy
-from pnpdepth_cli.io.formats.npz import parse_npz
+from pnpdepth_cli.io.formats.arrays import parse_npy, parse_npz
 
 _FARTHEST_M = 1e5
 _KITTI_FIELDS, _NUSCENES_FIELDS = 4, 5  # x, y, z, reflectance; nuScenes adds the laser's index
