@@ -145,16 +145,6 @@ MASKED_DENSE_DEFAULTS = replace(MASKED_DEFAULTS, iterations=6, lr=3e-4, mask_sca
 """The same for dense points hidden from the input."""
 
 
-def _inputs_in_order(
-    input_kind: InputKind, rgb: Tensor | None, sparse: Tensor | None
-) -> tuple[Tensor, ...]:
-    wanted = {"rgb": (rgb,), "sparse": (sparse,), "rgb+sparse": (rgb, sparse)}[input_kind]
-    present = tuple(tensor for tensor in wanted if tensor is not None)
-    if len(present) != len(wanted):
-        raise ValueError(f"a network with input kind {input_kind!r} needs all of its inputs")
-    return present
-
-
 @dataclass(frozen=True, kw_only=True)
 class ModelDefinition:
     """Everything the program needs to know of a network."""
@@ -267,7 +257,9 @@ class ModelDefinition:
         """
         if self.arguments is not None:
             return self.arguments(rgb, sparse)
-        return _inputs_in_order(self.input_kind, rgb, sparse)
+        by_name = {"rgb": rgb, "sparse": sparse}
+        inputs = (by_name[name] for name in self.input_kind.split("+"))
+        return tuple(tensor for tensor in inputs if tensor is not None)
 
 
 def undescribed(**known: Any) -> ModelDefinition:

@@ -23,8 +23,6 @@ from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.python_file import python_definition
 
-DEFAULT_MODEL = "compact"
-
 _WEIGHTS_ONLY = (
     *(".pt", ".pth", ".ts", ".torchscript", ".ckpt", ".bin", ".safetensors", ".tar"),
     *(".npy", ".npz", ".index"),
@@ -91,14 +89,9 @@ def find_definition(spec: str) -> ModelDefinition:
     for definitions in families().values():
         if spec in definitions:
             return definitions[spec]
-    raise ModelError(
-        f"model {spec!r} is neither a known name nor a Python file; {_near_names(spec)}"
-    )
-
-
-def _near_names(name: str) -> str:
-    near = difflib.get_close_matches(name, names(), n=1)
-    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names())}"
+    near = difflib.get_close_matches(spec, names(), n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names())}"
+    raise ModelError(f"model {spec!r} is neither a known name nor a Python file; {hint}")
 
 
 def _from_file(spec: str) -> ModelDefinition | None:

@@ -27,6 +27,7 @@ from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
 from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, view_of
+from pnpdepth_cli.models.weights.torch_file import refuse_inflated
 
 _ASSUMED_MULTIPLE = 32
 _OPERATOR = re.compile(r"torch\.ops\.(aten|prims?|torchvision|quantized)\.(\w+)\.(\w+)")
@@ -217,10 +218,7 @@ def _read(file: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
     """The program, and its tensors by name."""
     with zipfile.ZipFile(file) as archive:
         entries = {info.filename.partition("/")[2]: info for info in archive.infolist()}
-        if any(info.compress_type != zipfile.ZIP_STORED for info in entries.values()):
-            raise BrokenFileError("it is compressed, which torch never does")
-        if sum(info.file_size for info in entries.values()) > file.stat().st_size:
-            raise BrokenFileError("its entries are larger than the file")
+        refuse_inflated(archive, file)
         program = json.loads(archive.read(entries["models/model.json"]))
         tensors, storages = {}, {}
         for folder, kind in (("weights", "model_weights"), ("constants", "model_constants")):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.colmap import read_model
-from pnpdepth_cli.io.dataset.reading import read_matlab_array
 from pnpdepth_cli.io.extrinsics import read_extrinsics
 from pnpdepth_cli.io.scans import read_scan
 from tests.colmap_models import write_binary_model, write_text_model
@@ -25,14 +23,11 @@ from tests.io.test_scans import FILES, POINTS
 
 Reader = Callable[[Path], Any]
 CALIBRATIONS = {"kitti.txt": KITTI, "plain.txt": PLAIN, "ros.yaml": TOPIC, "kalibr.yaml": KALIBR}
-NUMBERS = functools.partial(read_matlab_array, name="a")
 
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, Reader]]:
     """Valid files, and what reads each."""
-    from scipy.io import savemat
-
     folder = tmp_path_factory.mktemp("valid")
     inputs: list[tuple[Path, Reader]] = []
     for name, text in CALIBRATIONS.items():
@@ -44,10 +39,6 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, Reader]
     for name, content in FILES.items():
         (folder / name).write_bytes(content(POINTS))
         inputs.append((folder / name, read_scan))
-    for compressed in (False, True):
-        path = folder / f"{compressed}.mat"
-        savemat(path, {"a": np.arange(3, dtype=np.uint16)}, do_compression=compressed)
-        inputs.append((path, NUMBERS))
     write_text_model(folder / "text", points=3)
     write_binary_model(folder / "binary")
     models = [*(folder / "text").iterdir(), *(folder / "binary").iterdir()]
