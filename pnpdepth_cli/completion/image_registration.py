@@ -53,10 +53,8 @@ class ImageRegistration:
     The colour of pixel x is at c + zoom (x − c) + (right, down), where c is the image's centre.
     """
 
-    zoom: float
-    """Ratio of the focal lengths, image over depth."""
-    right: float
-    """Shift in pixels, as `down`."""
+    zoom: float  # ratio of the focal lengths, image over depth
+    right: float  # shift in pixels, as `down`
     down: float
 
     def __str__(self) -> str:
@@ -87,8 +85,7 @@ class Evidence:
 
     log_likelihood: Floats
     """(zooms, rows, columns): of each zoom, and of each shift in pixels of the reduced image."""
-    size: tuple[int, int]
-    """(H, W) of the image."""
+    size: tuple[int, int]  # (H, W) of the image
 
 
 def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:

@@ -34,12 +34,10 @@ class Propagation:
     `dense` and `at` take a field whose kernel `fit` has chosen.
     """
 
-    title: str
-    """What it does, in a few words."""
+    title: str  # what it does, in a few words
     fit: Callable[[ResidualField], ResidualField] = lambda field: field
     """Chooses the field's kernel."""
-    dense: Callable[[ResidualField], Tensor]
-    """Residual (H, W) float32 at every pixel."""
+    dense: Callable[[ResidualField], Tensor]  # residual (H, W) float32 at every pixel
     at: Callable[[ResidualField, SparsePoints], Tensor] | None = None
     """Residual (M,) at the coordinates of M points. None: it is sampled from `dense`."""
 
@@ -65,10 +63,8 @@ TABLE = {
 class Propagated:
     """Depth after propagation."""
 
-    depth: Tensor
-    """(H, W) float32 metres, 0 = unknown."""
-    kernel: Kernel | None = None
-    """The kernel that fits the residual best. None with "none"."""
+    depth: Tensor  # (H, W) float32 metres, 0 = unknown
+    kernel: Kernel | None = None  # the kernel that fits the residual best. None with "none".
 
 
 def propagate(

@@ -27,8 +27,7 @@ class InfluentialField:
 
     in_z: tuple[int, int] | None
     """Of the patch of z, in elements; None if z has no two spatial axes."""
-    in_output: tuple[int, int]
-    """Of the patch of the output, in pixels."""
+    in_output: tuple[int, int]  # of the patch of the output, in pixels
 
 
 def influential_field(

@@ -33,10 +33,8 @@ class Measure:
     higher_is_better: bool = False
     decimals: int = 4
     percent: bool = False
-    shown_unit: str = ""
-    """Unit in tables; empty: `unit`, which is that in files."""
-    shown_factor: float = 1.0
-    """Factor from `unit` to the unit in tables."""
+    shown_unit: str = ""  # unit in tables; empty: `unit`, which is that in files
+    shown_factor: float = 1.0  # factor from `unit` to the unit in tables
 
 
 MEASURES = (

@@ -42,22 +42,15 @@ DepthOf = Callable[[Any], Tensor]
 class Refinement:
     """The result of a refinement."""
 
-    before: Tensor
-    """Depth (1, 1, h, w) in metres of z_0."""
-    after: Tensor
-    """Depth (1, 1, h, w) in metres of z_kept."""
-    losses: tuple[float, ...]
-    """L(z_0) … L(z_K)."""
-    step: float
-    """α as a number."""
-    kept: int
-    """Number of updates after which `after` was predicted: K, or those of the lowest loss."""
+    before: Tensor  # depth (1, 1, h, w) in metres of z_0
+    after: Tensor  # depth (1, 1, h, w) in metres of z_kept
+    losses: tuple[float, ...]  # L(z_0) … L(z_K)
+    step: float  # α as a number
+    kept: int  # number of updates after which `after` was predicted: K, or those of the lowest loss
     depths: Mapping[int, Tensor] = field(default_factory=dict)
     """Depth (1, 1, h, w) after each of the chosen numbers of updates, as far as they were made."""
-    z: Tensor | None = None
-    """z_K; None where weights moved."""
-    warm: bool = False
-    """Whether it began where the frame before ended."""
+    z: Tensor | None = None  # z_K; None where weights moved
+    warm: bool = False  # whether it began where the frame before ended
 
 
 def refine(

@@ -47,18 +47,13 @@ Predict = Callable[[SparsePoints], Any]
 class FrameOfPoints:
     """A frame whose depth the network predicts from any of its points."""
 
-    points: SparsePoints
-    """All points, on the network's grid."""
-    inliers: SparsePoints
-    """Those that the steps are made with."""
-    output: Any
-    """What the network returns for all points."""
-    predict: Predict
-    """Returns what the network returns for some of them, differentiably."""
+    points: SparsePoints  # all points, on the network's grid
+    inliers: SparsePoints  # those that the steps are made with
+    output: Any  # what the network returns for all points
+    predict: Predict  # returns what the network returns for some of them, differentiably
     predict_in_steps: Predict
     """The same for the steps, perhaps from a smaller image of the same field of view."""
-    depth_of: DepthOf
-    """Turns that into depth (1, 1, h, w) in metres, differentiably."""
+    depth_of: DepthOf  # turns that into depth (1, 1, h, w) in metres, differentiably
 
 
 def refine_weights(

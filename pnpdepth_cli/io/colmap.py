@@ -35,16 +35,12 @@ Integers = NDArray[np.int64]
 class ColmapCamera:
     """A camera of the model; several images may share it."""
 
-    model: str
-    """COLMAP's name, such as "SIMPLE_RADIAL"."""
-    size: tuple[int, int]
-    """(H, W) of its images."""
+    model: str  # COLMAP's name, such as "SIMPLE_RADIAL"
+    size: tuple[int, int]  # (H, W) of its images
     intrinsics: Floats
     """(3, 3) in pixels, with whole numbers at pixel centres (COLMAP has them at .5)."""
-    lens: str
-    """One of `choices.LENSES`."""
-    distortion: tuple[float, ...]
-    """Coefficients of the lens, or none."""
+    lens: str  # one of `choices.LENSES`
+    distortion: tuple[float, ...]  # coefficients of the lens, or none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,22 +50,17 @@ class ColmapImage:
     camera: int
     rotation: Floats
     translation: Floats
-    points: Integers
-    """Numbers of the points that are observed in it, sorted and unique."""
+    points: Integers  # numbers of the points that are observed in it, sorted and unique
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapPoints:
     """The points of a model, sorted by number."""
 
-    number: Integers
-    """(N,) COLMAP's numbers."""
-    xyz: Floats
-    """(N, 3) in model units."""
-    error: Floats
-    """(N,) mean reprojection error in pixels, negative where it was not computed."""
-    track: Integers
-    """(N,) images that observe the point."""
+    number: Integers  # (N,) COLMAP's numbers
+    xyz: Floats  # (N, 3) in model units
+    error: Floats  # (N,) mean reprojection error in pixels, negative where it was not computed
+    track: Integers  # (N,) images that observe the point
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,14 +69,12 @@ class ColmapModel:
 
     folder: Path
     cameras: dict[int, ColmapCamera]
-    images: dict[str, ColmapImage]
-    """The name is a path below the image folder."""
+    images: dict[str, ColmapImage]  # the name is a path below the image folder
     points: ColmapPoints
 
 
 class _CameraModel(NamedTuple):
-    number: int
-    """In binary files."""
+    number: int  # in binary files
     focals: int
     lens: str
     coefficients: int

@@ -160,10 +160,8 @@ def _with_query(text: str, query: str) -> RemotePath:
 class Status(NamedTuple):
     """What a store says of an object."""
 
-    size: int
-    """Bytes; -1 if unknown."""
-    version: str
-    """Equal only for equal content; empty if unknown."""
+    size: int  # bytes; -1 if unknown
+    version: str  # equal only for equal content; empty if unknown
 
 
 def status_of(path: RemotePath) -> Status | None:

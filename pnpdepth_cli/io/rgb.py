@@ -39,10 +39,8 @@ _PLAUSIBLE = (0.2, 50.0)
 class RgbImage:
     """An upright image."""
 
-    values: NDArray[np.float32]
-    """(H, W, 3) in 0..1, sRGB-encoded."""
-    note: str | None
-    """What was assumed or changed, for a person; None if nothing was."""
+    values: NDArray[np.float32]  # (H, W, 3) in 0..1, sRGB-encoded
+    note: str | None  # what was assumed or changed, for a person; None if nothing was
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
@@ -183,10 +181,8 @@ def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
 class ExifFocalLength:
     """A focal length from EXIF."""
 
-    pixels: float
-    """In pixels of the image."""
-    source: str
-    """What it was computed from, for a person."""
+    pixels: float  # in pixels of the image
+    source: str  # what it was computed from, for a person
 
 
 def read_focal_length(path: Path, size: tuple[int, int]) -> ExifFocalLength | None:

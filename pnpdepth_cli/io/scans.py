@@ -47,10 +47,8 @@ Points = NDArray[np.float32]
 class ScanFile:
     """A LiDAR scan as read from a file."""
 
-    points: Points
-    """(N, 3) metres, x y z in the scanner's frame; all finite, in file order."""
-    source: str
-    """What was read, for a person."""
+    points: Points  # (N, 3) metres, x y z in the scanner's frame; all finite, in file order
+    source: str  # what was read, for a person
 
 
 def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:

@@ -38,15 +38,13 @@ class Camera:
     Camera axes are x right, y down, z forward, in metres; whole pixel numbers are pixel centres.
     """
 
-    intrinsics: Floats
-    """(3, 3), last row 0 0 1, in pixels."""
+    intrinsics: Floats  # (3, 3), last row 0 0 1, in pixels
     rotation: Floats = field(default_factory=lambda: np.eye(3))
     """(3, 3), from the scanner's frame to the camera's."""
     translation: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) metres, the scanner's origin in the camera's frame."""
     distortion: Coefficients = ()
-    lens: str = "radial-tangential"
-    """One of `choices.LENSES`: what the coefficients are."""
+    lens: str = "radial-tangential"  # one of `choices.LENSES`: what the coefficients are
 
     @property
     def has_lens(self) -> bool:
@@ -157,10 +155,8 @@ class LensModel(NamedTuple):
 
     shown: Callable[[Floats, Coefficients], Floats]
     """From (N, 2) directions and the coefficients to (N, 2) points on the image plane."""
-    by_angle: bool
-    """Whether it is defined by the angle to the axis, not by the tangent of it."""
-    radial: tuple[int, ...] | None
-    """Which coefficients are radial. None: all."""
+    by_angle: bool  # whether it is defined by the angle to the axis, not by the tangent of it
+    radial: tuple[int, ...] | None  # which coefficients are radial. None: all.
 
 
 LENS_MODELS: dict[str, LensModel] = {}

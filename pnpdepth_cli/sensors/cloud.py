@@ -42,8 +42,7 @@ class PointCloud(NamedTuple):
     """(N, 3) in the unit of the depth, in the camera's or the world's frame."""
     normals: NDArray[np.float32]
     """(N, 3) unit vectors towards the camera; 0 where a point has no two neighbours."""
-    rgb: NDArray[np.uint8] | None
-    """(N, 3) colours 0…255. None: without colours."""
+    rgb: NDArray[np.uint8] | None  # (N, 3) colours 0…255. None: without colours.
 
     def transformed(self, pose: Floats) -> PointCloud:
         """Returns the cloud in the frame that a pose, (3, 4) or (4, 4), leads to."""
@@ -194,11 +193,9 @@ class VoxelGrid:
 class View:
     """A depth map with its camera."""
 
-    depth: NDArray[np.float32]
-    """(H, W), 0 = unknown."""
+    depth: NDArray[np.float32]  # (H, W), 0 = unknown
     camera: Camera
-    pose: Floats
-    """(3, 4) from the camera's frame to the world's."""
+    pose: Floats  # (3, 4) from the camera's frame to the world's
 
     @functools.cached_property
     def known(self) -> NDArray[np.intp]:

@@ -50,10 +50,8 @@ class Watch(TorchDispatchMode):
 
     escaped: bool
     """Whether a value of a tensor (not a shape) reached Python, which may branch on it."""
-    data_dependent: bool
-    """Whether such a value depended on z."""
-    torn: bool
-    """Whether z or the tensor it stands for was read after the other had been changed."""
+    data_dependent: bool  # whether such a value depended on z
+    torn: bool  # whether z or the tensor it stands for was read after the other had been changed
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
@@ -258,12 +256,9 @@ def _storage(tensor: Tensor) -> int:
 class _Facts:
     """What an operation may do, by its schema and tags."""
 
-    writes: tuple[tuple[int, str], ...]
-    """Index and name of the arguments that it changes in place."""
-    fresh: bool
-    """Whether its results are always new memory."""
-    escapes: bool
-    """Whether it gives values, or shapes that depend on values, to Python."""
+    writes: tuple[tuple[int, str], ...]  # index and name of the arguments that it changes in place
+    fresh: bool  # whether its results are always new memory
+    escapes: bool  # whether it gives values, or shapes that depend on values, to Python
 
 
 @functools.cache

@@ -32,20 +32,16 @@ class StoredArray:
 
     values: NDArray[Any]
     """Floats in metres, or integer codes; (H, W) or any shape that `is_image` allows."""
-    description: str
-    """What was read, for a person, such as "16-bit PNG"."""
-    is_image: bool = True
-    """False for NPY and NPZ, whose arrays may also be lists of points."""
-    scale: float | None = None
-    """Codes per metre that the file itself gives; None if it does not."""
+    description: str  # what was read, for a person, such as "16-bit PNG"
+    is_image: bool = True  # false for NPY and NPZ, whose arrays may also be lists of points
+    scale: float | None = None  # codes per metre that the file itself gives; None if it does not
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthFormat:
     """One file format of depth images."""
 
-    name: str
-    """As messages call it, such as "PNG"."""
+    name: str  # as messages call it, such as "PNG"
     suffixes: tuple[str, ...]
     """Of its files, in lower case; "." and the name in `choices.FORMATS` is one of them."""
     magic: tuple[bytes, ...]
@@ -55,8 +51,7 @@ class DepthFormat:
     write: Callable[[Path, NDArray[Any], Mapping[str, str]], None]
     """(H, W) float32 metres or uint16 codes, 0 where unknown, into an existing empty file, with
     texts by key where the format has room for them."""
-    integer: bool = False
-    """Whether files hold 16-bit integer codes, not float32 metres."""
+    integer: bool = False  # whether files hold 16-bit integer codes, not float32 metres
 
 
 def eight_bits(path: Path, kind: str) -> FileFormatError:

@@ -40,12 +40,9 @@ TABLE: dict[str, Layout] = {
 class Listing(NamedTuple):
     """What a data set holds."""
 
-    frames: list[Frame]
-    """Complete frames, in a fixed order."""
-    broken: list[Unmatched]
-    """Files of frames that lack a part, or cannot be read."""
-    spare: list[Unmatched]
-    """Other files beside them."""
+    frames: list[Frame]  # complete frames, in a fixed order
+    broken: list[Unmatched]  # files of frames that lack a part, or cannot be read
+    spare: list[Unmatched]  # other files beside them
 
 
 def find_layout(root: Path, name: str | None = None) -> str:

@@ -36,8 +36,7 @@ Fields = Mapping[str, Any] | Unmatched | None
 class Layout:
     """How the files of a data set lie on disk."""
 
-    matches: Callable[[Path], Any]
-    """True for a folder or file of this layout."""
+    matches: Callable[[Path], Any]  # true for a folder or file of this layout
     frames: Callable[[Path], Iterable[Frame | Unmatched]]
     """The frames of a folder or file that matches, and what is in no frame."""
     needs: tuple[str, ...] = ()
