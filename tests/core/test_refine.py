@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.core.refine import Refinement, frame_parts, refine, refine_from
+from pnpdepth_cli.core.refine import Refinement, refine, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
     BatchError,
@@ -550,20 +550,3 @@ def test_a_refinement_does_not_import_the_compiler() -> None:
     )
     root = Path(__file__).parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
-
-
-def test_every_tensor_of_a_structure_is_split_along_its_first_axis_and_of_one_frame_is_itself() -> (
-    None
-):
-    x = torch.arange(6.0).reshape(2, 3)
-    structure = {"a": x, "b": [x + 1, None]}
-    parts = frame_parts(structure, 2)
-    assert [part["a"].tolist() for part in parts] == [[[0, 1, 2]], [[3, 4, 5]]]
-    assert [part["b"][0].tolist() for part in parts] == [[[1, 2, 3]], [[4, 5, 6]]]
-    assert [part["b"][1] for part in parts] == [None, None]
-    assert frame_parts(structure, 1)[0] is structure
-
-
-def test_a_tensor_without_one_element_per_frame_is_named() -> None:
-    with pytest.raises(BatchError, match=r"deep\.0 of shape \(3, 1\)"):
-        frame_parts({"a": torch.ones(2, 1), "deep": [torch.ones(3, 1)]}, 2)

@@ -111,15 +111,6 @@ def test_torch_transformer_layers_with_their_fast_path_come_out_the_same(
             assert split.static_graph == (kind is not LooksAtValues)
 
 
-@pytest.mark.slow
-def test_a_compiled_network_can_be_cut() -> None:
-    network, x = build("unet"), image()
-    whole = plain(network, x)
-    compiled = torch.compile(network, backend="eager")
-    with Split(compiled, "_orig_mod.bottleneck") as split, torch.no_grad():
-        assert torch.equal(split.rear(split.front(x)), whole)
-
-
 class ChoosesByValue(nn.Module):
     """In front of the cut, one of two branches; the second changes what the first only reads."""
 
