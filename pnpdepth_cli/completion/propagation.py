@@ -42,17 +42,14 @@ class Propagation:
     """Residual (M,) at the coordinates of M points. None: it is sampled from `dense`."""
 
 
-def _gp_at(field: ResidualField, queries: SparsePoints) -> Tensor:
-    """With many points, each query is predicted from the points nearest to it."""
-    return gaussian_process.predict_at(field, queries.xy, field.features_at(queries))
-
-
 TABLE = {
     "gp": Propagation(
         title="Gaussian process",
         fit=gaussian_process.fit,
         dense=gaussian_process.predict,
-        at=_gp_at,
+        at=lambda field, queries: gaussian_process.predict_at(
+            field, queries.xy, field.features_at(queries)
+        ),
     ),
     "diffusion": Propagation(title="edge-aware diffusion", dense=diffuse),
 }

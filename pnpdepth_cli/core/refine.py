@@ -14,8 +14,8 @@ the network.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -47,8 +47,6 @@ class Refinement:
     losses: tuple[float, ...]  # L(z_0) … L(z_K)
     step: float  # α as a number
     kept: int  # number of updates after which `after` was predicted: K, or those of the lowest loss
-    depths: Mapping[int, Tensor] = field(default_factory=dict)
-    """Depth (1, 1, h, w) after each of the chosen numbers of updates, as far as they were made."""
     z: Tensor | None = None  # z_K; None where weights moved
     warm: bool = False  # whether it began where the frame before ended
 
@@ -60,8 +58,6 @@ def refine(
     settings: Settings,
     *,
     depth_of: DepthOf,
-    keep_depths: Collection[int] = (),
-    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
 ) -> Refinement:
     """Returns the network's depth for one frame, refined to agree with the points.
 
@@ -71,8 +67,6 @@ def refine(
         points: Sparse depth on the grid of the predicted depth's field of view.
         settings: How z is updated.
         depth_of: Turns the network's output into depth (1, 1, h, w) in metres, differentiably.
-        keep_depths: Numbers of updates after which depth is kept in `Refinement.depths`.
-        on_iteration: Called after each update k with k and L(z_k).
 
     Raises:
         DivergedError: The loss or its gradient is not finite; `last_good` is the Refinement until
@@ -82,15 +76,7 @@ def refine(
     """
     with torch.no_grad():
         z0 = split.front(*arguments)
-    (result,) = refine_from(
-        split,
-        z0,
-        (points,),
-        settings,
-        depth_of=(depth_of,),
-        keep_depths=keep_depths,
-        on_iteration=on_iteration,
-    )
+    (result,) = refine_from(split, z0, (points,), settings, depth_of=(depth_of,))
     if isinstance(result, PnpDepthError):
         raise result
     return result
@@ -103,7 +89,6 @@ def refine_from(
     settings: Settings,
     *,
     depth_of: Sequence[DepthOf],
-    keep_depths: Collection[int] = (),
     on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
 ) -> list[Refinement | PnpDepthError]:
     """Returns for each of B frames its refinement, or the error that ended it.
@@ -116,7 +101,6 @@ def refine_from(
         points: Of each frame.
         settings: Of all frames.
         depth_of: Of each frame; called with the frame's part of the network's output.
-        keep_depths: As in `refine`.
         on_iteration: Called after each update k with k and the mean of L(z_k).
 
     Raises:
@@ -125,7 +109,7 @@ def refine_from(
     settings, count = settings.complete(), len(points)
     scale = _LOSS_SCALE if split.in_half else 1.0  # of the loss, so that no gradient vanishes
     frames = [
-        _FrameRefinement(settings, z0, at, read, keep_depths)
+        _FrameRefinement(settings, z0, at, read)
         for z0, at, read in zip(frame_parts(z, count), points, depth_of, strict=True)
     ]
     for iteration in range(settings.iterations):
@@ -136,7 +120,11 @@ def refine_from(
                 break
             gradient = gradient_at(z, torch.stack(losses).sum() * scale)
         if gradient is None:
-            raise _no_gradient(split.layer)
+            raise LayerError(
+                f"layer {split.layer!r}: no gradient comes back from the prediction to it; either"
+                " the prediction does not depend on it or the network's forward runs under"
+                " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
+            )
         with torch.no_grad():
             parts = zip(
                 frames,
@@ -188,14 +176,6 @@ def _losses(frames: Sequence[_FrameRefinement], output: Any) -> list[Tensor]:
     return [loss for loss in losses if loss is not None]
 
 
-def _no_gradient(layer: str) -> LayerError:
-    return LayerError(
-        f"layer {layer!r}: no gradient comes back from the prediction to it; either the"
-        " prediction does not depend on it or the network's forward runs under"
-        " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
-    )
-
-
 class _FrameRefinement:
     """The refinement of one frame between updates: losses, depths, and the error that ended it.
 
@@ -208,7 +188,6 @@ class _FrameRefinement:
         z0: Tensor,
         points: SparsePoints,
         depth_of: DepthOf,
-        keep_depths: Collection[int],
     ) -> None:
         self._settings, self._points, self._depth_of = settings, points, depth_of
         self._step, self._halvings = step_size(settings.lr, z0), 0
@@ -219,9 +198,7 @@ class _FrameRefinement:
         self._first: Tensor | None = None  # depth of z_0
         self._after: Tensor | None = None  # depth of z_kept
         self._kept = 0
-        self._keep_depths = frozenset(keep_depths)
         self._z = z0
-        self._depths: dict[int, Tensor] = {}
         self.losses: list[float] = []
         self.error: PnpDepthError | None = None
 
@@ -248,8 +225,6 @@ class _FrameRefinement:
             self._first = depth
         if not self._settings.gives_best or self.losses[-1] <= min(self.losses):
             self._kept, self._after = updates, depth
-        if updates in self._keep_depths:
-            self._depths[updates] = depth
         return loss
 
     def updated(self, z: Tensor, gradient: Tensor) -> Tensor:
@@ -285,7 +260,6 @@ class _FrameRefinement:
             losses=tuple(self.losses),
             step=self._step,
             kept=self._kept,
-            depths=dict(self._depths),
             z=self._z.detach(),
         )
 

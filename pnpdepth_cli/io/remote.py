@@ -294,11 +294,6 @@ def _listed(folder: Path) -> Mapping[str, Status | None]:
     return {info["name"].rpartition("/")[2]: _status(info) for info in files}
 
 
-def forget_stores() -> None:
-    """Forgets connections and their credentials; the next question reads them again."""
-    _file_system.cache_clear()
-
-
 @functools.cache
 def _file_system(scheme: str) -> Any:
     package = STORES[scheme]

@@ -62,8 +62,8 @@ class Fixed:
     """
 
     def __post_init__(self) -> None:
-        validity.whole(self, "height", least=1)
-        validity.whole(self, "width", least=1)
+        validity.whole(self, "height")
+        validity.whole(self, "width")
         validity.one_of(self, "fit", choices.FITS)
 
 
@@ -77,9 +77,9 @@ class Multiple:
     """Images with a longer side, in pixels, are shrunk to it first; None shrinks none."""
 
     def __post_init__(self) -> None:
-        validity.whole(self, "of", least=1)
+        validity.whole(self, "of")
         if self.longest is not None:
-            validity.whole(self, "longest", least=1)
+            validity.whole(self, "longest")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,10 +93,10 @@ class Near:
     """Columns to approach, or None. With neither, the image keeps about its own size."""
 
     def __post_init__(self) -> None:
-        validity.whole(self, "of", least=1)
+        validity.whole(self, "of")
         for side in ("height", "width"):
             if getattr(self, side) is not None:
-                validity.whole(self, side, least=1)
+                validity.whole(self, side)
 
 
 @dataclass(frozen=True, kw_only=True)

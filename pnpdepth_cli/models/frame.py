@@ -39,7 +39,16 @@ class FrameMap:
                 image=(height, width), crop=(0, 0, height, width), resized=resized, network=network
             )
         if isinstance(size, Near):
-            return _near(size, height, width)
+            sides = ((size.height, height), (size.width, width))
+            factors = [wanted / own for wanted, own in sides if wanted]
+            factor = min(factors, key=lambda f: abs(1 - f), default=1.0)
+            rows, columns = (max(1, round(n * factor / size.of)) * size.of for n in (height, width))
+            return cls(
+                image=(height, width),
+                crop=(0, 0, height, width),
+                resized=(rows, columns),
+                network=(rows, columns),
+            )
         network = (size.height, size.width)
         crop = (0, 0, height, width)
         if size.fit == "crop":
@@ -86,20 +95,6 @@ class FrameMap:
         image = depth.new_zeros(self.image)
         image[top : top + height, left : left + width] = depth[0, 0]
         return image
-
-
-def _near(size: Near, height: int, width: int) -> FrameMap:
-    factors = [
-        wanted / own for wanted, own in ((size.height, height), (size.width, width)) if wanted
-    ]
-    factor = min(factors, key=lambda f: abs(1 - f), default=1.0)
-    network = tuple(max(1, round(n * factor / size.of)) * size.of for n in (height, width))
-    return FrameMap(
-        image=(height, width),
-        crop=(0, 0, height, width),
-        resized=(network[0], network[1]),
-        network=(network[0], network[1]),
-    )
 
 
 def _resize(depth: Tensor, size: tuple[int, int]) -> Tensor:

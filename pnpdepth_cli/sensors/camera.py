@@ -55,10 +55,6 @@ class Camera:
         """Returns (N, 3) points of the scanner's frame in the camera's frame, metres."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
-    def to_scanner(self, points: NDArray[np.floating]) -> Floats:
-        """Returns (N, 3) points of the camera's frame in the scanner's frame, metres."""
-        return (np.asarray(points, np.float64) - self.translation) @ self.rotation
-
     def pixels_of(self, points: NDArray[np.floating]) -> Floats:
         """Returns the (N, 2) pixel coordinates of (N, 3) points of the camera's frame, z > 0.
 

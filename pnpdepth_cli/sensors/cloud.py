@@ -84,13 +84,11 @@ def cloud_from_depth(
         kept = known[part]
         yield PointCloud(
             xyz=points[inner][kept].astype(np.float32),
-            rgb=None if rgb is None else _bytes_of(rgb[part][kept]),
+            rgb=None
+            if rgb is None
+            else np.rint(np.clip(rgb[part][kept], 0, 1) * 255).astype(np.uint8),
             normals=normals[inner][kept].astype(np.float32),
         )
-
-
-def _bytes_of(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
 
 
 def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None, edge: float = EDGE) -> Mask:

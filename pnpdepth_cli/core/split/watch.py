@@ -152,13 +152,17 @@ class Watch(TorchDispatchMode):
             if self._sees_escapes and not outer:
                 with self._function_mode:
                     yield
-            elif outer and not self._sees_escapes and self._function_mode.is_innermost():
+            elif outer and not self._sees_escapes and self._mode_is_innermost():
                 with overrides._pop_mode_temporarily():
                     yield
             else:
                 yield
         finally:
             self._sees_escapes = outer
+
+    def _mode_is_innermost(self) -> bool:
+        innermost: object = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
+        return innermost is self._function_mode
 
     def note_escape(self, tensor: Tensor) -> None:
         """Notes that values of the tensor reach Python."""
@@ -234,11 +238,6 @@ class _EscapeMode(TorchFunctionMode):
         if func in _ESCAPES:
             self._watch.note_escape(args[0])
         return func(*args, **(kwargs or {}))
-
-    def is_innermost(self) -> bool:
-        """Whether no other torch function mode was entered after this one."""
-        innermost: object = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
-        return innermost is self
 
 
 _NO_STORAGE = 0

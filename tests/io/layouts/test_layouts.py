@@ -20,7 +20,7 @@ from pnpdepth_cli.io.dataset.reading import (
     masked,
     moved_to,
 )
-from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames, read_frames
+from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames
 from tests.data_sets import (
     BENCHMARKS,
     DRIVE,
@@ -34,6 +34,7 @@ from tests.data_sets import (
     ground_truth,
     image,
     mask,
+    read_frames,
     tum,
     void,
 )
@@ -386,10 +387,6 @@ def test_what_is_no_data_set_is_an_error(tmp_path: Path) -> None:
         read_frames(tmp_path / "lost")
     with pytest.raises(UsageError, match="unknown layout 'nyu'; did you mean"):
         read_frames(tmp_path, "nyu")
-    for folder in ("rgb", "sparse"):
-        (tmp_path / folder).mkdir()
-    with pytest.raises(InputError, match="has no frame"):
-        read_frames(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, name_problem
-from pnpdepth_cli.io.layouts import read_frames
+from tests.data_sets import read_frames
 from tests.empty_files import touch
 
 

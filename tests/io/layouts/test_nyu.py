@@ -10,8 +10,8 @@ import pytest
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of, read_frame_image, shape_of
-from pnpdepth_cli.io.layouts import list_frames, read_frames
-from tests.data_sets import ground_truth, nyu_h5, nyu_mat
+from pnpdepth_cli.io.layouts import list_frames
+from tests.data_sets import ground_truth, nyu_h5, nyu_mat, read_frames
 from tests.empty_files import touch
 
 h5py = pytest.importorskip("h5py")
