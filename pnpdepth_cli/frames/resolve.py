@@ -16,6 +16,8 @@ from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
     IMAGENET_STD,
+    MASKED_DEFAULTS,
+    MASKED_DENSE_DEFAULTS,
     WEIGHTS_DEFAULTS,
     WEIGHTS_DENSE_DEFAULTS,
     ModelDefinition,
@@ -147,7 +149,7 @@ def resolve_settings(
         )
     defaults = definition.defaults
     if settings.masked:
-        defaults = definition.masked_dense if dense else definition.masked
+        defaults = MASKED_DENSE_DEFAULTS if dense else MASKED_DEFAULTS
     elif of_weights:
         defaults = WEIGHTS_DENSE_DEFAULTS if dense else WEIGHTS_DEFAULTS
     settings = settings.with_preset()

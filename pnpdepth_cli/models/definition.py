@@ -176,10 +176,6 @@ class ModelDefinition:
     Without any, they are suggested by the shapes of the feature maps."""
     defaults: Settings = Settings()
     """Its settings of refinement where no option sets them."""
-    masked: Settings = MASKED_DEFAULTS
-    """The same where weights are updated by points hidden from the input."""
-    masked_dense: Settings = MASKED_DENSE_DEFAULTS
-    """The same for points that lie closer than `DENSE_SPACING`."""
     checkpoint: Path | None = None
     """The weights that come with the definition; None if the user names them."""
     complete: bool = False
@@ -225,8 +221,7 @@ class ModelDefinition:
         validity.one_of(self, "output_kind", choices.OUTPUT_KINDS)
         validity.one_of(self, "output_scale", choices.OUTPUT_SCALES)
         validity.names(self, "layers")
-        for settings in ("defaults", "masked", "masked_dense"):
-            validity.instance(self, settings, Settings, "Settings(…)")
+        validity.instance(self, "defaults", Settings, "Settings(…)")
         for field, kind, wanted in (
             ("normalisation", Normalisation, "Normalisation(mean=…, std=…)"),
             ("image_encoder", str, "the name of a submodule"),

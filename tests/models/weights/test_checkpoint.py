@@ -291,6 +291,27 @@ def test_a_pointer_to_a_file_that_was_not_fetched_is_named(tmp_path: Path) -> No
     assert "is a Git LFS pointer" in refused(tmp_path / "w.pth.tar")
 
 
+@pytest.mark.parametrize(
+    ("save", "suffix"),
+    [
+        (torch.save, ".pth"),
+        (save_older, ".pth"),
+        (save_file, ".safetensors"),
+        (save_layers, ".npy"),
+        (save_numbered, ".npz"),
+    ],
+)
+def test_a_file_cut_anywhere_is_refused(
+    save: Callable[[Any, Path], None], suffix: str, tmp_path: Path
+) -> None:
+    path = tmp_path / f"w{suffix}"
+    save(weights(), path)
+    whole = path.read_bytes()
+    for length in range(0, len(whole) - 1, max(1, len(whole) // 60)):
+        path.write_bytes(whole[:length])
+        assert f"w{suffix} cannot be read" in refused(path)
+
+
 def test_garbage_is_refused(tmp_path: Path) -> None:
     garbage = [b"", b"\0" * 50, b"not a checkpoint\n", b"\x80\x02}q\0.", b"PK\x03\x04"]
     for content in garbage:

@@ -111,15 +111,6 @@ def test_the_hostile_pickles_do_run_where_torch_itself_reads_them(tmp_path: Path
     assert (tmp_path / "ran").exists()
 
 
-@both_layouts
-def test_a_file_cut_anywhere_is_refused(tmp_path: Path, new: bool) -> None:
-    whole = save({"model": Net(), "n": 3}, tmp_path / "x.pt", new).read_bytes()
-    cut = tmp_path / "cut.pt"
-    for length in range(0, len(whole) - 1, max(1, len(whole) // 60)):
-        cut.write_bytes(whole[:length])
-        assert "cut.pt cannot be read" in refused(cut)
-
-
 @given(data=st.binary(max_size=200))
 @settings(
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
