@@ -93,7 +93,6 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
 
     Args:
         rgb: (H, W, 3) in 0…1.
-        points: Sparse depth.
 
     Returns:
         None where the points cannot tell: too few, in a part of the image only, scan lines of a

@@ -55,7 +55,6 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
     Outside the points' hull, and everywhere if all are on one line, the nearest point's depth.
 
     Args:
-        points: Sparse depth.
         xy: (M, 2) pixel coordinates. None: every pixel.
         space: Quantity that is linear, one of `choices.SPACES`.
     """
@@ -98,7 +97,6 @@ def inverse_distance(
     nearest points only.
 
     Args:
-        points: Sparse depth.
         xy: (M, 2) pixel coordinates. None: every pixel.
     """
     points = distinct(points)

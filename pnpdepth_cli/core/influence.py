@@ -41,7 +41,6 @@ def influential_field(
     The sizes are lower bounds: connections through units that are zero for this image do not count.
 
     Args:
-        split: The network, cut and open.
         z: z_0, as returned by `split.front`.
         depth_of: Turns the network's output into depth (1, 1, h, w).
         enough: Rows and columns that the patch of the output is compared with. No further point is

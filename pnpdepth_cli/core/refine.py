@@ -62,8 +62,6 @@ def refine(
     """Returns the network's depth for one frame, refined to agree with the points.
 
     Args:
-        split: The network, cut and open.
-        arguments: Of the network, for this frame.
         points: Sparse depth on the grid of the predicted depth's field of view.
         settings: How z is updated.
         depth_of: Turns the network's output into depth (1, 1, h, w) in metres, differentiably.
@@ -96,7 +94,6 @@ def refine_from(
     The frames share the passes of the network; each has its own α, loss and end, as if alone.
 
     Args:
-        split: The network, cut and open.
         z: z_0 of all frames, stacked along axis 0; the front has run.
         points: Of each frame.
         settings: Of all frames.
@@ -147,7 +144,6 @@ def frame_parts(structure: Any, frames: int) -> list[Any]:
 
     Args:
         structure: A tensor, or tensors in nested containers, with the frames along axis 0.
-        frames: The number of frames.
 
     Raises:
         BatchError: A tensor does not have one element per frame along axis 0.

@@ -76,8 +76,6 @@ def refine_default(
     """Returns the frame refined by the default method.
 
     Args:
-        fusion: The networks, open.
-        frame: The frame, in the image frame.
         seed: Of the hidden points.
         until: As of `Fusion.fuse`.
 

@@ -43,10 +43,8 @@ def refine_frame(
     """Returns one refined frame. A divergence with a last good depth is returned in it.
 
     Args:
-        network: The network.
         split: The network cut at a layer, open. For frames of one size it is recorded once.
         settings: How z is updated.
-        frame: The frame, in the image frame.
         propagation: How the residual at the points is propagated: "none" or a name in
             `choices.PROPAGATIONS`.
         on_iteration: Called after each update of z.
@@ -180,7 +178,6 @@ def to_refined_frame(
     """Returns the result in the image frame, its residual propagated; an error if there is none.
 
     Args:
-        prepared: The frame.
         reader: What the refinement read depth with.
         result: What `core.refine` returned for the frame.
         propagation: As of `refine_frame`.

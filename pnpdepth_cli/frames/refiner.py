@@ -233,7 +233,6 @@ class Refiner:
         """Decides once what definitions leave open, and returns this refiner.
 
         Args:
-            frame: The first frame.
             more: Gives further frames, which decide as well; called only if a network needs it.
 
         Raises:

@@ -70,7 +70,6 @@ def resolve_definition(
     frames.
 
     Args:
-        network: The network.
         frame: The first frame, registered.
         more_frames: Gives further frames; called only where the input range is open.
 
@@ -97,7 +96,6 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     """Returns the name of the layer to cut at.
 
     Args:
-        definition: Of the network.
         layer: A name, a fraction 0…1 of the definition's layers, or None for its default.
 
     Raises:
@@ -128,8 +126,6 @@ def resolve_settings(
     an image alone is scaled to points in another unit.
 
     Args:
-        definition: Of the network.
-        settings: The user's.
         metric: Whether the points are in metres.
         dense: Whether the points lie as close as a LiDAR's; see `is_dense`.
 

@@ -53,7 +53,6 @@ def read_sparse(
     NPZ, or text with one `x y depth` per line (.csv, .txt), in metres; its order is kept.
 
     Args:
-        path: The file.
         size: (H, W) of the frame that a list belongs to; an image has its own.
         scale: Codes per metre of an integer image.
         channel: Name of an EXR channel or NPZ array.

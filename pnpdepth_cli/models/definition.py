@@ -261,9 +261,6 @@ def undescribed(**known: Any) -> ModelDefinition:
     """Returns a definition for a network of rgb that brings no description of its numbers.
 
     The points decide its normalisation and what its output means.
-
-    Args:
-        known: The fields that are known.
     """
     return ModelDefinition(
         input_kind="rgb",

@@ -111,12 +111,7 @@ class CutPoint:
         raise LayerError(f"layer {self.layer!r} {problem}")
 
     def never_ran(self, ran: Collection[nn.Module], calls: int) -> LayerError:
-        """Returns the error of a pass that did not reach the cut.
-
-        Args:
-            ran: The submodules that ran.
-            calls: How often the layer itself was called.
-        """
+        """Returns the error of a pass that did not reach the cut."""
         if self.module in ran:
             times = f"{calls} time{'s' if calls > 1 else ''}"
             return LayerError(f"layer {self.layer!r}: it is called only {times}")

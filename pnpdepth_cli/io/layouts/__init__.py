@@ -49,7 +49,6 @@ def find_layout(root: Path, name: str | None = None) -> str:
     """Returns the name of the layout that a folder or file is of.
 
     Args:
-        root: The data set.
         name: The only layout to consider; None for all, in the order of `choices.LAYOUTS`.
 
     Raises:
