@@ -8,32 +8,14 @@ from __future__ import annotations
 
 from pnpdepth_cli.choices import FORMATS
 from pnpdepth_cli.io.formats import arrays, images
-from pnpdepth_cli.io.formats.depth_format import (
-    KITTI_SCALE,
-    LARGEST_CODE,
-    SATURATED_CODE,
-    SCALE_KEY,
-    DepthFormat,
-    StoredArray,
-    check_scale,
-    eight_bits,
-)
-
-__all__ = [
-    "DEPTH_SUFFIXES",
-    "KITTI_SCALE",
-    "LARGEST_CODE",
-    "SATURATED_CODE",
-    "SCALE_KEY",
-    "TABLE",
-    "DepthFormat",
-    "StoredArray",
-    "check_scale",
-    "eight_bits",
-    "format_of_content",
-    "format_of_suffix",
-    "kind_of",
-]
+from pnpdepth_cli.io.formats.depth_format import KITTI_SCALE as KITTI_SCALE
+from pnpdepth_cli.io.formats.depth_format import LARGEST_CODE as LARGEST_CODE
+from pnpdepth_cli.io.formats.depth_format import SATURATED_CODE as SATURATED_CODE
+from pnpdepth_cli.io.formats.depth_format import SCALE_KEY as SCALE_KEY
+from pnpdepth_cli.io.formats.depth_format import DepthFormat as DepthFormat
+from pnpdepth_cli.io.formats.depth_format import StoredArray as StoredArray
+from pnpdepth_cli.io.formats.depth_format import check_scale as check_scale
+from pnpdepth_cli.io.formats.depth_format import eight_bits as eight_bits
 
 TABLE: dict[str, DepthFormat] = {
     "png": images.PNG,
