@@ -25,6 +25,7 @@ class Step:
     arguments: Sequence[Any]
     keywords: Mapping[str, Any] = field(default_factory=dict)
     outputs: str | Sequence[str | None]
+    name: str = ""  # for messages
     last_read: frozenset[str] = frozenset()
 
     def names(self) -> set[str]:

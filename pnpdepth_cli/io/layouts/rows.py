@@ -95,7 +95,7 @@ def _hypersim_name(root: Path, previews: Path, stem: str) -> str:
 def _of_hypersim(previews: Path) -> Callable[[Files], Mapping[str, Any]]:
     """Depth from the array, and the group."""
     group = f"{previews.parents[1].name}/{_camera_of(previews)}"
-    array = {"name": "dataset", "axes": (0, 1), "focal_px": _HYPERSIM_FOCAL_PX}
+    array: dict[str, Any] = {"name": "dataset", "axes": (0, 1), "focal_px": _HYPERSIM_FOCAL_PX}
     return lambda files: {"gt": Hdf5Array(path=files["gt"], **array), "group": group}
 
 

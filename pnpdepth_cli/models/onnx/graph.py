@@ -149,6 +149,7 @@ class OnnxGraph(nn.Module):
                     run=functools.partial(self._run, module, on_shapes),
                     arguments=[Value(n) for n in handed_in],
                     outputs=proto.output,
+                    name=name,
                 )
             )
         return steps
@@ -167,7 +168,7 @@ class OnnxGraph(nn.Module):
                 for step in run_steps(self._steps, values):
                     if sum(value.numel() for value in values.values()) > 2 * largest:
                         raise ModelError(
-                            f"ONNX node {step.run.args[0].node.name!r}: more than {2 * largest:,}"
+                            f"ONNX node {step.name!r}: more than {2 * largest:,}"
                             " elements are needed at a time, far more than image and weights have"
                         )
             self._allowed.add(sizes)
