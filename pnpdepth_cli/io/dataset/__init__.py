@@ -21,10 +21,7 @@ SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
 _LONGEST_PART = 255 - len("_improvement.png")
 """Bytes of a part of a name, so that the longest file name of a result has 255."""
 
-_LEADS_OUT = "leads out of the output folder"
 _DRIVE = re.compile(r"[A-Za-z]:")
-_RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])\s*(\..*)?", re.IGNORECASE)
-"""Device names that Windows reserves in every folder, with any suffix."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,7 +245,7 @@ def _walk(folder: Path, above: frozenset[str], problems: list[Unmatched]) -> Ite
 
 
 def name_problem(name: str) -> str | None:
-    """Returns why no result can be stored under a frame's name on POSIX; None if it can.
+    """Returns why no result can be stored under a frame's name; None if it can.
 
     The reason is a predicate, such as "holds a NUL character".
     """
@@ -256,25 +253,14 @@ def name_problem(name: str) -> str | None:
         return "holds a NUL character"
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts:
-        return _LEADS_OUT
+        return "leads out of the output folder"
+    if "\\" in name or _DRIVE.match(name):
+        return "holds a backslash or a drive letter, which lead out of the folder on Windows"
     if not path.parts:
         return "names no file"
     if any(len(part.encode("utf-8", "surrogateescape")) > _LONGEST_PART for part in path.parts):
         return f"is longer than {_LONGEST_PART} bytes"
     return None
-
-
-def portable_name_problem(name: str) -> str | None:
-    """Returns why a name is not fit for results on Linux, macOS or Windows; None if it is."""
-    if "\\" in name:
-        return "holds a backslash, which separates folders on Windows only; use /"
-    if _DRIVE.match(name):
-        return "begins with a drive letter"
-    for part in PurePosixPath(name).parts:
-        if _RESERVED.fullmatch(part):
-            return f"holds {part!r}, which Windows reserves"
-    problem = name_problem(name)
-    return None if problem == _LEADS_OUT else problem  # only what writes results minds
 
 
 _FRAME_NUMBER = re.compile(r"(?:^|[_\-/])\d+(?:_image_\d+)?$")

@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import math
 import re
-import struct
+import threading
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
@@ -19,11 +20,9 @@ from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, dam
 from pnpdepth_cli.io.formats.depth_format import DepthFormat, StoredArray
 
 _LONGEST_HEADER = 1 << 14
-_DTYPE = re.compile(r"['\"]descr['\"]\s*:\s*['\"]([^'\"]{1,20})['\"]")
-_FORTRAN = re.compile(r"['\"]fortran_order['\"]\s*:\s*(True|False)\b")
-_SHAPE = re.compile(r"['\"]shape['\"]\s*:\s*\(\s*((?:\d{1,18}\s*,\s*)*(?:\d{1,18}\s*)?)\)")
-"""The fields of a header. NumPy evaluates it as Python, and threads of CPython 3.11 that do so at
-once raise SystemError for a good file."""
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_LOCK = threading.Lock()
+"""NumPy evaluates a header as Python, and threads of CPython 3.11 that do so at once may fail."""
 
 
 def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[Any]:
@@ -43,27 +42,22 @@ def _npy_header(
     path: Path, data: bytes, kind: str
 ) -> tuple[tuple[int, ...], Any, np.dtype[Any], int]:
     """Shape, order ("C" or "F"), dtype, and the position of the data, of numbers alone."""
-    length = "<H" if data[6:8] == b"\1\0" else "<I"
-    start = 8 + struct.calcsize(length)
-    end = start + (struct.unpack_from(length, data, 8)[0] if len(data) >= start else 0)
-    text = data[start : min(end, start + _LONGEST_HEADER)].decode("latin-1")
-    descr, fortran, sides = (field.search(text) for field in (_DTYPE, _FORTRAN, _SHAPE))
-    known = data[6:8] in (b"\1\0", b"\2\0") and end <= len(data)
-    if not (known and descr and fortran and sides):
-        raise damaged(path, kind, "cannot be read (its header is damaged or of another version)")
-    if "O" in descr[1]:
+    stream = io.BytesIO(data)
+    try:
+        with _LOCK:
+            shape, is_fortran, dtype = _HEADERS[npy.read_magic(stream)](stream)
+        if min(shape, default=0) < 0:
+            raise ValueError(f"a shape of {shape}")
+    except Exception as error:  # what evaluates a damaged header decides
+        raise damaged(path, kind, f"cannot be read ({type(error).__name__}: {error})") from error
+    if dtype.hasobject:
         raise FileFormatError(
             f"{path} holds pickled Python objects, which are never loaded; save numbers, with"
             " allow_pickle=False"
         )
-    try:
-        dtype = np.dtype(descr[1])
-    except (TypeError, ValueError, SyntaxError) as error:
-        raise damaged(path, kind, f"cannot be read ({error})") from error
     if dtype.kind not in "fiu":
         raise FileFormatError(f"{path} holds {dtype} values; depth is float or integer, save it so")
-    shape = tuple(int(length) for length in re.findall(r"\d+", sides[1]))
-    return shape, "F" if fortran[1] == "True" else "C", dtype, end
+    return shape, "F" if is_fortran else "C", dtype, stream.tell()
 
 
 def _read_npy(path: Path, data: bytes, channel: str | None) -> StoredArray:
