@@ -115,8 +115,6 @@ _COUNT, _CAMERA = struct.Struct("<Q"), struct.Struct("<IiQQ")
 _IMAGE, _POINT = struct.Struct("<I7dI"), struct.Struct("<Q3d3BdQ")
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _TRACK_ENTRY = 8
-_LONGEST_NUMBER = 18
-"""Digits of a whole number in a text that fits 64 bits."""
 
 
 def model_files(folder: Path) -> list[Path]:
@@ -373,7 +371,7 @@ def _text_cameras(path: Path) -> Iterator[Described]:
                 f" {len(words) - 4}; create the model again"
             )
         try:
-            number, width, height = (_whole(words[i]) for i in (0, 2, 3))
+            number, width, height = (int(words[i]) for i in (0, 2, 3))
             parameters = [float(word) for word in words[4:]]
         except ValueError as error:
             raise _invalid(path, line, text, "numbers of a camera") from error
@@ -394,7 +392,7 @@ def _text_images(path: Path) -> Iterator[Registered]:
                 " short"
             )
         try:
-            pose, camera, name = [float(w) for w in words[1:8]], _whole(words[8]), words[9].strip()
+            pose, camera, name = [float(w) for w in words[1:8]], int(words[8]), words[9].strip()
             keypoints = following[1].split() if following else []
             if len(keypoints) % 3:
                 raise ValueError("not triples")
@@ -410,11 +408,11 @@ def _text_points(path: Path) -> Table:
     for line, text in _lines(path):
         words = text.split()
         try:
-            numbers.append(_whole(words[0]))
+            numbers.append(np.int64(words[0]))
             rows.append([float(words[i]) for i in (1, 2, 3, 7)])
             if len(words) % 2:
                 raise ValueError("not pairs")
-        except (ValueError, IndexError) as error:
+        except (ValueError, IndexError, OverflowError) as error:
             wanted = "a point and its track (or the file is cut short)"
             raise _invalid(path, line, text, wanted) from error
         tracks.append((len(words) - 8) // 2)
@@ -430,12 +428,6 @@ def _lines(path: Path, *, with_empty: bool = False) -> Iterator[tuple[int, str]]
     for number, line in enumerate(lines, start=1):
         if not line.startswith("#") and (with_empty or line.strip()):
             yield number, line
-
-
-def _whole(text: str) -> int:
-    if len(text) > _LONGEST_NUMBER:
-        raise ValueError("too many digits")
-    return int(text)
 
 
 def _invalid(path: Path, line: int, text: str, wanted: str) -> FileFormatError:
