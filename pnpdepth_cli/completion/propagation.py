@@ -65,11 +65,7 @@ class Propagated:
 
 
 def propagate(
-    prediction: Tensor,
-    points: SparsePoints,
-    rgb: Tensor | None,
-    *,
-    kind: str = "gp",
+    prediction: Tensor, points: SparsePoints, rgb: Tensor | None, *, kind: str = "gp"
 ) -> Propagated:
     """Returns the prediction with its residual at the points propagated.
 
