@@ -37,6 +37,9 @@ _LOSS_SCALE = 1024.0
 DepthOf = Callable[[Any], Tensor]
 """Turns the network's output for one frame into depth (1, 1, h, w) in metres, differentiably."""
 
+OnIteration = Callable[[int, float], None]
+"""Called with (updates made, loss)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Refinement:
@@ -87,7 +90,7 @@ def refine_from(
     settings: Settings,
     *,
     depth_of: Sequence[DepthOf],
-    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
+    on_iteration: OnIteration = lambda done, loss: None,
 ) -> list[Refinement | PnpDepthError]:
     """Returns for each of B frames its refinement, or the error that ended it.
 
@@ -98,7 +101,7 @@ def refine_from(
         points: Of each frame.
         settings: Of all frames.
         depth_of: Of each frame; called with the frame's part of the network's output.
-        on_iteration: Called after each update k with k and the mean of L(z_k).
+        on_iteration: Called after each update; gets the mean loss before it.
 
     Raises:
         BatchError: z or the output does not have one part per frame; refine them one at a time.
@@ -132,7 +135,7 @@ def refine_from(
             moved = [frame.updated(*part) for frame, *part in parts]
             z = torch.cat(moved) if count > 1 else moved[0]
         if running := [frame.losses[-1] for frame in frames if frame.error is None]:
-            on_iteration(iteration, sum(running) / len(running))
+            on_iteration(iteration + 1, sum(running) / len(running))
     else:
         with torch.no_grad():
             _losses(frames, split.rear(z))

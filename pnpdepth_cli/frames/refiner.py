@@ -22,6 +22,7 @@ from pnpdepth_cli.completion.image_registration import (
     estimated,
     evidence,
 )
+from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
 from pnpdepth_cli.frames.default import check_fixed, refine_default, split_hidden
@@ -38,7 +39,7 @@ from pnpdepth_cli.frames.frame import (
     registration_to_make,
 )
 from pnpdepth_cli.frames.fuse import Fusion, Member
-from pnpdepth_cli.frames.refine import OnIteration, refine_frame, refine_frames
+from pnpdepth_cli.frames.refine import refine_frame, refine_frames
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
 from pnpdepth_cli.frames.tiles import refine_tiled
 from pnpdepth_cli.frames.uncertainty import with_uncertainty

@@ -15,9 +15,10 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
+from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined, no_points
-from pnpdepth_cli.frames.refine import OnIteration, refine_frame, with_propagation
+from pnpdepth_cli.frames.refine import refine_frame, with_propagation
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings

@@ -467,7 +467,7 @@ def test_a_frame_that_diverges_does_not_touch_the_others() -> None:
     good = refined_at_once(network, "cut", settings)
     mixed = refined_at_once(
         network, "cut", settings, read=[depth_of, bad, depth_of],
-        on_iteration=lambda iteration, loss: seen.append((iteration, loss)),
+        on_iteration=lambda done, loss: seen.append((done, loss)),
     )  # fmt: skip
     assert isinstance(mixed[1], DivergedError)
     assert "after 2 updates" in str(mixed[1])
@@ -479,7 +479,7 @@ def test_a_frame_that_diverges_does_not_touch_the_others() -> None:
         assert isinstance(alone, Refinement)
         assert torch.equal(together.after, alone.after)
         assert together.losses == alone.losses
-    assert [iteration for iteration, _ in seen] == list(range(5))
+    assert [done for done, _ in seen] == [1, 2, 3, 4, 5]
     assert seen[2][1] == pytest.approx((mixed[0].losses[2] + mixed[2].losses[2]) / 2)
 
 
