@@ -129,12 +129,6 @@ def test_pixels_that_no_point_reaches_keep_their_bits(update: str) -> None:
     assert not changed[:, 8:].any()
 
 
-def test_the_loss_goes_down_and_iterations_are_updates_of_z() -> None:
-    result = refined(build("unet"), "bottleneck", Settings(iterations=7, lr=0.05))
-    assert len(result.losses) == 8
-    assert result.losses[-1] < result.losses[0]
-
-
 def doubled(pixels: int, depth: list[float], settings: Settings) -> Refinement:
     """`Doubling` refined in a row of pixels with a point on each, from depth 6 everywhere."""
     xy = torch.stack([torch.arange(float(pixels)), torch.zeros(pixels)], dim=1)
