@@ -15,8 +15,14 @@ import click
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.cli.printable import printable, shortened
-from pnpdepth_cli.cli.streams import INTERRUPTED, StdoutError, drop_stdout, guard_streams
+from pnpdepth_cli.cli.streams import (
+    INTERRUPTED,
+    StdoutError,
+    drop_stdout,
+    guard_streams,
+    printable,
+    shortened,
+)
 from pnpdepth_cli.errors import DeviceError, InputError, ModelError, OutputError, PnpDepthError
 
 _EXIT_CODES = """\b
@@ -54,7 +60,7 @@ COMMANDS = {
     "batch": "batch:batch",
     "adapt": "adapt:adapt",
     "models": "models:models",
-    "layers": "layers:layers",
+    "layers": "models:layers",
     "project": "sparse:project",
     "frames": "sparse:frames",
     "sample": "sparse:sample",

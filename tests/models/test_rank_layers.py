@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.commands.networks.layers import list_layers
+from pnpdepth_cli.commands.networks.describe import list_layers
 from pnpdepth_cli.commands.refinement.request import NetworkChoice
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.models import rank_layers as rank

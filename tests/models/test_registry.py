@@ -8,8 +8,8 @@ import pytest
 
 import model_zoo_defs
 from pnpdepth_cli import choices
-from pnpdepth_cli.commands.networks import list_models as list_models_module
-from pnpdepth_cli.commands.networks.list_models import list_models
+from pnpdepth_cli.commands.networks import describe
+from pnpdepth_cli.commands.networks.describe import list_models
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.registry import families, find_definition, names
 
@@ -83,7 +83,7 @@ def test_one_new_file_in_model_zoo_defs_adds_a_network(
     assert names()[-1] == name
     assert find_definition(name).build().out_channels == 1
     mine = {name: families()[name]}
-    monkeypatch.setattr(list_models_module, "families", lambda: mine)  # the others take long
+    monkeypatch.setattr(describe, "families", lambda: mine)  # the others take long
     assert [(one["name"], one["variant"]) for one in list_models()] == [(name, False)]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, SizeError, UsageError
-from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Hdf5Array
+from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Hdf5Array, Source
 from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
 from pnpdepth_cli.io.rgb import read_rgb
@@ -25,9 +25,12 @@ def read_frame_image(frame: Frame) -> NDArray[np.float32]:
     """Returns (H, W, 3) float32 in 0..1. Raises InputError if the frame has no image."""
     if frame.image is None:
         raise InputError(f"frame {frame.name} has no image")
-    source = frame.image
-    rgb = rgb_of(source) if isinstance(source, Hdf5Array) else read_rgb(source).values
-    return np.ascontiguousarray(frame.protocol.apply(rgb))
+    return np.ascontiguousarray(frame.protocol.apply(read_image(frame.image)))
+
+
+def read_image(source: Source) -> NDArray[np.float32]:
+    """Returns (H, W, 3) float32 in 0..1. Raises InputError for a file or array that is no image."""
+    return rgb_of(source) if isinstance(source, Hdf5Array) else read_rgb(source).values
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
