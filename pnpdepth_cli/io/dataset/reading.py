@@ -12,20 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, SizeError, UsageError
-from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Hdf5Array, Source
+from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Hdf5Array, Source
 from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
 from pnpdepth_cli.io.rgb import read_rgb
 
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
-
-
-def read_frame_image(frame: Frame) -> NDArray[np.float32]:
-    """Returns (H, W, 3) float32 in 0..1. Raises InputError if the frame has no image."""
-    if frame.image is None:
-        raise InputError(f"frame {frame.name} has no image")
-    return np.ascontiguousarray(frame.protocol.apply(read_image(frame.image)))
 
 
 def read_image(source: Source) -> NDArray[np.float32]:

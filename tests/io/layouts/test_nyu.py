@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset import Hdf5Array
-from pnpdepth_cli.io.dataset.reading import depth_of, read_frame_image, shape_of
+from pnpdepth_cli.io.dataset import Frame, Hdf5Array
+from pnpdepth_cli.io.dataset.reading import depth_of, read_image, shape_of
 from pnpdepth_cli.io.layouts import list_frames
 from tests.data_sets import ground_truth, nyu_h5, nyu_mat, read_frames
 from tests.empty_files import touch
@@ -17,14 +17,19 @@ from tests.empty_files import touch
 h5py = pytest.importorskip("h5py")
 
 
+def image_of(frame: Frame) -> np.ndarray:
+    assert frame.image is not None
+    return frame.protocol.apply(read_image(frame.image))
+
+
 def test_nyu_frames_come_halved_and_cropped_to_228_by_304(tmp_path: Path) -> None:
     nyu_h5(tmp_path / "h5")
     frame = read_frames(tmp_path / "h5")[1]
-    assert read_frame_image(frame).shape == (228, 304, 3)
+    assert image_of(frame).shape == (228, 304, 3)
     assert ground_truth(frame).tolist() == np.full((228, 304), 9.0).tolist()
     nyu_mat(tmp_path / "mat")
     frame = read_frames(tmp_path / "mat")[2]
-    np.testing.assert_array_equal(read_frame_image(frame), np.float32(2) / np.float32(255))
+    np.testing.assert_array_equal(image_of(frame), np.float32(2) / np.float32(255))
     # columns 8 … 311 of every second pixel, 1 3 5 …: column c holds 2 c + 2 metres
     want = 2 * np.arange(8, 312) + 2
     assert (ground_truth(frame) == want).all()
@@ -36,7 +41,7 @@ def test_kitti_in_files_of_the_same_kind_is_cut_as_kitti_is(tmp_path: Path) -> N
         file["rgb"], file["depth"] = np.zeros((3, 376, 1241), np.uint8), depth
     (frame,) = read_frames(tmp_path)
     assert frame.protocol.name == "kitti-odometry"
-    assert read_frame_image(frame).shape == (228, 912, 3)
+    assert image_of(frame).shape == (228, 912, 3)
     np.testing.assert_array_equal(ground_truth(frame), depth[148:, 164:1076])
 
 
