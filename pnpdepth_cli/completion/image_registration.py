@@ -63,10 +63,8 @@ class ImageRegistration:
     The colour of pixel x is at c + zoom (x − c) + (right, down), where c is the image's centre.
     """
 
-    zoom: float
-    """Ratio of the focal lengths, image over depth."""
-    right: float
-    """Shift in pixels, as `down`."""
+    zoom: float  # ratio of the focal lengths, image over depth
+    right: float  # shift in pixels, as `down`
     down: float
 
     def __str__(self) -> str:
@@ -122,7 +120,6 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
 
     Args:
         rgb: (H, W, 3) in 0…1.
-        points: Sparse depth.
 
     Returns:
         None where they cannot tell: points too few, in a part of the image only, scan lines of a

@@ -36,18 +36,12 @@ FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 class Frame:
     """An image and its sparse depth."""
 
-    rgb: Tensor | None
-    """(3, H, W) float32 in 0…1. None without an image."""
-    points: SparsePoints
-    """Sparse depth in the image frame, on the CPU."""
-    gt: DepthMap | None = None
-    """(H, W) metres, 0 = unknown. None without ground truth."""
-    held_out: SparsePoints | None = None
-    """Points that are kept out, to score at."""
-    unit: str = METRES
-    """Of all depths: "m", or "model units" of a COLMAP model without scale."""
-    register: Register = None
-    """How `rgb` is to be moved into the frame of the points."""
+    rgb: Tensor | None  # (3, H, W) float32 in 0…1. None without an image.
+    points: SparsePoints  # sparse depth in the image frame, on the CPU
+    gt: DepthMap | None = None  # (H, W) metres, 0 = unknown. None without ground truth.
+    held_out: SparsePoints | None = None  # points that are kept out, to score at
+    unit: str = METRES  # of all depths: "m", or "model units" of a COLMAP model without scale
+    register: Register = None  # how `rgb` is to be moved into the frame of the points
     outliers: SparsePoints | None = None
     """Points that were left out as outliers, for networks that weigh their points."""
     prior: Tensor | None = None
@@ -98,12 +92,9 @@ class Frame:
 class WarmStart:
     """What a frame of a window may take over from the frame before; the first has nothing."""
 
-    change: Tensor | None = None
-    """z_K − z_0 of the frame before."""
-    alignment: Alignment | None = None
-    """Its alignment of the network's output with the points."""
-    weights: MovingWeights | None = None
-    """Its weights, where weights move instead of z."""
+    change: Tensor | None = None  # z_K − z_0 of the frame before
+    alignment: Alignment | None = None  # its alignment of the network's output with the points
+    weights: MovingWeights | None = None  # its weights, where weights move instead of z
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,13 +150,10 @@ class Check:
     points, from four fifths of the points.
     """
 
-    hidden: SparsePoints
-    """The M hidden points."""
+    hidden: SparsePoints  # the M hidden points
     kept: SparsePoints
-    network: Tensor
-    """(H, W) metres, 0 = unknown: the user's network, aligned with the kept points."""
-    weights: Tensor
-    """(M,) 0…1, how consistent each hidden point is with its neighbours."""
+    network: Tensor  # (H, W) metres, 0 = unknown: the user's network, aligned with the kept points
+    weights: Tensor  # (M,) 0…1, how consistent each hidden point is with its neighbours
     predicted: Mapping[str, Tensor]
     """(M,) metres at the hidden points, by stage; also of linear interpolation and the result."""
 

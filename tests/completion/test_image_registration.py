@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given
-from hypothesis import strategies as st
 
 from pnpdepth_cli.completion.image_registration import (
     Evidence,
@@ -113,16 +111,6 @@ def test_points_or_an_image_without_an_edge_leave_the_image(case: str) -> None:
         rgb, depth = np.full((*SIZE, 3), 0.5, np.float32), points.depth
     known = evidence(rgb, SparsePoints(xy=xy, depth=depth, size=SIZE))
     assert estimated([known] if known is not None else []) is None
-
-
-@example(right=0, down=0)
-@given(right=st.integers(-6, 6), down=st.integers(-6, 6))
-def test_an_image_moved_by_whole_pixels_keeps_its_values(right: int, down: int) -> None:
-    rgb = np.random.default_rng(0).random((20, 30, 3), np.float32)
-    moved = ImageRegistration(zoom=1.0, right=float(right), down=float(down)).applied(rgb)
-    assert (moved == rgb).all() == (right == down == 0)
-    expected = np.roll(rgb, (-down, -right), axis=(0, 1))
-    assert (moved[6:-6, 6:-6] == expected[6:-6, 6:-6]).all()
 
 
 def test_the_colour_of_a_pixel_is_where_the_registration_says() -> None:

@@ -11,14 +11,13 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.commands.networks import describe
 from pnpdepth_cli.commands.networks.describe import list_models
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.registry import DEFAULT_MODEL, families, find_definition, names
+from pnpdepth_cli.models.registry import families, find_definition, names
 
 
 def test_every_known_name_has_a_definition_of_that_name() -> None:
     assert len(names()) == len(set(names()))
     for name in names():
         assert find_definition(name).name == name
-    assert DEFAULT_MODEL in names()
 
 
 PAPER = ("eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense", "latefusion")

@@ -111,7 +111,7 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
     row = FrameScores(pair=pair, known=known, kinds=frame.kinds)
     if frame.predicted is None:
         return replace(row, error="there is no prediction")
-    sums = error_sums(torch.from_numpy(depth), torch.from_numpy(gt), protocol.thresholds)[0]
+    sums = error_sums(torch.from_numpy(depth), torch.from_numpy(gt), protocol.thresholds)
     row = replace(
         row,
         pixels=pixels,

@@ -1,7 +1,7 @@
 """Data set layouts: which one a folder is, and its frames; `TABLE` has them by name.
 
-    frames = read_frames(Path("KITTI/object"))            # layout guessed
-    frames = read_frames(Path("frames"), "pairs")         # layout named
+    layout, listing = list_frames(Path("KITTI/object"))     # layout guessed
+    layout, listing = list_frames(Path("frames"), "pairs")  # layout named
 
 A new layout is a row of `rows`, or a `Layout` in `TABLE`, with its name in `choices.LAYOUTS`; or an
 entry point of the group `pnpdepth.layouts`.
@@ -19,7 +19,7 @@ from pnpdepth_cli.io.dataset import Frame, Unmatched
 from pnpdepth_cli.io.layouts import driving, indexed, kitti, manifest, nyu, rows
 from pnpdepth_cli.io.layouts.layout import Layout
 
-__all__ = ["LAYOUTS", "Layout", "Listing", "find_layout", "list_frames", "read_frames"]
+__all__ = ["LAYOUTS", "Layout", "Listing", "find_layout", "list_frames"]
 
 TABLE: dict[str, Layout] = {
     **rows.ROWS,
@@ -40,19 +40,15 @@ TABLE: dict[str, Layout] = {
 class Listing(NamedTuple):
     """What a data set holds."""
 
-    frames: list[Frame]
-    """Complete frames, in a fixed order."""
-    broken: list[Unmatched]
-    """Files of frames that lack a part, or cannot be read."""
-    spare: list[Unmatched]
-    """Other files beside them."""
+    frames: list[Frame]  # complete frames, in a fixed order
+    broken: list[Unmatched]  # files of frames that lack a part, or cannot be read
+    spare: list[Unmatched]  # other files beside them
 
 
 def find_layout(root: Path, name: str | None = None) -> str:
     """Returns the name of the layout that a folder or file is of.
 
     Args:
-        root: The data set.
         name: The only layout to consider; None for all, in the order of `choices.LAYOUTS`.
 
     Raises:
@@ -143,21 +139,3 @@ def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
         if not found:
             raise
         return list(found), layouts[0]
-
-
-def read_frames(root: Path, name: str | None = None) -> list[Frame]:
-    """Returns the frames of a data set, in a fixed order.
-
-    Args:
-        root: The data set.
-        name: Its layout; None to guess.
-
-    Raises:
-        InputError: There is no frame, or one is incomplete.
-    """
-    layout, listing = list_frames(root, name)
-    if listing.broken:
-        raise InputError(str(listing.broken[0]))
-    if not listing.frames:
-        raise InputError(f"{root} looks like {layout!r} but has no frame in it")
-    return listing.frames
