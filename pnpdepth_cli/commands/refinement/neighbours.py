@@ -21,6 +21,7 @@ from pnpdepth_cli.sensors.motion import (
     MotionEstimate,
     keypoints_of,
     motion_of_images,
+    motion_of_scans,
 )
 
 _IN_MEMORY = 16
@@ -48,6 +49,7 @@ def read_neighbours(
 
     Raises:
         InputError: The camera is unknown, a file cannot be read, or no motion is known.
+        UsageError: A library that estimates motion is missing.
     """
     if not files.neighbours:
         return used, [], []
@@ -66,7 +68,7 @@ def read_neighbours(
         assert source is not None
         known = neighbour.motion
         if known is None:
-            estimate = _estimated(files, neighbour.files, points, camera.camera)
+            estimate = _estimated(files, neighbour.files, own, points, camera.camera)
         else:
             estimate = MotionEstimate(motion=np.array(known), basis=neighbour.poses)
         entry: dict[str, Any] = {
@@ -94,10 +96,10 @@ def read_neighbours(
 
 
 def _estimated(
-    here: FrameFiles, there: FrameFiles, points: Points, camera: Camera
+    here: FrameFiles, there: FrameFiles, used: Points, points: Points, camera: Camera
 ) -> MotionEstimate:
     if here.image is None or there.image is None:
-        return MotionEstimate(None, "one of the two has no image")
+        return motion_of_scans(used, points, camera)
     return motion_of_images(
         _keypoints(here.image, here.protocol, fingerprint(file_of(here.image)).sha256),
         _keypoints(there.image, there.protocol, fingerprint(file_of(there.image)).sha256),
