@@ -116,13 +116,35 @@ def _from_file(spec: str) -> ModelDefinition | None:
 
         return exported_definition(Path(spec))
     if spec.endswith(_WEIGHTS_ONLY):
-        raise ModelError(
-            f"model {spec} is a file of weights, which cannot be cut; name the network's Python"
-            " file with --model and this file with --checkpoint, or export the network by"
-            " torch.export (.pt2) or to ONNX"
-        )
+        raise ModelError(_why_weights_are_no_network(Path(spec)))
     if Path(spec).is_dir():
         from pnpdepth_cli.models.hugging_face import hf_definition
 
         return hf_definition(Path(spec))
     return None
+
+
+def _why_weights_are_no_network(file: Path) -> str:
+    """What the file is, and the lines that make a network of it."""
+    from pnpdepth_cli.models.weights.torch_file import TORCHSCRIPT, is_module, read_torch_file
+
+    what, load = "is a file of weights", None
+    if file.is_file() and file.suffix not in (".safetensors", ".npy", ".npz", ".index"):
+        try:
+            if is_module(read_torch_file(file)[0]):
+                what, load = "is a whole pickled module", "torch.load({!r}, weights_only=False)"
+        except Exception as error:  # another file of weights, or none
+            if TORCHSCRIPT in str(error):
+                what, load = "is a TorchScript archive", "torch.jit.load({!r})"
+    if load is None:
+        return (
+            f"model {file} {what}, which cannot be cut; name the network's Python file with --model"
+            " and this file with --checkpoint, or export the network by torch.export (.pt2) or to"
+            " ONNX"
+        )
+    return (
+        f"model {file} {what}, which is not run; where you trust it, export it to ONNX (with the"
+        f" size of your images): net = {load.format(file.name)}.eval();"
+        f" torch.onnx.export(net, torch.zeros(1, 3, 480, 640), {file.stem + '.onnx'!r},"
+        " dynamo=False)"
+    )
