@@ -247,9 +247,10 @@ def _moved(
     check: Check,
     propagation: str,
 ) -> tuple[Tensor, Check, tuple[str, ...]]:
-    """The result (H, W), moved away from the image where the check says so, and why."""
+    """The result (H, W), moved away from an image that does not fit its points, and why."""
     count, gain = len(check.hidden), check.gain(PROPAGATED, LINEAR)
-    if count < ENOUGH_FOR_LOSS or gain >= (GAIN if count >= ENOUGH_FOR_GAIN else -LOSS):
+    worse = count >= ENOUGH_FOR_LOSS and gain < (GAIN if count >= ENOUGH_FOR_GAIN else -LOSS)
+    if not worse and not frame.unrelated:
         return depth, check, ()
     at_points, what = check.predicted[PROPAGATED], []
     blind = _blind(fusion, frame, hidden, propagation)
@@ -257,16 +258,21 @@ def _moved(
         depth = weighted_mean([(depth, 1.0), (blind[0], 1.0)])
         at_points = weighted_mean([(at_points, 1.0), (blind[1], 1.0)])
         what.append("half of the result leaves the image out")
-    if gain < -LOSS:
+    if worse and gain < -LOSS:
         depth = weighted_mean([(depth, 1.0), (linear(frame.points), 1.0)])
         at_points = weighted_mean([(at_points, 1.0), (check.predicted[LINEAR], 1.0)])
         what.append("half is linear interpolation")
     if not what:
         return depth, check, ()
     error, of_linear = check.error(PROPAGATED), check.error(LINEAR)
+    reason = (
+        f"with it the error at {count:,} hidden points is {error:.4f}, linear interpolation has"
+        f" {of_linear:.4f}"
+        if worse
+        else "depth changes at its edges no more often than by chance"
+    )
     note = (
-        "warning: the image does not seem to belong to these points: with it the error at"
-        f" {count:,} hidden points is {error:.4f}, linear interpolation has {of_linear:.4f};"
+        f"warning: the image does not seem to belong to these points: {reason};"
         f" {' and '.join(what)}; see --registration"
     )
     return depth, check.with_prediction(RESULT, at_points), (note,)

@@ -25,8 +25,9 @@ METRES = "m"
 DepthMap = NDArray[np.float32]
 Registration = str | tuple[float, float, float]
 """What the user says of the registration: "auto", "off", or zoom, right and down in pixels."""
-Register = ImageRegistration | Literal["auto"] | None
-"""How an image is to be moved into the frame of the points; "auto": as the points say."""
+Register = ImageRegistration | Literal["auto", "unrelated"] | None
+"""How an image is to be moved into the frame of the points. "auto": as the points say; "unrelated":
+not at all, as it seems not to belong to them."""
 FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 """Value of white by the type of an image's integers."""
 
@@ -54,6 +55,8 @@ class Frame:
     that take one. None without."""
     registration: ImageRegistration | None = None
     """How `rgb` was moved into the frame of the points. None: it was not."""
+    unrelated: bool = False
+    """Whether depth changes at edges of `rgb` no more often than by chance."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -66,8 +69,8 @@ class Frame:
         return None if self.rgb is None else np.ascontiguousarray(self.rgb.permute(1, 2, 0))
 
     @functools.cached_property
-    def _registration_of_points(self) -> ImageRegistration | None:
-        """How the points say that the image is moved: asked for more than once of most frames."""
+    def _registration_of_points(self) -> Register:
+        """What the points say of the registration: asked for more than once of most frames."""
         assert self.image is not None
         return estimated([evidence(self.image, self.points)])
 
@@ -77,8 +80,8 @@ class Frame:
         if image is None or how is None:
             return self
         how = self._registration_of_points if how == "auto" else how
-        if how is None:
-            return replace(self, register=None)
+        if how is None or isinstance(how, str):
+            return replace(self, register=None, unrelated=how == "unrelated")
         return replace(self, rgb=tensor_of(how.applied(image)), register=None, registration=how)
 
     def with_points(self, points: SparsePoints) -> Frame:

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike
 
 from pnpdepth_cli.completion.image_registration import (
     Evidence,
-    ImageRegistration,
     estimated,
     evidence,
 )
@@ -29,6 +28,7 @@ from pnpdepth_cli.frames.frame import (
     METRES,
     Frame,
     Refined,
+    Register,
     Registration,
     Unit,
     WarmStart,
@@ -96,9 +96,7 @@ class Refiner:
         self._uncertainty, self._check = uncertainty, check or uncertainty
         self._register = registration_to_make(registration, self.asked)
         self.members: tuple[Member, ...] = ()
-        self.registrations: Mapping[tuple[int, int], ImageRegistration | None] = MappingProxyType(
-            {}
-        )
+        self.registrations: Mapping[tuple[int, int], Register] = MappingProxyType({})
         self._stack = ExitStack()
         self._opened: Split | Fusion | None = None
         of_weights = self.asked.masked or self.asked.moves_weights

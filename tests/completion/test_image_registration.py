@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -38,7 +40,7 @@ def test_zoom_and_shift_between_the_cameras_are_found(
     seed: int, registration: ImageRegistration
 ) -> None:
     found = estimated([evidence_of(seed, registration)])
-    assert found is not None
+    assert isinstance(found, ImageRegistration)
     assert found.zoom == pytest.approx(registration.zoom, abs=0.012)
     assert found.right == pytest.approx(registration.right, abs=1.5)
     assert found.down == pytest.approx(registration.down, abs=1.5)
@@ -54,14 +56,30 @@ def test_frames_with_few_points_show_together_what_each_does_not() -> None:
     frames = [evidence_of(seed, UNREGISTERED, count=80) for seed in range(8)]
     assert [estimated([each]) for each in frames].count(None) >= 6
     found = estimated(frames)
-    assert found is not None
+    assert isinstance(found, ImageRegistration)
     assert found.zoom == pytest.approx(UNREGISTERED.zoom, abs=0.02)
 
 
 def test_frames_of_another_size_than_the_first_are_left_out() -> None:
     first, other = evidence_of(0, UNREGISTERED), evidence_of(1)
-    smaller = Evidence(log_likelihood=other.log_likelihood[:, 1:-1], size=(200, 320))
-    assert estimated([first, smaller]) == estimated([first])
+    assert estimated([first, replace(other, size=(200, 320))]) == estimated([first])
+
+
+@pytest.mark.parametrize("zoom", [0.72, 1.4])
+def test_frames_show_together_that_the_image_sees_much_less_or_more(zoom: float) -> None:
+    there = ImageRegistration(zoom=zoom, right=6.0, down=-4.0)
+    found = estimated([evidence_of(seed, there) for seed in range(4)])
+    assert isinstance(found, ImageRegistration)
+    assert found.zoom == pytest.approx(zoom, abs=0.01)
+    assert (found.right, found.down) == pytest.approx((6.0, -4.0), abs=1.5)
+
+
+@pytest.mark.parametrize(("count", "frames"), [(100, 6), (500, 5)])
+def test_images_of_other_scenes_are_unrelated_to_the_points(count: int, frames: int) -> None:
+    pairs = [
+        (frame(seed + 20, count=count)[0], frame(seed, count=count)[1]) for seed in range(frames)
+    ]
+    assert estimated([evidence(*pair) for pair in pairs]) == "unrelated"
 
 
 def test_points_that_were_found_in_the_image_show_nothing() -> None:
