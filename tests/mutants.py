@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import argparse
 import ast
+import compileall
 import copy
+import multiprocessing
 import os
 import random
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -124,7 +125,7 @@ def mutants(only: str) -> list[Mutant]:
 
 
 def matching_tests(file: Path) -> list[str]:
-    """Returns the test files that mirror a module, then those that import it."""
+    """Returns the test files that mirror a module and import it; without a mirror, its folder's."""
     parts = file.parts[1:-1] if file.parts[0] == "pnpdepth_cli" else file.parts[:1]
     folder = ROOT.joinpath("tests", *parts)
     module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
@@ -135,7 +136,7 @@ def matching_tests(file: Path) -> list[str]:
     mirror = sorted(folder.glob(f"test_{file.stem}*.py"))
     while not (near := sorted(folder.glob("test_*.py"))):  # such as io/formats, tested in io
         folder = folder.parent
-    chosen = dict.fromkeys([*mirror, *importing]) or near
+    chosen = dict.fromkeys([*mirror, *importing] if mirror else [*importing, *near])
     return [path.relative_to(ROOT).as_posix() for path in chosen]
 
 
@@ -148,6 +149,7 @@ class Trees:
         ignored = shutil.ignore_patterns(".*", "__pycache__", "out", "dist", "build", "site")
         for number in range(arguments.jobs):
             shutil.copytree(ROOT, folder / str(number), ignore=ignored)
+            compileall.compile_dir(folder / str(number), quiet=2)  # never of a mutant
             self._free.put(folder / str(number))
 
     def outcome(self, mutant: Mutant) -> str:
@@ -172,24 +174,48 @@ class Trees:
 
     def _failed(self, tree: Path, tests: list[str], without: list[str]) -> str:
         """The first test that fails, `time` if it does not end, or an empty text."""
-        options = ["-p", "no:cacheprovider", "-p", "tests.mutants", "-x", "-q", "-rfE", "--tb=no"]
-        options += ["-m", self._arguments.marked, *(f"--deselect={name}" for name in without)]
-        data = os.environ.get("PNPDEPTH_TEST_DATA", str(ROOT.parent / "shared" / "data"))
-        limit = self._arguments.limit
-        changes = {"PYTHONPATH": str(tree), "PNPDEPTH_TEST_DATA": data}
-        changes |= {"PNPDEPTH_MUTANT_LIMIT": str(limit), "PYTHONDONTWRITEBYTECODE": "1"}
-        command = [sys.executable, "-m", "pytest", *options, *tests]
-        how = {"capture_output": True, "text": True, "stdin": subprocess.DEVNULL}
-        try:
-            done = subprocess.run(  # type: ignore[call-overload]
-                command, cwd=tree, env=os.environ | changes, timeout=limit + ALARM_S, **how
-            )
-        except subprocess.TimeoutExpired:
+        options = ["-p", "no:cacheprovider", "-p", "tests.mutants", "--assert=plain", "--tb=no"]
+        options += ["-x", "-q", "-rfE", "-m", self._arguments.marked]
+        options += [*(f"--deselect={name}" for name in without), *tests]
+        printed, limit = tree / "printed.txt", self._arguments.limit
+        process = _FORKS.Process(target=_run_tests, args=(printed, limit, options))
+        process.start()
+        process.join(limit + ALARM_S)
+        if process.is_alive():
+            process.kill()
             return "time"
-        if done.returncode in (0, 5):  # 5: no test is left
+        if process.exitcode in (0, 5):  # 5: no test is left
             return ""
-        named = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+        named = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", printed.read_text(), re.MULTILINE)
         return named[1] if named else tests[0]
+
+
+_FORKS = multiprocessing.get_context("forkserver")
+_LIBRARIES = (
+    *("pytest", "hypothesis.extra.numpy", "torch", "safetensors.torch", "cv2", "PIL.Image"),
+    *("scipy.interpolate", "scipy.ndimage", "scipy.spatial", "scipy.stats", "click", "rich.table"),
+)
+_FORKS.set_forkserver_preload([*_LIBRARIES])
+
+
+def _run_tests(printed: Path, limit: float, arguments: list[str]) -> None:
+    """Ends the process, forked where the libraries are imported already, with pytest's exit code.
+
+    It runs in the folder of `printed`, where pytest's output goes.
+    """
+    for name in [name for name in sys.modules if name.partition(".")[0] == "tests"]:
+        del sys.modules[name]  # of the tree that the mutants were chosen in
+    with printed.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os.chdir(printed.parent)
+    sys.path[:0] = [str(printed.parent)]
+    sys.dont_write_bytecode = True
+    data = os.environ.get("PNPDEPTH_TEST_DATA", str(ROOT.parent / "shared" / "data"))
+    os.environ |= {"PYTHONPATH": str(printed.parent), "PNPDEPTH_TEST_DATA": data}
+    os.environ |= {"PNPDEPTH_MUTANT_LIMIT": str(limit), "PYTHONDONTWRITEBYTECODE": "1"}
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    sys.exit(int(pytest.main(arguments)))
 
 
 _STARTED = time.monotonic()
