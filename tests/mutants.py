@@ -4,9 +4,9 @@
 
 One expression of a file is changed: a comparison, an arithmetic operator, a constant, `and`, a
 returned value, min, any, floor, mean and the like. In a temporary copy of the tree the test files
-that mirror the module run first, then those that import it. A test that fails with the mutant and
-passes without it kills it; so does a run without end. Prints a table by package, and each survivor
-with its place and change.
+that mirror the module or import it run first, then the others of its folder. A test that fails with
+the mutant and passes without it kills it; so does a run without end. Prints a table by package, and
+each survivor with its place and change.
 """
 
 from __future__ import annotations
@@ -124,8 +124,8 @@ def mutants(only: str) -> list[Mutant]:
     return found
 
 
-def matching_tests(file: Path) -> list[str]:
-    """Returns the test files that mirror a module and import it; without a mirror, its folder's."""
+def matching_tests(file: Path) -> list[list[str]]:
+    """Returns the test files that mirror a module or import it, and the others of its folder."""
     parts = file.parts[1:-1] if file.parts[0] == "pnpdepth_cli" else file.parts[:1]
     folder = ROOT.joinpath("tests", *parts)
     module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
@@ -133,11 +133,11 @@ def matching_tests(file: Path) -> list[str]:
     imports = re.compile(rf"{module}\b|from {parent} import [^)\n]*\b{last}\b")
     tests = sorted((ROOT / "tests").rglob("test_*.py"))
     importing = [path for path in tests if imports.search(path.read_text("utf-8"))]
-    mirror = sorted(folder.glob(f"test_{file.stem}*.py"))
+    first = dict.fromkeys([*sorted(folder.glob(f"test_{file.stem}*.py")), *importing])
     while not (near := sorted(folder.glob("test_*.py"))):  # such as io/formats, tested in io
         folder = folder.parent
-    chosen = dict.fromkeys([*mirror, *importing] if mirror else [*importing, *near])
-    return [path.relative_to(ROOT).as_posix() for path in chosen]
+    chosen = ([*first], [path for path in near if path not in first])
+    return [[path.relative_to(ROOT).as_posix() for path in paths] for paths in chosen if paths]
 
 
 class Trees:
@@ -155,22 +155,27 @@ class Trees:
     def outcome(self, mutant: Mutant) -> str:
         """Returns `survived`, or what killed the mutant."""
         tree, broken = self._free.get(), list[str]()
-        file, tests = tree / mutant.file, matching_tests(mutant.file)
+        file = tree / mutant.file
         original = file.read_bytes()
+        mutated = original[: mutant.start] + mutant.text + original[mutant.end :]
         try:
-            while True:  # a test that fails without the mutant too is left out
-                file.write_bytes(original[: mutant.start] + mutant.text + original[mutant.end :])
-                failed = self._failed(tree, tests, broken)
-                if failed in ("", "time") or self._sound.get(failed):
-                    return failed or "survived"
-                file.write_bytes(original)
-                self._sound[failed] = not self._failed(tree, [failed], [])
-                if self._sound[failed]:
-                    return failed
-                broken.append(failed)
+            for tests in matching_tests(mutant.file):
+                file.write_bytes(mutated)
+                while failed := self._failed(tree, tests, broken):
+                    if failed == "time" or self._passes_without(failed, tree, file, original):
+                        return failed
+                    broken.append(failed)
+                    file.write_bytes(mutated)
+            return "survived"
         finally:
             file.write_bytes(original)
             self._free.put(tree)
+
+    def _passes_without(self, test: str, tree: Path, file: Path, original: bytes) -> bool:
+        if test not in self._sound:
+            file.write_bytes(original)
+            self._sound[test] = not self._failed(tree, [test], [])
+        return self._sound[test]
 
     def _failed(self, tree: Path, tests: list[str], without: list[str]) -> str:
         """The first test that fails, `time` if it does not end, or an empty text."""
