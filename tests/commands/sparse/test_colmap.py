@@ -145,6 +145,8 @@ def test_what_does_not_fit_a_model_is_refused(tmp_path: Path, project: Path) -> 
 def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) -> None:
     change(project, "points3D.txt", "9 9 9 0.5 1 0 2 0 3 0", "9 9 9 2.5 1 0 2 0 3 0")
     change(project, "points3D.txt", "9 9 9 0.5 1 1 2 1 3 1", "9 9 9 0.5 1 1 2 1")
+    change(project, "points3D.txt", "9 9 9 0.5 1 2 2 2 3 2", "9 9 9 2 1 2 2 2 3 2")
+    change(project, "images.txt", "5 5 -1", "5 5 99")  # a point that the model has no longer
     points = read(project).points
     assert points.dropped["seen in fewer than 3 images"] == 1
     assert points.dropped["with a reprojection error above 2 px"] == 1
