@@ -222,6 +222,7 @@ BAD = [
     ({"lr": "fast"}, UsageError, "lr must be a step size above 0"),
     ({"holdout": 1.0}, UsageError, "--holdout must be a fraction"),
     ({"layer": "1.5"}, UsageError, "between 0 and 1"),
+    ({"layer": "-0.5"}, UsageError, "between 0 and 1"),
     ({"layer": "midle"}, LayerError, "did you mean middle"),
     ({"layer": "unused"}, LayerError, "never runs"),
     ({"image": None}, PnpDepthError, "takes an rgb image"),

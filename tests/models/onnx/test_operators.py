@@ -74,7 +74,7 @@ UNARY = [
     ("Softplus", {}), ("Softsign", {}), ("Mish", {}), ("Erf", {}), ("Exp", {}), ("Abs", {}),
     ("Neg", {}), ("Floor", {}), ("Ceil", {}), ("Round", {}), ("Sign", {}), ("Sin", {}), ("Cos", {}),
     ("Tan", {}), ("Atan", {}), ("Sinh", {}), ("Cosh", {}), ("Identity", {}), ("IsNaN", {}),
-    ("IsInf", {}), ("Softmax", {"axis": 1}), ("LogSoftmax", {}), ("Flatten", {"axis": 2}),
+    ("Softmax", {"axis": 1}), ("LogSoftmax", {}), ("Flatten", {"axis": 2}),
     ("Flatten", {"axis": -1}), ("Transpose", {"perm": [0, 2, 3, 1]}), ("Transpose", {}),
     ("GlobalAveragePool", {}), ("GlobalMaxPool", {}), ("LRN", {"size": 3, "alpha": 0.01}),
     ("Shape", {"start": 1}),
@@ -126,8 +126,28 @@ def test_activations_of_old_and_new_opsets() -> None:
     check("Clip", [X, None, np.array(0.5, F32)])
     check("Clip", [X, np.array(2, F32), np.array(1, F32)])
     check("PRelu", [X, normal(4, 1, 1)])
+    for detect in ({"detect_negative": 0}, {"detect_positive": 0}):
+        check("IsInf", [np.array([np.inf, -np.inf, 1], F32)], **detect)
     check("Softmax", [X], opset=9)
     check("Softmax", [X], opset=11, axis=2)
+
+
+@pytest.mark.parametrize(
+    ("op", "shape", "more", "expected"),
+    [
+        ("PRelu", (4,), {}, lambda x, y: np.where(x < 0, x * y[:, None, None], x)),
+        ("Sub", (4, 7), {"axis": 1, "broadcast": 1}, lambda x, y: x - y[..., None]),
+        ("Mul", (4,), {"axis": -3, "broadcast": 1}, lambda x, y: x * y[:, None, None]),
+        ("Add", (7, 6), {"broadcast": 1}, np.add),
+        ("Div", (1, 4, 7, 6), {"axis": 0}, np.divide),
+    ],
+)
+def test_before_opset_7_which_onnxruntime_lacks_a_smaller_input_begins_at_an_axis(
+    op: str, shape: tuple[int, ...], more: dict[str, Any], expected: Any
+) -> None:
+    y = normal(*shape)
+    ours = OnnxGraph(model_of(op, [X, y], 6, 1, **more), Path("x.onnx"))(torch.from_numpy(X))
+    assert np.array_equal(ours.numpy(), expected(X, y))
 
 
 def test_matrices() -> None:
