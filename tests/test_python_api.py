@@ -65,14 +65,16 @@ def test_a_refiner_stays_open_and_takes_maps_rows_and_points_alike(
     rgb, sparse = frame
     y, x = np.nonzero(sparse)
     rows = np.stack([x, y, sparse[y, x]], axis=1)
+    unknown = np.array([[np.nan, 3, 2], [3, np.nan, 2], [3, 3, np.nan], [3, 3, 0], [3, 3, -1]])
     points = pnp.SparsePoints(
         xy=torch.from_numpy(rows[:, :2].astype(np.float32)),
         depth=torch.from_numpy(rows[:, 2].astype(np.float32)),
         size=sparse.shape,
     )
+    maps = (sparse, sparse, np.concatenate([unknown, rows]), points)
     before = {name: value.clone() for name, value in network.module.state_dict().items()}
     with pnp.Refiner(network, pnp.Settings(iterations=1)) as refiner:
-        depths = [refiner.refine(rgb, given).depth for given in (sparse, sparse, rows, points)]
+        depths = [refiner.refine(rgb, given).depth for given in maps]
     assert all(np.array_equal(depths[0], depth) for depth in depths[1:])
     assert all(torch.equal(before[n], v) for n, v in network.module.state_dict().items())
     assert not any("forward" in module.__dict__ for module in network.module.modules())
