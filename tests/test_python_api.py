@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -26,9 +27,13 @@ def network() -> pnp.Network:
     return pnp.load_network("compact")
 
 
+PART = slice(0, 128), slice(0, 160)
+
+
 @pytest.fixture(scope="module")
 def frame() -> Frame:
-    return read_rgb(SAMPLE / "rgb.png").values, read_depth(SAMPLE / "sparse.png").values
+    """A part of the sample."""
+    return read_rgb(SAMPLE / "rgb.png").values[PART], read_depth(SAMPLE / "sparse.png").values[PART]
 
 
 def test_the_public_names_are_these() -> None:
@@ -50,12 +55,14 @@ def test_arrays_are_refined_as_the_command_refines_files(
     from pnpdepth_cli.cli.main import main
 
     refined = pnp.refine(network, *frame)
-    files = [str(SAMPLE / "rgb.png"), "--sparse", str(SAMPLE / "sparse.png")]
+    files = [str(tmp_path / "rgb.png"), "--sparse", str(tmp_path / "sparse.npy")]
+    cv2.imwrite(files[0], np.rint(frame[0][:, :, ::-1] * 255))
+    np.save(files[2], frame[1])
     with pytest.raises(SystemExit) as ended:
         main(["refine", *files, "-o", str(tmp_path / "depth.npy")])
     assert ended.value.code in (None, 0)
     assert np.array_equal(refined.depth, np.load(tmp_path / "depth.npy"))
-    truth = read_depth(SAMPLE / "gt.png").values
+    truth = read_depth(SAMPLE / "gt.png").values[PART]
     assert pnp.score(refined.depth, truth).mae < pnp.score(refined.before, truth).mae
 
 

@@ -80,6 +80,11 @@ def test_a_missing_layer_and_no_points_are_errors(frame: FrameOnDisk) -> None:
 
 def test_the_papers_table_has_its_seven_networks_and_its_four_ratios() -> None:
     assert len({paper.name for paper in PAPER_TIMES}) == 7
+    sizes = {(paper.data, paper.size) for paper in PAPER_TIMES}
+    assert sizes == {
+        *(("NYU", size) for size in ((228, 304), (224, 320))),
+        *(("KITTI", size) for size in ((128, 416), (352, 1216))),
+    }
     printed = [(p.name, p.before, p.after) for p in PAPER_TIMES]
     ratios = {name: round(after / before, 1) for name, before, after in printed if before and after}
     assert ratios == {"Ma": 5.1, "Jaritz": 3.3, "Uhrig": 5.2, "Chodosh": 1.4}
