@@ -72,7 +72,7 @@ def test_a_refiner_stays_open_and_takes_maps_rows_and_points_alike(
     rgb, sparse = frame
     y, x = np.nonzero(sparse)
     rows = np.stack([x, y, sparse[y, x]], axis=1)
-    unknown = np.array([[np.nan, 3, 2], [3, np.nan, 2], [3, 3, np.nan], [3, 3, 0], [3, 3, -1]])
+    unknown = np.array([[np.nan, 3, 2], [3, np.nan, 2], [3, 3, np.nan], [3, 3, 0], [3, 3, np.inf]])
     points = pnp.SparsePoints(
         xy=torch.from_numpy(rows[:, :2].astype(np.float32)),
         depth=torch.from_numpy(rows[:, 2].astype(np.float32)),

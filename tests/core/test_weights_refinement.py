@@ -252,9 +252,15 @@ def test_a_few_points_leave_the_plain_depth(count: int) -> None:
 @pytest.mark.parametrize("fraction", [0.1, 0.3, 0.5, 0.8])
 @pytest.mark.parametrize("count", [2, 5, 40])
 def test_a_mask_hides_some_and_shows_some(kind: str, fraction: float, count: int) -> None:
-    masks = _masks(points(count), kind, fraction)
-    for _ in range(7):
-        assert 0 < int(masks.next().sum()) < count
+    row = SparsePoints(
+        xy=torch.arange(count)[:, None] * torch.tensor([0.3, 0.0]) + 1,
+        depth=torch.ones(count),
+        size=(16, 16),
+    )
+    for at in (points(count), row):
+        masks = _masks(at, kind, fraction)
+        for _ in range(7):
+            assert 0 < int(masks.next().sum()) < count
 
 
 @pytest.mark.parametrize(
