@@ -165,6 +165,7 @@ def test_every_unambiguous_form_of_an_image_is_read_alike(
     form: Callable[[NDArray[Any]], Any],
 ) -> None:
     grey = np.random.default_rng(0).integers(0, 256, (6, 8, 1), np.uint8)
+    grey[0, 0] = 0  # the darkest belongs to 0..255 too
     rgb = grey.repeat(3, axis=2)
     rows = [[1.0, 2, 3]]
     expected = frame_of_arrays(rgb, rows).rgb
