@@ -36,7 +36,7 @@ from benchmarks.frames import Depth, frame_inputs, refined
 from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, SETTING, PaperRow, networks_of
 from benchmarks.paper_report import heading, markdown, plot
 from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, TableFrame, rendered, shared
-from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.errors import PnpDepthError, UsageError

@@ -27,7 +27,7 @@ class Table(Mapping[str, Any]):
     is its entry point `<name>` in the group `pnpdepth.<group>`; the package's own entries win.
 
     Args:
-        path: Path of the folder or the module relative to `package`, such as "io/formats".
+        path: Path of the folder or the module relative to `package`, such as "commands/exports".
         attribute: Name of the object in each module.
         group: Last part of the entry point group.
         noun: What one entry is called in messages.
@@ -161,10 +161,9 @@ NETWORKS = Table(
 
 FORMATS = Table(
     "io/formats",
-    "FORMAT",
     group="formats",
     noun="depth format",
-    first=("png", "exr", "npy", "npz", "pfm", "tiff"),
+    names=("png", "exr", "npy", "npz", "pfm", "tiff"),
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 

@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.dataset import Frame, Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of
 from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.layouts import list_frames
 from tests.colmap_models import write_text_model
 from tests.empty_files import touch, tree
 
@@ -246,6 +248,14 @@ def ddad_scene(
     calibration = {"names": ["LIDAR", "CAMERA_01"], "intrinsics": [{}, intrinsics or PINHOLE]}
     (folder / "calibration/k.json").write_text(json.dumps(calibration))
     (folder / "scene_0a.json").write_text(json.dumps({"data": data, "samples": rows}))
+
+
+def read_frames(root: Path, name: str | None = None) -> list[Frame]:
+    """The frames of a data set, all of which are complete."""
+    _, listing = list_frames(root, name)
+    if listing.broken:
+        raise InputError(str(listing.broken[0]))
+    return listing.frames
 
 
 def ground_truth(frame: Frame) -> np.ndarray:

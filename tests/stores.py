@@ -23,7 +23,7 @@ def s3_server() -> Iterator[str]:
     """Yields the address of an S3 server on loopback; the environment names it until the end."""
     from moto.server import ThreadedMotoServer
 
-    from pnpdepth_cli.io.remote import forget_stores
+    from pnpdepth_cli.io import remote
 
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
@@ -32,11 +32,11 @@ def s3_server() -> Iterator[str]:
     settings = {**SETTINGS, "AWS_ENDPOINT_URL": f"http://{host}:{port}"}
     before = {name: os.environ.get(name) for name in settings}
     os.environ.update(settings)
-    forget_stores()
+    remote._file_system.cache_clear()
     try:
         yield settings["AWS_ENDPOINT_URL"]
     finally:
-        forget_stores()
+        remote._file_system.cache_clear()
         for name, value in before.items():
             os.environ.pop(name)
             if value is not None:

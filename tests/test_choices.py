@@ -22,30 +22,30 @@ from pnpdepth_cli.sensors import LIDARS, PATTERNS
 
 @pytest.fixture
 def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Table:
-    """A table over the modules of `io.formats`, and two entry points of another package."""
+    """A table over the modules of `io`, and two entry points of another package."""
     info = tmp_path / "other-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
-        "[pnpdepth.test_table]\nelsewhere = other_package:entry\npfm = other_package:entry\n"
+        "[pnpdepth.test_table]\nelsewhere = other_package:entry\ncolmap = other_package:entry\n"
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    return Table("io/formats", "__name__", group="test_table", noun="entry", first=("png",))
+    return Table("io", "__name__", group="test_table", noun="entry", first=("record",))
 
 
 def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_there(
     table: Table,
 ) -> None:
     names = list(table)
-    assert names == ["png", *sorted(set(names) - {"png"})]
-    assert {"pfm", "elsewhere"} <= set(names)
+    assert names == ["record", *sorted(set(names) - {"record"})]
+    assert {"colmap", "elsewhere"} <= set(names)
     assert "--init--" not in table
     assert len(table) == len(names)
-    assert table["pfm"] == "pnpdepth_cli.io.formats.pfm"  # of this package first
+    assert table["colmap"] == "pnpdepth_cli.io.colmap"  # of this package first
     assert table["elsewhere"] == "loaded from elsewhere"
-    with pytest.raises(UsageError, match=r"unknown entry 'pfmm'; did you mean 'pfm'\?"):
-        table["pfmm"]
+    with pytest.raises(UsageError, match=r"unknown entry 'colmapp'; did you mean 'colmap'\?"):
+        table["colmapp"]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -48,6 +49,14 @@ def test_every_file_that_is_no_module_is_listed_for_the_wheel() -> None:
         assert {path for path in files - listed if path.suffix not in (".py", ".pyc")} == set()
 
 
+def test_the_version_is_that_of_the_citation_and_of_the_changelog() -> None:
+    citation = (ROOT / "CITATION.cff").read_text()
+    (released,) = re.findall(r'^date-released: "?([\d-]+)"?$', citation, re.MULTILINE)
+    assert f"\nversion: {pnp.__version__}\n" in citation
+    first = next(line for line in (ROOT / "CHANGELOG.md").open() if line.startswith("## "))
+    assert first == f"## {pnp.__version__} ({released})\n"
+
+
 def test_the_package_runs_as_a_module_like_the_command(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pnpdepth_cli"]
     done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
@@ -57,6 +66,25 @@ def test_the_package_runs_as_a_module_like_the_command(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr.count("\n")) == (3, 1)
     assert done.stderr.startswith("pnpdepth: ")
     assert not list(tmp_path.iterdir())
+
+
+def test_the_line_of_the_documentation_completes_commands_and_options_in_bash() -> None:
+    scripts = Path(sys.executable).parent
+    if not (shutil.which("bash") and (scripts / "pnpdepth").is_file()):
+        pytest.skip("needs bash and an installed command")
+    (line,) = re.findall(r'^eval ".*"$', (ROOT / "docs/install.md").read_text(), re.MULTILINE)
+    script = f"""{line}
+        COMP_WORDS=(pnpdepth cl) COMP_CWORD=1
+        _pnpdepth_completion pnpdepth; echo "${{COMPREPLY[@]}}"; COMPREPLY=()
+        COMP_WORDS=(pnpdepth refine --unc) COMP_CWORD=2
+        _pnpdepth_completion pnpdepth; echo "${{COMPREPLY[@]}}"
+    """
+    path = os.pathsep.join([str(scripts), os.environ["PATH"]])
+    done = subprocess.run(
+        ["bash", "-c", script], capture_output=True, text=True, env={**os.environ, "PATH": path},
+        check=True,
+    )  # fmt: skip
+    assert done.stdout.split() == ["cloud", "--uncertainty"]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +107,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(
     wheel: Path, tmp_path: Path
 ) -> None:
-    assert wheel.stat().st_size < 25e6
+    assert wheel.stat().st_size < 20e6
     names = zipfile.ZipFile(wheel).namelist()
     assert "model_zoo_defs/weights/compact.safetensors" in names
     assert not [name for name in names if "training" in name or name.startswith("tests")]

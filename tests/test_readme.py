@@ -36,6 +36,14 @@ def shown_commands(page: Path) -> list[list[str]]:
     return [shlex.split(text.removeprefix("pnpdepth ")) for text in commands if text.strip()]
 
 
+def titled_blocks(page: Path) -> dict[str, str]:
+    """The Python files that a page shows, by their name."""
+    text = page.read_text(encoding="utf-8")
+    return dict(
+        re.findall(r'^```python title="([^"]+)"\n(.*?)^```', text, re.DOTALL | re.MULTILINE)
+    )
+
+
 def named(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
@@ -76,7 +84,12 @@ WITH_COMMANDS = [page for page in PAGES if shown_commands(page) and page != RECO
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=named)
 def test_the_commands_of_a_page_run(page: Path, folder: Path) -> None:
+    for name, code in titled_blocks(page).items():
+        (folder / name).write_text(code)
     for arguments in shown_commands(page):
+        if arguments[0] == "python":
+            run(arguments[1:], folder)
+            continue
         overwrite = ["--overwrite"] if arguments[0] in WRITES_FILES else []
         run(["-m", "pnpdepth_cli", *arguments, *overwrite], folder)
 

@@ -77,7 +77,7 @@ class Normaliser:
         times = next((n for n, line in enumerate(lines) if "where the time went" in line), None)
         if times is not None:
             lines[times:] = [
-                _NUMBER.sub("#", line) if line.startswith("│") else line for line in lines[times:]
+                re.sub(r"([ ─━])\1+", r"\1", _NUMBER.sub("#", line)) for line in lines[times:]
             ]
         if not step.figures:
             lines = [re.sub(r"([ ─━])\1+", r"\1", _NUMBER.sub("#", line)).strip() for line in lines]

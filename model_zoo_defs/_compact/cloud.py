@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import accumulate
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -39,7 +39,7 @@ class Cloud(NamedTuple):
     counts: tuple[int, ...]
 
     @classmethod
-    def of(cls, points: Points, rgb: Tensor) -> Self:
+    def of(cls, points: Points, rgb: Tensor) -> Cloud:
         """The cloud of all points of a batch and its normalised images (B, 3, H, W)."""
         maps = zip(points.mask, points.value, rgb, strict=True)
         return cls.joined(
@@ -47,7 +47,7 @@ class Cloud(NamedTuple):
         )
 
     @classmethod
-    def of_image(cls, mask: Tensor, value: Tensor, rgb: Tensor) -> Self:
+    def of_image(cls, mask: Tensor, value: Tensor, rgb: Tensor) -> Cloud:
         """The cloud of the points of one image: mask and value (H, W), rgb (3, H, W)."""
         rows, columns = torch.nonzero(mask, as_tuple=True)
         spacing = max(1.0, math.sqrt(mask.numel() / max(1, len(rows))))
@@ -61,7 +61,7 @@ class Cloud(NamedTuple):
         return cls(value[mask], colour, position, log_spacing, near, found, (len(rows),))
 
     @classmethod
-    def joined(cls, clouds: Sequence[Self]) -> Self:
+    def joined(cls, clouds: Sequence[Cloud]) -> Cloud:
         """One cloud of several."""
         counts = tuple(count for cloud in clouds for count in cloud.counts)
         starts = accumulate((len(cloud.value) for cloud in clouds), initial=0)

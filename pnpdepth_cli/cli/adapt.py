@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.commands.adapt_request import AdaptRequest
+from pnpdepth_cli.cli.streams import print_json, say
+from pnpdepth_cli.commands.batch.request import AdaptRequest
 from pnpdepth_cli.commands.refinement.request import parse_sample
 
 
@@ -48,13 +46,13 @@ def adapt(source: Path, output: Path, sample: str | None, as_json: bool, **value
     refine = options.request_of(values, sample=parse_sample(sample))
     request = AdaptRequest(source=source, output=output, refine=refine, **own)
     with progress_bar("adapt", "update") as show:
-        adapted = adapt_network(request, lambda text: click.echo(printable(text), err=True), show)
+        adapted = adapt_network(request, say, show)
     if as_json:
-        click.echo(json.dumps(asdict(adapted), indent=2))
+        print_json(adapted)
         return
-    before, after = adapted.losses[0], adapted.losses[adapted.kept]
+    before, after = adapted["losses"][0], adapted["losses"][adapted["kept"]]
     click.echo(
-        f"loss at hidden points of the frames for validation ({adapted.validation_frames}):"
-        f" {before:.5f} → {after:.5f} ({adapted.change:+.1%}), after {adapted.kept} updates"
+        f"loss at hidden points of the frames for validation ({adapted['validation_frames']}):"
+        f" {before:.5f} → {after:.5f} ({adapted['change']:+.1%}), after {adapted['kept']} updates"
     )
-    click.echo(printable(f"wrote {request.output} and {request.card}"), err=True)
+    say(f"wrote {request.output} and {request.card}")

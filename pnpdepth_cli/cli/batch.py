@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import threading
@@ -15,12 +14,23 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.printable import printable
-from pnpdepth_cli.cli.streams import INTERRUPTED
-from pnpdepth_cli.commands.batch.request import BatchRequest, ClusterOptions, SequenceOptions
-from pnpdepth_cli.commands.refinement.request import parse_sample
-from pnpdepth_cli.commands.sparse.options import BagOptions
+from pnpdepth_cli.cli.streams import INTERRUPTED, print_json, printable, say
+from pnpdepth_cli.commands.batch.request import (
+    BatchRequest,
+    ClusterOptions,
+    FrameSelection,
+    SequenceOptions,
+)
+from pnpdepth_cli.commands.refinement.request import (
+    FrameFiles,
+    HoldOut,
+    NetworkChoice,
+    OutputOptions,
+    parse_sample,
+)
+from pnpdepth_cli.commands.sparse.options import BagOptions, ColmapOptions, ScanOptions
 from pnpdepth_cli.errors import FramesFailedError, StorageError
+from pnpdepth_cli.settings import Settings
 
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
@@ -28,33 +38,17 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 @click.command(
     short_help="Refine all frames of a folder or a list.",
     cls=grouped_help.GroupedCommand,
-    common=frozenset(
-        {
-            *("--layout", "--sample", "--limit", "--shard", "--calib", "--model", "--checkpoint"),
-            *(
-                "--preset",
-                "--output",
-                "--ply",
-                "--html",
-                "--overwrite",
-                "--json",
-                "--workers",
-                "--dry-run",
-            ),
-        }
-    ),
+    common=grouped_help.COMMON - {"--sparse", "--gt"}
+    | {"--layout", "--sample", "--limit", "--shard", "--html", "--workers", "--dry-run"},
     groups={
-        "Frames": (
-            *("--layout", "--protocol", "--sample", "--limit", "--shard"),
-            *("--topics", "--tolerance"),
-        ),
-        "Sequences": ("--accumulate", "--poses", "--warm-start", "--adapt"),
-        "Input": (*grouped_help.LIDAR, *grouped_help.COLMAP, *grouped_help.FILE_READING),
-        "Network": grouped_help.NETWORK,
-        "Method": grouped_help.METHOD,
-        "Output": (*grouped_help.OUTPUT, "--html", "--html-3d"),
-        "Run": ("--workers", "--batch-size", "--profile", "--dry-run"),
-        "Cluster": grouped_help.CLUSTER,
+        "Frames": ("--sample", FrameSelection, "--shard", BagOptions),
+        "Sequences": (SequenceOptions, "--adapt"),
+        "Input": (ScanOptions, ColmapOptions, FrameFiles),
+        "Network": (NetworkChoice,),
+        "Method": (Settings, "--set", HoldOut),
+        "Output": ("--output", OutputOptions, "--json", "--html", "--html-3d"),
+        "Run": (BatchRequest, "--dry-run"),
+        "Cluster": (ClusterOptions,),
     },
 )
 @click.argument("source", type=options.Address(), metavar="FOLDER|LIST|BAG")
@@ -104,13 +98,13 @@ def batch(
     request = unpacked(
         request,
         bag_options,
-        lambda text: click.echo(printable(text), err=True),
+        say,
         may_write=not dry_run,
     )
     if dry_run:
-        planned = plan_batch(request, lambda text: click.echo(printable(text), err=True))
+        planned = plan_batch(request, say)
         if as_json:
-            click.echo(json.dumps([{"name": name, "why": why} for name, why in planned], indent=2))
+            print_json([{"name": name, "why": why} for name, why in planned])
         else:
             for name, why in planned:
                 click.echo(f"{printable(name)}  ({printable(why)})")
@@ -134,13 +128,13 @@ def _run(request: BatchRequest, as_json: bool) -> int:
             return INTERRUPTED
     counts = outcome.summary["counts"]
     if as_json:
-        click.echo(json.dumps(outcome.summary, indent=2))
+        print_json(outcome.summary)
     else:
         print_batch(outcome.summary)
     if request.profile:
         print_profile(outcome.summary["profile"])
     if request.html is not None:
-        click.echo(printable(f"wrote {request.html / 'index.html'}"), err=True)
+        say(f"wrote {request.html / 'index.html'}")
     if outcome.stopped:
         click.echo(
             f"stopped after {progress.done:,} of {progress.to_do:,} frames; run the same command"

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.printable import printable
 from pnpdepth_cli.cli.progress import progress_bar
-from pnpdepth_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.commands.bench import Bench
+from pnpdepth_cli.cli.streams import print_json, say
+from pnpdepth_cli.commands.refinement.request import NetworkChoice
+from pnpdepth_cli.settings import Settings
 
 
 @click.command(
@@ -22,9 +18,9 @@ if TYPE_CHECKING:
     cls=grouped_help.GroupedCommand,
     groups={
         "Input": ("--size", "--points"),
-        "Network": grouped_help.NETWORK,
-        "Method": grouped_help.METHOD,
-        "Run": ("--repeats", "--table"),
+        "Network": (NetworkChoice, "--precision"),
+        "Method": (Settings,),
+        "Run": ("--repeats",),
         "Output": ("--json",),
     },
 )
@@ -35,131 +31,75 @@ if TYPE_CHECKING:
     "--size", metavar="HxW", help="Size of the frame.  [default: 480x640, or the network's]"
 )
 @click.option(
-    "--points", type=int, default=500, show_default=True, metavar="N", help="Number of points."
+    "--points",
+    type=click.IntRange(1),
+    default=500,
+    show_default=True,
+    metavar="N",
+    help="Number of points.",
 )
 @click.option("--iterations", type=int, metavar="K", help="Number of updates of z.")
 @options.precision
 @options.device
 @click.option(
-    "--repeats", type=int, default=10, show_default=True, metavar="N", help="Runs of each part."
-)
-@click.option(
-    "--table",
-    is_flag=True,
-    help="Measure the paper's seven networks, beside its Table IV.",
+    "--repeats",
+    type=click.IntRange(1),
+    default=10,
+    show_default=True,
+    metavar="N",
+    help="Runs of each part.",
 )
 @options.as_json
-def bench(size: str | None, table: bool, as_json: bool, **values: Any) -> None:
+def bench(size: str | None, as_json: bool, **values: Any) -> None:
     """Measure the run time of a refinement on this machine, by part and in forward passes.
 
     \b
     pnpdepth bench
     pnpdepth bench --model net.onnx --layer Relu_315 --size 480x640
     pnpdepth bench --precision bf16
-    pnpdepth bench --table --repeats 5
 
     The frame is synthetic; a network without weights gets random ones. The parts run alternately.
     The table has median, quartiles, and median in forward passes. The limit is the least cost of K
     updates: (front + (2K+1) rear) / (front + rear). Memory is the peak of a part beyond the memory
     in use before it.
     """
-    if values["repeats"] < 1:
-        raise UsageError(f"--repeats must be >= 1, got {values['repeats']}")
-    if table:
-        refused = {"--size": size} | {
-            f"--{name}": values.pop(name) for name in ("checkpoint", "layer", "iterations")
-        }
-        if clash := [name for name, value in refused.items() if value is not None]:
-            raise UsageError(
-                f"--table measures the paper's networks and cannot be combined with {clash[0]}"
-            )
-        _table(as_json, **values)
-        return
-    from pnpdepth_cli.commands.bench import BenchRequest, run_bench
+    from pnpdepth_cli.commands.bench import run_bench
 
-    request = BenchRequest(size=options.height_and_width(size) if size else None, **values)
+    values["size"] = options.height_and_width(size) if size else None
     with progress_bar("bench", "round") as show:
-        result = run_bench(request, on_round=show)
+        result = run_bench(**values, on_round=show)
     if as_json:
-        click.echo(json.dumps(asdict(result), indent=2))
+        print_json(result)
     else:
         _print(result)
 
 
-def _print(result: Bench) -> None:
+def _print(result: dict[str, Any]) -> None:
     from pnpdepth_cli.cli.tables import print_rows
 
-    threads = f"{result.threads} thread{'' if result.threads == 1 else 's'}"
-    click.echo(f"{result.device}, {threads}, torch {result.versions['torch']}", err=True)
-    for note in result.notes:
-        click.echo(printable(note), err=True)
-    height, width = result.size
+    threads = f"{result['threads']} thread{'' if result['threads'] == 1 else 's'}"
+    click.echo(f"{result['device']}, {threads}, torch {result['versions']['torch']}", err=True)
+    for note in result["notes"]:
+        say(note)
+    height, width = result["size"]
     print_rows(
-        f"{result.model} cut at {result.layer}, {width}×{height}, {result.points:,} points,"
-        f" K = {result.iterations}, {result.precision}",
+        f"{result['model']} cut at {result['layer']}, {width}×{height}, {result['points']:,}"
+        f" points, K = {result['iterations']}, {result['precision']}",
         ("", "median", "quartiles", "× forward", "memory"),
         [
             (
-                part.name,
-                _ms(part.median_s),
-                f"{1000 * part.lower_s:,.1f}–{_ms(part.upper_s)}",
-                f"{part.forwards:.2f}",
-                "" if part.peak_mb is None else f"{part.peak_mb:,.0f} MB",
+                name,
+                _ms(part["median_s"]),
+                f"{1000 * part['lower_s']:,.1f}–{_ms(part['upper_s'])}",
+                f"{part['forwards']:.2f}",
+                "" if part["peak_mb"] is None else f"{part['peak_mb']:,.0f} MB",
             )
-            for part in result.parts
+            for name, part in result["parts"].items()
         ],
     )
     click.echo(
-        f"a refinement takes {result.part('refinement').forwards:.2f} forward passes; the limit is"
-        f" {result.limit:.2f}"
-    )
-
-
-def _table(as_json: bool, **values: Any) -> None:
-    """Prints the times of the paper's networks: full size, random weights, K = 5."""
-    from pnpdepth_cli.cli.tables import print_rows
-    from pnpdepth_cli.commands.bench import PAPER_TIMES, BenchRequest, run_bench
-
-    results = []
-    with progress_bar("bench", "network") as show:
-        for number, paper in enumerate(PAPER_TIMES):
-            show(number, len(PAPER_TIMES), paper.model)
-            each = {**values, "model": paper.model, "size": paper.size, "iterations": 5}
-            results.append((paper, run_bench(BenchRequest(**each))))
-    if as_json:
-        records = [{"paper": paper._asdict(), "bench": asdict(ours)} for paper, ours in results]
-        click.echo(json.dumps(records, indent=2))
-        return
-    rows = []
-    for paper, ours in results:
-        forward, refinement = ours.part("forward"), ours.part("refinement")
-        memory = refinement.peak_mb
-        printed = ["–"] * 3
-        if paper.before is not None and paper.after is not None:
-            ratio = f"{paper.after / paper.before:.2f}"
-            printed = [_ms(paper.before), _ms(paper.after), ratio]
-        rows.append(
-            [
-                paper.model,
-                f"{paper.name}, {paper.data}",
-                f"{paper.size[1]}×{paper.size[0]}",
-                _ms(forward.median_s),
-                _ms(refinement.median_s),
-                f"{refinement.forwards:.2f}",
-                f"{ours.limit:.2f}",
-                "–" if memory is None else f"{memory:,.0f} MB",
-                *printed,
-            ]
-        )
-    print_rows(
-        f"Table IV: random weights, K = 5, {values['precision']}, {values['device']},"
-        f" {results[0][1].threads} threads, medians of {values['repeats']}; beside the paper's"
-        " figures",
-        (
-            *("network", "paper's\nname", "size", "forward", "refinement", "×", "limit", "memory"),
-            *("paper,\nforward", "paper,\nrefinement", "paper,\n×"),
-        ),
-        rows,
+        f"a refinement takes {result['parts']['refinement']['forwards']:.2f} forward passes; the"
+        f" limit is {result['limit']:.2f}"
     )
 
 

@@ -55,7 +55,15 @@ from pnpdepth_cli.cli import options
     show_default=True,
     help="Keep pixels on which N views agree; their depth is the mean.",
 )
-@click.option("--voxel", type=float, metavar="M", help="Merge the points in cubes of this side.")
+@click.option(
+    "--voxel",
+    type=float,
+    metavar="M",
+    help="Merge the points in cubes of this side; also the voxels of --mesh.",
+)
+@click.option(
+    "--mesh", is_flag=True, help="Also write a triangle mesh, NAME_mesh.ply (extra mesh)."
+)
 @click.option("-o", "--output", type=options.FILE, required=True, help="PLY, GLB or LAZ file.")
 @options.overwrite
 @options.as_json
@@ -66,6 +74,7 @@ def cloud(as_json: bool, **values: Any) -> None:
     pnpdepth cloud out/img_depth.png -o img.ply
     pnpdepth cloud out/ --calib calib.txt --poses poses.txt --min-views 2 -o drive.ply
     pnpdepth cloud depth.exr --image img.png --fov 60 -o img.glb
+    pnpdepth cloud out/ --min-views 2 --mesh -o room.ply
 
     The cloud is in the camera's frame (x right, y down, z forward), with poses in the world's.
     Pixels that NAME_valid.png beside NAME_depth excludes are left out.
@@ -80,3 +89,7 @@ def cloud(as_json: bool, **values: Any) -> None:
         click.echo(note, err=True)
     colours = "coloured" if record["coloured"] else "without colours (no image is known)"
     click.echo(f"wrote {record['points']:,} points, {colours}: {record['output']}")
+    if record["mesh"]:
+        click.echo(
+            "wrote {triangles:,} triangles, voxels of {voxel:.3g}: {path}".format(**record["mesh"])
+        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,18 +9,15 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.streams import print_json
+from pnpdepth_cli.commands.evaluation.request import parse_names
 
 _LABEL_LETTERS = 36
 
 
-def names_in(text: str) -> tuple[str, ...]:
-    """Returns the names in a text such as `rmse,mae`."""
-    return tuple(dict.fromkeys(text.split(",")))
-
-
 columns = click.option(
     "--columns",
-    type=names_in,
+    type=parse_names,
     metavar="KEY,…",
     help="Measures of the tables, in this order, such as rmse,mae,delta1.",
 )
@@ -88,11 +84,11 @@ def compare(
         all_measures=all_measures,
         columns=columns,
     )
-    print_notes(comparison.notes)
+    print_notes(comparison["notes"])
     table = comparison_table(comparison)
     to_stdout = files.write(csv=table, markdown=table, latex=methods_table(comparison))
     if files.as_json:
-        click.echo(json.dumps(comparison.as_record(), indent=2))
+        print_json(comparison)
     elif not to_stdout:
         # a long label would make the table wider than a terminal
         rows = [[title, _short(label), *cells] for title, label, *cells in table.rows]

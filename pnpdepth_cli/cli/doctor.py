@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
 import click
+
+from pnpdepth_cli.cli.streams import print_json
 
 
 @click.command(short_help="Show versions, devices and extras, and test the installation.")
@@ -18,7 +18,7 @@ def doctor(as_json: bool) -> None:
 
     report = examine()
     if as_json:
-        click.echo(json.dumps(report, indent=2))
+        print_json(report)
     else:
         for name, value in report.items():
             for number, line in enumerate(value if isinstance(value, list) else [value]):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import click
 
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.streams import print_json
 
 
 @click.command(short_help="Write depth for COLMAP, Nerfstudio or 3DGS.")
@@ -33,11 +33,11 @@ def export(as_json: bool, **values: Any) -> None:
     Camera and pose come from the records, so RESULTS are best those of a COLMAP project
     (`pnpdepth batch --layout colmap`). OUTPUT may be the project itself.
     """
-    from pnpdepth_cli.commands.export import ExportRequest, export_results
+    from pnpdepth_cli.commands.exports import export_results
 
-    record = export_results(ExportRequest(**values))
+    record = export_results(**values)
     if as_json:
-        click.echo(json.dumps(record, indent=2))
+        print_json(record)
         return
     for note in record["notes"]:
         click.echo(note, err=True)

@@ -11,25 +11,11 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.settings import options_of
+
 OTHER = "Other"
 """Title of the options that no group lists."""
 
-LIDAR = ("--calib", "--camera", "--scan")
-COLMAP = ("--colmap",)
-FILE_READING = ("--depth-scale", "--gt-scale", "--channel", "--registration")
-NETWORK = (
-    *("--model", "--checkpoint", "--layer", "--align", "--output-kind", "--normalise"),
-    *("--precision", "--device", "--tile"),
-)
-METHOD = (
-    *("--preset", "--time-budget", "--iterations", "--lr", "--loss", "--update"),
-    *("--target", "--propagate", "--set", "--holdout", "--seed"),
-)
-OUTPUT = (
-    *("--output", "--format", "--ply", "--fov", "--baselines", "--uncertainty"),
-    *("--overwrite", "--json"),
-)
-CLUSTER = ("--ray", "--ray-workers", "--cpus-per-worker", "--retries")
 COMMON = frozenset(
     {
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),
@@ -45,8 +31,9 @@ class GroupedCommand(click.Command):
     """A command whose help lists its options in groups.
 
     Args:
-        groups: Long option names by the title of their group, in the order of the help. Names that
-            the command does not have are skipped, so that commands can share a group.
+        groups: By the title of their group, in the order of the help, long names of options and
+            dataclasses of a request, which stand for those of their options that are named nowhere
+            else. What the command does not have is skipped.
         common: Long names of the options that `--help` shows; None shows all, and there is no
             `--help-all`.
     """
@@ -54,12 +41,25 @@ class GroupedCommand(click.Command):
     def __init__(
         self,
         *args: Any,
-        groups: Mapping[str, tuple[str, ...]],
+        groups: Mapping[str, tuple[str | type, ...]],
         common: frozenset[str] | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self.groups, self.common = groups, common
+        self.common = common
+        self.groups: dict[str, tuple[str, ...]] = {}
+        grouped = {member for of in groups.values() for member in of if isinstance(member, str)}
+        for title, members in groups.items():
+            flags: list[str] = []
+            for member in members:
+                if isinstance(member, str):
+                    flags.append(member)
+                    continue
+                own = (field.option.within or field.flag for field in options_of(member))
+                names = dict.fromkeys(flag.partition("/")[0] for flag in own)
+                flags += [name for name in names if name not in grouped]
+                grouped |= {*names}
+            self.groups[title] = tuple(flags)
         if common is not None:
             self.params.append(_help_all())
 

@@ -15,8 +15,14 @@ import click
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.cli.printable import printable, shortened
-from pnpdepth_cli.cli.streams import INTERRUPTED, StdoutError, drop_stdout, guard_streams
+from pnpdepth_cli.cli.streams import (
+    INTERRUPTED,
+    StdoutError,
+    drop_stdout,
+    guard_streams,
+    printable,
+    shortened,
+)
 from pnpdepth_cli.errors import DeviceError, InputError, ModelError, OutputError, PnpDepthError
 
 _EXIT_CODES = """\b
@@ -54,7 +60,7 @@ COMMANDS = {
     "batch": "batch:batch",
     "adapt": "adapt:adapt",
     "models": "models:models",
-    "layers": "layers:layers",
+    "layers": "models:layers",
     "project": "sparse:project",
     "frames": "sparse:frames",
     "sample": "sparse:sample",
@@ -93,7 +99,7 @@ class _Commands(click.Group):
     "--max-pixels",
     type=click.IntRange(1),
     metavar="N",
-    help="Largest image to read; files may have 4 N bytes.  [default: memory / 64, at most 2^28]",
+    help="Largest image to read; files may have 4 N bytes.  [default: memory / 64, at most 64e6]",
 )
 def cli(max_pixels: int | None) -> None:
     """Refine the depth of any depth network with sparse depth, without training."""

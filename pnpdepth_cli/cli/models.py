@@ -1,17 +1,19 @@
-"""`pnpdepth models` and its subcommands."""
+"""`pnpdepth models` and its subcommands, and `pnpdepth layers`."""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.cli.streams import print_json, say
+from pnpdepth_cli.commands.refinement.request import NetworkChoice
 
 
 class _Models(click.Group):
@@ -39,12 +41,12 @@ def models() -> None:
 @options.as_json
 def list_command(every: bool, as_json: bool) -> None:
     """List the networks that --model takes by name, with their inputs, outputs and defaults."""
-    from pnpdepth_cli.commands.networks.list_models import list_models
+    from pnpdepth_cli.commands.networks.describe import list_models
 
     listed = list_models()
     hidden = Counter(model["family"] for model in listed if model["variant"] and not every)
     if as_json:
-        click.echo(json.dumps(listed, indent=2))
+        print_json(listed)
         return
     from pnpdepth_cli.cli.tables import print_rows
 
@@ -83,7 +85,7 @@ def check(
 
     A .py file is Python code and is run.
     """
-    from pnpdepth_cli.commands.networks.check import check_model
+    from pnpdepth_cli.commands.networks.describe import check_model
 
     _print(check_model(network, checkpoint, image, device), as_json)
 
@@ -95,7 +97,7 @@ def check(
 @options.as_json
 def convert(source: Path, target: Path, overwrite: bool, as_json: bool) -> None:
     """Write the tensors of the checkpoint IN to OUT.safetensors. No code in IN is run."""
-    from pnpdepth_cli.commands.networks.convert import convert_checkpoint
+    from pnpdepth_cli.commands.networks.weights import convert_checkpoint
 
     _print(convert_checkpoint(source, target, overwrite=overwrite), as_json)
 
@@ -107,7 +109,7 @@ def convert(source: Path, target: Path, overwrite: bool, as_json: bool) -> None:
 @options.as_json
 def fetch(repository: str, revision: str | None, output: Path | None, as_json: bool) -> None:
     """Download a network from Hugging Face. No other command uses the internet."""
-    from pnpdepth_cli.commands.networks.fetch import fetch_model
+    from pnpdepth_cli.commands.networks.weights import fetch_model
 
     _print(fetch_model(repository, revision, output), as_json)
 
@@ -115,12 +117,12 @@ def fetch(repository: str, revision: str | None, output: Path | None, as_json: b
 def _print(record: Mapping[str, Any], as_json: bool) -> None:
     """Prints the record to stdout; as text, its `notes` go to stderr."""
     if as_json:
-        click.echo(json.dumps(record, indent=2))
+        print_json(record)
         return
     for key, value in record.items():
         if key == "notes":
             for note in value:
-                click.echo(printable(note), err=True)
+                say(note)
         elif isinstance(value, dict):
             click.echo(f"{key}:")
             for name, text in value.items():
@@ -129,3 +131,67 @@ def _print(record: Mapping[str, Any], as_json: bool) -> None:
             click.echo(f"{key}: {' '.join(map(str, value))}")
         else:
             click.echo(f"{key}: {value}")
+
+
+@click.command(short_help="List the layers a network can be cut at.")
+@options.model
+@options.checkpoint
+@click.option(
+    "--all", "every", is_flag=True, help="List every submodule, not only the definition's."
+)
+@click.option("--size", metavar="HxW", help="Size of the frame to measure with.")
+@click.option(
+    "--sparse",
+    type=options.FILE,
+    help="Rank the layers for the point density of this sparse depth.",
+)
+@options.device
+@options.as_json
+def layers(
+    size: str | None, every: bool, sparse: Path | None, as_json: bool, **values: Any
+) -> None:
+    """List the layers a network can be cut at.
+
+    For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
+    every update repeats), and the influential field of one sparse point in z and in the depth map.
+    """
+    from pnpdepth_cli.commands.networks.describe import list_layers
+
+    choice = NetworkChoice(**values)
+    with progress_bar("layers", "layer") as show:
+        result = list_layers(
+            choice,
+            every=every,
+            size=options.height_and_width(size) if size else None,
+            sparse=sparse,
+            on_layer=show,
+        )
+    if as_json:
+        print_json([asdict(row) for row in result.rows])
+        return
+    from pnpdepth_cli.cli.tables import print_rows
+
+    fields = ("field\nin z", "field\nin depth")
+    spacing = "" if result.spacing is None else f", points {result.spacing:.3g} pixels apart"
+    print_rows(
+        f"layers of {choice.model}{spacing}",
+        ("layer", "z", "stride", "params", "cost\nbehind", "time\nbehind", *fields, "rank"),
+        [_cells(asdict(row)) for row in result.rows],
+    )
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    if row["problem"]:
+        reason = row["problem"].partition(": ")[2] or row["problem"]
+        return (row["name"], "–", *[""] * 5, reason)
+    return (
+        row["name"],
+        "×".join(str(n) for n in row["shape"]),
+        f"{row['stride']:g}" if row["stride"] else "–",
+        f"{row['parameters'] / 1000:,.0f} k",
+        f"{row['cost_behind']:.0%}" if row["cost_behind"] is not None else "–",
+        f"{1000 * row['seconds_behind']:.0f} ms",
+        "{}×{}".format(*row["field_in_z"]) if row["field_in_z"] else "–",
+        "{}×{}".format(*row["field_in_output"]),
+        str(row["rank"] or ""),
+    )

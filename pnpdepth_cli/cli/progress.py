@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.streams import printable
 
 if TYPE_CHECKING:
     from tqdm import tqdm

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.cli.streams import print_json
+from pnpdepth_cli.commands.refinement.request import (
+    FrameFiles,
+    HoldOut,
+    NetworkChoice,
+    OutputOptions,
+)
+from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.settings import Settings
 
 
 @click.command(
@@ -16,16 +24,10 @@ from pnpdepth_cli.cli.progress import progress_bar
     cls=grouped_help.GroupedCommand,
     common=grouped_help.COMMON,
     groups={
-        "Input": (
-            "--sparse",
-            "--gt",
-            *grouped_help.LIDAR,
-            *grouped_help.COLMAP,
-            *grouped_help.FILE_READING,
-        ),
-        "Network": grouped_help.NETWORK,
-        "Method": grouped_help.METHOD,
-        "Output": grouped_help.OUTPUT,
+        "Input": ("--sparse", "--gt", ScanOptions, ColmapOptions, FrameFiles),
+        "Network": (NetworkChoice,),
+        "Method": (Settings, "--set", HoldOut),
+        "Output": ("--output", OutputOptions, "--json"),
     },
 )
 @click.argument("image", type=options.FILE, required=False)
@@ -69,7 +71,7 @@ def refine(as_json: bool, **values: Any) -> None:
 
         outcome = refine_image(request, on_iteration=show_update)
     if as_json:
-        click.echo(json.dumps(outcome.record, indent=2))
+        print_json(outcome.record)
     else:
         print_refinement(outcome.record)
     if outcome.diverged is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import click
 
 from pnpdepth_cli.choices import PATTERNS, SENSORS
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.printable import printable
+from pnpdepth_cli.cli.streams import print_json, say
 from pnpdepth_cli.commands.refinement.request import sample_pattern
 from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
 
@@ -200,17 +199,17 @@ def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
 
     bag_options = BagOptions(**options.taken(BagOptions, values))
     request = FramesRequest(bag=bag, output=output, options=bag_options, **values)
-    record = write_frames(request, lambda text: click.echo(printable(text), err=True))
+    record = write_frames(request, say)
     if as_json:
-        click.echo(json.dumps(record, indent=2))
+        print_json(record)
     else:
-        click.echo(printable(f"wrote {record['frames']:,} frames to {output}"), err=True)
+        say(f"wrote {record['frames']:,} frames to {output}")
 
 
 def _print(record: Mapping[str, Any], *, as_json: bool) -> None:
     from pnpdepth_cli.cli.tables import print_sparse
 
     if as_json:
-        click.echo(json.dumps(record, indent=2))
+        print_json(record)
     else:
         print_sparse(record)

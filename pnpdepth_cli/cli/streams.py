@@ -1,17 +1,44 @@
-"""stdout and stderr that may be closed, full or cut off: one error class, no tracebacks."""
+"""Text for a terminal, and stdout and stderr that may be closed, full or cut off."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import io
+import json
 import os
 import signal
 import sys
 from typing import Any, TextIO
 
+import click
+
 INTERRUPTED = 128 + signal.SIGINT
 """The exit code after Ctrl-C."""
+_LONGEST = 2000
+
+
+def printable(text: object) -> str:
+    """Returns the text with unprintable characters, such as line breaks, as escapes."""
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text)
+    )
+
+
+def say(text: object) -> None:
+    """Prints a line on stderr."""
+    click.echo(printable(text), err=True)
+
+
+def print_json(value: Any) -> None:
+    """Prints a value of JSON's own types on stdout."""
+    click.echo(json.dumps(value, indent=2))
+
+
+def shortened(text: str) -> str:
+    """Returns the text, without its middle where it is longer than 2,000 characters."""
+    half = _LONGEST // 2
+    return text if len(text) <= _LONGEST else f"{text[:half]} … {text[-half:]}"
 
 
 class StdoutError(Exception):

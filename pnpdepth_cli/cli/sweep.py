@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import click
@@ -10,7 +9,7 @@ import click
 from pnpdepth_cli.choices import PLOT_FORMATS
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import BatchProgress
-from pnpdepth_cli.cli.streams import INTERRUPTED
+from pnpdepth_cli.cli.streams import INTERRUPTED, print_json
 from pnpdepth_cli.commands.batch.request import FrameSelection
 from pnpdepth_cli.commands.refinement.request import FrameFiles, NetworkChoice
 from pnpdepth_cli.commands.sparse.options import ScanOptions
@@ -33,9 +32,9 @@ _RARE = ("output_kind", "normalise", "precision", "sparse_size_ok", "channel")
     ),
     groups={
         "Sweep": ("--vary", "--set", "--one-by-one", "--sample", "--seeds"),
-        "Frames": ("--layout", "--protocol", "--limit"),
-        "Input": (*grouped_help.LIDAR, *grouped_help.FILE_READING),
-        "Network": grouped_help.NETWORK,
+        "Frames": (FrameSelection,),
+        "Input": (ScanOptions, FrameFiles),
+        "Network": (NetworkChoice, "--output-kind", "--normalise"),
         "Output": ("--output", "--plots", "--cost", "--json"),
     },
 )
@@ -152,7 +151,7 @@ def sweep(
             progress.say("stopped; run the same command to continue")
             raise click.exceptions.Exit(INTERRUPTED) from None
     if as_json:
-        click.echo(json.dumps(record, indent=2))
+        print_json(record)
     else:
         for study in record["studies"]:
             print_table(study_table(study, record))

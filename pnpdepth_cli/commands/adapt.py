@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.commands.adapt_request import AdaptRequest
 from pnpdepth_cli.commands.batch.frames import Task, task_of
+from pnpdepth_cli.commands.batch.request import AdaptRequest
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.masks import Masks
@@ -50,34 +50,10 @@ OnStep = Callable[[int, int, str], None]
 """Called with (updates made, of, text)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Adapted:
-    """What was learnt, and from what."""
-
-    network: str
-    checkpoint: str | None
-    """The weights it began with. None: its own."""
-    source: str
-    output: str
-    training_frames: int
-    validation_frames: int
-    steps: int
-    kept: int
-    """Updates after which the weights are those written; 0 leaves them as they were."""
-    lr: float
-    seed: int
-    loss: str
-    hidden: float
-    """Fraction of the points that was hidden at every update."""
-    losses: dict[int, float]
-    """Loss at hidden points of the validation frames by the number of updates."""
-    p_value: float | None
-    """Of a one-sided paired t test that the loss fell. None with fewer than two frames."""
-
-    @property
-    def change(self) -> float:
-        """Loss of the written weights over that of the first, minus 1."""
-        return self.losses[self.kept] / self.losses[0] - 1
+Adapted = dict[str, Any]
+"""What was learnt, and from what: `losses` at hidden points of the validation frames by the number
+of updates; the weights written are those after `kept` of them, whose loss is `change` over that of
+the first minus 1; `p_value` is of a one-sided paired t test that it fell."""
 
 
 def adapt(request: AdaptRequest, say: Callable[[str], None], on_step: OnStep) -> Adapted:
@@ -124,22 +100,23 @@ def adapt_to(
     say(f"frames to learn from: {training}; for validation: {validation}")
     with network.cut_at_points() as split:
         losses = adaptation.run(split, on_step)
-    adapted = Adapted(
-        network=network.definition.name,
-        checkpoint=None if choice.checkpoint is None else str(choice.checkpoint),
-        source=str(request.source),
-        output=str(request.output),
-        training_frames=training,
-        validation_frames=validation,
-        steps=request.steps,
-        kept=adaptation.kept,
-        lr=request.lr,
-        seed=seed,
-        loss=settings.loss,
-        hidden=settings.mask_fraction,
-        losses=losses,
-        p_value=adaptation.p_value(),
-    )
+    adapted = {
+        "network": network.definition.name,
+        "checkpoint": None if choice.checkpoint is None else str(choice.checkpoint),
+        "source": str(request.source),
+        "output": str(request.output),
+        "training_frames": training,
+        "validation_frames": validation,
+        "steps": request.steps,
+        "kept": adaptation.kept,
+        "change": losses[adaptation.kept] / losses[0] - 1,
+        "lr": request.lr,
+        "seed": seed,
+        "loss": settings.loss,
+        "hidden": settings.mask_fraction,
+        "losses": losses,
+        "p_value": adaptation.p_value(),
+    }
     _write(request, adapted, network.module, adaptation.best.values())
     return adapted
 
@@ -285,20 +262,20 @@ def _write(
 
 def card_of(adapted: Adapted, file: str) -> str:
     """Returns the model card in Markdown."""
-    rows = "\n".join(f"| {updates} | {loss:.5f} |" for updates, loss in adapted.losses.items())
+    rows = "\n".join(f"| {updates} | {loss:.5f} |" for updates, loss in adapted["losses"].items())
     return f"""# {file}
 
-Weights of `{adapted.network}`, adapted to the frames of `{adapted.source}` by
-`pnpdepth adapt` {__version__}. Use: `--model {adapted.network} --checkpoint {file}`.
+Weights of `{adapted["network"]}`, adapted to the frames of `{adapted["source"]}` by
+`pnpdepth adapt` {__version__}. Use: `--model {adapted["network"]} --checkpoint {file}`.
 
-- **Start**: {adapted.checkpoint or "the network's own weights"}.
-- **Data**: frames to learn from: {adapted.training_frames}; for validation:
-  {adapted.validation_frames}; images and sparse depth, no ground truth.
-- **Method**: {adapted.hidden:.0%} of the points of a frame are hidden from the input, and the
-  loss (`{adapted.loss}`) is taken at these. {adapted.steps} updates, step size {adapted.lr:g},
-  seed {adapted.seed}.
-- **Written**: the weights after {adapted.kept} updates, whose validation loss is the smallest:
-  {adapted.change:+.1%} against the start.
+- **Start**: {adapted["checkpoint"] or "the network's own weights"}.
+- **Data**: frames to learn from: {adapted["training_frames"]}; for validation:
+  {adapted["validation_frames"]}; images and sparse depth, no ground truth.
+- **Method**: {adapted["hidden"]:.0%} of the points of a frame are hidden from the input, and the
+  loss (`{adapted["loss"]}`) is taken at these. {adapted["steps"]} updates,
+  step size {adapted["lr"]:g}, seed {adapted["seed"]}.
+- **Written**: the weights after {adapted["kept"]} updates, whose validation loss is the smallest:
+  {adapted["change"]:+.1%} against the start.
 - **Limits**: adapted to this camera, sensor and scene; others may get worse. The licence of the
   start and that of the frames apply.
 

@@ -6,10 +6,10 @@ import ctypes
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from pnpdepth_cli.choices import LOSSES
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
@@ -33,139 +33,83 @@ FIRST_FRAME = "refinement, first frame"
 _WITH_PEAK = ("forward", "refinement", FIRST_FRAME)
 
 
-@dataclass(frozen=True, kw_only=True)
-class BenchRequest:
-    """What to measure; None is the network's own default."""
-
-    model: str = "compact"
-    checkpoint: Path | None = None
-    layer: str | None = None
-    size: tuple[int, int] | None = None
-    """(H, W) of the synthetic frame."""
-    points: int = 500
-    iterations: int | None = None
-    precision: str = "fp32"
-    device: str = "cpu"
-    repeats: int = 10
-    """Measured runs, after one warm-up."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchPart:
-    """One timed part: quartiles of the seconds of its runs."""
-
-    name: str
-    median_s: float
-    lower_s: float
-    upper_s: float
-    forwards: float
-    """Its median in forward passes."""
-    peak_mb: float | None
-    """Peak memory beyond what was in use before, 10^6 bytes; None if not measured."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Bench:
-    """The result of `run_bench`."""
-
-    model: str
-    checkpoint: str | None
-    """None for random weights."""
-    layer: str
-    size: tuple[int, int]
-    """(H, W) of the image."""
-    network_size: tuple[int, int]
-    """(H, W) of the network's input."""
-    points: int
-    """Sparse points inside the network's crop."""
-    iterations: int
-    precision: str
-    device: str
-    threads: int
-    """Of torch on the CPU."""
-    versions: dict[str, str]
-    parts: tuple[BenchPart, ...]
-    limit: float
-    """(front + (2K + 1)·rear) / (front + rear) forward passes: what K updates cost at least."""
-    notes: tuple[str, ...]
-
-    def part(self, name: str) -> BenchPart:
-        """Returns the part of that name."""
-        return next(part for part in self.parts if part.name == name)
-
-
 def run_bench(
-    request: BenchRequest, *, on_round: Callable[[int, int], None] = lambda done, of: None
-) -> Bench:
-    """Returns the times and memory of all parts on a synthetic frame.
+    model: str = "compact",
+    checkpoint: Path | None = None,
+    *,
+    layer: str | None = None,
+    size: tuple[int, int] | None = None,
+    points: int = 500,
+    iterations: int | None = None,
+    precision: str = "fp32",
+    device: str = "cpu",
+    repeats: int = 10,
+    on_round: Callable[[int, int], None] = lambda done, of: None,
+) -> dict[str, Any]:
+    """Returns the times and memory of all parts on a synthetic frame; None is the network's own.
 
-    A network without weights gets random ones.
+    A network without weights gets random ones. Each of `parts` has, by its name, the quartiles of
+    the seconds of its runs, its median in forward passes, and its peak memory beyond what was in
+    use before in 10^6 bytes, None if not measured. `limit` is (front + (2K + 1)·rear) / (front +
+    rear) forward passes: what K updates cost at least.
 
     Args:
-        request: What to measure.
+        model: As of `load_network`, with `checkpoint`, `precision` and `device`.
+        layer: Where the network is cut.
+        size: (H, W) of the frame.
+        points: Of the frame.
+        iterations: K.
+        repeats: Measured runs, after one warm-up.
         on_round: Called with (done, of) after every round, in which each part runs once.
     """
-    if request.repeats < 1 or request.points < 1:
-        raise UsageError(
-            f"repeats {request.repeats}, points {request.points}: there must be at least one"
-        )
     torch.manual_seed(0)  # the same random weights each time
-    network = load_network(
-        request.model,
-        request.checkpoint,
-        request.device,
-        precision=request.precision,
-        untrained=True,
-    )
+    network = load_network(model, checkpoint, device, precision=precision, untrained=True)
     policy = network.definition.size
     own = (policy.height, policy.width) if isinstance(policy, Fixed) else DEFAULT_SIZE
-    rgb, points = synthetic_frame(request.size or own, request.points)
-    layer = request.layer or default_layer(network, points.size, len(points))
+    rgb, drawn = synthetic_frame(size or own, points)
+    layer = layer or default_layer(network, drawn.size, len(drawn))
     layer = resolve_layer(network.definition, layer)
     method = Settings()
-    if request.iterations is not None:
-        method = replace(method, iterations=request.iterations)
+    if iterations is not None:
+        method = replace(method, iterations=iterations)
     if not (network.checkpoint or network.definition.complete):
         method = replace(method, align="none")  # random weights have no relation to the points
     settings = resolve_settings(network.definition, method)
-    prepared = prepare(network, Frame(rgb=rgb[0], points=points))
+    prepared = prepare(network, Frame(rgb=rgb[0], points=drawn))
     if not len(prepared.points):
-        raise NoPointsError(f"none of {len(points)} points lies in the network's view; take more")
+        raise NoPointsError(f"none of {points} points lies in the network's view; take more")
     with out_of_memory_is_a_device_error(network.device), network.cut_at(layer) as split:
         todo = _parts(split, layer, prepared, settings)
-        spent = in_turn(todo, request.repeats, network.device, on_round=on_round)
+        spent = in_turn(todo, repeats, network.device, on_round=on_round)
         peaks = {name: peak_mb(todo[name], network.device) for name in _WITH_PEAK}
     forward, front, rear = (statistics.median(spent[name]) for name in ("forward", "front", "rear"))
-    parts = []
+    parts = {}
     for name, seconds in spent.items():
         many = seconds if len(seconds) > 1 else seconds * 2
         lower, median, upper = statistics.quantiles(many, n=4, method="inclusive")
-        parts.append(
-            BenchPart(
-                name=name,
-                median_s=median,
-                lower_s=lower,
-                upper_s=upper,
-                forwards=median / forward,
-                peak_mb=peaks.get(name),
-            )
-        )
-    return Bench(
-        model=request.model,
-        checkpoint=str(network.checkpoint) if network.checkpoint else None,
-        layer=layer,
-        size=prepared.map.image,
-        network_size=prepared.map.network,
-        points=len(prepared.points),
-        iterations=settings.iterations,
-        precision=request.precision,
-        device=str(network.device),
-        threads=torch.get_num_threads(),
-        versions=versions(),
-        parts=tuple(parts),
-        limit=(front + (2 * settings.iterations + 1) * rear) / (front + rear),
-        notes=tuple(network.notes),
-    )
+        parts[name] = {
+            "median_s": median,
+            "lower_s": lower,
+            "upper_s": upper,
+            "forwards": median / forward,
+            "peak_mb": peaks.get(name),
+        }
+    return {
+        "model": model,
+        "checkpoint": str(network.checkpoint) if network.checkpoint else None,
+        "layer": layer,
+        "size": list(prepared.map.image),
+        "network_size": list(prepared.map.network),
+        "points": len(prepared.points),
+        "iterations": settings.iterations,
+        "precision": precision,
+        "device": str(network.device),
+        "threads": torch.get_num_threads(),
+        "versions": versions(),
+        "parts": parts,
+        "limit": (front + (2 * settings.iterations + 1) * rear) / (front + rear),
+        "notes": list(network.notes),
+    }
 
 
 def _parts(
@@ -262,30 +206,3 @@ def peak_mb(run: Callable[[], object], device: torch.device) -> float | None:
 def _kilobytes(name: str) -> int:
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
-
-
-class PaperTime(NamedTuple):
-    """A network of the paper's Table IV, and the seconds that the paper prints."""
-
-    name: str
-    """The paper's name of it."""
-    model: str
-    """Ours."""
-    data: str
-    size: tuple[int, int]
-    """(H, W) of its frames."""
-    before: float | None = None
-    """The network alone, on a GPU that the paper does not name; None if not printed."""
-    after: float | None = None
-
-
-PAPER_TIMES = (
-    PaperTime("Eigen", "eigen", "NYU", (228, 304)),
-    PaperTime("FCRN", "fcrn", "NYU", (228, 304)),
-    PaperTime("Zhou", "sfmlearner", "KITTI", (128, 416)),
-    PaperTime("Uhrig", "sparseconv", "KITTI", (352, 1216), 0.0311, 0.1614),
-    PaperTime("Chodosh", "adnn", "KITTI", (352, 1216), 0.0320, 0.0447),
-    PaperTime("Ma", "sparse2dense-r18-deconv3", "NYU", (228, 304), 0.0046, 0.0233),
-    PaperTime("Jaritz", "latefusion", "NYU", (224, 320), 0.0484, 0.1593),
-)
-"""Wang et al. (ICRA 2019), Table IV, and the three networks that it leaves out."""

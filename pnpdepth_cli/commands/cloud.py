@@ -1,4 +1,4 @@
-"""`pnpdepth cloud`: depth maps as one coloured point cloud."""
+"""`pnpdepth cloud`: depth maps as one coloured point cloud, and as a mesh."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pnpdepth_cli.commands.refinement.frame_camera import (
 )
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
-from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
 from pnpdepth_cli.io.cloud_files import check_cloud_suffix, write_cloud
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.record import plain, write_json
@@ -33,8 +33,10 @@ from pnpdepth_cli.sensors.cloud import (
     VoxelGrid,
     cloud_from_depth,
     consistent_depth,
+    kept_pixels,
     neighbouring_views,
 )
+from pnpdepth_cli.sensors.mesh import MeshVolume
 
 _IN_MEMORY = 12
 """Depth maps of neighbouring views that are kept, with their points."""
@@ -69,7 +71,10 @@ class CloudRequest:
     min_views: int = 1
     """Views that have to agree on a pixel, its own included; see `consistent_depth`."""
     voxel: float | None = None
-    """Side of the cubes in which points are merged. None: all points are kept."""
+    """Side of the cubes in which points are merged, and of the voxels of the mesh. None: all
+    points are kept, and voxels follow from the depth."""
+    mesh: bool = False
+    """Whether a triangle mesh is written beside the cloud."""
     overwrite: bool = False
 
 
@@ -89,9 +94,13 @@ def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
         )
     coloured = all(request.image or frame.image for frame in frames)
     notes: list[str] = []
-    parts = _parts(request, frames, poses, coloured, notes)
+    mesh = MeshVolume(request.voxel) if request.mesh else None
+    parts = _parts(request, frames, poses, coloured, notes, mesh)
     make_folder(request.output.parent)
-    points = write_cloud(request.output, _merged(request, parts, coloured))
+    outputs = [request.output, *([] if mesh is None else [mesh_path(request.output)])]
+    with all_or_none(outputs):
+        points = write_cloud(request.output, _merged(request, parts, coloured))
+        triangles = None if mesh is None else _write_mesh(outputs[-1], mesh, coloured)
     inputs = ("depth", "output", "image", "overwrite", "camera", "calib", "poses")
     settings = {name: value for name, value in asdict(request).items() if name not in inputs}
     record = {
@@ -99,6 +108,7 @@ def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
         "version": __version__,
         "output": str(request.output),
         "points": points,
+        "mesh": triangles,
         "coloured": coloured,
         "unit": frames[0].unit,
         "inputs": {
@@ -119,9 +129,22 @@ def record_path(output: Path) -> Path:
     return output.with_name(f"{output.name}.json")
 
 
+def mesh_path(output: Path) -> Path:
+    """Returns the path of the mesh of a cloud."""
+    return output.with_name(f"{output.stem}_mesh.ply")
+
+
+def _write_mesh(path: Path, mesh: MeshVolume, coloured: bool) -> dict[str, Any]:
+    """Writes the mesh and returns what the record says of it."""
+    with atomic_path(path) as temporary:
+        triangles = mesh.write(temporary, coloured=coloured)
+    return {"path": str(path), "triangles": triangles, "voxel": mesh.voxel}
+
+
 def _check(request: CloudRequest) -> None:
     check_cloud_suffix(request.output)
-    for path in (request.output, record_path(request.output)):
+    meshes = [mesh_path(request.output)] if request.mesh else []
+    for path in (request.output, record_path(request.output), *meshes):
         if path.exists() and not request.overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
     if request.calib is not None and request.fov_deg is not None:
@@ -155,8 +178,12 @@ def _parts(
     poses: list[NDArray[np.float64] | None],
     coloured: bool,
     notes: list[str],
+    mesh: MeshVolume | None,
 ) -> Iterator[PointCloud]:
-    """Yields the clouds of all depth maps, in the world's frame if there are poses."""
+    """Yields the clouds of all depth maps, in the world's frame if there are poses.
+
+    Adds them to the mesh as well.
+    """
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def view(index: int) -> View:
@@ -173,6 +200,9 @@ def _parts(
             others = (view(other) for other in neighbouring_views(known, index))
             depth = consistent_depth(here, others, request.min_views)
         rgb = _colours(request, frame, here.depth) if coloured else None
+        if mesh is not None:
+            kept = np.where(kept_pixels(depth, edge=request.edge), depth, np.float32(0))
+            mesh.add(replace(here, depth=kept), rgb)
         for part in cloud_from_depth(depth, here.camera, rgb=rgb, edge=request.edge):
             yield part if pose is None else part.transformed(pose)
 

@@ -31,9 +31,7 @@ class ResultFrame:
     """Path below the folder of the results, without the ending."""
     depth: Path
     sigma: Path | None = None
-    """Standard deviation of the depth."""
     valid: Path | None = None
-    """Mask of the pixels whose depth is valid."""
     record: Mapping[str, Any] = field(default_factory=dict)
     """The record beside the depth; empty if there is none."""
 

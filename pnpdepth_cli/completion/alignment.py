@@ -40,21 +40,16 @@ _MIN_ERROR = 1e-3  # relative errors below this do not distinguish alignments
 class Alignment:
     """How the network's numbers are converted to metres."""
 
-    space: str
-    """Quantity in which the line is fitted, one of `choices.SPACES`."""
-    kind: str
-    """Kind of the fit, one of `choices.ALIGNMENTS`."""
+    space: str  # quantity in which the line is fitted, one of `choices.SPACES`
+    kind: str  # kind of the fit, one of `choices.ALIGNMENTS`
     scale: float
     shift: float
     bounds: tuple[float, float]
     """(nearest, farthest) metres; depth outside, or no positive depth at all, becomes the bound."""
     points: int
-    error: float = math.nan
-    """Mean |log(aligned / measured depth)| of the best 70 % of the points."""
-    misfit: float = math.nan
-    """The same of all points, none counting more than 1.0."""
-    outliers: float = 0.0
-    """Fraction of the points that are far off."""
+    error: float = math.nan  # mean |log(aligned / measured depth)| of the best 70 % of the points
+    misfit: float = math.nan  # the same of all points, none counting more than 1.0
+    outliers: float = 0.0  # fraction of the points that are far off
 
     def depth(self, x: Tensor) -> Tensor:
         """Returns metres within `bounds`, of the shape of x.

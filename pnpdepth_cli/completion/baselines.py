@@ -51,10 +51,8 @@ _OUTLIER_WEIGHT = 1e-6  # what an outlier counts where no other point is near
 class Baseline:
     """Predicts dense depth (H, W) float32 metres, from the points or from a prediction."""
 
-    title: str
-    """What it does, for a table."""
-    of_points: Callable[..., Tensor] | None = None
-    """Depth from the points alone."""
+    title: str  # what it does, for a table
+    of_points: Callable[..., Tensor] | None = None  # depth from the points alone
     of_prediction: Callable[..., Tensor] | None = None
     """Depth from a prediction (H, W), up to scale and shift with 0 unknown, and the points."""
     pointwise: bool = False

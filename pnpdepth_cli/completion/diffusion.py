@@ -57,15 +57,11 @@ def diffuse(field: ResidualField) -> Tensor:
     system = reads.T @ reads + laplacian(adjacent) + _REGULARISATION * eye_array(total)
     right = reads.T @ (field.residual - middle).numpy()
     # The matrix is positive definite: diagonal pivots are stable, and keep the factors sparse.
-    factors = splu(
-        csc_array(system),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
-    correction = (
-        torch.from_numpy(factors.solve(right)).float().reshape(1, 1, rows, columns) + middle
-    )
+    mode = {"SymmetricMode": True}
+    order = "MMD_AT_PLUS_A"
+    factors = splu(csc_array(system), permc_spec=order, diag_pivot_thresh=0.0, options=mode)
+    solution = torch.from_numpy(factors.solve(right)).float()
+    correction = solution.reshape(1, 1, rows, columns) + middle
     return F.interpolate(correction, (height, width), mode="bilinear", align_corners=False)[0, 0]
 
 
@@ -78,14 +74,7 @@ def _readings(field: ResidualField, rows: int, columns: int) -> Any:
     left, top = x.floor(), y.floor()
     fx, fy = x - left, y - top
     right, bottom = x.ceil(), y.ceil()
-    nodes = torch.stack(
-        [
-            top * columns + left,
-            top * columns + right,
-            bottom * columns + left,
-            bottom * columns + right,
-        ]
-    )
+    nodes = torch.stack([row * columns + x for row in (top, bottom) for x in (left, right)])
     weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
     which = torch.arange(len(xy)).repeat(4, 1)
     values = (weights.flatten().numpy(), (which.flatten().numpy(), nodes.long().flatten().numpy()))

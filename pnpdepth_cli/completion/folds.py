@@ -30,11 +30,6 @@ def spatial_folds(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor:
 
     With fewer points than folds every point has a fold of its own. Neighbouring scan lines of a
     LiDAR are in different folds.
-
-    Args:
-        points: Sparse depth.
-        folds: Number of folds.
-        seed: Of the random division.
     """
     generator = torch.Generator().manual_seed(seed)
     line = scan_lines(points.xy.cpu().numpy(), points.size)

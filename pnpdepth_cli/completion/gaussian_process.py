@@ -105,7 +105,6 @@ def predict_at(field: ResidualField, xy: Tensor, features: Tensor) -> Tensor:
     """Returns the mean residual (M,) at single pixels.
 
     Args:
-        field: The fitted field.
         xy: (M, 2) pixel coordinates.
         features: (M, 3 or 6), the features there.
     """
@@ -123,7 +122,6 @@ def leave_one_out(
     Computed without solving again: Rasmussen and Williams, eq. 5.12.
 
     Args:
-        field: The field.
         near: (B, k) numbers of points of each neighbourhood.
         weight: (N,) 0…1 of each point as a predictor; one of 0 predicts nothing.
     """

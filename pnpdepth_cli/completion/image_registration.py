@@ -9,8 +9,10 @@ correlation of two maps, computed for all shifts at once.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -30,9 +32,14 @@ FOUND = 4.0
 The constants here were chosen on rendered frames, of which 1 % of the registered ones exceed it
 with 500 to 5,000 points, none with 100."""
 
-_ZOOMS = np.linspace(0.85, 1.15, 31)
+REGISTERED, DOUBT, CHANCE = 3.0, 1.8, 3.0
+"""Log of the Bayes factor of an image that belongs to its points over one that is unrelated: from
+which it is not moved, under whose negative it counts as unrelated, and which the best of all
+registrations exceeds by chance: once for one frame, twice for more."""
+
+_ZOOMS = np.exp(np.linspace(-0.4, 0.4, 81))  # 0.67 to 1.49
 _LARGEST_SHIFT = 0.05  # of the image's sides
-_ZOOM_SIGMA, _SHIFT_SIGMA = 0.07, 0.025  # of the prior; log zoom, and of the image's sides
+_ZOOM_SCALE, _SHIFT_SIGMA = 0.07, 0.025  # of the prior; log zoom, and of the image's sides
 _LONGEST_PX = 320  # the image is reduced to this size
 _MIN_POINTS, _MOST_POINTS = 10, 2000
 _LEAST_HULL = 0.5  # of the image's area; points of one part say little of the zoom
@@ -40,10 +47,13 @@ _MOST_AT_EDGES = 4.0  # standard errors; points on edges of the image were found
 _LONGEST_PAIR = 0.95  # quantile of the distances between neighbouring points
 _STEPS = 12  # samples between two points
 _SMALLEST_CHANGE = 0.03  # of log depth; smaller ones are noise
+_LEAST_SPREAD = 0.4  # standard deviation of the log of that change; a noisy wall has 0.4, rooms 0.6
 _LARGEST_EVIDENCE = 2.5  # standard deviations
+_LEAST_CONTRAST = 0.02  # of an image with edges
 _EDGE_SIGMA, _EDGE_REACH, _EDGE_BAND = 1.0, 8.0, 6.0  # pixels of the reduced image
 _WEIGHT = 0.1  # log likelihood per unit of correlation
 _INDEPENDENT = 37.0  # norm of the evidence from which pairs are no longer independent
+_NO_EVIDENCE, _EVIDENCE = 25, 0.85  # points that say nothing, and what each e-fold of more says
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,10 +63,8 @@ class ImageRegistration:
     The colour of pixel x is at c + zoom (x − c) + (right, down), where c is the image's centre.
     """
 
-    zoom: float
-    """Ratio of the focal lengths, image over depth."""
-    right: float
-    """Shift in pixels, as `down`."""
+    zoom: float  # ratio of the focal lengths, image over depth
+    right: float  # shift in pixels, as `down`
     down: float
 
     def __str__(self) -> str:
@@ -83,12 +91,28 @@ class ImageRegistration:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What one frame says of the registration."""
+    """What one frame says of the registration, at the reduced size."""
 
-    log_likelihood: Floats
-    """(zooms, rows, columns): of each zoom, and of each shift in pixels of the reduced image."""
+    edges: Image
+    """(h, w) strength of the image's edges."""
+    ends: Floats
+    """(M, 2, 2) x and y of neighbouring points, by pairs."""
+    weight: Floats
+    """(M,) by how much depth changes between the two."""
     size: tuple[int, int]
     """(H, W) of the image."""
+    points: int
+    """Number of points."""
+
+    @functools.cached_property
+    def unmoved(self) -> Floats:
+        """(rows, columns) log likelihood of each shift of the image in its own zoom."""
+        return self.log_likelihood(1.0)
+
+    def log_likelihood(self, zoom: float) -> Floats:
+        """Returns (rows, columns): of each shift, in pixels of the reduced image."""
+        factor = _WEIGHT * min(1.0, _INDEPENDENT / float(np.linalg.norm(self.weight)))
+        return factor * _correlation(self.edges, self.ends, self.weight, zoom)
 
 
 def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
@@ -96,10 +120,9 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
 
     Args:
         rgb: (H, W, 3) in 0…1.
-        points: Sparse depth.
 
     Returns:
-        None where the points cannot tell: too few, in a part of the image only, scan lines of a
+        None where they cannot tell: points too few, in a part of the image only, scan lines of a
         LiDAR, or points that were found in the image, such as SfM points.
     """
     xy, depth = points.xy.numpy().astype(np.float64), points.depth.numpy().astype(np.float64)
@@ -114,6 +137,8 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
     scale = min(1.0, _LONGEST_PX / max(points.size))
     rows, columns = (round(side * scale) for side in points.size)
     small = cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA)
+    if np.ptp(small) < _LEAST_CONTRAST:
+        return None
     edges = _edges(np.asarray(small, np.float32))
     at = (xy + 0.5) * scale
     x, y = at.astype(np.intp).T
@@ -124,44 +149,69 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
     if pairs is None:
         return None
     weight = _depth_edges(at, np.log(depth), pairs)
-    norm = float(np.linalg.norm(weight))
-    if norm == 0:
+    if weight is None:
         return None
-    factor = _WEIGHT * min(1.0, _INDEPENDENT / norm)
-    return Evidence(
-        log_likelihood=factor * _correlation(edges, at[pairs], weight), size=points.size
-    )
+    return Evidence(edges=edges, ends=at[pairs], weight=weight, size=points.size, points=len(xy))
 
 
-def estimated(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
+def estimated(
+    frames: Iterable[Evidence | None],
+) -> ImageRegistration | Literal["unrelated"] | None:
     """Returns the registration that frames of one size have in common: the posterior's mean.
 
-    None where the evidence is no better than for an image that is registered already.
+    None where the evidence is no better than for an image that is registered already, "unrelated"
+    where depth changes at edges no more often than by chance, wherever the image is moved.
 
     Args:
         frames: Their evidence; None of a frame that says nothing. The first decides the size.
     """
-    usable = [frame for frame in frames if frame is not None]
-    if not usable:
+    known = [frame for frame in frames if frame is not None]
+    if not known:
         return None
-    size = usable[0].size
-    total = np.sum([frame.log_likelihood for frame in usable if frame.size == size], axis=0)
+    size = known[0].size
+    usable = [frame for frame in known if frame.size == size]
+    middle = tuple(count // 2 for count in usable[0].unmoved.shape)
+    related = _related(usable, [frame.unmoved for frame in usable], middle)
+    if related > REGISTERED:
+        return None
+    total = np.stack(
+        [np.sum([frame.log_likelihood(zoom) for frame in usable], axis=0) for zoom in _ZOOMS]
+    )
     down, right = (_shifts(count, size) for count in total.shape[1:])
     prior = (
-        (np.log(_ZOOMS) / _ZOOM_SIGMA)[:, None, None] ** 2
-        + (down / size[0] / _SHIFT_SIGMA)[None, :, None] ** 2
-        + (right / size[1] / _SHIFT_SIGMA)[None, None, :] ** 2
+        (np.abs(np.log(_ZOOMS)) / _ZOOM_SCALE)[:, None, None]
+        + ((down / size[0] / _SHIFT_SIGMA) ** 2 / 2)[None, :, None]
+        + ((right / size[1] / _SHIFT_SIGMA) ** 2 / 2)[None, None, :]
     )
-    logits = total - prior / 2 - logsumexp(-prior / 2)
-    unmoved = total[len(_ZOOMS) // 2, len(down) // 2, len(right) // 2]
+    logits = total - prior - logsumexp(-prior)
+    unmoved = sum(float(frame.unmoved[middle]) for frame in usable)
     if logsumexp(logits) - unmoved < FOUND:
-        return None
+        return "unrelated" if related < -DOUBT else None
+    number, *place = np.unravel_index(logits.argmax(), logits.shape)
+    maps = [frame.log_likelihood(float(_ZOOMS[number])) for frame in usable]
+    if _related(usable, maps, tuple(place)) < CHANCE * min(len(usable), 2):
+        return "unrelated"
     probability = np.exp(logits - logsumexp(logits))
     return ImageRegistration(
         zoom=round(float(_ZOOMS @ probability.sum((1, 2))), 4),
         right=round(float(right @ probability.sum((0, 1))), 2),
         down=round(float(down @ probability.sum((0, 2))), 2),
     )
+
+
+def _related(
+    frames: Sequence[Evidence], maps: Sequence[Floats], place: tuple[np.intp, ...]
+) -> float:
+    """Log of the Bayes factor of images that belong to their points at one shift over chance.
+
+    By how many standard deviations over all shifts the log likelihood there exceeds its mean: of an
+    unrelated image 0 ± 1, of one that belongs there a number that grows with the logarithm of the
+    number of points (even frames of 7-Scenes and ICL-NUIM).
+    """
+    standing = np.array([(each[place] - each.mean()) / (each.std() + 1e-9) for each in maps])
+    points = np.array([frame.points for frame in frames])
+    expected = _EVIDENCE * np.log(np.maximum(points / _NO_EVIDENCE, 1.0))
+    return float(np.sum(expected * (standing - expected / 2)))
 
 
 def _shifts(count: int, size: tuple[int, int]) -> Floats:
@@ -196,23 +246,29 @@ def _pairs(at: Floats) -> NDArray[np.intp] | None:
     return near
 
 
-def _depth_edges(at: Floats, log_depth: Floats, pairs: NDArray[np.intp]) -> Floats:
-    """(M,) by how many standard deviations depth changes more than at pairs of that length."""
+def _depth_edges(at: Floats, log_depth: Floats, pairs: NDArray[np.intp]) -> Floats | None:
+    """(M,) by how many standard deviations depth changes more than at pairs of that length.
+
+    None where depth has no edges, such as of a wall.
+    """
     change = np.log(np.abs(np.diff(log_depth[pairs], axis=1)[:, 0]) + _SMALLEST_CHANGE)
     length = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
     terms = np.stack([np.ones_like(length), np.log(length + 0.1)], axis=1)
     rest = change - terms @ np.linalg.lstsq(terms, change, rcond=None)[0]
-    clipped = (rest / (rest.std() + 1e-9)).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
+    if rest.std() < _LEAST_SPREAD:
+        return None
+    clipped = (rest / rest.std()).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
     return np.asarray(clipped - clipped.mean(), np.float64)
 
 
-def _correlation(edges: Image, ends: Floats, weight: Floats) -> Floats:
-    """(zooms, rows, columns) sum of weight × mean edge strength between the ends of each pair.
+def _correlation(edges: Image, ends: Floats, weight: Floats, zoom: float) -> Floats:
+    """(rows, columns) sum of weight × mean edge strength between the ends of each pair.
 
     Args:
         edges: (h, w), 0 is assumed outside.
         ends: (M, 2, 2) the two ends of each pair, x and y.
         weight: (M,) of each pair.
+        zoom: Of the image.
     """
     shape = np.array(edges.shape)
     reach = np.rint(_LARGEST_SHIFT * shape).astype(int)
@@ -222,12 +278,9 @@ def _correlation(edges: Image, ends: Floats, weight: Floats) -> Floats:
     top, left = (int(n) for n in 2 * reach)
     padded = cv2.copyMakeBorder(edges, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
     centre, (rows, columns) = shape[::-1] / 2, shape + 2 * reach
-    correlations = []
-    for zoom in _ZOOMS:
-        x, y = np.floor((between - centre) * zoom + centre).astype(np.intp).T
-        x, y = x + reach[1], y + reach[0]
-        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-        drawn = np.bincount((y * columns + x)[inside], weights[inside], rows * columns)
-        template = drawn.reshape(rows, columns).astype(np.float32)
-        correlations.append(cv2.matchTemplate(padded, template, cv2.TM_CCORR))
-    return np.stack(correlations).astype(np.float64)
+    x, y = np.floor((between - centre) * zoom + centre).astype(np.intp).T
+    x, y = x + reach[1], y + reach[0]
+    inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+    drawn = np.bincount((y * columns + x)[inside], weights[inside], rows * columns)
+    template = drawn.reshape(rows, columns).astype(np.float32)
+    return np.asarray(cv2.matchTemplate(padded, template, cv2.TM_CCORR), np.float64)

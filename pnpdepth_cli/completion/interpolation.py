@@ -52,12 +52,8 @@ def nearest(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
 def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "depth") -> Tensor:
     """Returns linear interpolation in the Delaunay triangles of the points.
 
-    Outside the points' hull, and everywhere if all are on one line, the nearest point's depth.
-
-    Args:
-        points: Sparse depth.
-        xy: (M, 2) pixel coordinates. None: every pixel.
-        space: Quantity that is linear, one of `choices.SPACES`.
+    Linear is a quantity of `choices.SPACES`. Outside the points' hull, and everywhere if all are
+    on one line, the nearest point's depth.
     """
     points = distinct(points)
     pixels = _queries(points, xy)
@@ -88,18 +84,11 @@ def in_hull(points: SparsePoints) -> Tensor:
     return inside.reshape(points.size).to(points.depth.device)
 
 
-def inverse_distance(
-    points: SparsePoints,
-    xy: Tensor | None = None,
-) -> Tensor:
+def inverse_distance(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
     """Returns the mean log depth of the six nearest points, weighted by 1 / distance⁴, as depth.
 
     Shepard, "A two-dimensional interpolation function for irregularly-spaced data", 1968, of the
     nearest points only.
-
-    Args:
-        points: Sparse depth.
-        xy: (M, 2) pixel coordinates. None: every pixel.
     """
     points = distinct(points)
     value = points.depth.double().cpu().log()

@@ -69,7 +69,6 @@ def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
     nothing can be learnt from it for others.
 
     Args:
-        points: Sparse depth.
         residual: (N,) log measured − log predicted depth.
     """
     if len(points) <= _AGREEING:

@@ -34,19 +34,12 @@ class Propagation:
     `dense` and `at` take a field whose kernel `fit` has chosen.
     """
 
-    title: str
-    """What it does, in a few words."""
+    title: str  # what it does, in a few words
     fit: Callable[[ResidualField], ResidualField] = lambda field: field
     """Chooses the field's kernel."""
-    dense: Callable[[ResidualField], Tensor]
-    """Residual (H, W) float32 at every pixel."""
+    dense: Callable[[ResidualField], Tensor]  # residual (H, W) float32 at every pixel
     at: Callable[[ResidualField, SparsePoints], Tensor] | None = None
     """Residual (M,) at the coordinates of M points. None: it is sampled from `dense`."""
-
-
-def _gp_at(field: ResidualField, queries: SparsePoints) -> Tensor:
-    """With many points, each query is predicted from the points nearest to it."""
-    return gaussian_process.predict_at(field, queries.xy, field.features_at(queries))
 
 
 TABLE = {
@@ -54,7 +47,9 @@ TABLE = {
         title="Gaussian process",
         fit=gaussian_process.fit,
         dense=gaussian_process.predict,
-        at=_gp_at,
+        at=lambda field, queries: gaussian_process.predict_at(
+            field, queries.xy, field.features_at(queries)
+        ),
     ),
     "diffusion": Propagation(title="edge-aware diffusion", dense=diffuse),
 }
@@ -65,18 +60,12 @@ TABLE = {
 class Propagated:
     """Depth after propagation."""
 
-    depth: Tensor
-    """(H, W) float32 metres, 0 = unknown."""
-    kernel: Kernel | None = None
-    """The kernel that fits the residual best. None with "none"."""
+    depth: Tensor  # (H, W) float32 metres, 0 = unknown
+    kernel: Kernel | None = None  # the kernel that fits the residual best. None with "none".
 
 
 def propagate(
-    prediction: Tensor,
-    points: SparsePoints,
-    rgb: Tensor | None,
-    *,
-    kind: str = "gp",
+    prediction: Tensor, points: SparsePoints, rgb: Tensor | None, *, kind: str = "gp"
 ) -> Propagated:
     """Returns the prediction with its residual at the points propagated.
 

@@ -28,12 +28,9 @@ _XYZ_OF_RGB = (
 class Kernel:
     """Covariance of a Gaussian process: its length scales and its noise."""
 
-    depth: float = 2.5
-    """Length scale of the predicted log depth."""
-    colour: float = 8.0
-    """Length scale of the colour."""
-    noise: float = 1e-3
-    """Variance of the noise."""
+    depth: float = 2.5  # length scale of the predicted log depth
+    colour: float = 8.0  # length scale of the colour
+    noise: float = 1e-3  # variance of the noise
 
     def scaled(self, features: Tensor) -> Tensor:
         """Returns features (..., 3 or 6) divided by their length scales."""
@@ -45,16 +42,11 @@ class Kernel:
 class ResidualField:
     """A residual that is known at N points of an image."""
 
-    features: tuple[Tensor, ...]
-    """3 or 6 maps (H, W), see `features_of`."""
-    points: SparsePoints
-    """The points in the image frame, on the CPU."""
-    at: Tensor
-    """(N, 3 or 6), features at the points."""
-    residual: Tensor
-    """(N,) float64, log measured − log predicted depth."""
-    kernel: Kernel = Kernel()
-    """Covariance; `gaussian_process.fit` chooses it."""
+    features: tuple[Tensor, ...]  # 3 or 6 maps (H, W), see `features_of`
+    points: SparsePoints  # the points in the image frame, on the CPU
+    at: Tensor  # (N, 3 or 6), features at the points
+    residual: Tensor  # (N,) float64, log measured − log predicted depth
+    kernel: Kernel = Kernel()  # covariance; `gaussian_process.fit` chooses it
 
     def features_at(self, queries: SparsePoints) -> Tensor:
         """Returns the features (M, 3 or 6) at the coordinates of M points."""

@@ -27,8 +27,7 @@ class InfluentialField:
 
     in_z: tuple[int, int] | None
     """Of the patch of z, in elements; None if z has no two spatial axes."""
-    in_output: tuple[int, int]
-    """Of the patch of the output, in pixels."""
+    in_output: tuple[int, int]  # of the patch of the output, in pixels
 
 
 def influential_field(
@@ -42,7 +41,6 @@ def influential_field(
     The sizes are lower bounds: connections through units that are zero for this image do not count.
 
     Args:
-        split: The network, cut and open.
         z: z_0, as returned by `split.front`.
         depth_of: Turns the network's output into depth (1, 1, h, w).
         enough: Rows and columns that the patch of the output is compared with. No further point is

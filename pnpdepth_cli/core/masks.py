@@ -58,7 +58,6 @@ class Masks:
         points: The N points that may be hidden.
         settings: `mask` and `mask_fraction`, which are not open. A fraction of 1/3 makes three
             parts; above 1/2, one part is shown and all others are hidden.
-        generator: Of the parts.
     """
 
     def __init__(

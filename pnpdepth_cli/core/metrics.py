@@ -1,4 +1,4 @@
-"""The error measures of depth estimation: of an image, of many images, of parts of an image.
+"""The error measures of depth estimation: of an image, and of many images.
 
 Definitions: Eigen et al. 2014 (RMSE, RMSE of the logarithm, AbsRel = MRE, SqRel, δ < 1.25^k,
 SILog), the paper and NYU's tables (log10), the KITTI depth completion benchmark (iRMSE, iMAE).
@@ -33,10 +33,8 @@ class Measure:
     higher_is_better: bool = False
     decimals: int = 4
     percent: bool = False
-    shown_unit: str = ""
-    """Unit in tables; empty: `unit`, which is that in files."""
-    shown_factor: float = 1.0
-    """Factor from `unit` to the unit in tables."""
+    shown_unit: str = ""  # unit in tables; empty: `unit`, which is that in files
+    shown_factor: float = 1.0  # factor from `unit` to the unit in tables
 
 
 MEASURES = (
@@ -102,7 +100,7 @@ def score(
         ground_truth: Ground truth depth of the same shape, likewise.
         thresholds: Of δ1 to δ3.
     """
-    (sums,) = error_sums(predicted, ground_truth, thresholds)
+    sums = error_sums(predicted, ground_truth, thresholds)
     values = measures_of(sums).tolist()
     pixels, known = int(sums[SUMS.index("pixels")]), int(sums[SUMS.index("known")])
     return Scores(
@@ -116,40 +114,22 @@ def error_sums(
     predicted: Tensor,
     ground_truth: Tensor,
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS,
-    part: Tensor | None = None,
-    parts: int = 1,
 ) -> Tensor:
-    """Returns the sums over each part of an image, (parts, len(SUMS)) float64.
-
-    Args:
-        predicted: Depth as for `score`.
-        ground_truth: Ground truth as for `score`.
-        thresholds: Of δ1 to δ3.
-        part: Number, 0 to parts − 1, of the part that each pixel belongs to, of the image's shape.
-            None: the image is one part.
-        parts: Number of parts.
-    """
+    """Returns the sums over an image, (len(SUMS),) float64; arguments as of `score`."""
     if predicted.shape != ground_truth.shape:
         raise ValueError(
             f"prediction is {tuple(predicted.shape)}, ground truth {tuple(ground_truth.shape)}"
         )
-    sums = torch.zeros(parts, len(SUMS), dtype=torch.float64, device=ground_truth.device)
+    sums = torch.zeros(len(SUMS), dtype=torch.float64, device=ground_truth.device)
     predicted, ground_truth = predicted.reshape(-1), ground_truth.reshape(-1)
-    labels = None if part is None else part.reshape(-1)
     for start in range(0, ground_truth.numel(), _CHUNK):
         piece = slice(start, start + _CHUNK)
         p, g = predicted[piece].double(), ground_truth[piece].double()
         known = g.isfinite() & (g > 0)
         scored = known & p.isfinite() & (p > 0)
         terms = _terms(p[scored], g[scored], thresholds)
-        if labels is None:
-            added = {name: term.sum()[None] for name, term in terms.items()}
-            added["known"] = known.sum()[None]
-        else:
-            label = labels[piece]
-            added = {name: label[scored].bincount(term, parts) for name, term in terms.items()}
-            added["known"] = label[known].bincount(minlength=parts)
-        sums += torch.stack([added[name].double() for name in SUMS], dim=-1)
+        added = {name: term.sum() for name, term in terms.items()} | {"known": known.sum()}
+        sums += torch.stack([added[name].double() for name in SUMS])
     return sums
 
 

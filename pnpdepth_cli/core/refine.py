@@ -14,8 +14,8 @@ the network.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -37,27 +37,21 @@ _LOSS_SCALE = 1024.0
 DepthOf = Callable[[Any], Tensor]
 """Turns the network's output for one frame into depth (1, 1, h, w) in metres, differentiably."""
 
+OnIteration = Callable[[int, float], None]
+"""Called with (updates made, loss)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Refinement:
     """The result of a refinement."""
 
-    before: Tensor
-    """Depth (1, 1, h, w) in metres of z_0."""
-    after: Tensor
-    """Depth (1, 1, h, w) in metres of z_kept."""
-    losses: tuple[float, ...]
-    """L(z_0) … L(z_K)."""
-    step: float
-    """α as a number."""
-    kept: int
-    """Number of updates after which `after` was predicted: K, or those of the lowest loss."""
-    depths: Mapping[int, Tensor] = field(default_factory=dict)
-    """Depth (1, 1, h, w) after each of the chosen numbers of updates, as far as they were made."""
-    z: Tensor | None = None
-    """z_K; None where weights moved."""
-    warm: bool = False
-    """Whether it began where the frame before ended."""
+    before: Tensor  # depth (1, 1, h, w) in metres of z_0
+    after: Tensor  # depth (1, 1, h, w) in metres of z_kept
+    losses: tuple[float, ...]  # L(z_0) … L(z_K)
+    step: float  # α as a number
+    kept: int  # number of updates after which `after` was predicted: K, or those of the lowest loss
+    z: Tensor | None = None  # z_K; None where weights moved
+    warm: bool = False  # whether it began where the frame before ended
 
 
 def refine(
@@ -67,19 +61,13 @@ def refine(
     settings: Settings,
     *,
     depth_of: DepthOf,
-    keep_depths: Collection[int] = (),
-    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
 ) -> Refinement:
     """Returns the network's depth for one frame, refined to agree with the points.
 
     Args:
-        split: The network, cut and open.
-        arguments: Of the network, for this frame.
         points: Sparse depth on the grid of the predicted depth's field of view.
         settings: How z is updated.
         depth_of: Turns the network's output into depth (1, 1, h, w) in metres, differentiably.
-        keep_depths: Numbers of updates after which depth is kept in `Refinement.depths`.
-        on_iteration: Called after each update k with k and L(z_k).
 
     Raises:
         DivergedError: The loss or its gradient is not finite; `last_good` is the Refinement until
@@ -89,15 +77,7 @@ def refine(
     """
     with torch.no_grad():
         z0 = split.front(*arguments)
-    (result,) = refine_from(
-        split,
-        z0,
-        (points,),
-        settings,
-        depth_of=(depth_of,),
-        keep_depths=keep_depths,
-        on_iteration=on_iteration,
-    )
+    (result,) = refine_from(split, z0, (points,), settings, depth_of=(depth_of,))
     if isinstance(result, PnpDepthError):
         raise result
     return result
@@ -110,21 +90,18 @@ def refine_from(
     settings: Settings,
     *,
     depth_of: Sequence[DepthOf],
-    keep_depths: Collection[int] = (),
-    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
+    on_iteration: OnIteration = lambda done, loss: None,
 ) -> list[Refinement | PnpDepthError]:
     """Returns for each of B frames its refinement, or the error that ended it.
 
     The frames share the passes of the network; each has its own α, loss and end, as if alone.
 
     Args:
-        split: The network, cut and open.
         z: z_0 of all frames, stacked along axis 0; the front has run.
         points: Of each frame.
         settings: Of all frames.
         depth_of: Of each frame; called with the frame's part of the network's output.
-        keep_depths: As in `refine`.
-        on_iteration: Called after each update k with k and the mean of L(z_k).
+        on_iteration: Called after each update; gets the mean loss before it.
 
     Raises:
         BatchError: z or the output does not have one part per frame; refine them one at a time.
@@ -132,7 +109,7 @@ def refine_from(
     settings, count = settings.complete(), len(points)
     scale = _LOSS_SCALE if split.in_half else 1.0  # of the loss, so that no gradient vanishes
     frames = [
-        _FrameRefinement(settings, z0, at, read, keep_depths)
+        _FrameRefinement(settings, z0, at, read)
         for z0, at, read in zip(frame_parts(z, count), points, depth_of, strict=True)
     ]
     for iteration in range(settings.iterations):
@@ -143,7 +120,11 @@ def refine_from(
                 break
             gradient = gradient_at(z, torch.stack(losses).sum() * scale)
         if gradient is None:
-            raise _no_gradient(split.layer)
+            raise LayerError(
+                f"layer {split.layer!r}: no gradient comes back from the prediction to it; either"
+                " the prediction does not depend on it or the network's forward runs under"
+                " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
+            )
         with torch.no_grad():
             parts = zip(
                 frames,
@@ -154,7 +135,7 @@ def refine_from(
             moved = [frame.updated(*part) for frame, *part in parts]
             z = torch.cat(moved) if count > 1 else moved[0]
         if running := [frame.losses[-1] for frame in frames if frame.error is None]:
-            on_iteration(iteration, sum(running) / len(running))
+            on_iteration(iteration + 1, sum(running) / len(running))
     else:
         with torch.no_grad():
             _losses(frames, split.rear(z))
@@ -166,7 +147,6 @@ def frame_parts(structure: Any, frames: int) -> list[Any]:
 
     Args:
         structure: A tensor, or tensors in nested containers, with the frames along axis 0.
-        frames: The number of frames.
 
     Raises:
         BatchError: A tensor does not have one element per frame along axis 0.
@@ -195,14 +175,6 @@ def _losses(frames: Sequence[_FrameRefinement], output: Any) -> list[Tensor]:
     return [loss for loss in losses if loss is not None]
 
 
-def _no_gradient(layer: str) -> LayerError:
-    return LayerError(
-        f"layer {layer!r}: no gradient comes back from the prediction to it; either the"
-        " prediction does not depend on it or the network's forward runs under"
-        " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
-    )
-
-
 class _FrameRefinement:
     """The refinement of one frame between updates: losses, depths, and the error that ended it.
 
@@ -215,7 +187,6 @@ class _FrameRefinement:
         z0: Tensor,
         points: SparsePoints,
         depth_of: DepthOf,
-        keep_depths: Collection[int],
     ) -> None:
         self._settings, self._points, self._depth_of = settings, points, depth_of
         self._step, self._halvings = step_size(settings.lr, z0), 0
@@ -226,9 +197,7 @@ class _FrameRefinement:
         self._first: Tensor | None = None  # depth of z_0
         self._after: Tensor | None = None  # depth of z_kept
         self._kept = 0
-        self._keep_depths = frozenset(keep_depths)
         self._z = z0
-        self._depths: dict[int, Tensor] = {}
         self.losses: list[float] = []
         self.error: PnpDepthError | None = None
 
@@ -255,8 +224,6 @@ class _FrameRefinement:
             self._first = depth
         if not self._settings.gives_best or self.losses[-1] <= min(self.losses):
             self._kept, self._after = updates, depth
-        if updates in self._keep_depths:
-            self._depths[updates] = depth
         return loss
 
     def updated(self, z: Tensor, gradient: Tensor) -> Tensor:
@@ -292,7 +259,6 @@ class _FrameRefinement:
             losses=tuple(self.losses),
             step=self._step,
             kept=self._kept,
-            depths=dict(self._depths),
             z=self._z.detach(),
         )
 

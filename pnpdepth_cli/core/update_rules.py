@@ -31,12 +31,7 @@ MAX_RMS = 10.0
 
 def update_rule(name: str) -> Callable[[Rule], Rule]:
     """Enters the decorated function in the table."""
-
-    def enter(function: Rule) -> Rule:
-        TABLE[name] = function
-        return function
-
-    return enter
+    return lambda function: TABLE.setdefault(name, function)  # type: ignore[return-value]
 
 
 @update_rule("sign")

@@ -23,12 +23,9 @@ from pnpdepth_cli.errors import UsageError
 class _StandIn:
     """The parts of θ of one parameter."""
 
-    parameter: nn.Parameter
-    """W."""
-    users: tuple[tuple[nn.Module, str], ...]
-    """The submodules that use it, each with its name there."""
-    leaves: tuple[int, ...]
-    """Positions of its parts in θ: one of W's shape, or A and B."""
+    parameter: nn.Parameter  # W
+    users: tuple[tuple[nn.Module, str], ...]  # the submodules that use it, each with its name there
+    leaves: tuple[int, ...]  # positions of its parts in θ: one of W's shape, or A and B
 
     def value(self, theta: Sequence[Tensor]) -> Tensor:
         """Returns W(θ)."""

@@ -24,7 +24,7 @@ from torch import Tensor
 from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.losses import Loss
 from pnpdepth_cli.core.masks import SET_ASIDE, Masks, set_aside
-from pnpdepth_cli.core.refine import DepthOf, Refinement, bad_prediction
+from pnpdepth_cli.core.refine import DepthOf, OnIteration, Refinement, bad_prediction
 from pnpdepth_cli.core.update_rules import SCHEDULES, Update, step_size
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.core.weights import MovingWeights
@@ -47,18 +47,13 @@ Predict = Callable[[SparsePoints], Any]
 class FrameOfPoints:
     """A frame whose depth the network predicts from any of its points."""
 
-    points: SparsePoints
-    """All points, on the network's grid."""
-    inliers: SparsePoints
-    """Those that the steps are made with."""
-    output: Any
-    """What the network returns for all points."""
-    predict: Predict
-    """Returns what the network returns for some of them, differentiably."""
+    points: SparsePoints  # all points, on the network's grid
+    inliers: SparsePoints  # those that the steps are made with
+    output: Any  # what the network returns for all points
+    predict: Predict  # returns what the network returns for some of them, differentiably
     predict_in_steps: Predict
     """The same for the steps, perhaps from a smaller image of the same field of view."""
-    depth_of: DepthOf
-    """Turns that into depth (1, 1, h, w) in metres, differentiably."""
+    depth_of: DepthOf  # turns that into depth (1, 1, h, w) in metres, differentiably
 
 
 def refine_weights(
@@ -67,7 +62,7 @@ def refine_weights(
     settings: Settings,
     *,
     carried: MovingWeights | None = None,
-    on_iteration: Callable[[int, float], None] = lambda iteration, loss: None,
+    on_iteration: OnIteration = lambda done, loss: None,
 ) -> Refinement:
     """Returns the depth of one frame after moving weights, which are back in place afterwards.
 
@@ -77,7 +72,7 @@ def refine_weights(
         settings: What is updated and how.
         carried: θ* of the frame before, which moves instead where its L is lower than that of θ_0
             at the points set aside, or without any at all inliers.
-        on_iteration: Called after each step k with k and L(θ_k).
+        on_iteration: Called after each step; gets the loss before it.
 
     Raises:
         DivergedError: As of `refine`.
@@ -87,9 +82,9 @@ def refine_weights(
     state = _WeightsRefinement(frame, weights, settings.complete())
     if carried is not None:
         state.start_from(carried)
-    for iteration in range(state.iterations):
+    for _ in range(state.iterations):
         state.step()
-        on_iteration(iteration, state.losses[-1])
+        on_iteration(len(state.losses), state.losses[-1])
         if state.finished():
             break
     return state.result()

@@ -70,16 +70,12 @@ def refine_default(
     fusion: Fusion,
     frame: Frame,
     *,
-    propagation: str = "gp",
     seed: int = 0,
     until: float | None = None,
 ) -> Refined:
     """Returns the frame refined by the default method.
 
     Args:
-        fusion: The networks, open.
-        frame: The frame, in the image frame.
-        propagation: How the residual is propagated, a name in `choices.PROPAGATIONS`.
         seed: Of the hidden points.
         until: As of `Fusion.fuse`.
 
@@ -91,7 +87,7 @@ def refine_default(
     hidden = _hidden(fusion, inliers, torch.from_numpy(user.before), seed)
     rejected = () if hidden is None else hidden.rejected
     fused = fusion.fuse(inliers, user=user, rejected=rejected, until=until)
-    propagated = propagate(fused.after, inliers.points, inliers.rgb, kind=propagation)
+    propagated = propagate(fused.after, inliers.points, inliers.rgb)
     check, notes = None, tuple[str, ...]()
     if left_out := len(frame.points) - len(inliers.points):
         notes = (
@@ -101,9 +97,9 @@ def refine_default(
     completion = _completion(fusion, fused, rejected)
     depth = final = _with_completion(propagated.depth, completion)
     if hidden is not None:
-        check = _check(fusion, hidden, propagation, propagated.kernel)
+        check = _check(fusion, hidden, propagated.kernel)
         if not completion:  # hidden lines are gaps that such a network was not trained with
-            depth, check, moved = _moved(fusion, inliers, hidden, depth, check, propagation)
+            depth, check, moved = _moved(fusion, inliers, hidden, depth, check)
             notes += moved
     if fused.steps:
         steps = ", ".join(f"{count} with {name}" for name, count in fused.steps.items())
@@ -215,11 +211,9 @@ def _inlier_weights(points: SparsePoints, prediction: Tensor) -> Tensor:
     return weights if bool(weights.any()) else torch.ones_like(weights)
 
 
-def _check(fusion: Fusion, hidden: _Hidden, propagation: str, kernel: Kernel | None) -> Check:
+def _check(fusion: Fusion, hidden: _Hidden, kernel: Kernel | None) -> Check:
     points, frame, fused = hidden.points, hidden.frame, hidden.fused
-    propagated = propagate_at(
-        fused.after, frame.points, frame.rgb, points.xy, kind=propagation, kernel=kernel
-    )
+    propagated = propagate_at(fused.after, frame.points, frame.rgb, points.xy, kernel=kernel)
     own = [points.sample(depth) for depth in _completion(fusion, fused, hidden.rejected)]
     propagated = _with_completion(propagated, own)
     network = torch.from_numpy(fused.user.before)
@@ -245,36 +239,39 @@ def _moved(
     hidden: _Hidden,
     depth: Tensor,
     check: Check,
-    propagation: str,
 ) -> tuple[Tensor, Check, tuple[str, ...]]:
-    """The result (H, W), moved away from the image where the check says so, and why."""
+    """The result (H, W), moved away from an image that does not fit its points, and why."""
     count, gain = len(check.hidden), check.gain(PROPAGATED, LINEAR)
-    if count < ENOUGH_FOR_LOSS or gain >= (GAIN if count >= ENOUGH_FOR_GAIN else -LOSS):
+    worse = count >= ENOUGH_FOR_LOSS and gain < (GAIN if count >= ENOUGH_FOR_GAIN else -LOSS)
+    if not worse and not frame.unrelated:
         return depth, check, ()
     at_points, what = check.predicted[PROPAGATED], []
-    blind = _blind(fusion, frame, hidden, propagation)
+    blind = _blind(fusion, frame, hidden)
     if blind is not None:
         depth = weighted_mean([(depth, 1.0), (blind[0], 1.0)])
         at_points = weighted_mean([(at_points, 1.0), (blind[1], 1.0)])
         what.append("half of the result leaves the image out")
-    if gain < -LOSS:
+    if worse and gain < -LOSS:
         depth = weighted_mean([(depth, 1.0), (linear(frame.points), 1.0)])
         at_points = weighted_mean([(at_points, 1.0), (check.predicted[LINEAR], 1.0)])
         what.append("half is linear interpolation")
     if not what:
         return depth, check, ()
     error, of_linear = check.error(PROPAGATED), check.error(LINEAR)
+    reason = (
+        f"with it the error at {count:,} hidden points is {error:.4f}, linear interpolation has"
+        f" {of_linear:.4f}"
+        if worse
+        else "depth changes at its edges no more often than by chance"
+    )
     note = (
-        "warning: the image does not seem to belong to these points: with it the error at"
-        f" {count:,} hidden points is {error:.4f}, linear interpolation has {of_linear:.4f};"
+        f"warning: the image does not seem to belong to these points: {reason};"
         f" {' and '.join(what)}; see --registration"
     )
     return depth, check.with_prediction(RESULT, at_points), (note,)
 
 
-def _blind(
-    fusion: Fusion, frame: Frame, hidden: _Hidden, propagation: str
-) -> tuple[Tensor, Tensor] | None:
+def _blind(fusion: Fusion, frame: Frame, hidden: _Hidden) -> tuple[Tensor, Tensor] | None:
     """Depth of a grey image (H, W), and at the hidden points (M,), by a network with points."""
     takers = [member for member in fusion.members if member.takes_prior]
     if frame.rgb is None or not takers:
@@ -294,6 +291,6 @@ def _blind(
     whole, part = results
     kept, xy = hidden.frame.points, hidden.points.xy
     return (
-        propagate(whole, frame.points, grey, kind=propagation).depth,
-        propagate_at(part, kept, grey, xy, kind=propagation),
+        propagate(whole, frame.points, grey).depth,
+        propagate_at(part, kept, grey, xy),
     )

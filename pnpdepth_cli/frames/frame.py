@@ -25,8 +25,9 @@ METRES = "m"
 DepthMap = NDArray[np.float32]
 Registration = str | tuple[float, float, float]
 """What the user says of the registration: "auto", "off", or zoom, right and down in pixels."""
-Register = ImageRegistration | Literal["auto"] | None
-"""How an image is to be moved into the frame of the points; "auto": as the points say."""
+Register = ImageRegistration | Literal["auto", "unrelated"] | None
+"""How an image is to be moved into the frame of the points. "auto": as the points say; "unrelated":
+not at all, as it seems not to belong to them."""
 FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 """Value of white by the type of an image's integers."""
 
@@ -35,18 +36,12 @@ FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 class Frame:
     """An image and its sparse depth."""
 
-    rgb: Tensor | None
-    """(3, H, W) float32 in 0…1. None without an image."""
-    points: SparsePoints
-    """Sparse depth in the image frame, on the CPU."""
-    gt: DepthMap | None = None
-    """(H, W) metres, 0 = unknown. None without ground truth."""
-    held_out: SparsePoints | None = None
-    """Points that are kept out, to score at."""
-    unit: str = METRES
-    """Of all depths: "m", or "model units" of a COLMAP model without scale."""
-    register: Register = None
-    """How `rgb` is to be moved into the frame of the points."""
+    rgb: Tensor | None  # (3, H, W) float32 in 0…1. None without an image.
+    points: SparsePoints  # sparse depth in the image frame, on the CPU
+    gt: DepthMap | None = None  # (H, W) metres, 0 = unknown. None without ground truth.
+    held_out: SparsePoints | None = None  # points that are kept out, to score at
+    unit: str = METRES  # of all depths: "m", or "model units" of a COLMAP model without scale
+    register: Register = None  # how `rgb` is to be moved into the frame of the points
     outliers: SparsePoints | None = None
     """Points that were left out as outliers, for networks that weigh their points."""
     prior: Tensor | None = None
@@ -54,6 +49,8 @@ class Frame:
     that take one. None without."""
     registration: ImageRegistration | None = None
     """How `rgb` was moved into the frame of the points. None: it was not."""
+    unrelated: bool = False
+    """Whether depth changes at edges of `rgb` no more often than by chance."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -66,8 +63,8 @@ class Frame:
         return None if self.rgb is None else np.ascontiguousarray(self.rgb.permute(1, 2, 0))
 
     @functools.cached_property
-    def _registration_of_points(self) -> ImageRegistration | None:
-        """How the points say that the image is moved: asked for more than once of most frames."""
+    def _registration_of_points(self) -> Register:
+        """What the points say of the registration: asked for more than once of most frames."""
         assert self.image is not None
         return estimated([evidence(self.image, self.points)])
 
@@ -77,8 +74,8 @@ class Frame:
         if image is None or how is None:
             return self
         how = self._registration_of_points if how == "auto" else how
-        if how is None:
-            return replace(self, register=None)
+        if how is None or isinstance(how, str):
+            return replace(self, register=None, unrelated=how == "unrelated")
         return replace(self, rgb=tensor_of(how.applied(image)), register=None, registration=how)
 
     def with_points(self, points: SparsePoints) -> Frame:
@@ -95,12 +92,9 @@ class Frame:
 class WarmStart:
     """What a frame of a window may take over from the frame before; the first has nothing."""
 
-    change: Tensor | None = None
-    """z_K − z_0 of the frame before."""
-    alignment: Alignment | None = None
-    """Its alignment of the network's output with the points."""
-    weights: MovingWeights | None = None
-    """Its weights, where weights move instead of z."""
+    change: Tensor | None = None  # z_K − z_0 of the frame before
+    alignment: Alignment | None = None  # its alignment of the network's output with the points
+    weights: MovingWeights | None = None  # its weights, where weights move instead of z
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,13 +150,10 @@ class Check:
     points, from four fifths of the points.
     """
 
-    hidden: SparsePoints
-    """The M hidden points."""
+    hidden: SparsePoints  # the M hidden points
     kept: SparsePoints
-    network: Tensor
-    """(H, W) metres, 0 = unknown: the user's network, aligned with the kept points."""
-    weights: Tensor
-    """(M,) 0…1, how consistent each hidden point is with its neighbours."""
+    network: Tensor  # (H, W) metres, 0 = unknown: the user's network, aligned with the kept points
+    weights: Tensor  # (M,) 0…1, how consistent each hidden point is with its neighbours
     predicted: Mapping[str, Tensor]
     """(M,) metres at the hidden points, by stage; also of linear interpolation and the result."""
 

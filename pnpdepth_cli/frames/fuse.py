@@ -48,10 +48,8 @@ class Member:
     """A network of the default method."""
 
     network: Network
-    layer: str
-    """Layer to cut at."""
-    settings: Settings
-    """How its output is aligned and z is updated."""
+    layer: str  # layer to cut at
+    settings: Settings  # how its output is aligned and z is updated
     hidden_points: Settings | None = None
     """How its weights are updated by points hidden from its input, where there is time for it."""
 
@@ -72,12 +70,9 @@ class Fused:
 
     alone: Mapping[Member, Refined]
     """What the networks give without another one's prior, the user's first."""
-    before: Tensor
-    """(H, W) metres, 0 = unknown: fused before the updates of z."""
-    after: Tensor
-    """(H, W) metres, 0 = unknown: fused after the updates of z."""
-    steps: Mapping[str, int]
-    """Kept steps by hidden points, by network."""
+    before: Tensor  # (H, W) metres, 0 = unknown: fused before the updates of z
+    after: Tensor  # (H, W) metres, 0 = unknown: fused after the updates of z
+    steps: Mapping[str, int]  # kept steps by hidden points, by network
 
     @property
     def user(self) -> Refined:

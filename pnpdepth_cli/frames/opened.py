@@ -63,12 +63,7 @@ class SplitCache:
 
 
 class OpenNetwork:
-    """A network that is cut when first refined, as a context manager.
-
-    Args:
-        network: The network.
-        layer: Layer to cut at.
-    """
+    """A network that is cut when first refined, as a context manager."""
 
     def __init__(self, network: Network, layer: str) -> None:
         self.network, self.layer = network, layer

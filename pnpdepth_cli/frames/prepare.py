@@ -24,12 +24,9 @@ class PreparedFrame:
     """A frame as the network takes it."""
 
     network: Network
-    frame: Frame
-    """The same in the image frame."""
-    map: FrameMap
-    """From the image frame to the network's frame."""
-    image: Tensor | None
-    """None if the network takes none."""
+    frame: Frame  # the same in the image frame
+    map: FrameMap  # from the image frame to the network's frame
+    image: Tensor | None  # none if the network takes none
     arguments: tuple[Tensor, ...]
     points: SparsePoints
     """The points that the network sees, in its frame and on its device, without outliers."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.outliers import outliers
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.refine import Refinement, refine_from
+from pnpdepth_cli.core.refine import OnIteration, Refinement, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.core.weights_refinement import FrameOfPoints, Predict, refine_weights
@@ -27,9 +27,6 @@ from pnpdepth_cli.settings import Settings
 MIN_POINTS_FOR_OUTLIERS = 50
 """Of fewer points, one inconsistent with the others may be all that is seen of an object."""
 
-OnIteration = Callable[[int, float], None]
-"""Called with (updates made, loss)."""
-
 
 def refine_frame(
     network: Network,
@@ -43,10 +40,8 @@ def refine_frame(
     """Returns one refined frame. A divergence with a last good depth is returned in it.
 
     Args:
-        network: The network.
         split: The network cut at a layer, open. For frames of one size it is recorded once.
         settings: How z is updated.
-        frame: The frame, in the image frame.
         propagation: How the residual at the points is propagated: "none" or a name in
             `choices.PROPAGATIONS`.
         on_iteration: Called after each update of z.
@@ -91,10 +86,10 @@ def refine_frames(
         elif seen:
             with torch.no_grad():
                 z = split.front(*_stacked([frame.arguments for frame in seen]))
+            points = [frame.points for frame in seen]
             results = refine_from(
-                split, z, [frame.points for frame in seen], settings, depth_of=readers,
-                on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
-            )  # fmt: skip
+                split, z, points, settings, depth_of=readers, on_iteration=on_iteration
+            )
     refined = iter(
         to_refined_frame(*each, propagation=propagation)
         for each in zip(seen, readers, results, strict=True)
@@ -116,10 +111,7 @@ def refine_frame_weights(
     weights = MovingWeights(frame.network.module, settings.parameters, settings.seed)
     try:
         with opened_frame(split, frame, reader, settings.mask_scale) as seen:
-            return refine_weights(
-                seen, weights, settings,
-                on_iteration=lambda iteration, loss: on_iteration(iteration + 1, loss),
-            )  # fmt: skip
+            return refine_weights(seen, weights, settings, on_iteration=on_iteration)
     except PnpDepthError as error:
         return error
 
@@ -180,7 +172,6 @@ def to_refined_frame(
     """Returns the result in the image frame, its residual propagated; an error if there is none.
 
     Args:
-        prepared: The frame.
         reader: What the refinement read depth with.
         result: What `core.refine` returned for the frame.
         propagation: As of `refine_frame`.

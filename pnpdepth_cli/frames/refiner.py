@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 
 from pnpdepth_cli.completion.image_registration import (
     Evidence,
-    ImageRegistration,
     estimated,
     evidence,
 )
+from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
 from pnpdepth_cli.frames.default import check_fixed, refine_default, split_hidden
@@ -29,6 +29,7 @@ from pnpdepth_cli.frames.frame import (
     METRES,
     Frame,
     Refined,
+    Register,
     Registration,
     Unit,
     WarmStart,
@@ -38,7 +39,7 @@ from pnpdepth_cli.frames.frame import (
     registration_to_make,
 )
 from pnpdepth_cli.frames.fuse import Fusion, Member
-from pnpdepth_cli.frames.refine import OnIteration, refine_frames
+from pnpdepth_cli.frames.refine import refine_frame, refine_frames
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
 from pnpdepth_cli.frames.tiles import refine_tiled
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
@@ -96,9 +97,7 @@ class Refiner:
         self._uncertainty, self._check = uncertainty, check or uncertainty
         self._register = registration_to_make(registration, self.asked)
         self.members: tuple[Member, ...] = ()
-        self.registrations: Mapping[tuple[int, int], ImageRegistration | None] = MappingProxyType(
-            {}
-        )
+        self.registrations: Mapping[tuple[int, int], Register] = MappingProxyType({})
         self._stack = ExitStack()
         self._opened: Split | Fusion | None = None
         of_weights = self.asked.masked or self.asked.moves_weights
@@ -188,20 +187,12 @@ class Refiner:
             until = None if seconds is None else time.monotonic() + seconds
             refined = refine_default(opened, frame, seed=seed, until=until)
         else:
-            settings, propagation = self.settings, self.settings.propagate
-            if settings.tile is None:
-                (result,) = refine_frames(
-                    self.network, opened, settings, (frame,),
-                    propagation=propagation, on_iteration=on_iteration,
-                )  # fmt: skip
-                if isinstance(result, PnpDepthError):
-                    raise result
-                refined = result
-            else:
-                refined = refine_tiled(
-                    self.network, opened, settings, frame,
-                    propagation=propagation, on_iteration=on_iteration,
-                )  # fmt: skip
+            settings = self.settings
+            refine = refine_frame if settings.tile is None else refine_tiled
+            refined = refine(
+                self.network, opened, settings, frame,
+                propagation=settings.propagate, on_iteration=on_iteration,
+            )  # fmt: skip
             if self._check:
                 refined = self._checked(frame, refined)
         if self._uncertainty:
@@ -241,7 +232,6 @@ class Refiner:
         """Decides once what definitions leave open, and returns this refiner.
 
         Args:
-            frame: The first frame.
             more: Gives further frames, which decide as well; called only if a network needs it.
 
         Raises:

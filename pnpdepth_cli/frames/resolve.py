@@ -16,6 +16,8 @@ from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
     IMAGENET_STD,
+    MASKED_DEFAULTS,
+    MASKED_DENSE_DEFAULTS,
     WEIGHTS_DEFAULTS,
     WEIGHTS_DENSE_DEFAULTS,
     ModelDefinition,
@@ -68,7 +70,6 @@ def resolve_definition(
     frames.
 
     Args:
-        network: The network.
         frame: The first frame, registered.
         more_frames: Gives further frames; called only where the input range is open.
 
@@ -95,7 +96,6 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     """Returns the name of the layer to cut at.
 
     Args:
-        definition: Of the network.
         layer: A name, a fraction 0…1 of the definition's layers, or None for its default.
 
     Raises:
@@ -126,8 +126,6 @@ def resolve_settings(
     an image alone is scaled to points in another unit.
 
     Args:
-        definition: Of the network.
-        settings: The user's.
         metric: Whether the points are in metres.
         dense: Whether the points lie as close as a LiDAR's; see `is_dense`.
 
@@ -147,7 +145,7 @@ def resolve_settings(
         )
     defaults = definition.defaults
     if settings.masked:
-        defaults = definition.masked_dense if dense else definition.masked
+        defaults = MASKED_DENSE_DEFAULTS if dense else MASKED_DEFAULTS
     elif of_weights:
         defaults = WEIGHTS_DENSE_DEFAULTS if dense else WEIGHTS_DEFAULTS
     settings = settings.with_preset()

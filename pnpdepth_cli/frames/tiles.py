@@ -15,9 +15,10 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
+from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined, no_points
-from pnpdepth_cli.frames.refine import OnIteration, refine_frame, with_propagation
+from pnpdepth_cli.frames.refine import refine_frame, with_propagation
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -50,14 +51,8 @@ class Tile:
         """Returns this part of a frame with these points of the tile."""
         rgb = frame.rgb
         if rgb is not None:
-            rows, columns = slice(self.top, self.top + self.height), slice(self.left, self.right)
-            rgb = rgb[:, rows, columns].contiguous()
-        return Frame(rgb=rgb, points=points)
-
-    @property
-    def right(self) -> int:
-        """The column after the last."""
-        return self.left + self.width
+            rgb = rgb[:, self.top : self.top + self.height, self.left : self.left + self.width]
+        return Frame(rgb=None if rgb is None else rgb.contiguous(), points=points)
 
     def weights(self, size: tuple[int, int]) -> DepthMap:
         """Returns blending weights (height, width) in 0…1.

@@ -38,10 +38,8 @@ def refine_next(
     """Returns one refined frame of a window, with what the next one may take over.
 
     Args:
-        network: The network.
         split: The network cut at a layer, or at its sparse depth; open.
         settings: What is updated and how.
-        frame: The frame, in the image frame.
         carried: Of the frame before; `WarmStart()` for the first of a window.
         propagation: As of `refine_frame`.
 

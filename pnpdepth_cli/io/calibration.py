@@ -78,20 +78,16 @@ Floats = NDArray[np.float64]
 class Calibration:
     """A camera and a scanner: x_camera = rotation · x_scanner + translation."""
 
-    intrinsics: Floats
-    """(3, 3), last row 0 0 1, in pixels."""
+    intrinsics: Floats  # (3, 3), last row 0 0 1, in pixels
     rotation: Floats = field(default_factory=lambda: np.eye(3))
     translation: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) metres, the scanner's origin in the camera's frame."""
     distortion: tuple[float, ...] = ()
-    size: tuple[int, int] | None = None
-    """(H, W) of the images; None if the file does not give it."""
+    size: tuple[int, int] | None = None  # (H, W) of the images; None if the file does not give it
     has_pose: bool
     """False if the file has no pose of a scanner; rotation and translation are then identity."""
-    source: str
-    """What was read, for a person."""
-    lens: str = "radial-tangential"
-    """One of `choices.LENSES`."""
+    source: str  # what was read, for a person
+    lens: str = "radial-tangential"  # one of `choices.LENSES`
     rectified: Mapping[str, Calibration] = field(default_factory=dict)
     """Cameras of rectified images by what they are made of, relative to this one, of raw images."""
 

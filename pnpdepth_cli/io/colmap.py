@@ -35,16 +35,12 @@ Integers = NDArray[np.int64]
 class ColmapCamera:
     """A camera of the model; several images may share it."""
 
-    model: str
-    """COLMAP's name, such as "SIMPLE_RADIAL"."""
-    size: tuple[int, int]
-    """(H, W) of its images."""
+    model: str  # COLMAP's name, such as "SIMPLE_RADIAL"
+    size: tuple[int, int]  # (H, W) of its images
     intrinsics: Floats
     """(3, 3) in pixels, with whole numbers at pixel centres (COLMAP has them at .5)."""
-    lens: str
-    """One of `choices.LENSES`."""
-    distortion: tuple[float, ...]
-    """Coefficients of the lens, or none."""
+    lens: str  # one of `choices.LENSES`
+    distortion: tuple[float, ...]  # coefficients of the lens, or none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,22 +50,17 @@ class ColmapImage:
     camera: int
     rotation: Floats
     translation: Floats
-    points: Integers
-    """Numbers of the points that are observed in it, sorted and unique."""
+    points: Integers  # numbers of the points that are observed in it, sorted and unique
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapPoints:
     """The points of a model, sorted by number."""
 
-    number: Integers
-    """(N,) COLMAP's numbers."""
-    xyz: Floats
-    """(N, 3) in model units."""
-    error: Floats
-    """(N,) mean reprojection error in pixels, negative where it was not computed."""
-    track: Integers
-    """(N,) images that observe the point."""
+    number: Integers  # (N,) COLMAP's numbers
+    xyz: Floats  # (N, 3) in model units
+    error: Floats  # (N,) mean reprojection error in pixels, negative where it was not computed
+    track: Integers  # (N,) images that observe the point
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,14 +69,12 @@ class ColmapModel:
 
     folder: Path
     cameras: dict[int, ColmapCamera]
-    images: dict[str, ColmapImage]
-    """The name is a path below the image folder."""
+    images: dict[str, ColmapImage]  # the name is a path below the image folder
     points: ColmapPoints
 
 
 class _CameraModel(NamedTuple):
-    number: int
-    """In binary files."""
+    number: int  # in binary files
     focals: int
     lens: str
     coefficients: int
@@ -126,8 +115,6 @@ _COUNT, _CAMERA = struct.Struct("<Q"), struct.Struct("<IiQQ")
 _IMAGE, _POINT = struct.Struct("<I7dI"), struct.Struct("<Q3d3BdQ")
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _TRACK_ENTRY = 8
-_LONGEST_NUMBER = 18
-"""Digits of a whole number in a text that fits 64 bits."""
 
 
 def model_files(folder: Path) -> list[Path]:
@@ -384,7 +371,7 @@ def _text_cameras(path: Path) -> Iterator[Described]:
                 f" {len(words) - 4}; create the model again"
             )
         try:
-            number, width, height = (_whole(words[i]) for i in (0, 2, 3))
+            number, width, height = (int(words[i]) for i in (0, 2, 3))
             parameters = [float(word) for word in words[4:]]
         except ValueError as error:
             raise _invalid(path, line, text, "numbers of a camera") from error
@@ -405,7 +392,7 @@ def _text_images(path: Path) -> Iterator[Registered]:
                 " short"
             )
         try:
-            pose, camera, name = [float(w) for w in words[1:8]], _whole(words[8]), words[9].strip()
+            pose, camera, name = [float(w) for w in words[1:8]], int(words[8]), words[9].strip()
             keypoints = following[1].split() if following else []
             if len(keypoints) % 3:
                 raise ValueError("not triples")
@@ -421,11 +408,11 @@ def _text_points(path: Path) -> Table:
     for line, text in _lines(path):
         words = text.split()
         try:
-            numbers.append(_whole(words[0]))
+            numbers.append(np.int64(words[0]))
             rows.append([float(words[i]) for i in (1, 2, 3, 7)])
             if len(words) % 2:
                 raise ValueError("not pairs")
-        except (ValueError, IndexError) as error:
+        except (ValueError, IndexError, OverflowError) as error:
             wanted = "a point and its track (or the file is cut short)"
             raise _invalid(path, line, text, wanted) from error
         tracks.append((len(words) - 8) // 2)
@@ -441,12 +428,6 @@ def _lines(path: Path, *, with_empty: bool = False) -> Iterator[tuple[int, str]]
     for number, line in enumerate(lines, start=1):
         if not line.startswith("#") and (with_empty or line.strip()):
             yield number, line
-
-
-def _whole(text: str) -> int:
-    if len(text) > _LONGEST_NUMBER:
-        raise ValueError("too many digits")
-    return int(text)
 
 
 def _invalid(path: Path, line: int, text: str, wanted: str) -> FileFormatError:

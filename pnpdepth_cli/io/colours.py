@@ -36,8 +36,7 @@ class DepthScale:
 
     low_m: float
     high_m: float
-    warm_is_far: bool = False
-    """Whether the warm end is the far one, as for a standard deviation."""
+    warm_is_far: bool = False  # whether the warm end is the far one, as for a standard deviation
 
     @property
     def logarithmic(self) -> bool:

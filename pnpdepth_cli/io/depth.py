@@ -43,24 +43,18 @@ _QUOTIENT_TOLERANCE = math.log(1.1)
 class DepthKind(NamedTuple):
     """What kind of depth file was read."""
 
-    source: str
-    """In words, such as `16-bit PNG ÷ 256`."""
-    scale: float | None
-    """Codes per metre; None for floats."""
-    assumed: bool
-    """True if neither the file nor the user nor the data set states the scale."""
+    source: str  # in words, such as `16-bit PNG ÷ 256`
+    scale: float | None  # codes per metre; None for floats
+    assumed: bool  # true if neither the file nor the user nor the data set states the scale
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthImage:
     """A depth image as read from a file."""
 
-    values: NDArray[np.float32]
-    """(H, W) metres, 0 where unknown."""
-    source: str
-    """What was read, for a person."""
-    assumed_scale: bool
-    """True if neither the file nor the user gave the scale."""
+    values: NDArray[np.float32]  # (H, W) metres, 0 where unknown
+    source: str  # what was read, for a person
+    assumed_scale: bool  # true if neither the file nor the user gave the scale
     scale: float | None = None
     """Codes per metre that integers were divided by; None for a float file."""
 

@@ -21,10 +21,8 @@ class Fingerprint:
     sha256: str
     mtime_ns: int = 0
     """When the content was changed last, as programs may set it; 0 of an object in a store."""
-    ctime_ns: int = 0
-    """When content or properties were changed last, which programs cannot set."""
-    version: str = ""
-    """Of an object in a store, as the store calls it; empty for a file."""
+    ctime_ns: int = 0  # when content or properties were changed last, which programs cannot set
+    version: str = ""  # of an object in a store, as the store calls it; empty for a file
 
     def as_record(self) -> dict[str, Any]:
         """Returns the fields that are known."""

@@ -33,7 +33,6 @@ def locked_folder(
     """Holds the lock of a run or of a shard until the end of the block.
 
     Args:
-        folder: The output folder.
         shard: (i, n) for one of n that run at once; None for all frames.
         when_alone: Called first in a run that is no shard.
 

@@ -84,10 +84,8 @@ def _rows(path: Path) -> list[tuple[int, Floats, Floats]]:
 class Trajectory:
     """Poses of one body over time."""
 
-    times_s: Floats
-    """(N,) seconds, ascending."""
-    poses: Floats
-    """(N, 3, 4) from the body's frame to the world's, metres."""
+    times_s: Floats  # (N,) seconds, ascending
+    poses: Floats  # (N, 3, 4) from the body's frame to the world's, metres
 
     def at(self, time_s: float, longest_gap_s: float) -> Floats | None:
         """Returns the pose (3, 4) at a time, interpolated between the poses before and after.

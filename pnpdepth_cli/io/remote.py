@@ -12,7 +12,7 @@ import posixpath
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -160,10 +160,8 @@ def _with_query(text: str, query: str) -> RemotePath:
 class Status(NamedTuple):
     """What a store says of an object."""
 
-    size: int
-    """Bytes; -1 if unknown."""
-    version: str
-    """Equal only for equal content; empty if unknown."""
+    size: int  # bytes; -1 if unknown
+    version: str  # equal only for equal content; empty if unknown
 
 
 def status_of(path: RemotePath) -> Status | None:
@@ -174,7 +172,7 @@ def status_of(path: RemotePath) -> Status | None:
         InputError: It may not be read.
         StorageError: The store cannot be reached.
     """
-    info = _call_if_there(path, "info")
+    info = _call(path, "info")
     return None if info is None or info.get("type") == "directory" else _status(info)
 
 
@@ -186,7 +184,7 @@ def _status(info: Mapping[str, Any]) -> Status:
 
 def read_object(path: RemotePath) -> bytes | None:
     """Returns the content of a small object; None if there is none. Raises as `status_of`."""
-    data: bytes | None = _call_if_there(path, "cat_file")
+    data: bytes | None = _call(path, "cat_file")
     return data
 
 
@@ -249,7 +247,7 @@ def _download(path: RemotePath, copy: Path) -> None:
             f"{path} cannot be copied to {copy.parent} ({error.strerror}); set TMPDIR to a larger"
             " disk"
         ) from error
-    if copy.stat().st_size != status.size:
+    if not copy.is_file() or copy.stat().st_size != status.size:
         raise InputError(f"{path} was replaced while it was read; run again")
 
 
@@ -291,14 +289,9 @@ def _listed(folder: Path) -> Mapping[str, Status | None]:
             return {}
         except OSError as error:
             raise cannot_read(folder, error) from error
-    infos = _call_if_there(folder, "ls", detail=True) or ()
+    infos = _call(folder, "ls", detail=True) or ()
     files = (info for info in infos if info.get("type") != "directory")
     return {info["name"].rpartition("/")[2]: _status(info) for info in files}
-
-
-def forget_stores() -> None:
-    """Forgets connections and their credentials; the next question reads them again."""
-    _file_system.cache_clear()
 
 
 @functools.cache
@@ -316,21 +309,10 @@ def _file_system(scheme: str) -> Any:
 
 
 def _call(path: RemotePath, method: str, *more: Any, **options: Any) -> Any:
-    with _errors_of(path):
-        return getattr(_file_system(_scheme(path)), method)(
-            str(path) + path.query, *more, **options
-        )
-
-
-class _MissingError(InputError):
-    """There is no such object."""
-
-
-def _call_if_there(path: RemotePath, method: str, **options: Any) -> Any:
-    try:
-        return _call(path, method, **options)
-    except _MissingError:
-        return None
+    """What the method returns; None if there is no such object."""
+    with _errors_of(path), suppress(FileNotFoundError):
+        file_system = _file_system(_scheme(path))
+        return getattr(file_system, method)(str(path) + path.query, *more, **options)
 
 
 def _scheme(path: RemotePath) -> str:
@@ -345,10 +327,8 @@ def _errors_of(path: RemotePath, *, writing: bool = False) -> Iterator[None]:
         yield
     except PnpDepthError:
         raise
-    except FileNotFoundError as error:
-        if writing:
-            raise StorageError(f"{bucket}: no such bucket; check the output") from error
-        raise _MissingError(f"{path}: no such object; check the address") from None
+    except FileNotFoundError as error:  # of writing
+        raise StorageError(f"{bucket}: no such bucket; check the output") from error
     except Exception as error:
         if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
             raise

@@ -10,7 +10,7 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -43,22 +43,19 @@ _SMALL = 480  # smaller views are enlarged by a whole number, so that their pixe
 _QUALITY = 85
 
 
-@dataclass(frozen=True, kw_only=True)
-class Column:
-    """A value of each frame, and how the page shows it."""
+def column(key: str, title: str, **shown: Any) -> dict[str, Any]:
+    """Returns a value of each frame, and how the page shows it.
 
-    key: str
-    title: str
-    unit: str = ""
-    """Unit of value × factor."""
-    decimals: int = 4
-    factor: float = 1.0
-    percent: bool = False
-    higher_is_better: bool = False
-    signed: bool = False
-    """True if values above 0 are better and below 0 worse."""
-    listed: bool = True
-    """True to show it in the list of frames, not only in a frame's own view."""
+    Args:
+        key: Of the value.
+        title: Without the unit.
+        **shown: `unit` of value × `factor`; `decimals`; `percent`; `higher_is_better`; `signed` if
+            values above 0 are better and below 0 worse; `listed` in the list of frames, not only in
+            a frame's own view.
+    """
+    defaults = {"unit": "", "decimals": 4, "factor": 1.0, "percent": False, "signed": False}
+    defaults |= {"higher_is_better": False, "listed": True}
+    return {"key": key, "title": title, **defaults, **shown}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +75,8 @@ class Head:
     (x, y) by the name of the line."""
     without_title: str = ""
     without: Sequence[tuple[str, str]] = ()
-    """Name and reason of each frame that has no result."""
-    columns: Sequence[Column] = ()
+    columns: Sequence[Mapping[str, Any]] = ()
+    """As `column` returns them."""
     sort_by: str = ""
     """Key of the column that the page is sorted by at first."""
     labels: Mapping[str, str]
@@ -88,7 +85,6 @@ class Head:
     """The view in the list of a frame that has no `image`."""
     map_colours: Sequence[str] = ()
     unit: str = "m"
-    """Unit of depth."""
 
 
 def check_report_folder(
@@ -112,7 +108,8 @@ def check_report_folder(
         if read.is_relative_to(resolved):
             raise OutputError(f"{folder} holds {source}, which is read; name another folder")
     try:
-        empty = not folder.exists() or next(folder.iterdir(), None) is None
+        # hidden files are of a writer that was killed
+        empty = not folder.exists() or all(path.name[0] == "." for path in folder.iterdir())
     except OSError as error:
         raise cannot_write(folder, error) from error
     if not (empty or overwrite or _is_of(folder, made_of)):
@@ -132,19 +129,12 @@ def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
 @contextmanager
 def whole_report(folder: Path) -> Iterator[Path]:
     """Yields a folder for a report that replaces the one in `folder`, which stays if it fails."""
-    remove_report_leftovers(folder)
+    remove_leftovers(folder)  # of a writer that was killed
     with atomic_folder(folder) as temporary:
         yield temporary
         images = {path.name for path in (temporary / IMAGES).iterdir()}
+        images |= {VIEWER} if (temporary / VIEWER).exists() else set()
     _remove_unused(folder, images)
-
-
-def remove_report_leftovers(folder: Path) -> int:
-    """Removes what killed writers left, while nobody writes; returns how many there were."""
-    try:
-        return sum(remove_leftovers(path) for path in (folder, folder / IMAGES) if path.is_dir())
-    except OSError as error:
-        raise cannot_write(folder, error) from error
 
 
 def image_key(name: str) -> str:
@@ -179,8 +169,8 @@ def write_report(
 
     style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
     data = {
-        "columns": [asdict(column) for column in head.columns],
-        "sort_by": next((n for n, c in enumerate(head.columns) if c.key == head.sort_by), 0),
+        "columns": head.columns,
+        "sort_by": next((n for n, c in enumerate(head.columns) if c["key"] == head.sort_by), 0),
         "labels": head.labels,
         "thumb": head.thumb,
         "unit": head.unit,
@@ -225,19 +215,11 @@ def save_views(images: Path, key: str, views: Mapping[str, Pixels]) -> dict[str,
 
 
 def link_image(source: Path, target: Path) -> None:
-    """Makes `target` the same file as `source`, or a copy of it on another file system."""
+    """Makes the new file `target` the same as `source`, or a copy of it on another disk."""
     try:
-        old, new = (target.stat() if target.exists() else None), source.stat()
-    except OSError as error:
-        raise cannot_write(target, error) from error
-    if old and (old.st_mtime_ns, old.st_size) == (new.st_mtime_ns, new.st_size):
-        return
-    with atomic_path(target) as temporary:
-        temporary.unlink()
-        try:
-            os.link(source, temporary)
-        except OSError:
-            shutil.copy2(source, temporary)
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def save_view_3d(source: Path, target: Path) -> float:

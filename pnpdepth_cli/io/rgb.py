@@ -23,7 +23,7 @@ from pnpdepth_cli.io.decoding import (
 )
 from pnpdepth_cli.io.file_bytes import read_bytes
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.tiff import read_tiff_facts
+from pnpdepth_cli.io.formats.images import read_exr_channels, read_tiff_facts
 
 _EXIF_FOLDER = 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
@@ -39,10 +39,8 @@ _PLAUSIBLE = (0.2, 50.0)
 class RgbImage:
     """An upright image."""
 
-    values: NDArray[np.float32]
-    """(H, W, 3) in 0..1, sRGB-encoded."""
-    note: str | None
-    """What was assumed or changed, for a person; None if nothing was."""
+    values: NDArray[np.float32]  # (H, W, 3) in 0..1, sRGB-encoded
+    note: str | None  # what was assumed or changed, for a person; None if nothing was
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
@@ -150,8 +148,6 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
 
 
 def _from_linear_light(path: Path, data: bytes) -> RgbImage:
-    from pnpdepth_cli.io.formats.exr import read_exr_channels
-
     linear = _colour_of(path, read_exr_channels(path, data)).astype(np.float32)
     linear = np.nan_to_num(linear, nan=0.0, posinf=1e9, neginf=0.0)
     outside = float(((linear > 1) | (linear < 0)).any(axis=2).mean())
@@ -185,10 +181,8 @@ def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
 class ExifFocalLength:
     """A focal length from EXIF."""
 
-    pixels: float
-    """In pixels of the image."""
-    source: str
-    """What it was computed from, for a person."""
+    pixels: float  # in pixels of the image
+    source: str  # what it was computed from, for a person
 
 
 def read_focal_length(path: Path, size: tuple[int, int]) -> ExifFocalLength | None:

@@ -10,7 +10,6 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, NoPointsError
 from pnpdepth_cli.io.file_bytes import damaged, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.npy import parse_npy
-from pnpdepth_cli.io.formats.npz import parse_npz
+from pnpdepth_cli.io.formats.arrays import parse_npy, parse_npz
 
 _FARTHEST_M = 1e5
 _KITTI_FIELDS, _NUSCENES_FIELDS = 4, 5  # x, y, z, reflectance; nuScenes adds the laser's index
@@ -48,10 +46,8 @@ Points = NDArray[np.float32]
 class ScanFile:
     """A LiDAR scan as read from a file."""
 
-    points: Points
-    """(N, 3) metres, x y z in the scanner's frame; all finite, in file order."""
-    source: str
-    """What was read, for a person."""
+    points: Points  # (N, 3) metres, x y z in the scanner's frame; all finite, in file order
+    source: str  # what was read, for a person
 
 
 def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
@@ -143,18 +139,14 @@ def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
     return bool(np.mean(near & numbered) >= _NEARLY_ALL)
 
 
-def _parse_npy(path: Path, data: bytes) -> tuple[Points, str]:
-    if kind_of(data) != "NPY":
-        raise FileFormatError(f"{path} is not an NPY file; save it with numpy.save")
-    return _points_of(path, parse_npy(path, data)), "NPY scan"
-
-
-def _parse_npz(path: Path, data: bytes) -> tuple[Points, str]:
-    return _points_of(path, parse_npz(path, data, "data")[1]), "DDAD scan"
-
-
-def _points_of(path: Path, array: NDArray[Any]) -> Points:
+def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
     """The first columns of (N, 3 or more) floats."""
+    if path.suffix.lower() == ".npz":
+        array, source = parse_npz(path, data, "data")[1], "DDAD scan"
+    elif kind_of(data) == "NPY":
+        array, source = parse_npy(path, data), "NPY scan"
+    else:
+        raise FileFormatError(f"{path} is not an NPY file; save it with numpy.save")
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind != "f":
         shape = "×".join(str(n) for n in array.shape)
         raise FileFormatError(
@@ -162,7 +154,7 @@ def _points_of(path: Path, array: NDArray[Any]) -> Points:
             " x y z in the first columns"
         )
     with np.errstate(over="ignore"):
-        return np.ascontiguousarray(array[:, :3], np.float32)
+        return np.ascontiguousarray(array[:, :3], np.float32), source
 
 
 Column = tuple[str, str, int]
@@ -292,8 +284,8 @@ def _whole(path: Path, text: str) -> int:
 
 
 _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
-    ".npy": _parse_npy,
-    ".npz": _parse_npz,
+    ".npy": _parse_array,
+    ".npz": _parse_array,
     ".pcd": _parse_pcd,
     ".ply": _parse_ply,
 }

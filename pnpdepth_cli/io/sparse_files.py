@@ -34,12 +34,10 @@ class SparseFile:
     """The points of a file, and how it was read."""
 
     points: SparsePoints[NDArray[np.float32]]
-    source: str
-    """What the file is, for messages."""
+    source: str  # what the file is, for messages
     assumed_scale: bool
     """Whether the scale of an integer file was assumed, because neither user nor file states it."""
-    scale: float | None = None
-    """Codes per metre of an integer file."""
+    scale: float | None = None  # codes per metre of an integer file
 
 
 def read_sparse(
@@ -55,7 +53,6 @@ def read_sparse(
     NPZ, or text with one `x y depth` per line (.csv, .txt), in metres; its order is kept.
 
     Args:
-        path: The file.
         size: (H, W) of the frame that a list belongs to; an image has its own.
         scale: Codes per metre of an integer image.
         channel: Name of an EXR channel or NPZ array.

@@ -63,7 +63,7 @@ class AlignedDepth:
     def _notes(self, fit: Alignment, raw: Tensor) -> tuple[str, ...]:
         decided = " (decided from the points)" if self._kind == "auto" else ""
         notes = [
-            f"alignment {fit}{decided}; {fit.points:,} points, off by {fit.error:.1%} of depth"
+            f"alignment: {fit}{decided}; {fit.points:,} points, off by {fit.error:.1%} of depth"
             f" over the best 70 %, {fit.outliers:.0%} outliers"
         ]
         beyond = fit.beyond(raw)

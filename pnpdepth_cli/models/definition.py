@@ -62,8 +62,8 @@ class Fixed:
     """
 
     def __post_init__(self) -> None:
-        validity.whole(self, "height", least=1)
-        validity.whole(self, "width", least=1)
+        validity.whole(self, "height")
+        validity.whole(self, "width")
         validity.one_of(self, "fit", choices.FITS)
 
 
@@ -77,9 +77,9 @@ class Multiple:
     """Images with a longer side, in pixels, are shrunk to it first; None shrinks none."""
 
     def __post_init__(self) -> None:
-        validity.whole(self, "of", least=1)
+        validity.whole(self, "of")
         if self.longest is not None:
-            validity.whole(self, "longest", least=1)
+            validity.whole(self, "longest")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,10 +93,10 @@ class Near:
     """Columns to approach, or None. With neither, the image keeps about its own size."""
 
     def __post_init__(self) -> None:
-        validity.whole(self, "of", least=1)
+        validity.whole(self, "of")
         for side in ("height", "width"):
             if getattr(self, side) is not None:
-                validity.whole(self, side, least=1)
+                validity.whole(self, side)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,16 +145,6 @@ MASKED_DENSE_DEFAULTS = replace(MASKED_DEFAULTS, iterations=6, lr=3e-4, mask_sca
 """The same for dense points hidden from the input."""
 
 
-def _inputs_in_order(
-    input_kind: InputKind, rgb: Tensor | None, sparse: Tensor | None
-) -> tuple[Tensor, ...]:
-    wanted = {"rgb": (rgb,), "sparse": (sparse,), "rgb+sparse": (rgb, sparse)}[input_kind]
-    present = tuple(tensor for tensor in wanted if tensor is not None)
-    if len(present) != len(wanted):
-        raise ValueError(f"a network with input kind {input_kind!r} needs all of its inputs")
-    return present
-
-
 @dataclass(frozen=True, kw_only=True)
 class ModelDefinition:
     """Everything the program needs to know of a network."""
@@ -186,10 +176,6 @@ class ModelDefinition:
     Without any, they are suggested by the shapes of the feature maps."""
     defaults: Settings = Settings()
     """Its settings of refinement where no option sets them."""
-    masked: Settings = MASKED_DEFAULTS
-    """The same where weights are updated by points hidden from the input."""
-    masked_dense: Settings = MASKED_DENSE_DEFAULTS
-    """The same for points that lie closer than `DENSE_SPACING`."""
     checkpoint: Path | None = None
     """The weights that come with the definition; None if the user names them."""
     complete: bool = False
@@ -235,8 +221,7 @@ class ModelDefinition:
         validity.one_of(self, "output_kind", choices.OUTPUT_KINDS)
         validity.one_of(self, "output_scale", choices.OUTPUT_SCALES)
         validity.names(self, "layers")
-        for settings in ("defaults", "masked", "masked_dense"):
-            validity.instance(self, settings, Settings, "Settings(…)")
+        validity.instance(self, "defaults", Settings, "Settings(…)")
         for field, kind, wanted in (
             ("normalisation", Normalisation, "Normalisation(mean=…, std=…)"),
             ("image_encoder", str, "the name of a submodule"),
@@ -267,16 +252,15 @@ class ModelDefinition:
         """
         if self.arguments is not None:
             return self.arguments(rgb, sparse)
-        return _inputs_in_order(self.input_kind, rgb, sparse)
+        by_name = {"rgb": rgb, "sparse": sparse}
+        inputs = (by_name[name] for name in self.input_kind.split("+"))
+        return tuple(tensor for tensor in inputs if tensor is not None)
 
 
 def undescribed(**known: Any) -> ModelDefinition:
     """Returns a definition for a network of rgb that brings no description of its numbers.
 
     The points decide its normalisation and what its output means.
-
-    Args:
-        known: The fields that are known.
     """
     return ModelDefinition(
         input_kind="rgb",

@@ -31,22 +31,24 @@ class FrameMap:
     @classmethod
     def fit(cls, size: Fixed | Multiple | Near, height: int, width: int) -> FrameMap:
         """The map for an image of this size under a network's size policy."""
+        crop = (0, 0, height, width)
         if isinstance(size, Multiple):
             shrink = min(1.0, (size.longest or max(height, width)) / max(height, width))
             resized = (max(1, round(height * shrink)), max(1, round(width * shrink)))
             network = (-(-resized[0] // size.of) * size.of, -(-resized[1] // size.of) * size.of)
-            return cls(
-                image=(height, width), crop=(0, 0, height, width), resized=resized, network=network
-            )
-        if isinstance(size, Near):
-            return _near(size, height, width)
-        network = (size.height, size.width)
-        crop = (0, 0, height, width)
-        if size.fit == "crop":
-            scale = min(height / size.height, width / size.width)
-            h, w = max(1, round(size.height * scale)), max(1, round(size.width * scale))
-            crop = ((height - h) // 2, (width - w) // 2, h, w)
-        return cls(image=(height, width), crop=crop, resized=network, network=network)
+        elif isinstance(size, Near):
+            sides = ((size.height, height), (size.width, width))
+            factors = [wanted / own for wanted, own in sides if wanted]
+            factor = min(factors, key=lambda f: abs(1 - f), default=1.0)
+            rows, columns = (max(1, round(n * factor / size.of)) * size.of for n in (height, width))
+            resized = network = (rows, columns)
+        else:
+            resized = network = (size.height, size.width)
+            if size.fit == "crop":
+                scale = min(height / size.height, width / size.width)
+                h, w = max(1, round(size.height * scale)), max(1, round(size.width * scale))
+                crop = ((height - h) // 2, (width - w) // 2, h, w)
+        return cls(image=(height, width), crop=crop, resized=resized, network=network)
 
     def rgb_to_network(self, rgb: Tensor) -> Tensor:
         """(1, 3, H, W) → (1, 3, h, w); antialiased when shrinking, edge pixels in the padding."""
@@ -86,20 +88,6 @@ class FrameMap:
         image = depth.new_zeros(self.image)
         image[top : top + height, left : left + width] = depth[0, 0]
         return image
-
-
-def _near(size: Near, height: int, width: int) -> FrameMap:
-    factors = [
-        wanted / own for wanted, own in ((size.height, height), (size.width, width)) if wanted
-    ]
-    factor = min(factors, key=lambda f: abs(1 - f), default=1.0)
-    network = tuple(max(1, round(n * factor / size.of)) * size.of for n in (height, width))
-    return FrameMap(
-        image=(height, width),
-        crop=(0, 0, height, width),
-        resized=(network[0], network[1]),
-        network=(network[0], network[1]),
-    )
 
 
 def _resize(depth: Tensor, size: tuple[int, int]) -> Tensor:

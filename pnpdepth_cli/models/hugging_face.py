@@ -39,7 +39,6 @@ _MOST_JSON_BYTES = 1 << 24
 _WEIGHTS = ("model.safetensors", "model.safetensors.index.json")
 _PICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
 
-
 _MAX_SIDE = 1 << 16  # pixels
 _LARGEST_NUMBER = 1e6  # in a config.json; no network has more of any part
 _PLAIN_ATTENTION = ("eager", "sdpa")
@@ -133,7 +132,7 @@ def hf_definition(folder: Path) -> ModelDefinition:
         complete=True,
         checkpoint=weights,
         arguments=_with_prompt if prompted else None,
-        output=_predicted_depth,
+        output=lambda output: output.predicted_depth,
         defaults=UNTUNED_DEFAULTS,
         assumed=assumed,
     )
@@ -169,11 +168,6 @@ def _with_prompt(rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...
         size=(sparse.shape[-2], sparse.shape[-1]),
     )
     return rgb, linear(points.resized(*PROMPT_SIZE))[None, None].to(sparse)
-
-
-def _predicted_depth(output: Any) -> Tensor:
-    depth: Tensor = output.predicted_depth
-    return depth
 
 
 def _json(file: Path, why: str) -> Mapping[str, Any]:

@@ -125,7 +125,6 @@ def rank_layers(layers: Iterable[MeasuredLayer], wanted: float) -> list[Measured
     others, the one with the widest field before the others. Layers with a problem have no rank.
 
     Args:
-        layers: As measured.
         wanted: Pixels of the network's frame.
     """
 
@@ -151,7 +150,6 @@ def measure_layers(
     """Returns the layers, each measured by a cut there.
 
     Args:
-        network: The network.
         names: The layers, in the order of the result.
         arguments: The network's arguments for one frame, real or synthetic.
         size: Rows and columns of the network's input.

@@ -23,8 +23,6 @@ from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.python_file import python_definition
 
-DEFAULT_MODEL = "compact"
-
 _WEIGHTS_ONLY = (
     *(".pt", ".pth", ".ts", ".torchscript", ".ckpt", ".bin", ".safetensors", ".tar"),
     *(".npy", ".npz", ".index"),
@@ -92,13 +90,14 @@ def find_definition(spec: str) -> ModelDefinition:
         if spec in definitions:
             return definitions[spec]
     raise ModelError(
-        f"model {spec!r} is neither a known name nor a Python file; {_near_names(spec)}"
+        f"model {spec!r} is neither a known name nor a file or folder of a network;"
+        f" {_near_names(spec)}"
     )
 
 
 def _near_names(name: str) -> str:
     near = difflib.get_close_matches(name, names(), n=1)
-    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names())}"
+    return f"did you mean {near[0]!r}?" if near else "`pnpdepth models` lists all names"
 
 
 def _from_file(spec: str) -> ModelDefinition | None:

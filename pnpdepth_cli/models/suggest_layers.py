@@ -55,8 +55,6 @@ def suggest_layers(
     prediction depends on.
 
     Args:
-        module: The network.
-        arguments: Its arguments for one frame.
         prediction_of: Returns the prediction (1, 1, h, w) from what the network returns.
 
     Returns:

@@ -13,20 +13,21 @@ import math
 import operator
 import re
 import zipfile
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.utils._pytree import tree_leaves, tree_map_only
 
 from pnpdepth_cli.budget import size_problem
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
+from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
 from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, view_of
+from pnpdepth_cli.models.weights.torch_file import refuse_inflated
 
 _ASSUMED_MULTIPLE = 32
 _OPERATOR = re.compile(r"torch\.ops\.(aten|prims?|torchvision|quantized)\.(\w+)\.(\w+)")
@@ -59,23 +60,6 @@ class ExportedOperation(nn.Module):
         return self._operation(*args, **kwargs)
 
 
-@dataclass(frozen=True)
-class _Value:
-    """Stands for a value of the graph among the arguments of a step."""
-
-    name: str
-
-
-@dataclass(frozen=True)
-class _Step:
-    """One call; outputs: names of its result's parts, or of the result itself as a text."""
-
-    run: Callable[..., Any]
-    arguments: list[Any]
-    keywords: dict[str, Any]
-    outputs: str | list[str | None]
-
-
 class ExportedGraph(nn.Module):
     """The graph of an exported program as a module of one image; every operation is a submodule.
 
@@ -102,27 +86,13 @@ class ExportedGraph(nn.Module):
             for spec in module["signature"]["output_specs"]
             if "user_output" in spec
         ]
-        self._steps = list(self._steps_of(module["graph"]))
-        last = {name: at for at, step in enumerate(self._steps) for name in _names_in(step)}
-        self._ends: list[list[str]] = [[] for _ in self._steps]
-        for name in last.keys() - {*self._outputs}:
-            self._ends[last[name]].append(name)
+        self._steps = with_ends(list(self._steps_of(module["graph"])), self._outputs)
 
     def forward(self, *inputs: Tensor) -> Any:
         """Returns the output, or a tuple of several."""
         values: dict[str, Any] = dict(zip(self.inputs, inputs, strict=True))
         values |= {name: getattr(self, attribute) for name, attribute in self.held.items()}
-        for step, ends in zip(self._steps, self._ends, strict=True):
-            arguments, keywords = tree_map_only(
-                _Value, lambda value: values[value.name], (step.arguments, step.keywords)
-            )
-            result = step.run(*arguments, **keywords)
-            if isinstance(step.outputs, str):
-                values[step.outputs] = result
-            else:
-                values.update((n, r) for n, r in zip(step.outputs, result, strict=False) if n)
-            for name in ends:
-                values.pop(name, None)
+        deque(run_steps(self._steps, values), maxlen=0)
         outputs = tuple(values[name] for name in self._outputs)
         return outputs if len(outputs) > 1 else outputs[0]
 
@@ -133,7 +103,7 @@ class ExportedGraph(nn.Module):
         else:
             self.register_buffer(self.held[name], value)
 
-    def _steps_of(self, graph: Mapping[str, Any]) -> Iterator[_Step]:
+    def _steps_of(self, graph: Mapping[str, Any]) -> Iterator[Step]:
         for node in graph["nodes"]:
             target, outputs = node["target"], node["outputs"]
             if target == _WITHOUT_GRADIENT:
@@ -142,7 +112,7 @@ class ExportedGraph(nn.Module):
             elif outputs:  # the others only check what the exporter saw
                 yield self._step(target, node["inputs"], outputs)
 
-    def _step(self, target: str, inputs: list[Any], outputs: list[Any]) -> _Step:
+    def _step(self, target: str, inputs: list[Any], outputs: list[Any]) -> Step:
         run = _function(target)
         named = [one for output in outputs for one in _outputs_in(output)]
         alone = len(outputs) == 1 and "as_tensors" not in outputs[0]
@@ -152,7 +122,7 @@ class ExportedGraph(nn.Module):
             while hasattr(self, name):  # as a node named `to`, a method of every module
                 name += "_"
             self._modules[name] = run
-        return _Step(
+        return Step(
             run=run,
             arguments=[_argument(one["arg"]) for one in inputs if one.get("kind") != 2],
             keywords={one["name"]: _argument(one["arg"]) for one in inputs if one.get("kind") == 2},
@@ -161,16 +131,17 @@ class ExportedGraph(nn.Module):
 
     def _inlined(
         self, body: Mapping[str, Any], given: list[Any], outputs: list[Any], *, as_bool: bool
-    ) -> Iterator[_Step]:
+    ) -> Iterator[Step]:
         """A graph in the graph, whose result has no gradient unless `as_bool` says so."""
         before = [one for value in body["inputs"] for one in _outputs_in(value)]
         for name, value in zip(before, given, strict=True):
-            yield _Step(_same, [_argument(value)], {}, str(name))
+            yield Step(run=_same, arguments=[_argument(value)], outputs=str(name))
         yield from self._steps_of(body)
         results = [one for value in body["outputs"] for one in _outputs_in(value)]
         names = [one for output in outputs for one in _outputs_in(output)]
         for name, result in zip(names, results, strict=True):
-            yield _Step(_same if as_bool else torch.detach, [_Value(str(result))], {}, str(name))
+            run = _same if as_bool else torch.detach
+            yield Step(run=run, arguments=[Value(str(result))], outputs=str(name))
 
 
 def exported_definition(file: Path) -> ModelDefinition:
@@ -217,10 +188,7 @@ def _read(file: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
     """The program, and its tensors by name."""
     with zipfile.ZipFile(file) as archive:
         entries = {info.filename.partition("/")[2]: info for info in archive.infolist()}
-        if any(info.compress_type != zipfile.ZIP_STORED for info in entries.values()):
-            raise BrokenFileError("it is compressed, which torch never does")
-        if sum(info.file_size for info in entries.values()) > file.stat().st_size:
-            raise BrokenFileError("its entries are larger than the file")
+        refuse_inflated(archive, file)
         program = json.loads(archive.read(entries["models/model.json"]))
         tensors, storages = {}, {}
         for folder, kind in (("weights", "model_weights"), ("constants", "model_constants")):
@@ -260,15 +228,15 @@ def _function(target: str) -> Callable[..., Any]:
 
 
 def _argument(stated: Mapping[str, Any]) -> Any:
-    """An argument of a call, with `_Value` for what the graph computes."""
+    """An argument of a call, with `Value` for what the graph computes."""
     ((kind, value),) = stated.items()
     match kind.removeprefix("as_").replace("optional_", "").replace("sym_", ""):
         case "none":
             return None
         case "name":
-            return _Value(value)
+            return Value(value)
         case "tensor" if "name" in value:
-            return _Value(value["name"])
+            return Value(value["name"])
         case "float" if not isinstance(value, Mapping):
             return float(value)  # JSON has a text for an infinite one
         case "tensor" | "int" | "float" | "bool" | "string":
@@ -299,13 +267,6 @@ def _outputs_in(stated: Mapping[str, Any]) -> list[str | None]:
     if not isinstance(name, str):
         raise BrokenFileError(f"it has an output {str(kind)[:40]!r}")
     return [name]
-
-
-def _names_in(step: _Step) -> set[str]:
-    """The values that a step reads or gives."""
-    read = tree_leaves((step.arguments, step.keywords))
-    given = [step.outputs] if isinstance(step.outputs, str) else step.outputs
-    return {*filter(None, given), *(one.name for one in read if isinstance(one, _Value))}
 
 
 def _same(value: Any) -> Any:

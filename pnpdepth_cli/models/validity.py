@@ -30,11 +30,11 @@ def one_of(owner: object, field: str, valid: Collection[str]) -> None:
         refuse(owner, field, f"is none of {', '.join(map(repr, valid))}{hint}")
 
 
-def whole(owner: object, field: str, *, least: int) -> None:
-    """Checks that the field is a whole number of at least `least`."""
+def whole(owner: object, field: str) -> None:
+    """Checks that the field is a whole number of at least 1."""
     value = getattr(owner, field)
-    if not isinstance(value, Integral) or isinstance(value, bool) or int(value) < least:
-        refuse(owner, field, f"is not a whole number of at least {least}")
+    if not isinstance(value, Integral) or isinstance(value, bool) or int(value) < 1:
+        refuse(owner, field, "is not a whole number of at least 1")
 
 
 def per_channel(owner: object, field: str, *, positive: bool = False) -> None:

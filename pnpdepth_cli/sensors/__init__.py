@@ -6,36 +6,21 @@ x right, y down, whole numbers at pixel centres. Nothing here reads a file.
 
 from __future__ import annotations
 
-from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulated
-from pnpdepth_cli.sensors.camera import Camera
-from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP, LIDARS, Lidar, simulate_lidar
-from pnpdepth_cli.sensors.projection import edge_agreement, occluded_in_map, project_velodyne
-from pnpdepth_cli.sensors.samplers import (
-    PATTERNS,
-    SampleNoise,
-    SamplePattern,
-    sample_points,
-    with_noise,
-)
-from pnpdepth_cli.sensors.sparse import Points, as_depth_image, describe_dropped
-
-__all__ = [
-    "FORWARD_LEFT_UP",
-    "LIDARS",
-    "PATTERNS",
-    "Camera",
-    "Lidar",
-    "NeighbourScan",
-    "Points",
-    "SampleNoise",
-    "SamplePattern",
-    "accumulated",
-    "as_depth_image",
-    "describe_dropped",
-    "edge_agreement",
-    "occluded_in_map",
-    "project_velodyne",
-    "sample_points",
-    "simulate_lidar",
-    "with_noise",
-]
+from pnpdepth_cli.sensors.accumulation import NeighbourScan as NeighbourScan
+from pnpdepth_cli.sensors.accumulation import accumulated as accumulated
+from pnpdepth_cli.sensors.camera import Camera as Camera
+from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP as FORWARD_LEFT_UP
+from pnpdepth_cli.sensors.lidar import LIDARS as LIDARS
+from pnpdepth_cli.sensors.lidar import Lidar as Lidar
+from pnpdepth_cli.sensors.lidar import simulate_lidar as simulate_lidar
+from pnpdepth_cli.sensors.projection import edge_agreement as edge_agreement
+from pnpdepth_cli.sensors.projection import occluded_in_map as occluded_in_map
+from pnpdepth_cli.sensors.projection import project_velodyne as project_velodyne
+from pnpdepth_cli.sensors.samplers import PATTERNS as PATTERNS
+from pnpdepth_cli.sensors.samplers import SampleNoise as SampleNoise
+from pnpdepth_cli.sensors.samplers import SamplePattern as SamplePattern
+from pnpdepth_cli.sensors.samplers import sample_points as sample_points
+from pnpdepth_cli.sensors.samplers import with_noise as with_noise
+from pnpdepth_cli.sensors.sparse import Points as Points
+from pnpdepth_cli.sensors.sparse import as_depth_image as as_depth_image
+from pnpdepth_cli.sensors.sparse import describe_dropped as describe_dropped

@@ -53,12 +53,9 @@ _NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
 class NeighbourScan:
     """The points of another frame of the sequence."""
 
-    points: Points
-    """In the other frame's image."""
-    motion: Floats
-    """(3, 4) from the other camera's frame to this one's, metres."""
-    apart: int
-    """Frames between the two, at least 1."""
+    points: Points  # in the other frame's image
+    motion: Floats  # (3, 4) from the other camera's frame to this one's, metres
+    apart: int  # frames between the two, at least 1
 
 
 @dataclass(frozen=True, kw_only=True)

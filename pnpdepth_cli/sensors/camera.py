@@ -38,15 +38,13 @@ class Camera:
     Camera axes are x right, y down, z forward, in metres; whole pixel numbers are pixel centres.
     """
 
-    intrinsics: Floats
-    """(3, 3), last row 0 0 1, in pixels."""
+    intrinsics: Floats  # (3, 3), last row 0 0 1, in pixels
     rotation: Floats = field(default_factory=lambda: np.eye(3))
     """(3, 3), from the scanner's frame to the camera's."""
     translation: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) metres, the scanner's origin in the camera's frame."""
     distortion: Coefficients = ()
-    lens: str = "radial-tangential"
-    """One of `choices.LENSES`: what the coefficients are."""
+    lens: str = "radial-tangential"  # one of `choices.LENSES`: what the coefficients are
 
     @property
     def has_lens(self) -> bool:
@@ -56,10 +54,6 @@ class Camera:
     def from_scanner(self, points: NDArray[np.floating]) -> Floats:
         """Returns (N, 3) points of the scanner's frame in the camera's frame, metres."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
-
-    def to_scanner(self, points: NDArray[np.floating]) -> Floats:
-        """Returns (N, 3) points of the camera's frame in the scanner's frame, metres."""
-        return (np.asarray(points, np.float64) - self.translation) @ self.rotation
 
     def pixels_of(self, points: NDArray[np.floating]) -> Floats:
         """Returns the (N, 2) pixel coordinates of (N, 3) points of the camera's frame, z > 0.
@@ -157,29 +151,10 @@ class LensModel(NamedTuple):
 
     shown: Callable[[Floats, Coefficients], Floats]
     """From (N, 2) directions and the coefficients to (N, 2) points on the image plane."""
-    by_angle: bool
-    """Whether it is defined by the angle to the axis, not by the tangent of it."""
-    radial: tuple[int, ...] | None
-    """Which coefficients are radial. None: all."""
+    by_angle: bool  # whether it is defined by the angle to the axis, not by the tangent of it
+    radial: tuple[int, ...] | None = None  # which coefficients are radial. None: all.
 
 
-LENS_MODELS: dict[str, LensModel] = {}
-"""By name, as in `choices.LENSES`."""
-
-
-def _lens(
-    name: str, *, by_angle: bool, radial: tuple[int, ...] | None = None
-) -> Callable[[Callable[..., Floats]], Callable[..., Floats]]:
-    """Returns a decorator that adds a lens model."""
-
-    def add(shown: Callable[..., Floats]) -> Callable[..., Floats]:
-        LENS_MODELS[name] = LensModel(shown, by_angle, radial)
-        return shown
-
-    return add
-
-
-@_lens("radial-tangential", by_angle=False, radial=(0, 1, 4, 5, 6, 7))
 def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
     """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]."""
     points = np.column_stack([plane, np.ones(len(plane))])
@@ -188,14 +163,12 @@ def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
     return np.asarray(shown[:, 0], np.float64)
 
 
-@_lens("fisheye", by_angle=True)
 def _fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
     """OpenCV's equidistant k1 k2 k3 k4; without them the angle is the distance to the centre."""
     padded = np.array((*coefficients, *[0.0] * 4)[:4])
     return np.asarray(cv2.fisheye.distortPoints(plane[:, None], np.eye(3), padded)[:, 0])
 
 
-@_lens("fov", by_angle=True)
 def _fov(plane: Floats, coefficients: Coefficients) -> Floats:
     """One angle omega (Devernay and Faugeras, 2001)."""
     (omega,) = coefficients
@@ -207,7 +180,6 @@ def _fov(plane: Floats, coefficients: Coefficients) -> Floats:
     return np.asarray(plane * factor[:, None])
 
 
-@_lens("thin-prism-fisheye", by_angle=True, radial=(0, 1, 4, 5))
 def _thin_prism_fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
     """k1 k2 p1 p2 k3 k4 sx1 sy1 on the equidistant plane."""
     k1, k2, p1, p2, k3, k4, sx1, sy1 = coefficients
@@ -217,7 +189,6 @@ def _thin_prism_fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
     return np.asarray(radial + _tangential(angles, (p2, p1)) + prism)
 
 
-@_lens("rad-tan-thin-prism-fisheye", by_angle=True, radial=(0, 1, 2, 3, 4, 5))
 def _rad_tan_thin_prism_fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
     """k0 … k5 p0 p1 s0 … s3, as of Project Aria."""
     k, p, s = coefficients[:6], coefficients[6:8], coefficients[8:]
@@ -233,15 +204,25 @@ def _tangential(plane: Floats, p: tuple[float, ...]) -> Floats:
     return np.asarray(2 * along[:, None] * plane + square[:, None] * np.array(p))
 
 
-@_lens("division", by_angle=False)
 def _division(plane: Floats, coefficients: Coefficients) -> Floats:
     """One k: direction = seen / (1 + k seen²) (Fitzgibbon, 2001)."""
     (k,) = coefficients
     return np.asarray(plane * (2 / (1 + np.sqrt(1 - 4 * k * _square(plane))))[:, None])
 
 
-@_lens("eucm", by_angle=True)
 def _eucm(plane: Floats, coefficients: Coefficients) -> Floats:
     """Alpha and beta of the enhanced unified camera model (Khomutenko et al., 2016)."""
     alpha, beta = coefficients
     return np.asarray(plane / (alpha * np.sqrt(beta * _square(plane) + 1) + 1 - alpha)[:, None])
+
+
+LENS_MODELS = {
+    "radial-tangential": LensModel(_radial_tangential, False, (0, 1, 4, 5, 6, 7)),
+    "fisheye": LensModel(_fisheye, True),
+    "fov": LensModel(_fov, True),
+    "thin-prism-fisheye": LensModel(_thin_prism_fisheye, True, (0, 1, 4, 5)),
+    "rad-tan-thin-prism-fisheye": LensModel(_rad_tan_thin_prism_fisheye, True, (0, 1, 2, 3, 4, 5)),
+    "division": LensModel(_division, False),
+    "eucm": LensModel(_eucm, True),
+}
+"""By name, as in `choices.LENSES`."""

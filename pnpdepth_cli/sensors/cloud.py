@@ -42,17 +42,12 @@ class PointCloud(NamedTuple):
     """(N, 3) in the unit of the depth, in the camera's or the world's frame."""
     normals: NDArray[np.float32]
     """(N, 3) unit vectors towards the camera; 0 where a point has no two neighbours."""
-    rgb: NDArray[np.uint8] | None
-    """(N, 3) colours 0…255. None: without colours."""
+    rgb: NDArray[np.uint8] | None  # (N, 3) colours 0…255. None: without colours.
 
     def transformed(self, pose: Floats) -> PointCloud:
         """Returns the cloud in the frame that a pose, (3, 4) or (4, 4), leads to."""
-        rotation, translation = pose[:3, :3], pose[:3, 3]
-        return PointCloud(
-            xyz=(self.xyz @ rotation.T + translation).astype(np.float32),
-            rgb=self.rgb,
-            normals=(self.normals @ rotation.T).astype(np.float32),
-        )
+        xyz, normals = _moved(self.xyz, pose[:3]), self.normals @ pose[:3, :3].T
+        return PointCloud(xyz.astype(np.float32), normals.astype(np.float32), self.rgb)
 
 
 def cloud_from_depth(
@@ -83,15 +78,12 @@ def cloud_from_depth(
         normals = _normals(points, known[around])
         inner = slice(top - around.start, part.stop - around.start)
         kept = known[part]
+        colours = None if rgb is None else np.clip(rgb[part][kept], 0, 1) * 255
         yield PointCloud(
             xyz=points[inner][kept].astype(np.float32),
-            rgb=None if rgb is None else _bytes_of(rgb[part][kept]),
             normals=normals[inner][kept].astype(np.float32),
+            rgb=None if colours is None else np.rint(colours).astype(np.uint8),
         )
-
-
-def _bytes_of(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
 
 
 def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None, edge: float = EDGE) -> Mask:
@@ -194,25 +186,20 @@ class VoxelGrid:
 class View:
     """A depth map with its camera."""
 
-    depth: NDArray[np.float32]
-    """(H, W), 0 = unknown."""
+    depth: NDArray[np.float32]  # (H, W), 0 = unknown
     camera: Camera
-    pose: Floats
-    """(3, 4) from the camera's frame to the world's."""
+    pose: Floats  # (3, 4) from the camera's frame to the world's
 
     @functools.cached_property
     def known(self) -> NDArray[np.intp]:
         """(N,) row-major indices of the pixels with known depth."""
-        return np.flatnonzero((self.depth > 0) & np.isfinite(self.depth))
+        return np.flatnonzero(kept_pixels(self.depth, edge=0))
 
     @functools.cached_property
     def points(self) -> NDArray[np.float32]:
         """(H·W, 3) point of each pixel in the camera's frame, 0 where unknown."""
-        rows, columns = np.divmod(self.known, self.depth.shape[1])
-        points = np.zeros((self.depth.size, 3), np.float32)
-        xy, depth = np.column_stack([columns, rows]), self.depth.ravel()[self.known]
-        points[self.known] = self.camera.unproject(xy, depth)
-        return points
+        known = kept_pixels(self.depth, edge=0)
+        return _points(self.depth, known, self.camera).reshape(-1, 3).astype(np.float32)
 
 
 def neighbouring_views(poses: Floats, index: int) -> list[int]:

@@ -39,20 +39,14 @@ class Lidar:
     """A rotating LiDAR; noise is given as standard deviations."""
 
     name: str
-    elevations_deg: tuple[float, ...]
-    """Elevation of each beam, −90° to 90°."""
-    azimuth_step_deg: float
-    """Angle between firings."""
-    max_range: float = np.inf
-    """Metres from the scanner."""
-    range_noise: float = 0.0
-    """Metres."""
+    elevations_deg: tuple[float, ...]  # elevation of each beam, −90° to 90°
+    azimuth_step_deg: float  # angle between firings
+    max_range: float = np.inf  # metres from the scanner
+    range_noise: float = 0.0  # metres
     angle_noise_deg: float = 0.0
     """Of the direction of each measurement, in elevation and in azimuth."""
-    rotation_noise_deg: float = 0.0
-    """Of a rotation of the whole scanner about each axis."""
-    dropout: float = 0.0
-    """Fraction of beams without return."""
+    rotation_noise_deg: float = 0.0  # of a rotation of the whole scanner about each axis
+    dropout: float = 0.0  # fraction of beams without return
 
     def __post_init__(self) -> None:
         angles, step = np.array(self.elevations_deg, np.float64), self.azimuth_step_deg

@@ -44,8 +44,7 @@ class MotionEstimate(NamedTuple):
 
     motion: Floats | None
     """(3, 4) from the other camera's frame to this one's, metres. None: refused."""
-    basis: str
-    """What supports it, or why it is refused; for a person."""
+    basis: str  # what supports it, or why it is refused; for a person
 
 
 def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:

@@ -20,12 +20,9 @@ Pixels = NDArray[np.intp]
 class SamplePattern:
     """Which of the pixels with known depth are sampled."""
 
-    kind: str = "uniform"
-    """One of `choices.PATTERNS`."""
-    count: int | None = None
-    """Number of points, or of lines for `lines`; None with a fraction."""
-    fraction: float | None = None
-    """Fraction of the known pixels, 0 to 1; None with a count."""
+    kind: str = "uniform"  # one of `choices.PATTERNS`
+    count: int | None = None  # number of points, or of lines for `lines`; None with a fraction
+    fraction: float | None = None  # fraction of the known pixels, 0 to 1; None with a count
     region: tuple[int, int, int, int] | None = None
     """x, y, width and height in pixels, for `region` alone."""
 
@@ -55,14 +52,11 @@ class SamplePattern:
 class SampleNoise:
     """Noise that a sensor adds to true depth; all zero for none."""
 
-    metres: float = 0.0
-    """Standard deviation of the depth, metres."""
-    relative: float = 0.0
-    """Standard deviation of the depth as a fraction of it."""
+    metres: float = 0.0  # standard deviation of the depth, metres
+    relative: float = 0.0  # standard deviation of the depth as a fraction of it
     outliers: float = 0.0
     """Fraction of points whose depth is redrawn between the smallest and the largest."""
-    jitter_px: float = 0.0
-    """Standard deviation of the pixel coordinates, in x and in y."""
+    jitter_px: float = 0.0  # standard deviation of the pixel coordinates, in x and in y
 
     def __post_init__(self) -> None:
         sizes = (self.metres, self.relative, self.jitter_px)
@@ -76,8 +70,7 @@ class SampleNoise:
 class Scene:
     """A dense depth map that is sampled."""
 
-    known: Pixels
-    """Row-major indices of the pixels with known depth."""
+    known: Pixels  # row-major indices of the pixels with known depth
     size: tuple[int, int]
     image: Image | None
     pattern: SamplePattern

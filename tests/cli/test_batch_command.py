@@ -72,31 +72,14 @@ def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
     assert "\x1b" not in err
 
 
-def test_a_name_that_leads_out_of_the_folder_ends_with_7_and_the_others_are_done(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rows = ["rgb/a.png,sparse/a.png,a", "rgb/b.png,sparse/b.png,../b"]
-    (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]))
-    assert code_of(arguments(source="drive/list.csv")) == 7
-    err = capsys.readouterr().err
-    assert "failed: ../b: the name '../b' leads out of the output folder; rename it" in err
-    assert [path.name for path in Path().rglob("*_depth.png")] == ["a_depth.png"]
-
-
 EXITS: list[tuple[list[str], int, str]] = [
-    (["--shard", "2"], 2, "I/N"),
     (["--shard", "0/2"], 2, "1/4"),
-    (["--limit", "0"], 2, "'--limit': 0 is not in the range x>=1"),
     (["--workers", "0"], 2, "'--workers': 0 is not in the range x>=1"),
-    (["--batch-size", "many"], 2, "not a valid integer"),
     (["--html-3d"], 2, "name its folder with --html"),
     (["--sample", "many"], 2, "500"),
     (["--layout", "tum"], 3, "does not look like 'tum'"),
     (["--layer", "encod"], 4, "encode"),
-    (["--model", "compakt"], 4, "compact"),
     (["--device", "cuda:9"], 6, "--device cpu"),
-    (["--device", "cpu,cuda"], 2, "workers run on cpu, cuda"),
-    (["--ray", "frames"], 2, "is no address of a Ray cluster"),
 ]
 
 
@@ -159,9 +142,7 @@ def test_ctrl_c_finishes_the_frame_prints_how_to_continue_and_exits_130(
     for name in "cd":
         add_frame(root, name)
     slow = root / "net/my_net.py"
-    text = slow.read_text().replace(
-        "        return 2", "        time.sleep(0.02)\n        return 2"
-    )
+    text = slow.read_text().replace("        return 2", "        time.sleep(0.1)\n        return 2")
     slow.write_text("import time\n" + text)
     with subprocess.Popen([*PROGRAM, *arguments()], stderr=subprocess.PIPE, text=True) as running:
         until = time.monotonic() + 60
@@ -224,15 +205,3 @@ def test_on_a_terminal_there_is_a_bar(
 
 def test_the_choices_are_those_that_there_are() -> None:
     assert list(FRAME_PROTOCOLS) == list(PROTOCOLS)
-
-
-def test_the_layout_of_a_real_drive_is_recognised_and_reported(
-    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source, output = str(shared_data / "kitti_dc"), str(tmp_path / "out")
-    assert code_of(["batch", source, "-o", output, "--limit", "1"]) == 0
-    err = capsys.readouterr().err
-    assert "layout: kitti-depth (guessed; --layout names another): 6 frames, 6 with" in err
-    assert "1 of 6 frames done, 5 pending" in err
-    row = json.loads((tmp_path / "out/summary.json").read_text())["frames"][0]
-    assert row["scores"]["after"]["mae"] < row["scores"]["before"]["mae"]

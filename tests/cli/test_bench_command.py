@@ -1,10 +1,7 @@
 from __future__ import annotations
 
-import json
-
 import pytest
 
-from pnpdepth_cli.commands import bench as bench_table
 from tests.cli.test_commands import code_of
 from tests.commands.frames import FrameOnDisk
 
@@ -28,37 +25,12 @@ def test_the_table_goes_to_stdout_and_what_it_was_measured_with_to_stderr(
     assert "torch" in err
 
 
-def test_json_is_all_that_goes_to_stdout(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of(bench(frame, "--json")) == 0
-    record = json.loads(capsys.readouterr().out)
-    assert record["parts"][0]["forwards"] == 1
-    assert record["limit"] > 1
-
-
-def test_the_papers_table_shows_its_figures_beside_ours(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small = bench_table.PaperTime(
-        name="Chodosh", model="adnn", data="KITTI", size=(16, 24), before=0.0320, after=0.0447
-    )
-    monkeypatch.setattr(bench_table, "PAPER_TIMES", (small,))
-    assert code_of(["bench", "--table", "--repeats", "1"]) == 0
-    out, _ = capsys.readouterr()
-    assert "random weights" in out
-    for cell in ("Chodosh, KITTI", "24×16", "44.7 ms", "1.40"):
-        assert cell in out
-
-
 @pytest.mark.parametrize(
     ("more", "code", "message"),
     [
-        (["--table", "--layer", "encode"], 2, "--layer"),
-        (["--repeats", "0"], 2, "--repeats must be >= 1"),
+        (["--repeats", "0"], 2, "0 is not in the range x>=1"),
+        (["--layer", "encod"], 4, "did you mean encode"),
         (["--size", "big"], 2, "HxW"),
-        (["--precision", "fp16"], 6, "bf16"),
-        (["--layer", "encod"], 4, "encode"),
     ],
 )
 def test_the_exit_code_is_that_of_the_kind_of_error(
@@ -68,8 +40,7 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
     code: int,
     message: str,
 ) -> None:
-    arguments = ["bench", *more] if "--table" in more else bench(frame, *more)
-    assert code_of(arguments) == code
+    assert code_of(bench(frame, *more)) == code
     out, err = capsys.readouterr()
     assert out == ""
     assert message in err

@@ -69,23 +69,6 @@ def test_networks_are_listed_without_a_subcommand_and_variants_only_if_asked(
     assert code_of(["models", "--check", "net.onnx"]) == 2
 
 
-def test_fetch_offline_is_an_error_of_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hub = pytest.importorskip("huggingface_hub", reason="needs the extra [hf]")
-
-    def refuse(*_: object, **__: object) -> None:
-        raise ConnectionError("no route\nto host")
-
-    monkeypatch.setattr(hub.HfApi, "model_info", refuse)
-    assert code_of(["models", "fetch", "org/name", "-o", str(tmp_path / "name")]) == 4
-    err = capsys.readouterr().err
-    assert "no route to host" in err
-    assert err.count("\n") == 1
-    assert not (tmp_path / "name").exists()
-    assert code_of(["models", "fetch", "name"]) == 2
-
-
 def test_doctor_reports_versions_devices_extras_and_a_refined_plane() -> None:
     result = CliRunner().invoke(cli, ["doctor", "--json"])
     assert result.exit_code == 0, result.output

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.export import ExportRequest, export_results
+from pnpdepth_cli.commands.exports import export_results
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
 from pnpdepth_cli.commands.sparse.options import ColmapOptions
@@ -55,7 +55,7 @@ def results(root: Path, depth: np.ndarray = DEPTH, unit_scale: float | None = No
 
 
 def export(folder: Path, to: str, output: Path, **values: Any) -> dict[str, Any]:
-    return export_results(ExportRequest(results=folder, to=to, output=output, **values))
+    return export_results(folder, output, to=to, **values)
 
 
 @pytest.fixture

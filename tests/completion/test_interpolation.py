@@ -228,18 +228,3 @@ def test_the_last_results_of_a_few_coordinates_are_remembered_and_those_of_many_
     for count, factor in [(5, 1), (5, 1), (5, 3), (4, 1), (5, 1), (6, 1), (6, 1)]:
         assert total(np.full((count, 2), 0.5), factor) == count * factor
     assert calls == [5, 5, 4, 5, 6, 6]
-
-
-@pytest.mark.parametrize(
-    ("xy", "inside"),
-    [
-        ([(2.0, 2.0)], 0),
-        ([(0.0, 2.0), (4.0, 2.0)], 0),
-        ([(0.0, 0.0), (2.0, 2.0), (4.0, 4.0)], 0),  # on one line
-        ([(0.0, 0.0), (4.0, 0.0), (0.0, 4.0)], 15),  # 5 + 4 + 3 + 2 + 1 pixels
-    ],
-)
-def test_only_points_that_span_an_area_have_a_hull(
-    xy: list[tuple[float, float]], inside: int
-) -> None:
-    assert int(in_hull(points_at(xy, [1.0] * len(xy), (5, 5))).sum()) == inside

@@ -1,14 +1,11 @@
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import BEYOND, aligned, from_space, to_space
 from pnpdepth_cli.completion.baselines import locally_aligned
-from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene_depth
 
@@ -64,19 +61,6 @@ def test_inlier_weights_reduce_the_effect_of_20_percent_gross_outliers(
     weighted = rise()
     monkeypatch.setattr("pnpdepth_cli.completion.outliers.ALONE", 1e9)
     assert weighted < fraction * rise()
-
-
-def test_where_the_network_has_nothing_there_is_nothing() -> None:
-    gt = scene_depth()
-    prediction = gt / 2
-    prediction[:, :20] = 0
-    prediction[:, 60:] = math.nan
-    dense = locally_aligned(prediction, random_points(gt, 100))
-    assert bool((dense[:, :20] == 0).all())
-    assert bool((dense[:, 60:] == 0).all())
-    assert torch.allclose(dense[:, 20:60], gt[:, 20:60], rtol=1e-3)
-    with pytest.raises(NoPointsError, match="none of the 100"):
-        locally_aligned(torch.zeros(SIZE), random_points(gt, 100))
 
 
 def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:

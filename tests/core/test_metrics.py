@@ -15,7 +15,6 @@ from pnpdepth_cli.core.metrics import (
     MEASURES,
     Scores,
     error_sums,
-    measures_of,
     score,
 )
 
@@ -111,28 +110,8 @@ def test_shapes_that_differ_are_refused() -> None:
         score(torch.ones(2, 3), torch.ones(3, 2))
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(depths, depths, st.integers(0, 2)), min_size=1, max_size=40))
-def test_the_sums_of_the_parts_are_the_sums_of_the_image(
-    rows: list[tuple[float, float, int]],
-) -> None:
-    predicted = torch.tensor([row[0] for row in rows])
-    gt = torch.tensor([row[1] for row in rows])
-    part = torch.tensor([row[2] for row in rows])
-    parts = error_sums(predicted, gt, part=part, parts=3)
-    torch.testing.assert_close(parts.sum(0), error_sums(predicted, gt)[0])
-    assert torch.allclose(
-        measures_of(parts.sum(0)), measures_of(error_sums(predicted, gt)[0]), equal_nan=True
-    )
-    for number in range(3):
-        inside = part == number
-        torch.testing.assert_close(parts[number], error_sums(predicted[inside], gt[inside])[0])
-
-
 def test_an_image_of_many_chunks_is_scored_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     predicted, gt = torch.rand(7, 9) + 1, torch.rand(7, 9) + 1
-    part = (gt * 2).long() - 2
-    whole = error_sums(predicted, gt, part=part, parts=2)
+    whole = error_sums(predicted, gt)
     monkeypatch.setattr("pnpdepth_cli.core.metrics._CHUNK", 10)
-    torch.testing.assert_close(error_sums(predicted, gt, part=part, parts=2), whole)
-    torch.testing.assert_close(error_sums(predicted, gt)[0], whole.sum(0))
+    torch.testing.assert_close(error_sums(predicted, gt), whole)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.core.refine import Refinement, frame_parts, refine, refine_from
+from pnpdepth_cli.core.refine import Refinement, refine, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
     BatchError,
@@ -63,10 +63,11 @@ CUTS = {
 }
 
 
-def refined(network: nn.Module, layer: str, settings: Settings, **more: Any) -> Refinement:
-    points = more.pop("points", POINTS)
+def refined(
+    network: nn.Module, layer: str, settings: Settings, points: SparsePoints = POINTS
+) -> Refinement:
     with Split(network, layer) as split:
-        return refine(split, (image(),), points, settings, depth_of=depth_of, **more)
+        return refine(split, (image(),), points, settings, depth_of=depth_of)
 
 
 def test_every_network_is_compared_except_one_that_no_hook_can_follow() -> None:
@@ -128,21 +129,6 @@ def test_pixels_that_no_point_reaches_keep_their_bits(update: str) -> None:
     assert not changed[:, 8:].any()
 
 
-def test_the_loss_goes_down_and_iterations_are_updates_of_z() -> None:
-    network = build("unet")
-    seen: list[tuple[int, float]] = []
-    result = refined(
-        network,
-        "bottleneck",
-        Settings(iterations=7, lr=0.05),
-        on_iteration=lambda iteration, loss: seen.append((iteration, loss)),
-    )
-    assert [iteration for iteration, _ in seen] == list(range(7))
-    assert [loss for _, loss in seen] == list(result.losses[:-1])
-    assert len(result.losses) == 8
-    assert result.losses[-1] < result.losses[0]
-
-
 def doubled(pixels: int, depth: list[float], settings: Settings) -> Refinement:
     """`Doubling` refined in a row of pixels with a point on each, from depth 6 everywhere."""
     xy = torch.stack([torch.arange(float(pixels)), torch.zeros(pixels)], dim=1)
@@ -171,18 +157,6 @@ def test_grad_mode_and_random_state_of_the_caller_stay_and_change_nothing() -> N
             assert not results[-1].before.requires_grad
     assert torch.equal(torch.get_rng_state(), before)
     assert torch.equal(results[0].after, results[1].after)
-
-
-@pytest.mark.parametrize("keep_best", [False, True])
-def test_depths_are_kept_after_the_chosen_numbers_of_updates(keep_best: bool) -> None:
-    settings = Settings(iterations=5, lr=0.05, keep_best=keep_best)
-    result = refined(build("unet"), "bottleneck", settings, keep_depths=(0, 2, 5, 9))
-    assert list(result.depths) == [0, 2, 5]
-    assert result.depths[0] is result.before
-    for updates in (2, 5):
-        shorter = Settings(iterations=updates, lr=0.05)
-        alone = refined(build("unet"), "bottleneck", shorter)
-        assert torch.equal(result.depths[updates], alone.after)
 
 
 # ------------------------------------------------------------------ the step size
@@ -309,9 +283,8 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_depth(
     with pytest.raises(
         DivergedError, match=f"loss is not finite after {iteration} update"
     ) as error:
-        refined(network, "cut", Settings(), keep_depths=range(6))
+        refined(network, "cut", Settings())
     assert error.value.exit_code == 5
-    assert list(error.value.last_good.depths) == list(range(iteration))
     network.n = 0
     good = refined(network, "cut", Settings(iterations=iteration - 1))
     assert torch.equal(error.value.last_good.after, good.after)
@@ -483,12 +456,12 @@ def test_a_frame_that_diverges_does_not_touch_the_others() -> None:
         return output * float("nan") if len(calls) == 3 else output
 
     calls: list[int] = []
-    seen: list[float] = []
+    seen: list[tuple[int, float]] = []
     settings, network = Settings(lr="5%"), PerPixel()
     good = refined_at_once(network, "cut", settings)
     mixed = refined_at_once(
         network, "cut", settings, read=[depth_of, bad, depth_of],
-        on_iteration=lambda _, loss: seen.append(loss),
+        on_iteration=lambda done, loss: seen.append((done, loss)),
     )  # fmt: skip
     assert isinstance(mixed[1], DivergedError)
     assert "after 2 updates" in str(mixed[1])
@@ -500,8 +473,8 @@ def test_a_frame_that_diverges_does_not_touch_the_others() -> None:
         assert isinstance(alone, Refinement)
         assert torch.equal(together.after, alone.after)
         assert together.losses == alone.losses
-    assert len(seen) == 5
-    assert seen[2] == pytest.approx((mixed[0].losses[2] + mixed[2].losses[2]) / 2)
+    assert [done for done, _ in seen] == [1, 2, 3, 4, 5]
+    assert seen[2][1] == pytest.approx((mixed[0].losses[2] + mixed[2].losses[2]) / 2)
 
 
 def test_an_error_of_one_frames_reading_stays_its_own() -> None:
@@ -550,20 +523,3 @@ def test_a_refinement_does_not_import_the_compiler() -> None:
     )
     root = Path(__file__).parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
-
-
-def test_every_tensor_of_a_structure_is_split_along_its_first_axis_and_of_one_frame_is_itself() -> (
-    None
-):
-    x = torch.arange(6.0).reshape(2, 3)
-    structure = {"a": x, "b": [x + 1, None]}
-    parts = frame_parts(structure, 2)
-    assert [part["a"].tolist() for part in parts] == [[[0, 1, 2]], [[3, 4, 5]]]
-    assert [part["b"][0].tolist() for part in parts] == [[[1, 2, 3]], [[4, 5, 6]]]
-    assert [part["b"][1] for part in parts] == [None, None]
-    assert frame_parts(structure, 1)[0] is structure
-
-
-def test_a_tensor_without_one_element_per_frame_is_named() -> None:
-    with pytest.raises(BatchError, match=r"deep\.0 of shape \(3, 1\)"):
-        frame_parts({"a": torch.ones(2, 1), "deep": [torch.ones(3, 1)]}, 2)

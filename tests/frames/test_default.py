@@ -152,6 +152,17 @@ def test_an_image_that_does_not_belong_to_its_points_is_used_less() -> None:
     assert np.allclose(moved.after, half.numpy(), rtol=1e-5)
 
 
+def test_an_image_whose_edges_lie_where_depth_changes_by_chance_is_used_by_half() -> None:
+    frame = frame_in_memory(400)
+    assert frame.rgb is not None
+    result = refined(replace(frame, unrelated=True), compact())
+    grey = refined(replace(frame, rgb=torch.full_like(frame.rgb, 0.5)), compact())
+    depths = [(torch.from_numpy(r.stages["propagated"]), 1.0) for r in (result, grey)]
+    assert np.allclose(result.after, weighted_mean(depths).numpy(), rtol=1e-5)
+    (note,) = [note for note in result.notes if "does not seem to belong" in note]
+    assert "depth changes at its edges no more often than by chance; half of the result" in note
+
+
 @pytest.mark.parametrize(
     ("off", "hidden", "half_linear"),
     [(0.30, 80, True), (0.30, 20, True), (0.30, 19, False), (0.0, 80, False)],

@@ -20,10 +20,9 @@ from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.frames.tiles import MIN_POINTS, OVERLAP, refine_tiled, tiles_of
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
-from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
-from tests.commands.frames import frame_on_disk
 
 CPU = torch.device("cpu")
 PLAIN = Settings(iterations=0)
@@ -190,19 +189,3 @@ def test_propagation_follows_once_over_all_tiles() -> None:
         float((one.points.sample(torch.from_numpy(refined.before)) - one.points.depth).abs().mean())
         > 0.2
     )
-
-
-def test_the_split_is_as_before_for_the_next_frame(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    frame = frame_on_disk(tmp_path_factory.mktemp("frame"))
-    loaded, one = load_network(str(frame.model), frame.checkpoint), everywhere((100, 150))
-    settings = Settings(iterations=3, tile=SIDE)
-    with Split(loaded.module, "middle") as split:
-        first = refine_tiled(loaded, split, settings, one)
-        small = refine_frame(loaded, split, settings, everywhere((60, 64)))
-        again = refine_tiled(loaded, split, settings, one)
-    assert np.array_equal(first.after, again.after)
-    with Split(loaded.module, "middle") as split:
-        alone = refine_frame(loaded, split, settings, everywhere((60, 64)))
-    assert np.array_equal(small.after, alone.after)

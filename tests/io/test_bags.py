@@ -7,14 +7,12 @@ import sqlite3
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import bags as bounds
-from pnpdepth_cli.io.bags import Bag, open_bag
+from pnpdepth_cli.io.bags import open_bag
 from tests.bags import write_bag
 
 pytest.importorskip("rosbags")
@@ -123,14 +121,3 @@ def test_a_database_that_computes_what_is_read_is_refused(statements: str, tmp_p
     for path in (bag, file):
         with pytest.raises(FileFormatError, match="is no plain table"):
             read_all(path)
-
-
-def test_a_bag_whose_message_counts_are_missing_is_damaged() -> None:
-    class Reader:
-        @property
-        def topics(self) -> dict[str, Any]:
-            raise TypeError("unsupported operand type(s) for +: 'int' and 'NoneType'")
-
-    types = SimpleNamespace(deserialize_ros1=None, deserialize_cdr=None)
-    with pytest.raises(FileFormatError, match="drive"):
-        Bag(Path("drive"), Reader(), types, ros1=False).topics(["sensor_msgs/msg/Image"])

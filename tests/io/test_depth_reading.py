@@ -302,18 +302,3 @@ def test_a_16_bit_png_with_one_channel_off_by_one_code_is_refused(
     pixels[1, 2, channel] += 1
     with pytest.raises(FileFormatError, match="several channels; depth is one 16-bit grey"):
         read_depth(save(tmp_path / "rgb.png", pixels))
-
-
-def test_the_content_decides_not_the_suffix(tmp_path: Path) -> None:
-    path = save(tmp_path / "d.npy", METRES).rename(tmp_path / "d.exr")
-    assert np.array_equal(read_depth(path).values, KNOWN)
-
-
-def test_real_depth_of_lidar_and_kinect_is_read_as_its_codes(shared_data: Path) -> None:
-    path = next((shared_data / "kitti_dc" / "groundtruth").glob("*.png"))
-    depth = read_depth(path)
-    assert np.array_equal(depth.values, np.asarray(Image.open(path)).astype(np.float32) / 256)
-    assert depth.assumed_scale
-    for path in sorted((shared_data / "7scenes").glob("*.depth.png"))[:3]:
-        codes = np.asarray(Image.open(path))
-        assert np.array_equal(read_depth(path, scale=1000).valid, (codes > 0) & (codes < 65535))

@@ -83,7 +83,7 @@ def test_tags_that_share_their_bytes_are_refused(where: str, tmp_path: Path) -> 
             read(path)
 
 
-SHAPES = ["(\n", "(6, 8", "(True, 5)", "(2L, 3)", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
+SHAPES = ["(\n", "(6, 8", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
 DTYPES = ["f999", "<q8", ",", "i4, i4", "M8[x]", "\x00f4"]
 
 
@@ -111,12 +111,6 @@ def test_tags_and_odd_values_of_yaml_are_no_crash(tmp_path: Path, value: str) ->
     with pytest.raises(FileFormatError) as caught:
         read_calibration(path)
     assert "\n" not in str(caught.value)
-
-
-def test_colours_of_a_common_camera_are_within_the_budget() -> None:
-    check_pixel_count(Path("a.jpg"), 9000, 7000, channels=4, value_bytes=2, file_bytes=1 << 20)
-    with pytest.raises(FileFormatError, match="in 756,000,000 bytes, more than 512,000,000"):
-        check_pixel_count(Path("a.exr"), 9000, 7000, channels=3, value_bytes=4)
 
 
 @pytest.mark.parametrize("sixteen", ["value_bytes", "channels"])

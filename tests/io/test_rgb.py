@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,17 +20,6 @@ COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.u
 BLOCKS = np.kron(COLOURS, np.ones((6, 6, 1), np.uint8))
 ONES = np.ones((2, 3), np.float32)
 EXIF = 0x8769
-
-
-@pytest.mark.parametrize(
-    ("name", "options"), [("a.png", {}), ("a.tif", {}), ("a.webp", {"lossless": True})]
-)
-def test_8_bit_colours_come_back_exactly(tmp_path: Path, name: str, options: Any) -> None:
-    Image.fromarray(COLOURS).save(tmp_path / name, **options)
-    image = read_rgb(tmp_path / name)
-    assert image.values.dtype == np.float32
-    assert np.array_equal(image.values, COLOURS.astype(np.float32) / np.float32(255))
-    assert image.note is None
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
@@ -201,12 +189,6 @@ def test_a_progressive_jpeg_cut_between_scans_and_an_altered_png_are_refused(
     path.write_bytes(altered)
     with pytest.raises(FileFormatError, match="wrong checksum"):
         read_rgb(path)
-
-
-def test_a_real_frame_is_read_as_other_programs_read_it(shared_data: Path) -> None:
-    path = shared_data / "7scenes" / "frame-000000.color.jpg"
-    with Image.open(path) as image:
-        assert np.array_equal(np.rint(read_rgb(path).values * 255), np.asarray(image))
 
 
 def photo(path: Path, tags: dict[int, object]) -> Path:

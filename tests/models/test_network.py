@@ -21,7 +21,6 @@ from pnpdepth_cli.models.network import (
     Network,
     find_device,
     load_network,
-    out_of_memory_is_a_device_error,
 )
 from pnpdepth_cli.points import SparsePoints
 
@@ -263,30 +262,3 @@ def test_memory_running_out_is_a_device_error(
     with pytest.raises(DeviceError, match="'cpu' is out of memory; use a smaller image") as raised:
         load_network(f"{file}:owned", None)
     assert raised.value.exit_code == 6
-
-
-def test_memory_running_out_in_the_networks_forward_is_one_too() -> None:
-    from pnpdepth_cli.core.split import Split
-
-    class Hungry(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.cut = nn.Identity()
-
-        def forward(self, x: Tensor) -> Tensor:
-            return self.cut(torch.empty(2**60, dtype=torch.uint8))
-
-    with (
-        pytest.raises(DeviceError),
-        out_of_memory_is_a_device_error(torch.device("cpu")),
-        Split(Hungry(), "cut") as split,
-    ):
-        split.front(torch.zeros(1))
-
-
-def test_points_stay_on_the_grid_through_a_padded_frame() -> None:
-    frame = FrameMap.fit(Multiple(32), 2, 3)
-    sparse = network(input_kind="sparse").arguments_of(None, frame.points_to_network(POINTS))[0]
-    assert tuple(sparse.shape) == (1, 1, 32, 32)
-    assert (float(sparse[0, 0, 0, 0]), float(sparse[0, 0, 1, 2])) == (4, 2)
-    assert int(sparse.count_nonzero()) == 2

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.commands.networks.layers import list_layers
+from pnpdepth_cli.commands.networks.describe import list_layers
 from pnpdepth_cli.commands.refinement.request import NetworkChoice
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.models import rank_layers as rank
@@ -23,8 +23,6 @@ from pnpdepth_cli.models.rank_layers import (
     rank_layers,
     wanted_field,
 )
-from pnpdepth_cli.sensors import as_depth_image, occluded_in_map
-from tests.sensors.test_projected_map import boards_before_a_wall
 
 IMAGE = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
 
@@ -144,16 +142,6 @@ def test_the_layer_of_the_default_is_the_one_that_layers_ranks_first(
     listed = list_layers(choice, every=False, sparse=tmp_path / "s.npy")
     (first,) = [row.name for row in listed.rows if row.rank == 1]
     assert default_layer(network, size, count) == first
-
-
-def test_occluded_points_of_a_projected_scan_do_not_count(tmp_path: Path, network: Network) -> None:
-    points = boards_before_a_wall()
-    hidden = occluded_in_map(points)
-    assert hidden is not None
-    write_depth(tmp_path / "s.png", as_depth_image(points), scale=256)
-    choice = NetworkChoice(model=str(tmp_path / "net.py"))
-    listed = list_layers(choice, every=False, sparse=tmp_path / "s.png")
-    assert listed.spacing == point_spacing((240, 640), int((~hidden).sum()))
 
 
 def test_a_layer_that_cannot_be_cut_at_is_measured_as_a_problem(network: Network) -> None:

@@ -8,17 +8,16 @@ import pytest
 
 import model_zoo_defs
 from pnpdepth_cli import choices
-from pnpdepth_cli.commands.networks import list_models as list_models_module
-from pnpdepth_cli.commands.networks.list_models import list_models
+from pnpdepth_cli.commands.networks import describe
+from pnpdepth_cli.commands.networks.describe import list_models
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.registry import DEFAULT_MODEL, families, find_definition, names
+from pnpdepth_cli.models.registry import families, find_definition, names
 
 
 def test_every_known_name_has_a_definition_of_that_name() -> None:
     assert len(names()) == len(set(names()))
     for name in names():
         assert find_definition(name).name == name
-    assert DEFAULT_MODEL in names()
 
 
 PAPER = ("eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense", "latefusion")
@@ -38,7 +37,7 @@ def test_an_unknown_name_suggests_a_near_one() -> None:
         find_definition("fcrn-tyni")
     with pytest.raises(ModelError, match="did you mean 'sparse2dense-r50-upproj'"):
         find_definition("sparse2dense-r50-upprj")
-    with pytest.raises(ModelError, match="known: compact"):
+    with pytest.raises(ModelError, match="`pnpdepth models` lists all"):
         find_definition("zzz")
 
 
@@ -84,7 +83,7 @@ def test_one_new_file_in_model_zoo_defs_adds_a_network(
     assert names()[-1] == name
     assert find_definition(name).build().out_channels == 1
     mine = {name: families()[name]}
-    monkeypatch.setattr(list_models_module, "families", lambda: mine)  # the others take long
+    monkeypatch.setattr(describe, "families", lambda: mine)  # the others take long
     assert [(one["name"], one["variant"]) for one in list_models()] == [(name, False)]
 
 

@@ -76,14 +76,6 @@ def test_a_fisheye_that_turns_back_shows_nothing_beyond() -> None:
     assert shown.tolist() == pytest.approx([np.pi / 4 - 0.2 * (np.pi / 4) ** 3, 0])
 
 
-def test_undoing_a_lens_converges_as_newtons_method(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pnpdepth_cli.sensors.camera._NEWTON_STEPS", 5)
-    decentred, plane = (-0.15, 0.03, 0.04, -0.03), directions(1, 0.6)
-    shown = distort(plane, "radial-tangential", decentred)
-    found = undistort(shown, "radial-tangential", decentred)
-    np.testing.assert_allclose(found, plane, rtol=0, atol=1e-10)
-
-
 def test_a_point_that_the_lens_shows_nothing_at_has_no_direction() -> None:
     barrel = (-0.4, 0.0, 0.0, 0.0)  # r − 0.4 r³ has its maximum of 0.61 at 0.91
     plane = undistort(np.array([[0.7, 0.0], [0.5, 0.3]]), "radial-tangential", barrel)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     Camera,
@@ -109,35 +106,3 @@ def test_a_point_is_hidden_by_a_nearer_one_beside_its_beam(
     hidden = hidden_points(xy, depth, (24, 32), focal_px=focal_px, scanner=scanner)
     assert hidden.tolist() == expected.tolist()
     assert 0.1 < expected.mean() < 0.9
-
-
-def kept_and_removed(
-    hidden: NDArray[np.bool_], depth: NDArray[np.floating], gt: NDArray[np.floating]
-) -> tuple[float, float]:
-    """Fraction kept of the points within 10 % of the ground truth, and removed of the others."""
-    known = gt > 0
-    agrees = np.abs(depth[known] - gt[known]) <= 0.1 * gt[known]
-    gone = hidden[known]
-    return float((~gone[agrees]).mean()), float(gone[~agrees].mean())
-
-
-def test_on_kitti_most_points_that_contradict_the_ground_truth_go(shared_data: Path) -> None:
-    folder = shared_data / "kitti_dc"
-    calibration = read_calibration(folder)
-    scanner = calibration.intrinsics @ calibration.translation
-    hidden, depth, gt = [], [], []
-    for path in sorted((folder / "velodyne_raw").glob("*.png")):
-        raw = read_depth(path).values
-        row, column = np.nonzero(raw)
-        xy = np.column_stack([column, row]).astype(np.float64)
-        depth.append(raw[row, column].astype(np.float64))
-        gt.append(read_depth(folder / "groundtruth" / path.name).values[row, column])
-        hidden.append(
-            hidden_points(
-                xy, depth[-1], raw.shape, focal_px=float(calibration.intrinsics[0, 0]),
-                scanner=scanner,
-            )
-        )  # fmt: skip
-    kept, removed = kept_and_removed(*(np.concatenate(x) for x in (hidden, depth, gt)))
-    assert kept >= 0.95
-    assert removed >= 0.65

@@ -144,6 +144,9 @@ def test_what_the_depth_map_cannot_give_is_refused() -> None:
         sample_points(HOLES, SamplePattern(count=DEPTH.size), 0)
     with pytest.raises(NoPointsError):
         sample_points(np.zeros((5, 5), np.float32), SamplePattern(count=1), 0)
+    plain = np.full((60, 80, 3), 0.5, np.float32)
+    with pytest.raises(NoPointsError, match="leaves no point"):
+        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=plain)
     with pytest.raises(NoPointsError, match="100,0,5,5"):
         sample_points(DEPTH, SamplePattern(kind="region", region=(100, 0, 5, 5)), 0)
     with pytest.raises(UsageError, match="needs the image"):
@@ -159,12 +162,6 @@ def test_what_the_depth_map_cannot_give_is_refused() -> None:
 def test_noise_that_makes_no_sense_is_refused(name: str, value: float) -> None:
     with pytest.raises(UsageError):
         SampleNoise(**{name: value})
-
-
-def test_a_plain_image_has_no_features() -> None:
-    flat = np.full((60, 80, 3), 0.5, np.float32)
-    with pytest.raises(NoPointsError, match="leaves no point"):
-        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=flat)
 
 
 @pytest.mark.filterwarnings("error")

@@ -44,7 +44,7 @@ def test_from_another_position_every_point_lies_on_the_wall_it_hits(
     got = simulate_lidar(depth, camera, IDEAL, seed=0)
     points = camera.unproject(got.xy, got.depth)
     np.testing.assert_allclose(points @ [-0.4, 0, 1], 6, atol=0.02)
-    seen = camera.to_scanner(points)
+    seen = (points - camera.translation) @ camera.rotation
     elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
     np.testing.assert_allclose(elevation, 2 * np.rint(elevation / 2), atol=1e-3)
     assert set(np.rint(elevation).astype(int)) == set(range(-14, 15, 2))
@@ -102,7 +102,7 @@ def test_dropout_and_maximum_range_remove_points() -> None:
 def test_rotation_noise_turns_the_whole_scanner() -> None:
     depth = np.full((240, 320), 10.0)
     got = simulate_lidar(depth, CAMERA, replace(IDEAL, rotation_noise_deg=1.0), seed=4)
-    points = CAMERA.to_scanner(CAMERA.unproject(got.xy, got.depth))
+    points = CAMERA.unproject(got.xy, got.depth) @ CAMERA.rotation
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     off = elevation - 2 * np.rint(elevation / 2)
     assert np.abs(off).max() > 0.2

@@ -95,7 +95,7 @@ def _learn(
     if len(tasks) < LEAST_FRAMES:
         return f"{len(tasks)} frames; at least {LEAST_FRAMES} are needed"
     from pnpdepth_cli.commands.adapt import adapt_to  # these import torch
-    from pnpdepth_cli.commands.adapt_request import AdaptRequest
+    from pnpdepth_cli.commands.batch.request import AdaptRequest
     from pnpdepth_cli.commands.refinement.inputs import read_inputs
     from pnpdepth_cli.frames.frame import is_dense
 
@@ -121,8 +121,10 @@ def _learn(
         raise UsageError(
             "--adapt needs a network that takes points, such as compact, as the first --model"
         ) from error
-    change = f"{adapted.change:+.1%} loss at hidden points of {adapted.validation_frames} frames"
-    if adapted.p_value is not None and adapted.p_value < SIGNIFICANT:
+    change = (
+        f"{adapted['change']:+.1%} loss at hidden points of {adapted['validation_frames']} frames"
+    )
+    if adapted["p_value"] is not None and adapted["p_value"] < SIGNIFICANT:
         say(f"adapt: {change}")
         return None
     for path in (weights, asked.card):

@@ -10,9 +10,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from pnpdepth_cli.commands.batch.frames import Task, find_frames, source_files, task_of
 from pnpdepth_cli.commands.batch.records import (
@@ -42,10 +42,6 @@ from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.io.remote import RemotePath, upload
-from pnpdepth_cli.io.report import remove_report_leftovers
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.commands.report.batch import BatchReport
 
 Result = TypeVar("Result")
 _MAX_LISTED = 5
@@ -69,14 +65,11 @@ class Listener(Protocol):
         """Called with the summary's row of each frame that is done or has failed."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class BatchOutcome:
-    """How a batch ended."""
+class BatchOutcome(NamedTuple):
+    """The contents of summary.json without its frames, and whether the batch was stopped early."""
 
     summary: dict[str, Any]
-    """The contents of summary.json without its frames."""
     stopped: bool
-    """True if it was stopped before all frames were done."""
 
 
 def run_batch(
@@ -102,8 +95,6 @@ def run_batch(
         batch.adapt(stopped)
         to_do = [frame for frame, _ in batch.to_do()]
         batch.records.mark()
-        if batch.report is not None:
-            batch.report.begin()
         began, refined, start = 0, 0, time.perf_counter()
         seconds = Counter[str]()
         if to_do:
@@ -159,7 +150,7 @@ class _Batch:
         self.request = request = replace(request, refine=refine)
         self._say, self.found = say, find_frames(request)
         self.model = model_identity(request.refine)
-        self.report = self._report()
+        self._check_report()
         for note in self._notes():
             say(note)
         self.records = Records(request.output, self.model)
@@ -188,25 +179,17 @@ class _Batch:
     def _task(self, frame: Frame) -> Task:
         return task_of(self._part(frame).request, frame)
 
-    def _report(self) -> BatchReport | None:
-        """The report, if one is wanted. OutputError if it cannot or may not be written there."""
+    def _check_report(self) -> None:
+        """OutputError if a report is wanted where it cannot or may not be written."""
         request = self.request
         if request.html is None:
-            return None
+            return
         if isinstance(request.output, RemotePath) or isinstance(request.html, RemotePath):
             raise UsageError("--html needs local folders; give a local -o and a local folder")
-        from pnpdepth_cli.commands.report.batch import BatchReport
+        from pnpdepth_cli.commands.report.batch import check_batch_report
 
-        report = BatchReport(
-            folder=request.html,
-            output=request.output,
-            view_3d=request.html_3d,
-            colors=request.refine.outputs.colors,
-        )
         files = (path for frame in self.found.frames for path in source_files(frame))
-        inputs = [request.source, *(files if request.html.exists() else ())]
-        report.check(inputs, overwrite=request.refine.outputs.overwrite)
-        return report
+        check_batch_report(request, request.html, files)
 
     def _notes(self) -> Iterator[str]:
         request, frames, unmatched = self.request, self.found.frames, self.found.unmatched
@@ -233,14 +216,12 @@ class _Batch:
 
     def opened_output(self, stack: ExitStack) -> Path:
         """Returns the output folder, locked; of one in a store, a local one for the summaries."""
-        output, report = self.request.output, self.report
+        output = self.request.output
         if isinstance(output, RemotePath):
             return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pnpdepth-")))
 
         def clean() -> None:
-            leftovers = remove_all_leftovers(output)
-            leftovers += 0 if report is None else remove_report_leftovers(report.folder)
-            if leftovers:
+            if leftovers := remove_all_leftovers(output):
                 self._say(f"removed {leftovers:,} half-written files of a run that was killed")
 
         make_folder(output)
@@ -338,9 +319,11 @@ class _Batch:
                 file.seek(0)
                 return map(json.loads, file)
 
-            write_summaries(local, summary, file, list(tally.baselines))
-            if self.report is not None:
-                self.report.write(summary, rows)
+            write_summaries(local, summary, file, tally.baselines)
+            if request.html is not None:
+                from pnpdepth_cli.commands.report.batch import write_batch_report
+
+                write_batch_report(request, request.html, summary, rows)
         if isinstance(request.output, RemotePath):
             for name in (CSV, JSON):
                 upload(local / name, request.output / name)

@@ -17,7 +17,7 @@ from pnpdepth_cli.commands.batch.sequence import (
     with_windows,
 )
 from pnpdepth_cli.commands.batch.summary import CSV, JSON
-from pnpdepth_cli.commands.refinement.output_files import Outputs
+from pnpdepth_cli.commands.refinement.output_files import Outputs, outputs_in
 from pnpdepth_cli.commands.refinement.request import FrameFiles, NeighbourFiles, RefineRequest
 from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
@@ -53,7 +53,6 @@ class BatchFrames:
     refused: Sequence[tuple[Frame, str]]
     """Frames whose results would have no files of their own, and why."""
     unmatched: tuple[Unmatched, ...]
-    """Files that are in no frame, and why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +61,6 @@ class Task:
 
     name: str
     request: RefineRequest
-    """With the frame's files."""
     inputs: dict[str, Path]
     """The files that are read for it, by their part."""
     outputs: Outputs
@@ -72,8 +70,7 @@ class Task:
     @property
     def record(self) -> Path:
         """The record of the results, which is the last file that is written."""
-        assert self.outputs.record is not None
-        return self.outputs.record
+        return self.outputs["record"]
 
 
 def unpacked(
@@ -197,7 +194,7 @@ def task_of(request: FrameSelection, frame: Frame) -> Task:
         name=frame.name,
         request=replace(refine, files=files),
         inputs=dict(_earlier_files(frame)) | dict(_input_files(files)),
-        outputs=Outputs.in_folder(request.output, frame.name, refine),
+        outputs=outputs_in(request.output, frame.name, refine),
     )
 
 
@@ -313,7 +310,7 @@ def _with_own_files(
 
     Names that differ in Unicode normalisation only are one file on macOS.
     """
-    endings = [path.name for path in Outputs.in_folder(Path(), "", refine).paths()]
+    endings = [path.name for path in outputs_in(Path(), "", refine).values()]
     owners, folders = dict[str, str](), dict[str, str]()  # names of frames by file, by folder
     kept, refused = list[Frame](), list[tuple[Frame, str]]()
     for frame in frames:

@@ -226,13 +226,10 @@ def rows_of_actors(
 
 
 def reason_of(error: Exception) -> str:
-    """Returns what Ray says of a worker's death, in a few words."""
-    text = str(error)
-    if "error raised in its creation task" in text:
-        return text.strip().splitlines()[-1][:200]
-    if "out of memory" in text.lower() or "OOM" in text.split("Some common causes")[0]:
-        return "out of memory"
-    return "its node is gone" if "node has died" in text else "its process ended unexpectedly"
+    """Returns what Ray says of a worker's death, one line of many."""
+    first, *others = str(error).strip().splitlines() or ["no reason is known"]
+    in_creation = "error raised in its creation task" in first
+    return (others[-1] if others and in_creation else first)[:200]
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.batch.frames import Task
 from pnpdepth_cli.commands.batch.summary import CSV, JSON, Row, failed_row, row_of
-from pnpdepth_cli.commands.refinement.output_files import Outputs
+from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
@@ -29,6 +29,7 @@ from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.remote import Listing, RemotePath, read_object, remove, renamed, upload
+from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.refinement.refine import RefineOutcome
@@ -61,7 +62,7 @@ class Records:
             return
         if JSON in names and (_content(self.output / JSON) or b"").startswith(_OWN_SUMMARY):
             return
-        results = (path for task in tasks for path in task.outputs.paths())
+        results = (path for task in tasks for path in task.outputs.values())
         for path in (self.output / CSV, self.output / JSON, *results):
             if path.name in names_in(path.parent):
                 raise OutputError(
@@ -80,7 +81,7 @@ class Records:
 
         The reason is a word or two, with details after a colon.
         """
-        names, files = self._listing.names(task.record.parent), task.outputs.by_kind()
+        names, files = self._listing.names(task.record.parent), task.outputs
         if task.record.name not in names:
             return "interrupted" if any(path.name in names for path in files.values()) else "new"
         entry, digest = _entry(_record(task.record)), self._digest(task)
@@ -95,9 +96,9 @@ class Records:
                 known = Fingerprint(**entry["inputs"][part])
                 if not is_unchanged(path, known, self._listing):
                     return f"input changed: {part}"
-            may_lack = task.outputs.optional()
+            may_lack = IMAGES if task.request.outputs.previews != "all" else ()
             for kind, path in files.items():
-                wanted = kind in entry["outputs"] or path not in may_lack
+                wanted = kind in entry["outputs"] or kind not in may_lack
                 if wanted and path.name not in names:
                     return f"result missing: {path.name}"
         except DAMAGED:
@@ -132,12 +133,11 @@ class Records:
             inputs: What identifies its files, by part.
             write: Writes all but the record to the paths that it is given.
         """
-        planned = task.outputs.by_kind()
-        with _staged(task.outputs, self.output) as stage:
+        planned = task.outputs
+        with _staged(planned, self.output) as staged:
             _remove(task.record)
-            outcome = write(replace(stage, record=None))
-            staged = stage.by_kind()
-            written = [*outcome.outputs.by_kind(), "record"]
+            outcome = write({kind: path for kind, path in staged.items() if kind != "record"})
+            written = [*outcome.outputs, "record"]
             entry = {
                 "settings": self._digest(task),
                 "inputs": {part: known.as_record() for part, known in inputs.items()},
@@ -146,8 +146,8 @@ class Records:
             record = {_ENTRY: entry} | outcome.record
             if isinstance(self.output, RemotePath):
                 record = renamed(record, {str(staged[k]): str(planned[k]) for k in planned})
-                for path in task.outputs.optional():
-                    _remove(path)
+                for kind in planned.keys() - written:
+                    _remove(planned[kind])
             write_json(staged["record"], record)
             for kind in written:
                 _put(staged[kind], planned[kind])
@@ -156,8 +156,8 @@ class Records:
     def fail(self, task: Task, message: str) -> Row:
         """Writes a record that says why a frame failed; returns the summary's row."""
         entry = {"settings": self._digest(task), "failed": message}
-        with _staged(task.outputs, self.output) as stage:
-            file = stage.by_kind()["record"]
+        with _staged(task.outputs, self.output) as staged:
+            file = staged["record"]
             make_folder(file.parent)
             write_json(file, {_ENTRY: entry})
             _put(file, task.record)
@@ -190,23 +190,23 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
         model: The `model_identity` of the request.
         *groups: Names of the request's groups. None: all of them.
     """
-    fields = {
+    values = {
         name: value
         for name, value in request.settings(*groups).items()
         if name != "more_models" and (value or name not in _ONLY_IF_SET)
     }
-    if "neighbours" in fields:
-        fields["neighbours"] = [(other.motion, other.apart) for other in fields["neighbours"]]
-    if "device" in fields:  # devices of one kind give equal results, so shards may use one each
-        fields["device"] = fields["device"].split(":")[0]
-    settings: dict[str, Any] = plain(fields | model)
+    if "neighbours" in values:
+        values["neighbours"] = [(other.motion, other.apart) for other in values["neighbours"]]
+    if "device" in values:  # devices of one kind give equal results, so shards may use one each
+        values["device"] = values["device"].split(":")[0]
+    settings: dict[str, Any] = plain(values | model)
     for name in ("calib", "extrinsics"):
         settings.get("scan", {}).pop(name, None)
     return settings
 
 
 def model_identity(request: RefineRequest) -> dict[str, Any]:
-    """Returns the program's version and the digests of the network's files.
+    """Returns the program's version and the digests of the network's files and of code.
 
     A file's name with its :ATTRIBUTE or :OUTPUT counts; its folder does not.
     """
@@ -216,8 +216,16 @@ def model_identity(request: RefineRequest) -> dict[str, Any]:
         **_identity(network.model),
         "checkpoint": None if network.checkpoint is None else sha256_of(network.checkpoint),
     }
-    more = [_identity(spec) for spec in network.more_models]
-    return identity | ({"more_models": more} if more else {})
+    more, code = [_identity(spec) for spec in network.more_models], code_digests(request.method)
+    identity |= {"more_models": more} if more else {}
+    return identity | ({"code": code} if code else {})
+
+
+def code_digests(method: Settings) -> dict[str, str]:
+    """Returns the SHA-256 of the user's Python files among the settings, such as of --loss."""
+    values = (getattr(method, field.name) for field in fields(method))
+    files = {value for value in values if isinstance(value, str) and value.endswith(".py")}
+    return {file: sha256_of(Path(file)) for file in sorted(files)}
 
 
 def _identity(spec: str) -> dict[str, Any]:
@@ -293,6 +301,4 @@ def _staged(outputs: Outputs, output: Path) -> Iterator[Outputs]:
         yield outputs
         return
     with tempfile.TemporaryDirectory(prefix="pnpdepth-") as folder:
-        planned = outputs.by_kind().items()
-        paths: Any = {kind: Path(folder) / path.relative_to(output) for kind, path in planned}
-        yield replace(outputs, **paths)
+        yield {kind: Path(folder) / path.relative_to(output) for kind, path in outputs.items()}

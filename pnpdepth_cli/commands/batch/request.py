@@ -1,14 +1,15 @@
-"""What the user asks of a batch. Imports neither numpy nor torch."""
+"""What the user asks of a batch, and of an adaptation. Imports neither numpy nor torch."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.commands.refinement.request import RefineRequest
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.settings import option
 
 LOCAL = "local"
@@ -31,7 +32,6 @@ class FrameSelection:
     source: Path
     """A folder or a list of frames."""
     output: Path
-    """The folder for the results."""
     refine: RefineRequest
     """How a frame is refined; its files, output and protocol are set for each frame."""
     layout: str | None = option(
@@ -153,10 +153,8 @@ class BatchRequest(FrameSelection):
         " frames are refined with them if they are better. The network must take points.",
     )
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
-    """What a frame takes over from its neighbours."""
     profile: bool = option(False, "Print the time spent in each stage.")
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
-    """The Ray workers, if any."""
 
     def __post_init__(self) -> None:
         if self.adapt and self.shard is not None:
@@ -166,17 +164,41 @@ class BatchRequest(FrameSelection):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RayWorkers:
+class AdaptRequest(FrameSelection):
+    """Which frames a network learns from, and how. `output` is the file of its weights."""
+
+    steps: int = option(
+        200, "Number of updates of the weights.", metavar="N", least=1, show_default=True
+    )
+    lr: float = option(4e-4, "Step size at the start.", metavar="NUMBER", show_default=True)
+    validated: int = 10
+    """One frame in this many is for validation; of fewer frames, the last."""
+    checks: int = 5
+    """How often the validation frames are looked at, besides before the first update."""
+
+    def __post_init__(self) -> None:
+        if self.output.suffix != ".safetensors":
+            raise UsageError(f"{self.output}: name the file of the weights NAME.safetensors")
+        for path in (self.output, self.card):
+            if path.exists() and not self.refine.outputs.overwrite:
+                raise OutputError(f"{path} exists; --overwrite replaces it, -o names another file")
+
+    @property
+    def card(self) -> Path:
+        """The file that describes the weights."""
+        return self.output.with_suffix(".md")
+
+
+class RayWorkers(NamedTuple):
     """The workers that a command asks for."""
 
     address: str
     """Of the cluster, or LOCAL."""
     device: str
     """Kind of device that every worker computes on: cpu or cuda."""
-    indices: tuple[int, ...] = ()
+    indices: tuple[int, ...]
     """Which GPUs of this machine; empty for all."""
     options: ClusterOptions
-    """The user's."""
 
     @property
     def each(self) -> str:
@@ -215,4 +237,4 @@ def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
             f"device {device!r}: GPUs of a cluster have no numbers; take --device cuda, and"
             f" --ray-workers {len(indices)}"
         )
-    return RayWorkers(address=address, device=kind, indices=indices, options=options)
+    return RayWorkers(address, kind, indices, options)

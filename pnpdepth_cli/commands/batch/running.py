@@ -148,7 +148,12 @@ def opened_network(
     if first.register == "auto":
         refiner.share_registration(readable(references.registering))
         for (height, width), registration in refiner.registrations.items():
-            if registration is not None:
+            if registration == "unrelated":
+                say(
+                    f"warning: images of {width}×{height} do not seem to belong to their points:"
+                    " depth changes at their edges no more often than by chance"
+                )
+            elif registration is not None:
                 say(
                     f"images of {width}×{height} are moved into the frame of the points by"
                     f" {registration}; --registration off leaves them"

@@ -14,10 +14,8 @@ from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain
 
 Row = dict[str, Any]
-"""What the summary says of a frame."""
 # a file name that is no UTF-8 has surrogates; JSON escapes them so
 TEXT: Any = {"encoding": "utf-8", "errors": "backslashreplace", "newline": "\n"}
-"""How files of the summary are opened."""
 CSV, JSON = "summary.csv", "summary.json"
 
 _POINT_ERRORS = ("mae", "rmse")
@@ -31,8 +29,10 @@ _MEASURED = {
     "scores": _SCORES,
 }
 _OF_LINEAR = ("scores", "held_out_error")
+_BASELINE = "baseline"
 _RUN_STAGES = ("read", "refine", "write")
-_CHECKED = {"before": "aligned", "after": "result", "linear": "linear"}
+_CHECKED = ("aligned", "result", "linear")
+"""Stages whose errors at hidden points are averaged."""
 _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 
 
@@ -74,31 +74,6 @@ def failed_row(name: str, inputs: Mapping[str, str], message: str) -> dict[str, 
     }
 
 
-class _Means:
-    """The mean of each value over the frames that have it; None and NaN are not counted."""
-
-    def __init__(self) -> None:
-        self._totals: dict[str, float] = {}
-        self._counts = Counter[str]()
-
-    def add(self, values: Mapping[str, float | None]) -> None:
-        """Adds the values of a frame."""
-        for name, value in values.items():
-            known = value is not None and not math.isnan(value)
-            self._totals[name] = self._totals.get(name, 0.0) + (value if known and value else 0.0)
-            self._counts[name] += known
-
-    def values(self) -> dict[str, float | None]:
-        """Returns the means; None for a value that no frame has."""
-        counts = self._counts
-        return {n: total / counts[n] if counts[n] else None for n, total in self._totals.items()}
-
-    @property
-    def frames(self) -> int:
-        """The number of frames that have any of the values."""
-        return max(self._counts.values(), default=0)
-
-
 class Tally:
     """Counts rows and adds up their scores; the rows are not kept."""
 
@@ -107,11 +82,10 @@ class Tally:
         self.warned = 0
         self.unsure: dict[str, None] = {}
         """What was guessed of the network and may be wrong, each once."""
-        self.baselines: defaultdict[str, _Means] = defaultdict(_Means)
-        """Errors of the baselines, in the order of the records."""
         self._units: set[str] = set()
         self._compared, self._worse = 0, 0
-        self._means: defaultdict[tuple[str, str], _Means] = defaultdict(_Means)
+        # by kind and stage, the total of each measure and the number of frames that have it
+        self._sums: defaultdict[tuple[str, str], dict[str, tuple[float, int]]] = defaultdict(dict)
 
     def add(self, row: Row) -> None:
         """Adds one row."""
@@ -120,61 +94,82 @@ class Tally:
         self.unsure |= dict.fromkeys(row.get("unsure", ()))
         self._units |= {row["unit"]} if "unit" in row else set()
         for key, values in _measured(row).items():
-            self._means[key].add(values)
-        linear = row.get("linear") or {}
-        for kind in _OF_LINEAR:
-            scores = linear.get(kind) or {}
-            self._means[kind, "linear"].add({name: scores.get(name) for name in _MEASURED[kind]})
-        if linear.get("worse") is not None:
-            self._compared += 1
-            self._worse += linear["worse"]
-            if check := linear.get("check"):
-                self._means["check", ""].add({key: check[name] for key, name in _CHECKED.items()})
-        for name, entry in (row.get("baselines") or {}).items():
-            self.baselines[name].add(_of_baseline(entry))
+            sums = self._sums[key]
+            for name, value in values.items():
+                total, count = sums.get(name, (0.0, 0))
+                known = value is not None and not math.isnan(value)
+                sums[name] = (
+                    (total + value, count + 1) if known and value else (total, count + known)
+                )
+        worse = (row.get("linear") or {}).get("worse")
+        self._compared += worse is not None
+        self._worse += bool(worse)
 
     @property
     def unit(self) -> str:
         """The unit of all depths."""
         return " and ".join(sorted(self._units)) or "m"
 
+    @property
+    def baselines(self) -> list[str]:
+        """Names of the baselines, in the order of the records."""
+        return [name for kind, name in self._sums if kind == _BASELINE]
+
     def means(self) -> dict[str, Any]:
         """Returns the means of the results, of linear interpolation and of the baselines.
 
         "mean" has {"scores": {"frames": 9, "before": {"rmse": …}, …}, …}, or None without frames;
-        "linear" also how many frames are worse, and the errors of all at the hidden points.
+        "linear" also how many frames are worse, and the errors of all at the hidden points. A mean
+        is over the frames that have the value; None where none has it.
         """
         mean: dict[str, Any] = {}
         for kind in _MEASURED:
-            before, after = self._means[kind, "before"], self._means[kind, "after"]
-            frames = max(before.frames, after.frames)
-            both = {"frames": frames, "before": before.values(), "after": after.values()}
-            mean[kind] = both if frames else None
-        check = self._means["check", ""]
+            frames = max(self._frames(kind, "before"), self._frames(kind, "after"))
+            both = {stage: self._mean(kind, stage) for stage in ("before", "after")}
+            mean[kind] = {"frames": frames, **both} if frames else None
+        checked = self._frames("check", "")
         linear = {
-            **{kind: self._means[kind, "linear"].values() for kind in _OF_LINEAR},
-            "check": check.values() | {"frames": check.frames} if check.frames else None,
+            **{kind: self._mean(kind, "linear") for kind in _OF_LINEAR},
+            "check": self._mean("check", "") | {"frames": checked} if checked else None,
             "frames": self._compared,
             "worse": self._worse,
         }
-        baselines = {n: {"frames": m.frames, **m.values()} for n, m in self.baselines.items()}
+        baselines = {
+            name: {"frames": self._frames(_BASELINE, name), **self._mean(_BASELINE, name)}
+            for name in self.baselines
+        }
         return {"mean": mean, "linear": linear, "baselines": baselines or None}
+
+    def _mean(self, kind: str, stage: str) -> dict[str, float | None]:
+        sums = self._sums.get((kind, stage), {})
+        return {name: total / n if n else None for name, (total, n) in sums.items()}
+
+    def _frames(self, kind: str, stage: str) -> int:
+        """The number of frames that have any of the values."""
+        return max((count for _, count in self._sums.get((kind, stage), {}).values()), default=0)
 
 
 def _measured(row: Row) -> dict[tuple[str, str], dict[str, float | None]]:
-    """The errors of a row by kind and stage."""
-    return {
-        (kind, stage): {measure: (row[kind][stage] or {}).get(measure) for measure in measures}
-        for kind, measures in _MEASURED.items()
+    """The errors of a row by kind and stage, or by name of the baseline."""
+    linear = row.get("linear") or {}
+    errors = {
+        (kind, stage): row[kind][stage]
+        for kind in _MEASURED
         if row.get(kind)
         for stage in ("before", "after")
     }
-
-
-def _of_baseline(entry: Mapping[str, Any]) -> dict[str, float | None]:
-    scores = entry.get("scores") or {}
-    errors = {measure: scores.get(measure) for measure in ("mae", "rmse")}
-    return {"held_out_mae": entry.get("held_out_mae"), **errors}
+    errors |= {(kind, "linear"): linear.get(kind) for kind in _OF_LINEAR}
+    found = {
+        key: {name: (values or {}).get(name) for name in _MEASURED[key[0]]}
+        for key, values in errors.items()
+    }
+    if check := linear.get("check"):
+        found["check", ""] = {name: check[name] for name in _CHECKED}
+    for name, entry in (row.get("baselines") or {}).items():
+        scores = entry.get("scores") or {}
+        of_truth = {measure: scores.get(measure) for measure in _POINT_ERRORS}
+        found[_BASELINE, name] = {"held_out_mae": entry.get("held_out_mae"), **of_truth}
+    return found
 
 
 def profile_of(seconds: Mapping[str, float], frames: int, wall_s: float) -> dict[str, Any]:
@@ -234,6 +229,7 @@ def _columns(row: Row, baselines: Sequence[str]) -> dict[str, Any]:
     cells["warnings"] = "; ".join(row.get("warnings") or ())
     cells |= {f"seconds_{stage}": seconds.get(stage) for stage in _RUN_STAGES}
     for name in baselines:
-        values = _of_baseline((row.get("baselines") or {}).get(name, {}))
-        cells |= {f"baseline_{name}_{measure}": value for measure, value in values.items()}
+        values = measured.get((_BASELINE, name), {})
+        keys = ("held_out_mae", *_POINT_ERRORS)
+        cells |= {f"baseline_{name}_{key}": values.get(key) for key in keys}
     return cells

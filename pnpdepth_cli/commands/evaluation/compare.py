@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,103 +36,27 @@ ALPHA = 0.05
 MAIN_MEASURES = ("rmse", "mae", "mre", "delta1", "inverse_rmse", "inverse_mae")
 """Keys of the measures that are compared by default; the last two are the kit's."""
 _STAGES = ("before", "after")
+_GAIN = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunFrame:
-    """The saved scores of one frame."""
-
-    values: dict[str, float]
-    """Measures by their key; NaN for null."""
-    pixels: int
-    """Scored pixels."""
-    group: str
-    """The sequence the frame belongs to."""
-    known: int | None = None
-    """Pixels with ground truth; None where the file does not say."""
-    sums: tuple[float, ...] = ()
-    """Of a pooled run: over the pixels, in the order of core.metrics.SUMS."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run:
+class Run(NamedTuple):
     """The scored frames of one saved run, by name."""
 
     label: str
     """The file's name without its folder."""
     path: str
-    """As the user gave it."""
-    measures: tuple[Measure, ...]
-    """Those of all frames."""
+    measures: Sequence[Measure]
     scoring: dict[str, Any]
-    """The rules that decide the figures."""
-    frames: dict[str, RunFrame]
+    frames: dict[str, dict[str, Any]]
+    """`values` by measure (NaN for null), scored `pixels`, `known` pixels of the ground truth (None
+    where the file does not say), `group`, and `sums` of a pooled run."""
 
     def coverage(self, names: Sequence[str]) -> float | None:
         """Returns the fraction of the ground truth that is scored; None where files do not say."""
-        known = [self.frames[name].known or 0 for name in names]
+        known = [self.frames[name]["known"] or 0 for name in names]
         if not all(known):
             return None
-        return sum(self.frames[name].pixels for name in names) / sum(known)
-
-
-@dataclass(frozen=True)
-class Gain:
-    """How much better a run is than the first one; positive is better for every measure.
-
-    Values are NaN where there is none, as for a single frame.
-    """
-
-    percent: float
-    """Of the first run's mean; with the ends of its 95 % interval."""
-    low_percent: float
-    high_percent: float
-    difference: float
-    """This run's mean minus the first run's, in the measure's unit."""
-    p_value: float
-    """Two-sided, of no difference, by swapping the runs cluster by cluster."""
-    p_adjusted: float
-    """The same, adjusted for the number of measures (Holm 1979)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunMean:
-    """A run's means over the frames that all runs have."""
-
-    label: str
-    path: str
-    mean: dict[str, float]
-    coverage: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Runs on the frames they share."""
-
-    frames: tuple[str, ...]
-    """Names of the shared ones."""
-    measures: tuple[Measure, ...]
-    """Those compared; p-values are adjusted for their number."""
-    scoring: dict[str, Any]
-    """The rules by which all runs were scored."""
-    runs: tuple[RunMean, ...]
-    """In the user's order; the first is what the others are compared with."""
-    gains: tuple[dict[str, Gain], ...]
-    """Of each run but the first, by the measure's key."""
-    clusters: Clusters
-    """What is resampled and swapped as a whole."""
-    exact_p_values: bool
-    """True if they are of all swaps, not of random ones."""
-    resamples: int
-    seed: int
-    notes: tuple[str, ...]
-
-    def as_record(self) -> dict[str, Any]:
-        """Returns what `--json` prints; NaN is null."""
-        clusters = {"count": self.clusters.count, "unit": self.clusters.unit}
-        own = {"command": "compare", "level": LEVEL, "clusters": clusters}
-        result: dict[str, Any] = plain(asdict(self) | own)
-        return result
+        return float(sum(self.frames[name]["pixels"] for name in names) / sum(known))
 
 
 def compare(
@@ -143,10 +67,14 @@ def compare(
     grouped: bool = True,
     all_measures: bool = False,
     columns: Sequence[str] | None = None,
-) -> Comparison:
+) -> dict[str, Any]:
     """Returns the runs on the frames that all of them scored, compared with the first.
 
     A measure that a frame lacks in one of the runs is averaged and tested over the other frames.
+    `runs` has the means of each run, `gains` those of each but the first: in per cent of the first
+    run's mean with the ends of the 95 % interval, and as a difference; positive per cents are
+    better. `p_value` is that of no difference, `p_adjusted` by the number of measures. None is a
+    value that there is not, as for a single frame.
 
     Args:
         paths: Files as `read_run` takes them; the first is the reference.
@@ -180,15 +108,15 @@ def compare(
         measures = main
     keys = [measure.key for measure in measures]
     values = np.array(
-        [[[run.frames[n].values.get(k, math.nan) for k in keys] for n in names] for run in runs]
+        [[[run.frames[n]["values"].get(k, math.nan) for k in keys] for n in names] for run in runs]
     )
     known = np.isfinite(values).all(axis=0)
     differences = np.concatenate(list(values[1:] - values[0]), axis=1)
-    groups = [runs[0].frames[name].group for name in names]
+    groups = [runs[0].frames[name]["group"] for name in names]
     clusters = find_clusters(groups, differences, grouped=grouped)
     pooled = runs[0].scoring.get("average") == "pooled"
     if pooled:
-        sums = (np.array([run.frames[name].sums for name in names]) for run in runs)
+        sums = (np.array([run.frames[name]["sums"] for name in names]) for run in runs)
         tables = [FrameTable.of_pixels(of_run, keys) for of_run in sums]
     else:
         tables = [FrameTable.of_frames(np.where(known, of_run, math.nan)) for of_run in values]
@@ -200,31 +128,38 @@ def compare(
         p_values, exact = swap_p_values(tables[0], table, *drawing)
         percent, difference = gain(means[0], mean, better), mean - means[0]
         rows = np.stack([percent, low, high, difference, p_values, holm(p_values)], axis=1)
-        gains.append({key: Gain(*row) for key, row in zip(keys, rows.tolist(), strict=True)})
-    return Comparison(
-        frames=names,
-        measures=measures,
-        scoring=runs[0].scoring,
-        runs=tuple(
-            RunMean(
-                label=label,
-                path=run.path,
-                mean=dict(zip(keys, mean.tolist(), strict=True)),
-                coverage=run.coverage(names),
-            )
+        gains.append({
+            key: dict(zip(_GAIN, row, strict=True))
+            for key, row in zip(keys, rows.tolist(), strict=True)
+        })  # fmt: skip
+    record = {
+        "command": "compare",
+        "frames": names,
+        "measures": [asdict(measure) for measure in measures],
+        "scoring": runs[0].scoring,
+        "runs": [
+            {
+                "label": label,
+                "path": run.path,
+                "mean": dict(zip(keys, mean.tolist(), strict=True)),
+                "coverage": run.coverage(names),
+            }
             for label, run, mean in zip(_labels(runs), runs, means, strict=True)
-        ),
-        gains=tuple(gains),
-        clusters=clusters,
-        exact_p_values=exact,
-        resamples=resamples,
-        seed=seed,
-        notes=(
+        ],
+        "gains": gains,
+        "level": LEVEL,
+        "clusters": {"count": clusters.count, "unit": clusters.unit},
+        "exact_p_values": exact,
+        "resamples": resamples,
+        "seed": seed,
+        "notes": [
             *_notes(runs, names),
             *([] if pooled else _lacking(names, measures, known)),
             *_cluster_notes(clusters, len(names), len(measures)),
-        ),
-    )
+        ],
+    }
+    result: dict[str, Any] = plain(record)
+    return result
 
 
 def _check_rules(first: Run, other: Run) -> None:
@@ -260,16 +195,16 @@ def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
                 f" left out: {some_names(unshared)}"
             )
     frames = {name: [run.frames[name] for run in runs] for name in names}
-    other_truth = [n for n, of in frames.items() if len({f.known for f in of} - {None}) > 1]
+    other_truth = [n for n, of in frames.items() if len({f["known"] for f in of} - {None}) > 1]
     if other_truth:
         lines.append(
             f"warning: {len(other_truth):,} frames have another number of pixels with ground truth"
             f" in another run, so the runs were not scored on the same: {some_names(other_truth)}"
         )
-    elif any(len({frame.pixels for frame in of}) > 1 for of in frames.values()):
+    elif any(len({frame["pixels"] for frame in of}) > 1 for of in frames.values()):
         shares = []
         for run in runs:
-            share, pixels = run.coverage(names), sum(run.frames[n].pixels for n in names)
+            share, pixels = run.coverage(names), sum(run.frames[n]["pixels"] for n in names)
             text = f"{pixels:,} pixels" if share is None else f"{share:.2%}"
             shares.append(f"{text} in {run.path}")
         lines.append(
@@ -354,13 +289,13 @@ def _evaluated(record: Mapping[str, Any]) -> dict[str, Any]:
         "measures": tuple(known[key] for key in keys if key in known),
         "scoring": dict(protocol["scoring"]),
         "frames": {
-            str(frame["name"]): RunFrame(
-                values=_numbers(frame["values"]),
-                pixels=int(frame["pixels"]),
-                group=str(frame["group"]),
-                known=None if frame["known"] is None else int(frame["known"]),
-                sums=tuple(float(each) for each in frame.get("sums", ())),
-            )
+            str(frame["name"]): {
+                "values": _numbers(frame["values"]),
+                "pixels": int(frame["pixels"]),
+                "group": str(frame["group"]),
+                "known": None if frame["known"] is None else int(frame["known"]),
+                "sums": [float(value) for value in frame.get("sums", ())],
+            }
             for frame in record["frames"]
             if frame["error"] is None
         },
@@ -383,12 +318,12 @@ def _refined(record: Mapping[str, Any], path: Path, stage: str) -> dict[str, Any
         "measures": tuple(m for m in MEASURES if all(m.key in each for each in values.values())),
         "scoring": PROTOCOLS["paper"].scoring(),
         "frames": {
-            name: RunFrame(
-                values=each,
-                pixels=round(each["pixels"]),
-                group=group,
-                known=round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
-            )
+            name: {
+                "values": each,
+                "pixels": round(each["pixels"]),
+                "group": group,
+                "known": round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
+            }
             for (name, each), group in zip(
                 values.items(), groups_by_name(list(values)), strict=True
             )

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.evaluation.frames import Scales
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, choose_protocol
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.scoring import (
     FrameScores,
-    Uncertainty,
     score_pair,
     summarise_uncertainty,
 )
@@ -30,8 +28,9 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     interval,
 )
 from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.commands.stopwatch import versions
-from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.depth import DepthKind, scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import plain
@@ -39,44 +38,6 @@ from pnpdepth_cli.io.record import plain
 _LEAK_WARNING_FRACTION = 0.01
 _LISTED = 3
 _OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale", "sparse": "--sparse-scale"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvalRequest:
-    """What to score, and how."""
-
-    prediction: Path
-    """A depth file, or a folder of them."""
-    ground_truth: Path
-    """A depth file, a folder of them, or a data set of a known layout."""
-    sparse: Path | None = None
-    """The networks' sparse input: a file, or a folder of them."""
-    protocol: str = "paper"
-    changes: dict[str, Any] = field(default_factory=dict)
-    """Fields of the protocol that the user sets otherwise."""
-    calib: Path | None = None
-    layout_protocol: str | None = None
-    scales: Scales = field(default_factory=Scales)
-    resamples: int = 2000
-    """Bootstrap samples behind the intervals; 0 computes none."""
-    seed: int = 0
-    grouped: bool = True
-    """False if every frame counts as independent."""
-    workers: int = 2
-    """Frames read at once."""
-
-    def __post_init__(self) -> None:
-        for option, scale in (
-            ("--pred-scale", self.scales.prediction),
-            ("--gt-scale", self.scales.truth),
-            ("--sparse-scale", self.scales.sparse),
-        ):
-            if scale is not None and not (math.isfinite(scale) and scale > 0):
-                raise UsageError(f"{option} must be a finite number above 0, got {scale:g}")
-        if self.workers < 1:
-            raise UsageError(f"--workers must be >= 1, got {self.workers}")
-        if self.resamples < 0:
-            raise UsageError(f"--bootstrap must be >= 0, got {self.resamples}; 0 leaves it out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,15 +50,11 @@ class Evaluation:
     frames: tuple[FrameScores, ...]
     """A row for each frame of the ground truth, in its order."""
     mean: dict[str, float]
-    """Over the scored frames, by the measure's key."""
     interval: dict[str, tuple[float, float]] | None
     """The ends of the 95 % interval of each mean; None with too few independent frames."""
     clusters: Clusters
-    """What the bootstrap resamples as a whole."""
-    uncertainty: Uncertainty | None
-    """Whether predicted standard deviations are right; None without any."""
+    uncertainty: dict[str, Any] | None
     notes: tuple[str, ...]
-    """What was assumed, and warnings; one line each."""
 
     @property
     def scored(self) -> tuple[FrameScores, ...]:
@@ -154,7 +111,12 @@ class Evaluation:
                 "truth": request.ground_truth,
                 **of_request,
                 "layout_protocol": request.layout_protocol,
-                "scales": request.scales,
+                "scales": {
+                    "prediction": request.pred_scale,
+                    "truth": request.gt_scale,
+                    "sparse": request.sparse_scale,
+                    "channel": request.channel,
+                },
             },
             "protocol": {
                 "name": protocol.name,
@@ -220,7 +182,7 @@ def evaluate(
         PnpDepthError: For two single files whatever is wrong with them, for folders only what
             concerns all frames.
     """
-    protocol = choose_protocol(request.protocol, **request.changes)
+    protocol = choose_protocol(request.protocol, **request.changes())
     pairs, notes = pair_frames(
         request.prediction,
         request.ground_truth,
@@ -233,7 +195,7 @@ def evaluate(
 
     def score(pair: FramePair) -> FrameScores:
         try:
-            row = score_pair(pair, protocol, request.scales)
+            row = score_pair(pair, protocol, request)
         except PnpDepthError as error:
             if single:
                 raise
@@ -352,6 +314,11 @@ def _warnings(rows: Sequence[FrameScores], protocol: EvalProtocol) -> list[str]:
         lines.append(
             f"scale-by {protocol.scale_by}: factor {median:.4g} (median of {len(factors):,}"
             f" images), standard deviation / median {spread:.3f}"
+        )
+    if protocol.scale_by == "none" and (unscaled := [r for r in scored if r.pair.unit != METRES]):
+        lines.append(
+            f"warning: {len(unscaled):,} predictions are in {unscaled[0].pair.unit}, not in metres,"
+            " so errors against the ground truth show nothing; --scale-by median scales each image"
         )
     kinds = {side: found[0][0] for side, found in kinds_of(rows).items() if found}
     for side, what, ratios in (

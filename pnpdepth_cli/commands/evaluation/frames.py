@@ -5,9 +5,9 @@ Predictions of relative networks are scaled to the ground truth of each image (`
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,10 +15,11 @@ import numpy as np
 from pnpdepth_cli.commands.evaluation.measures import Depth, Floats, Mask, MeasuredFrame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, load_stacked
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, crop_window
-from pnpdepth_cli.errors import InputError, SizeError, UsageError
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.errors import InputError, SizeError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset import Hdf5Array
-from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_mask, rgb_of
+from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image, read_mask
 from pnpdepth_cli.io.depth import (
     DepthImage,
     DepthKind,
@@ -26,26 +27,12 @@ from pnpdepth_cli.io.depth import (
     known_metres,
     load_stored,
 )
-from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors import SamplePattern, sample_points
 from pnpdepth_cli.sensors.sparse import as_depth_image
 
 Size = tuple[int, ...]
 Window = tuple[slice, slice]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scales:
-    """How the user says that stored numbers are to be read; None leaves it to the files."""
-
-    prediction: float | None = None
-    """Codes per metre of integers, here and in the next two."""
-    truth: float | None = None
-    sparse: float | None = None
-    channel: str | None = None
-    """Which EXR channel or NPZ array holds the depth."""
 
 
 class Fit(NamedTuple):
@@ -64,7 +51,6 @@ class LoadedFrame(MeasuredFrame):
     predicted: Mask | None = None
     """(H, W) true where the file has a prediction; None without a file."""
     fit: Fit | None = None
-    """How the prediction was scaled to the ground truth, if it was."""
     sigma: Depth | None = None
     """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
 
@@ -75,7 +61,7 @@ class LoadedFrame(MeasuredFrame):
         return sum(0.5 / scale for scale in {k.scale for k in kinds if k and k.scale})
 
 
-def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> LoadedFrame:
+def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) -> LoadedFrame:
     """Returns the frame's depths as the protocol scores them.
 
     Raises:
@@ -88,20 +74,19 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
         whole = DepthImage(values=depth_of(frame.gt), source=source, assumed_scale=False)
     else:
         assert frame.gt is not None
-        scale = scales.truth if scales.truth is not None else frame.gt_scale
-        whole = _read(frame.gt, scale, scales.channel, protocol, pair.index)
+        scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
+        whole = _read(frame.gt, scale, request.channel, protocol, pair.index)
     gt = np.ascontiguousarray(frame.protocol.apply(masked(whole.values, frame.masks)))
     kinds = {"gt": whole.kind}
-    sparse, kind = _known_sparse(pair, protocol, scales, gt.shape)
+    sparse, kind = _known_sparse(pair, protocol, request, gt.shape)
     if kind is not None:
         kinds["sparse"] = kind
     mask = _scored_mask(pair, gt, protocol)
     if protocol.exclude_sparse:
-        if sparse is None and pair.sampling is not None:
-            sparse = _sampled_again(pair, pair.sampling, gt)
         if sparse is None:
             raise InputError(
                 f"frame {pair.name} has no sparse depth file to exclude; give it with --sparse"
+                + ("; `pnpdepth sample` draws the same points again" if pair.sampled else "")
             )
         mask &= sparse == 0
     loaded = LoadedFrame(
@@ -111,16 +96,16 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Loade
         intrinsics=_intrinsics(pair, protocol, (whole.values.shape[0], whole.values.shape[1])),
         kinds=kinds,
     )
-    return loaded if pair.prediction is None else _with_prediction(loaded, pair, protocol, scales)
+    return loaded if pair.prediction is None else _with_prediction(loaded, pair, protocol, request)
 
 
 def _with_prediction(
-    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, scales: Scales
+    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, request: EvalRequest
 ) -> LoadedFrame:
     """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
     assert pair.prediction is not None
     size = frame.gt.shape
-    image = _read(pair.prediction, scales.prediction, scales.channel, protocol, pair.index)
+    image = _read(pair.prediction, request.pred_scale, request.channel, protocol, pair.index)
     window = crop_window(protocol.prediction_crop or "none", size, "--pred-crop")
     values = _to_size(pair, image.values, size, window, protocol.resize)
     depth, fit = scaled(values, frame.gt, protocol.prediction_kind, protocol.scale_by)
@@ -188,7 +173,7 @@ def _read(
 
 
 def _known_sparse(
-    pair: FramePair, protocol: EvalProtocol, scales: Scales, size: Size
+    pair: FramePair, protocol: EvalProtocol, request: EvalRequest, size: Size
 ) -> tuple[Depth | None, DepthKind | None]:
     """(H, W) metres of the points on their pixels, 0 elsewhere, and the kind of file.
 
@@ -198,7 +183,9 @@ def _known_sparse(
         return None, None
     height, width = size
     try:
-        scale = scales.sparse if scales.sparse is not None else pair.frame.sparse_scale
+        scale = (
+            request.sparse_scale if request.sparse_scale is not None else pair.frame.sparse_scale
+        )
         sparse = read_sparse(pair.sparse, size=(height, width), scale=scale)
         assumed = sparse.assumed_scale
         if assumed and protocol.scale != sparse.scale:
@@ -218,28 +205,6 @@ def _known_sparse(
     return as_depth_image(points), DepthKind(sparse.source, sparse.scale, assumed)
 
 
-def _sampled_again(pair: FramePair, sampling: dict[str, Any], ground_truth: Depth) -> Depth:
-    """(H, W) the points that a run sampled from this ground truth, drawn again by its record."""
-    pattern: dict[str, Any] = {each.name: sampling.get(each.name) for each in fields(SamplePattern)}
-    image = image_of(pair, ground_truth.shape) if isinstance(pair.image, Path) else None
-    try:
-        if pattern["region"] is not None:
-            pattern["region"] = tuple(pattern["region"])
-        drawn = SamplePattern(**pattern)
-        points = sample_points(ground_truth, drawn, int(sampling["seed"]), image=image)
-    except (KeyError, TypeError, ValueError, UsageError) as error:
-        raise InputError(
-            f"the points of frame {pair.name} cannot be sampled again as its record says"
-            f" ({error}); give them with --sparse"
-        ) from error
-    if len(points.depth) < pair.sampled:
-        raise InputError(
-            f"the record of frame {pair.name} has {pair.sampled:,} points, but sampling again gives"
-            f" {len(points.depth):,}: it is of another ground truth; give them with --sparse"
-        )
-    return as_depth_image(points)
-
-
 def image_of(pair: FramePair, size: Size) -> Depth | None:
     """Returns (H, W, 3) in 0…1, the frame's image; None unless one is known and of that size.
 
@@ -248,7 +213,7 @@ def image_of(pair: FramePair, size: Size) -> Depth | None:
     """
     if pair.image is None:
         return None
-    rgb = rgb_of(pair.image) if isinstance(pair.image, Hdf5Array) else read_rgb(pair.image).values
+    rgb = read_image(pair.image)
     if rgb.shape[:2] != size:
         rgb = pair.frame.protocol.apply(rgb)
     return rgb if rgb.shape[:2] == size else None

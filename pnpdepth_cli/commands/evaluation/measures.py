@@ -28,13 +28,11 @@ class MeasuredFrame:
     """A frame as its protocol scores it; depths are (H, W) metres, 0 where unknown."""
 
     depth: Depth
-    """The prediction."""
     gt: Depth
     """0 also where the protocol does not score."""
     intrinsics: Floats | None = None
     """(3, 3)"""
     sparse: Depth | None = None
-    """The sparse points on their pixels."""
     previous: MeasuredFrame | None = None
     """The frame before in the same sequence; None for the first."""
 
@@ -61,13 +59,10 @@ class MeasureGroup:
     measures: tuple[Measure, ...]
     values: Values
     needs: Literal["nothing", "intrinsics", "sparse"] = "nothing"
-    """What a frame must have beside its depths."""
     in_sequences: bool = False
-    """True if `previous` is used."""
 
 
 TABLE: dict[str, MeasureGroup] = {}
-"""The groups by name."""
 
 
 def measures(

@@ -16,6 +16,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.results import result_frames
+from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.dataset import (
     IMAGE_SUFFIXES,
@@ -29,11 +31,10 @@ from pnpdepth_cli.io.dataset import (
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray
 from pnpdepth_cli.io.layouts import find_layout, list_frames
-from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.remote import RemotePath
 
 _DEPTH_MARKS = ("_depth", ".depth")
-_COMPANIONS = ("_preview", "_improvement", "_sigma", "_valid")
+_COMPANIONS = ("_sigma_preview", "_preview", "_improvement", "_sigma", "_valid")
 # KITTI's selection names the kind of file in the middle.
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5
@@ -58,17 +59,13 @@ class FramePair:
     sparse: Path | None = None
     """The network's sparse input: the user's, the run's record's or the data set's."""
     sparse_named: bool = False
-    """Whether the user named the sparse input."""
     sigma: Path | None = None
-    """The standard deviation that a refinement wrote beside its depth."""
     index: int | None = None
     """Of the frame, in files of several frames."""
     previous: FramePair | None = None
-    """The frame before in the same sequence."""
-    sampling: dict[str, Any] | None = None
-    """How the sparse input was sampled from the ground truth, by the run's record."""
     sampled: int = 0
     """Points of the ground truth that were the sparse input, by the run's record."""
+    unit: str = METRES
     image: Source | None = None
     mask: Path | None = None
 
@@ -194,17 +191,15 @@ def _by_frame(
 
 def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePair:
     """The frame with what the record of a refinement, beside its depth, says of its inputs."""
-    record, sigma = {}, None
+    record: Mapping[str, Any] = {}
+    sigma: Path | None = None
     if prediction is not None:
-        name = _base(prediction.stem, _DEPTH_MARKS) or prediction.stem
-        suffixes = (prediction.suffix, ".exr", ".npy")
-        sigmas = (prediction.with_name(f"{name}_sigma{suffix}") for suffix in suffixes)
-        sigma = next((file for file in sigmas if file.is_file()), None)
         with contextlib.suppress(PnpDepthError):
-            record = read_json(prediction.with_name(f"{name}.json"))
+            (result,) = result_frames(prediction)
+            record, sigma = result.record, result.sigma
     inputs = _dict(record.get("inputs"))
-    used, sampling = _dict(record.get("points")).get("used"), _dict(inputs.get("sparse"))
-    is_sampled = "sampled_from" in sampling
+    used = _dict(record.get("points")).get("used")
+    is_sampled = "sampled_from" in _dict(inputs.get("sparse"))
     known = frame.sparse
     if known is not None and known.suffix.lower() not in DEPTH_SUFFIXES:
         known = None
@@ -215,9 +210,9 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
         sparse=sparse or _input(inputs, "sparse") or known,
         sparse_named=sparse is not None,
         sigma=sigma,
-        sampling=sampling if is_sampled else None,
         sampled=used if is_sampled and isinstance(used, int) else 0,
         image=_input(inputs, "image") or frame.image,
+        unit=str(record.get("unit", METRES)),
     )
 
 

@@ -33,20 +33,16 @@ _CROPS = ("none", "nyu", *_CROP_FRACTIONS)
 
 @dataclass(frozen=True, kw_only=True)
 class EvalProtocol:
-    """How predictions are scored; depths in metres."""
+    """How predictions are scored: `ScoringRules` with nothing open."""
 
     name: str
     scale: float = 256.0
     """Codes per metre of integer files that neither the file nor the user states."""
     min_depth: float = 0.0
-    """Ground truth is scored above it, and below `max_depth`."""
     max_depth: float | None = None
     clip: bool = False
-    """Whether predictions are clipped to these bounds."""
     crop: str = "none"
-    """One of _CROPS, or X,Y,WIDTH,HEIGHT in pixels."""
     mask: Path | None = None
-    """An image, or a folder of one per frame, whose pixels above 0 are scored."""
     average: str = "per-image"
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
     exclude_sparse: bool = False
@@ -54,12 +50,8 @@ class EvalProtocol:
     prediction_kind: str = "depth"
     scale_by: str = "none"
     prediction_crop: str | None = None
-    """Part of the ground truth's frame that predictions show: "kb", or X,Y,WIDTH,HEIGHT; None for
-    all of it. The rest counts as empty."""
     groups: tuple[str, ...] = ()
-    """Additional measures, names of MEASURE_GROUPS."""
     resize: str | None = None
-    """How a prediction of another size is resized to the ground truth's; None refuses it."""
 
     @property
     def is_devkit(self) -> bool:

@@ -11,18 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from pnpdepth_cli.commands.evaluation.frames import Fit, LoadedFrame, Scales, load_frame
+from pnpdepth_cli.commands.evaluation.frames import Fit, LoadedFrame, load_frame
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
 from pnpdepth_cli.commands.evaluation.measures import Depth, Floats
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.core.metrics import MEASURES, error_sums, measures_of
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import DepthKind
@@ -54,9 +55,7 @@ class FrameScores:
     values: dict[str, float] = field(default_factory=dict)
     """Each measure by its key; empty where the frame was not scored."""
     error: str | None = None
-    """Why the frame was not scored; None if it was."""
     pixels: int = 0
-    """Scored pixels."""
     known: int = 0
     """Pixels with ground truth that the protocol scores."""
     predicted: int = 0
@@ -95,14 +94,14 @@ class FrameScores:
         return self.predicted / self.known if self.known else math.nan
 
 
-def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> FrameScores:
+def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) -> FrameScores:
     """Returns the scores of a frame's files; a missing or empty prediction has a row without any.
 
     Raises:
         InputError: For a file that cannot be read, or no ground truth where the protocol scores.
         SizeError: Where sizes differ.
     """
-    frame = load_frame(pair, protocol, scales)
+    frame = load_frame(pair, protocol, request)
     depth, gt, both = frame.depth, frame.gt, frame.both
     known, pixels = int(np.count_nonzero(gt)), int(both.sum())
     if not known:
@@ -112,7 +111,7 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Frame
     row = FrameScores(pair=pair, known=known, kinds=frame.kinds)
     if frame.predicted is None:
         return replace(row, error="there is no prediction")
-    sums = error_sums(torch.from_numpy(depth), torch.from_numpy(gt), protocol.thresholds)[0]
+    sums = error_sums(torch.from_numpy(depth), torch.from_numpy(gt), protocol.thresholds)
     row = replace(
         row,
         pixels=pixels,
@@ -128,7 +127,7 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, scales: Scales) -> Frame
     else:
         keys = (measure.key for measure in MEASURES)
         values = dict(zip(keys, measures_of(sums).tolist(), strict=True))
-        values |= _additional(frame, pair, protocol, scales)
+        values |= _additional(frame, pair, protocol, request)
     leaked, sparse_ratio = min(pair.sampled, pixels) or None, math.nan
     if frame.sparse is not None:
         equal = np.abs(frame.sparse - gt) <= frame.tolerance + 1e-6 * gt
@@ -151,7 +150,7 @@ def _median_ratio(depth: Depth, gt: Depth) -> float:
 
 
 def _additional(
-    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, scales: Scales
+    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, request: EvalRequest
 ) -> dict[str, float]:
     """The measures of the protocol's additional groups."""
     values: dict[str, float] = {}
@@ -166,7 +165,7 @@ def _additional(
             )
         previous = None
         if group.in_sequences and pair.previous is not None and pair.previous.prediction:
-            previous = load_frame(pair.previous, protocol, scales)
+            previous = load_frame(pair.previous, protocol, request)
         found = group.values(replace(frame, previous=previous))
         values |= zip((measure.key for measure in group.measures), found, strict=True)
     return values
@@ -175,28 +174,6 @@ def _additional(
 def filled(depth: Depth) -> Depth:
     """Returns the depth with what the development kit fills in, without its −1."""
     return np.maximum(fill_background(depth), np.float32(0))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Uncertainty:
-    """Calibration over the pixels of all frames, and the mean sparsification of the frames."""
-
-    frames: int
-    pixels: int
-    within_1_sigma: float
-    """Fraction of errors within one standard deviation; 0.683 if calibrated."""
-    within_2_sigma: float
-    """Within two; 0.954 if calibrated."""
-    ause: float
-    """Area between sparsification and oracle, in units of the error of all pixels; 0 is best."""
-    expected: tuple[float, ...]
-    """LEVELS, the calibration curve's."""
-    observed: tuple[float, ...]
-    """Fraction of errors within the interval of each."""
-    removed: tuple[float, ...]
-    """REMOVED, the sparsification curve's."""
-    sparsification: tuple[float, ...]
-    oracle: tuple[float, ...]
 
 
 def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty | None:
@@ -226,23 +203,29 @@ def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty
     )
 
 
-def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> Uncertainty | None:
-    """Returns the calibration and sparsification of all frames; None without any."""
+def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> dict[str, Any] | None:
+    """Returns the calibration and sparsification of all frames; None without any.
+
+    Calibration is over the pixels of all frames: `observed` is the fraction of errors within the
+    interval of each probability `expected`. Sparsification is the mean of the frames by fraction of
+    pixels `removed`; `ause` is the area between `sparsification` and `oracle` in units of the error
+    of all pixels, 0 is best.
+    """
     if not frames:
         return None
     pixels, within, by_sigma, by_error = zip(*frames, strict=True)
     observed = np.sum(within, axis=0) / sum(pixels)
     sparsification, oracle = np.mean(by_sigma, axis=0), np.mean(by_error, axis=0)
     area = float(np.trapezoid(sparsification - oracle, REMOVED))
-    return Uncertainty(
-        frames=len(frames),
-        pixels=sum(pixels),
-        within_1_sigma=float(observed[LEVELS.index(ONE_SIGMA)]),
-        within_2_sigma=float(observed[LEVELS.index(TWO_SIGMA)]),
-        ause=area / float(sparsification[0]) if sparsification[0] else 0.0,
-        expected=LEVELS,
-        observed=tuple(observed.tolist()),
-        removed=REMOVED,
-        sparsification=tuple(sparsification.tolist()),
-        oracle=tuple(oracle.tolist()),
-    )
+    return {
+        "frames": len(frames),
+        "pixels": sum(pixels),
+        "within_1_sigma": float(observed[LEVELS.index(ONE_SIGMA)]),
+        "within_2_sigma": float(observed[LEVELS.index(TWO_SIGMA)]),
+        "ause": area / float(sparsification[0]) if sparsification[0] else 0.0,
+        "expected": LEVELS,
+        "observed": observed.tolist(),
+        "removed": REMOVED,
+        "sparsification": sparsification.tolist(),
+        "oracle": oracle.tolist(),
+    }

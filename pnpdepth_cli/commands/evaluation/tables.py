@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from pnpdepth_cli.commands.evaluation.compare import ALPHA, Comparison
+from pnpdepth_cli.commands.evaluation.compare import ALPHA
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, frame_record, kinds_of
 from pnpdepth_cli.commands.evaluation.scoring import FrameScores
 from pnpdepth_cli.commands.tables import (
@@ -126,79 +127,85 @@ def calibration_tables(evaluation: Evaluation) -> list[Table]:
     if found is None:
         return []
     rows = [
-        ["errors within 1σ", f"{found.within_1_sigma:.1%}", "68.3%"],
-        ["errors within 2σ", f"{found.within_2_sigma:.1%}", "95.4%"],
-        ["AUSE (MAE, normalised)", f"{found.ause:.4f}", "0"],
+        ["errors within 1σ", f"{found['within_1_sigma']:.1%}", "68.3%"],
+        ["errors within 2σ", f"{found['within_2_sigma']:.1%}", "95.4%"],
+        ["AUSE (MAE, normalised)", f"{found['ause']:.4f}", "0"],
     ]
-    caption = f"Standard deviation of {found.frames:,} frame{'' if found.frames == 1 else 's'}"
+    count = found["frames"]
+    caption = f"Standard deviation of {count:,} frame{'' if count == 1 else 's'}"
     return [Table(caption=caption, header=["", "observed", "calibrated"], rows=rows)]
 
 
-def comparison_table(comparison: Comparison) -> Table:
+def comparison_table(comparison: Mapping[str, Any]) -> Table:
     """Returns a row for each measure and run; all runs but the first have gain and p."""
-    base, *others = comparison.runs
+    (base, *others), measures = comparison["runs"], _measures(comparison)
     rows = []
-    for measure in comparison.measures:
-        title, mean = column_title(measure), format_value(measure, base.mean[measure.key])
-        rows.append([title, base.label, mean, *["–"] * 4])
-        for run, gains in zip(others, comparison.gains, strict=True):
+    for measure in measures:
+        title, mean = column_title(measure), format_value(measure, base["mean"][measure.key])
+        rows.append([title, base["label"], mean, *["–"] * 4])
+        for run, gains in zip(others, comparison["gains"], strict=True):
             found = gains[measure.key]
-            style: Style = (
-                "dim" if not found.p_adjusted < ALPHA else "good" if found.percent > 0 else "bad"
-            )
+            percent, p = found["percent"], found["p_adjusted"]
+            style: Style = "good" if (percent or 0) > 0 else "bad"
+            style = style if p is not None and p < ALPHA else "dim"
             rows.append([
                 title,
-                run.label,
-                format_value(measure, run.mean[measure.key]),
-                Cell(_signed(found.percent), style),
-                *(_signed(end) for end in (found.low_percent, found.high_percent)),
-                "–" if math.isnan(found.p_adjusted) else f"{found.p_adjusted:.4f}",
+                run["label"],
+                format_value(measure, run["mean"][measure.key]),
+                Cell(_signed(percent), style),
+                *(_signed(found[end]) for end in ("low_percent", "high_percent")),
+                "–" if p is None else f"{p:.4f}",
             ])  # fmt: skip
-    swaps = "all" if comparison.exact_p_values else f"{comparison.resamples:,} random"
+    swaps = "all" if comparison["exact_p_values"] else f"{comparison['resamples']:,} random"
     return Table(
         header=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
         rows=rows,
         caption=(
-            f"{len(comparison.frames):,} shared frames; gains in per cent of the error of"
-            f" {base.label}, positive is better; intervals (95 %) and p-values, from {swaps} swaps,"
-            f" {_tested(comparison)}"
+            f"{len(comparison['frames']):,} shared frames; gains in per cent of the error of"
+            f" {base['label']}, positive is better; intervals (95 %) and p-values, from {swaps}"
+            f" swaps, {_tested(comparison)}"
         ),
     )
 
 
-def _tested(comparison: Comparison) -> str:
-    clusters, count = comparison.clusters.describe(), len(comparison.measures)
-    return f"over {clusters}, p adjusted for {count} measures (Holm)"
+def _measures(comparison: Mapping[str, Any]) -> list[Measure]:
+    return [Measure(**measure) for measure in comparison["measures"]]
 
 
-def _signed(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:+.2f}"
+def _tested(comparison: Mapping[str, Any]) -> str:
+    clusters, count = comparison["clusters"], len(comparison["measures"])
+    over = f"{clusters['count']:,} {clusters['unit']}"
+    return f"over {over}, p adjusted for {count} measures (Holm)"
 
 
-def methods_table(comparison: Comparison) -> Table:
+def _signed(value: float | None) -> str:
+    return "–" if value is None else f"{value:+.2f}"
+
+
+def methods_table(comparison: Mapping[str, Any]) -> Table:
     """Returns a row for each run and a column for each measure, the best of a column in bold.
 
     Stars mark where a run differs from the first significantly.
     """
-    rows: list[list[str]] = [[run.label] for run in comparison.runs]
-    for measure in comparison.measures:
-        means = [run.mean[measure.key] for run in comparison.runs]
+    runs, measures = comparison["runs"], _measures(comparison)
+    rows: list[list[str]] = [[run["label"]] for run in runs]
+    for measure in measures:
+        means = [run["mean"][measure.key] for run in runs]
         pick = max if measure.higher_is_better else min
-        best = pick((mean for mean in means if not math.isnan(mean)), default=None)
-        p_values = [1.0, *(gains[measure.key].p_adjusted for gains in comparison.gains)]
+        best = format_value(measure, pick((m for m in means if m is not None), default=None))
+        p_values = [1.0, *(gains[measure.key]["p_adjusted"] for gains in comparison["gains"])]
         for row, mean, p in zip(rows, means, p_values, strict=True):
-            text, stars = format_value(measure, mean), "*" * sum(p < limit for limit in _STARS)
-            row.append(
-                Cell(
-                    text + stars,
-                    "bold" if not math.isnan(mean) and text == format_value(measure, best) else "",
-                )
+            text, stars = (
+                format_value(measure, mean),
+                "*" * sum(p is not None and p < limit for limit in _STARS),
             )
+            is_best = text == best and mean is not None
+            row.append(Cell(text + stars, "bold" if is_best else ""))
     return Table(
-        header=["", *map(column_title, comparison.measures)],
+        header=["", *map(column_title, measures)],
         rows=rows,
         caption=(
-            f"means over {len(comparison.frames):,} frames, the best in bold; *, **, ***: differs"
-            f" from {comparison.runs[0].label} with p < 0.05, 0.01, 0.001 {_tested(comparison)}"
+            f"means over {len(comparison['frames']):,} frames, the best in bold; *, **, ***:"
+            f" differs from {runs[0]['label']} with p < 0.05, 0.01, 0.001 {_tested(comparison)}"
         ),
     )

@@ -46,6 +46,4 @@ def _write_map(path: Path, values: NDArray[np.floating]) -> None:
         file.write(np.ascontiguousarray(values.transpose(2, 0, 1)).astype("<f4").tobytes())
 
 
-EXPORT = Export(
-    title="COLMAP depth and normal maps (stereo/)", needs_pose=False, files=_files, write=_write
-)
+EXPORT = Export(needs_pose=False, files=_files, write=_write)

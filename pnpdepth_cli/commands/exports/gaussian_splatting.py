@@ -88,9 +88,4 @@ def _save(path: Path, pixels: NDArray[np.uint16] | NDArray[np.uint8]) -> None:
         Image.fromarray(pixels).save(temporary, "PNG")
 
 
-EXPORT = Export(
-    title="inverse depth and depth_params.json of 3D Gaussian splatting",
-    needs_pose=False,
-    files=_files,
-    write=_write,
-)
+EXPORT = Export(needs_pose=False, files=_files, write=_write)

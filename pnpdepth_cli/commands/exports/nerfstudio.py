@@ -138,9 +138,4 @@ def _relative(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix()
 
 
-EXPORT = Export(
-    title="transforms.json of Nerfstudio and Instant-NGP with depth",
-    needs_pose=True,
-    files=_files,
-    write=_write,
-)
+EXPORT = Export(needs_pose=True, files=_files, write=_write)

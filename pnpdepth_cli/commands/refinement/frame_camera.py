@@ -28,7 +28,6 @@ class FrameCamera:
 
     camera: Camera
     source: str
-    """Where it is from, for a person."""
     pose: NDArray[np.float64] | None = None
     """(3, 4) x_world = pose · (x, 1), in the unit of the depth. None: unknown."""
     notes: tuple[str, ...] = ()

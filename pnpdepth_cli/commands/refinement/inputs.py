@@ -56,21 +56,14 @@ class Inputs(Frame):
     record: dict[str, Any] = field(default_factory=dict)
     """Files and digests, for a record."""
     notes: tuple[str, ...] = ()
-    """What was assumed, and warnings."""
     camera: FrameCamera | None = None
     """The camera in pixels of the image frame. None: unknown."""
     has_neighbours: bool = False
-    """Whether `points` have those of other frames of the sequence."""
 
     @property
     def window(self) -> tuple[str, ...]:
         """Names of the frames of its window up to this one; empty outside of windows."""
         return self.request.files.window
-
-    @property
-    def own_used(self) -> int:
-        """Number of its own points that are used."""
-        return len(self.own) - (0 if self.held_out is None else len(self.held_out))
 
 
 def read_inputs(request: RefineRequest) -> Inputs:

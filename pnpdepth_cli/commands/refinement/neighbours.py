@@ -11,8 +11,8 @@ import numpy as np
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.commands.refinement.request import FrameFiles
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset import Frame, Protocol, Source, file_of
-from pnpdepth_cli.io.dataset.reading import read_frame_image
+from pnpdepth_cli.io.dataset import Protocol, Source, file_of
+from pnpdepth_cli.io.dataset.reading import read_image
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Camera, NeighbourScan, Points, accumulated
@@ -61,7 +61,11 @@ def read_neighbours(
     own, scans, notes = _in_numpy(used), list[NeighbourScan](), list[str]()
     record: list[dict[str, Any]] = []
     for neighbour in files.neighbours:
-        points, source = _in_numpy(points_of(neighbour.files)), _source_of(neighbour.files)
+        points, source = (
+            _in_numpy(points_of(neighbour.files)),
+            neighbour.files.sparse or neighbour.files.gt,
+        )
+        assert source is not None
         known = neighbour.motion
         if known is None:
             estimate = _estimated(files, neighbour.files, own, points, camera.camera)
@@ -107,13 +111,7 @@ def _estimated(
 @functools.lru_cache(maxsize=_IN_MEMORY)
 def _keypoints(image: Source, protocol: Protocol, digest: str) -> Keypoints:
     """The keypoints of an image whose file has this digest."""
-    return keypoints_of(read_frame_image(Frame(name=str(image), image=image, protocol=protocol)))
-
-
-def _source_of(files: FrameFiles) -> Source:
-    source = files.sparse or files.gt
-    assert source is not None
-    return source
+    return keypoints_of(np.ascontiguousarray(protocol.apply(read_image(image))))
 
 
 def _name_of(files: FrameFiles) -> str:

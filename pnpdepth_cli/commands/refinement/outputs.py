@@ -50,14 +50,15 @@ _RAY_NODES = 64
 """Nodes of the grid of directions along the longer side: exact to 1e-4 of it for strong lenses."""
 
 
-def output_scale(outputs: Outputs, inputs: Inputs) -> float:
+def output_scale(inputs: Inputs) -> float:
     """Returns the codes per metre of an integer depth file for this frame.
 
     What the user asks for, else the sparse depth file's own, else 256 unless the points do not fit;
     known before refinement.
     """
-    if outputs.scale is not None:
-        return outputs.scale
+    asked = inputs.request.outputs.output_scale
+    if asked is not None:
+        return asked
     if inputs.sparse_scale is not None:
         return inputs.sparse_scale
     nearest, farthest = float(inputs.own.depth.min()), float(inputs.own.depth.max())
@@ -73,10 +74,10 @@ def output_scale(outputs: Outputs, inputs: Inputs) -> float:
 
 def within_range(outputs: Outputs, inputs: Inputs, frame: Refined) -> Refined:
     """Returns the frame with depths that the format can hold, with a note if any is clipped."""
-    depth_format = format_of_suffix(outputs.depth.suffix)
+    depth_format = format_of_suffix(outputs["depth"].suffix)
     if depth_format is None or not depth_format.integer:
         return frame
-    scale = output_scale(outputs, inputs)
+    scale = output_scale(inputs)
     nearest, farthest = np.float32(1 / scale), np.float32(LARGEST_CODE / scale)
     known = np.isfinite(frame.after) & (frame.after > 0)
     beyond, below = known & (frame.after > farthest), known & (frame.after < 0.5 / scale)
@@ -96,43 +97,42 @@ def within_range(outputs: Outputs, inputs: Inputs, frame: Refined) -> Refined:
 def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str, Any]:
     """Writes the depth and its images. Returns their entries of the record."""
     image = replace(inputs, register=frame.registration).registered().image
-    make_folder(outputs.depth.parent)
-    write_depth(outputs.depth, frame.after, scale=output_scale(outputs, inputs))
-    if outputs.sigma is not None and frame.sigma is not None:
-        _write_sigma(outputs.sigma, frame.sigma)
-    if outputs.sigma_preview is not None and frame.sigma is not None:
-        sigma_preview(frame.sigma, frame.valid, outputs.sigma_preview, inputs.unit)
-    if outputs.valid is not None and frame.valid is not None:
-        write_mask(outputs.valid, frame.valid)
+    make_folder(outputs["depth"].parent)
+    write_depth(outputs["depth"], frame.after, scale=output_scale(inputs))
+    if frame.sigma is not None and "sigma" in outputs:
+        _write_sigma(outputs["sigma"], frame.sigma)
+    if frame.sigma is not None and "sigma_preview" in outputs:
+        sigma_preview(frame.sigma, frame.valid, outputs["sigma_preview"], inputs.unit)
+    if frame.valid is not None and "valid" in outputs:
+        write_mask(outputs["valid"], frame.valid)
     record: dict[str, Any] = {"improved_fraction": None}
-    if outputs.preview is not None:
+    if "preview" in outputs:
         preview(
             image,
             inputs.own.xy.numpy(),
             inputs.own.depth.numpy(),
             frame.before,
             frame.after,
-            outputs.preview,
+            outputs["preview"],
             inputs.unit,
             valid=frame.valid,
             linear=None if is_dense(frame.used) else linear(frame.used).numpy(),
         )
-    if outputs.improvement is not None:
+    if "improvement" in outputs:
         record["improved_fraction"] = _write_improvement(
-            outputs.improvement, image, inputs, frame, outputs.colors
+            outputs["improvement"], image, inputs, frame
         )
-    if outputs.cloud is not None:
+    if "cloud" in outputs:
         assert inputs.camera is not None
         pose = inputs.camera.pose  # known, it moves the cloud into the world's frame
         parts = cloud_from_depth(frame.after, inputs.camera.camera, rgb=image, keep=frame.valid)
         moved = (part if pose is None else part.transformed(pose) for part in parts)
-        points = write_cloud(outputs.cloud, moved)
+        points = write_cloud(outputs["cloud"], moved)
         record["cloud"] = {"points": points, "frame": "camera" if pose is None else "world"}
-    if outputs.view is not None:
-        _write_view(outputs.view, image, inputs, frame)
+    if "view" in outputs:
+        _write_view(outputs["view"], image, inputs, frame)
     kinds = ("depth", "sigma", "valid", "preview", "improvement", "cloud", "view")
-    written = outputs.by_kind()
-    record["outputs"] = {kind: str(written[kind]) if kind in written else None for kind in kinds}
+    record["outputs"] = {kind: str(outputs[kind]) if kind in outputs else None for kind in kinds}
     return record
 
 
@@ -146,9 +146,8 @@ def _write_sigma(path: Path, sigma: Image) -> None:
     write_depth(path, sigma, scale=scale)
 
 
-def _write_improvement(
-    path: Path, image: Image | None, inputs: Inputs, frame: Refined, colors: str
-) -> float:
+def _write_improvement(path: Path, image: Image | None, inputs: Inputs, frame: Refined) -> float:
+    colors = inputs.request.outputs.colors
     if inputs.gt is not None:
         return improvement(frame.before, frame.after, inputs.gt, path, rgb=image, colors=colors)
     points = frame.held_out if len(frame.held_out) else frame.used

@@ -13,7 +13,7 @@ import torch
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs
+from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs, plan_outputs
 from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
@@ -103,23 +103,26 @@ def write_refined(
     """
     frame = within_range(outputs, inputs, frame)
     record = record_of(refiner, inputs, frame)
-    planned, outputs = outputs, outputs.without_previews(worse=bool(record["linear"]["worse"]))
-    with all_or_none(outputs.paths()):
+    planned, previews = outputs, inputs.request.outputs.previews
+    if previews == "none" or (previews == "worst" and not record["linear"]["worse"]):
+        outputs = {kind: path for kind, path in planned.items() if kind not in IMAGES}
+    with all_or_none(outputs.values()):
         with watch("write"):
             record |= write_outputs(outputs, inputs, frame)
         record["seconds"] = watch.seconds
         record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
-        if outputs.record is not None:
-            write_json(outputs.record, record)
-    for path in {*planned.paths()} - {*outputs.paths()}:
-        path.unlink(missing_ok=True)  # of an earlier result
+        if "record" in outputs:
+            write_json(outputs["record"], record)
+    for kind in planned.keys() - outputs.keys():
+        planned[kind].unlink(missing_ok=True)  # of an earlier result
     return RefineOutcome(record=record, outputs=outputs, diverged=frame.diverged)
 
 
 def record_of(refiner: Refiner, inputs: Inputs, frame: Refined) -> dict[str, Any]:
     """Returns what the record says of a refined frame, apart from its files and times."""
     request, network, gt = inputs.request, refiner.network, inputs.gt
-    moved = {"moved": len(frame.used) - inputs.own_used} if inputs.has_neighbours else {}
+    own_used = len(inputs.own) - len(frame.held_out)
+    moved = {"moved": len(frame.used) - own_used} if inputs.has_neighbours else {}
     of_networks = [note for member in refiner.members for note in member.network.notes]
     stages = None if gt is None else frame.stages  # of the default method
     return {

@@ -109,7 +109,6 @@ class FrameFiles:
     gt_size_ok: bool = False
     """Accept ground truth of another size; its known pixels are moved to the image."""
     sample: SamplePattern | None = None
-    """Which pixels of the ground truth serve as sparse depth."""
     protocol: Protocol = field(default_factory=_whole_frame)
 
     @property
@@ -224,7 +223,6 @@ class OutputOptions:
         metavar="DEG",
     )
     view_3d: bool = False
-    """Whether the 3D view of the frame is written, which the report of a batch shows."""
     colors: str = option(
         "blue-orange",
         "Colours of better and worse: blue and orange, or the paper's red and green.",

@@ -8,26 +8,37 @@ the frames of earlier runs.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.commands.report.evaluation import column_of, frames_text
-from pnpdepth_cli.commands.tables import Table, column_title, format_value
-from pnpdepth_cli.core.metrics import MEASURES, Measure
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.error_tables import (
+    BASES,
+    GT,
+    HIDDEN,
+    USED,
+    baselines_table,
+    change,
+    errors_by_basis,
+    format_error,
+    frames_of,
+    means_table,
+)
+from pnpdepth_cli.commands.report.evaluation import frames_text
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.colours import hex_colours, signed_bar
 from pnpdepth_cli.io.figure import figure_content
 from pnpdepth_cli.io.report import (
     IMAGES,
-    Column,
     Head,
     begin_report,
     check_report_folder,
+    column,
     image_key,
     link_image,
     save_view_3d,
+    whole_report,
     write_report,
 )
 
@@ -48,108 +59,109 @@ _LABELS = {
     "sparse": "Sparse depth",
     "gt": "Ground truth",
 }
-_GT, _HELD_OUT, _HIDDEN, _USED = "scores", "held_out_error", "check", "sparse_error"
-_BASES = {
-    _GT: "against ground truth",
-    _HELD_OUT: "at held-out points",
-    _HIDDEN: "at points hidden for the check",
-    _USED: "at the points used",
-}
-"""What errors are measured on, the best first. A gain at the points used means nothing."""
-_ERRORS = {measure.key: measure for measure in MEASURES if measure.key in ("rmse", "mae")}
 
 
-@dataclass(frozen=True, kw_only=True)
-class BatchReport:
-    """Writes the report of a batch."""
+def check_batch_report(request: BatchRequest, folder: Path, files: Iterable[Path]) -> None:
+    """Raises OutputError for a folder that the report cannot or may not be written to.
 
-    folder: Path
-    output: Path
-    """The folder of the results."""
-    view_3d: bool = False
-    colors: str = "blue-orange"
-    """Colours of the improvement maps."""
+    Args:
+        request: Of the batch.
+        folder: Of the report.
+        files: Those that the batch reads.
+    """
+    inside, output = folder.resolve(), request.output.resolve()
+    if output.is_relative_to(inside):
+        raise OutputError(
+            f"{folder} holds the results; name a folder of its own for the report, such as"
+            f" {request.output / 'report'}"
+        )
+    inputs = [request.source, *(files if folder.exists() else ())]
+    others = [path for path in inputs if not _holds_results(path, output, inside)]
+    overwrite = request.refine.outputs.overwrite
+    check_report_folder(folder, others, made_of=_source(request, folder), overwrite=overwrite)
 
-    def check(self, inputs: Sequence[Path], *, overwrite: bool) -> None:
-        """Raises OutputError for a folder that the report cannot or may not be written to."""
-        folder, output = self.folder.resolve(), self.output.resolve()
-        if output.is_relative_to(folder):
-            raise OutputError(
-                f"{self.folder} holds the results; name a folder of its own for the report, such as"
-                f" {self.output / 'report'}"
-            )
-        others = [path for path in inputs if not _holds_results(path, output, folder)]
-        check_report_folder(self.folder, others, made_of=self._source(), overwrite=overwrite)
 
-    def begin(self) -> None:
-        """Creates the folder, marked so that the next run may replace it."""
-        begin_report(self.folder, self._source())
+def write_batch_report(
+    request: BatchRequest,
+    folder: Path,
+    summary: Mapping[str, Any],
+    rows: Callable[[], Iterable[Row]],
+) -> None:
+    """Writes the page, and links the images of all frames.
 
-    def write(self, summary: Mapping[str, Any], rows: Callable[[], Iterable[Row]]) -> None:
-        """Writes the page, and links the images of all frames.
+    Args:
+        request: Of the batch.
+        folder: Of the report.
+        summary: The batch's summary without its frames.
+        rows: Gives the summary's rows, each time anew.
+    """
+    bases, failed, first = set[str | None](), [], None
+    for row in rows():
+        if row["outputs"]:
+            first = first or row
+            bases.add(_basis(row))
+        else:
+            failed.append((row["name"], row["message"]))
+    mixed = len(bases - {None}) > 1
+    head = _head(summary, first, failed, request.refine.outputs.colors)
+    with whole_report(folder) as temporary:
+        begin_report(temporary, _source(request, folder))
+        entries = (
+            _entry(row, head.columns, mixed) | _views(row, request, temporary)
+            for row in rows()
+            if row["outputs"]
+        )
+        write_report(temporary, head, entries, viewer=request.html_3d)
 
-        Args:
-            summary: The batch's summary without its frames.
-            rows: Gives the summary's rows, each time anew.
-        """
-        bases, failed, first = set[str | None](), [], None
-        for row in rows():
-            if row["outputs"]:
-                first = first or row
-                bases.add(_basis(row))
-            else:
-                failed.append((row["name"], row["message"]))
-        bases.discard(None)
-        head, mixed = _head(summary, first, failed, self.colors), len(bases) > 1
-        entries = (self._entry(row, head.columns, mixed) for row in rows() if row["outputs"])
-        write_report(self.folder, head, entries, viewer=self.view_3d)
 
-    def _source(self) -> dict[str, Any]:
-        folder, output = self.folder.resolve(), self.output.resolve()
-        return {"command": "batch", "output": os.path.relpath(output, folder)}
+def _source(request: BatchRequest, folder: Path) -> dict[str, Any]:
+    """What the report is made of."""
+    output = os.path.relpath(request.output.resolve(), folder.resolve())
+    return {"command": "batch", "output": output}
 
-    def _entry(self, row: Row, columns: Sequence[Column], mixed: bool) -> dict[str, Any]:
-        basis = _basis(row)
-        values = _values(row, basis)
-        if basis == _USED and columns[0].signed:
-            values = {}  # others have a gain that means something
-        tag = _BASES[basis] if mixed and basis else ""
-        try:
-            views = self._views(row)
-        except InputError:  # a result has gone or changed; the next run refines it again
-            views = {"key": None}
-        return {
-            "name": row["name"],
-            "values": [values.get(column.key) for column in columns],
-            "notes": list(_notes(row, basis)),
-            "tag": "diverged" if row["status"] == "diverged" else tag,
-            **views,
-        }
 
-    def _views(self, row: Row) -> dict[str, Any]:
-        """Links the images of the row's frame; returns the page's entry of them."""
-        files = {kind: self.output / path for kind, path in row["outputs"].items()}
-        if not ("preview" in files and "improvement" in files):
-            return {"key": None}
-        key, views, figures = image_key(row["name"]), {}, {}
-        for kind in ("preview", "improvement"):
-            figure = figures[kind] = figure_content(files[kind])
-            name = f"{IMAGES}/{key}_{kind}.png"
-            link_image(files[kind], self.folder / name)
-            for panel in figure["panels"]:
-                if panel["title"] in _PANELS:
-                    place = {"src": name, "box": panel["box"], "size": figure["size"]}
-                    views[_PANELS[panel["title"]]] = place
-        view_mb = None
-        if self.view_3d and "view" in files:
-            view_mb = save_view_3d(files["view"], self.folder / IMAGES / f"{key}_view.js")
-        return {
-            "key": key,
-            "views": views,
-            "view_mb": view_mb,
-            "scale_m": [figures["preview"][end] for end in ("low_m", "high_m")],
-            "map": {name: figures["improvement"][name] for name in ("ends", "unknown", "footer")},
-        }
+def _entry(row: Row, columns: Sequence[Mapping[str, Any]], mixed: bool) -> dict[str, Any]:
+    basis = _basis(row)
+    values = _values(row, basis)
+    if basis == USED and columns[0]["signed"]:
+        values = {}  # others have a gain that means something
+    tag = BASES[basis] if mixed and basis else ""
+    return {
+        "name": row["name"],
+        "values": [values.get(shown["key"]) for shown in columns],
+        "notes": _notes(row, basis),
+        "tag": "diverged" if row["status"] == "diverged" else tag,
+    }
+
+
+def _views(row: Row, request: BatchRequest, folder: Path) -> dict[str, Any]:
+    """Links the images of the row's frame; returns the page's entry of them.
+
+    There are none of a result that has gone or changed; the next run refines it again.
+    """
+    files = {kind: request.output / path for kind, path in row["outputs"].items()}
+    key, views = image_key(row["name"]), dict[str, Any]()
+    try:
+        figures = {kind: figure_content(files[kind]) for kind in ("preview", "improvement")}
+    except (KeyError, InputError):
+        return {"key": None}
+    for kind, figure in figures.items():
+        name = f"{IMAGES}/{key}_{kind}.png"
+        link_image(files[kind], folder / name)
+        for panel in figure["panels"]:
+            if panel["title"] in _PANELS:
+                place = {"src": name, "box": panel["box"], "size": figure["size"]}
+                views[_PANELS[panel["title"]]] = place
+    view_mb = None
+    if request.html_3d and "view" in files:
+        view_mb = save_view_3d(files["view"], folder / IMAGES / f"{key}_view.js")
+    return {
+        "key": key,
+        "views": views,
+        "view_mb": view_mb,
+        "scale_m": [figures["preview"][end] for end in ("low_m", "high_m")],
+        "map": {name: figures["improvement"][name] for name in ("ends", "unknown", "footer")},
+    }
 
 
 def _holds_results(path: Path, output: Path, folder: Path) -> bool:
@@ -158,94 +170,79 @@ def _holds_results(path: Path, output: Path, folder: Path) -> bool:
 
 
 def _basis(row: Row) -> str | None:
-    return next((basis for basis in _BASES if _errors(row, basis)), None)
+    """What the errors of a row are measured on."""
+    return next(iter(errors_by_basis(row)), None)
 
 
-def _errors(row: Row, basis: str) -> Mapping[str, Any] | None:
-    """The errors of a row before and after, measured on that basis."""
-    if basis != _HIDDEN:
-        errors: Mapping[str, Any] | None = row[basis]
-        return errors
-    check = (row["linear"] or {}).get("check")
-    return check and {
-        stage: {"mae": check[name], "points": check["points"]}
-        for stage, name in (("before", "aligned"), ("after", "result"))
-    }
+def _measures(basis: str) -> tuple[str, ...]:
+    return ("mae",) if basis == HIDDEN else ("rmse", "mae")
 
 
-def _columns(best: str, unit: str) -> list[Column]:
+def _columns(best: str, unit: str) -> list[dict[str, Any]]:
     """Errors before and after on the best basis; with gains unless it is the points used."""
     columns = []
     percent: dict[str, Any] = {"decimals": 1, "percent": True, "higher_is_better": True}
-    for measure in _measures(best):
-        key = measure.key
-        if best != _USED:
-            title = f"{measure.title} gain"
-            columns.append(Column(key=f"{key}_gain", title=title, signed=True, **percent))
-        for stage in ("before", "after"):
-            title, name = f"{measure.title} {stage}", f"{key}_{stage}"
-            columns.append(column_of(in_unit(measure, unit), title=title, key=name, listed=True))
-    if best != _HIDDEN:  # the map is then of the points used
-        columns.append(Column(key="improved", title="Improved", **percent))
+    for key in _measures(best):
+        title = key.upper()
+        if best != USED:
+            columns.append(column(key=f"{key}_gain", title=f"{title} gain", signed=True, **percent))
+        columns += [
+            column(key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
+            for stage in ("before", "after")
+        ]
+    if best != HIDDEN:  # the map is then of the points used
+        columns.append(column(key="improved", title="Improved", **percent))
     return columns
 
 
 def _values(row: Row, basis: str | None) -> dict[str, float | None]:
     if basis is None:
         return {}
-    errors = _errors(row, basis)
-    assert errors is not None
+    errors = errors_by_basis(row)[basis]
     values: dict[str, float | None] = {"improved": row.get("improved_fraction")}
-    for key in _ERRORS:
+    for key in ("rmse", "mae"):
         before, after = (errors[stage].get(key) for stage in ("before", "after"))
-        values |= {f"{key}_before": before, f"{key}_after": after}
-        values[f"{key}_gain"] = _gain(before, after)
+        gain = 1 - after / before if before and after is not None else None
+        values |= {f"{key}_before": before, f"{key}_after": after, f"{key}_gain": gain}
     return values
 
 
-def _gain(before: float | None, after: float | None) -> float | None:
-    return 1 - after / before if before and after is not None else None
-
-
-def _notes(row: Row, basis: str | None) -> Iterator[str]:
-    if row["message"]:
-        yield row["message"]
+def _notes(row: Row, basis: str | None) -> list[str]:
+    notes = [row["message"]] if row["message"] else []
     if basis is not None:
-        errors = _errors(row, basis)
-        assert errors is not None
-        after = errors["after"]
-        count = f"{after['pixels']:,} pixels" if basis == _GT else f"{after['points']:,} points"
-        yield f"Errors are {_BASES[basis]}, {count}."
-    if basis == _USED:
-        yield "Refinement fits these points, so its gain there proves nothing."
-    yield from row["warnings"]
+        after = errors_by_basis(row)[basis]["after"]
+        count = f"{after['pixels']:,} pixels" if basis == GT else f"{after['points']:,} points"
+        notes.append(f"Errors are {BASES[basis]}, {count}.")
+    if basis == USED:
+        notes.append("Refinement fits these points, so its gain there proves nothing.")
+    return [*notes, *row["warnings"]]
 
 
 def _head(
     summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str, str]], colors: str
 ) -> Head:
     unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), []
-    means = _mean_errors(summary)
-    best = next(iter(means), _USED)
+    means = summary["mean"] | {"linear": summary["linear"]}
+    best = next(iter(errors_by_basis(means)), USED)
     if unmatched:
         notes = [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
-    if means and best == _USED:
+    if first is not None and best == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
     columns = _columns(best, unit)
+    tables = [means_table(summary)] if first is not None else []
+    if summary.get("baselines"):
+        tables.append(baselines_table(summary["baselines"], unit))
     return Head(
         kind="Batch refinement",
         title=summary["output"],
         tiles=_tiles(summary, means),
         facts=_facts(summary, first),
         notes=notes,
-        tables=[
-            *(_means(basis, mean, unit) for basis, mean in means.items()),
-            *_baselines(summary.get("baselines"), unit),
-        ],
+        tables=tables,
         without_title=f"Not refined: {len(failed):,}",
         without=failed,
         columns=columns,
-        sort_by="rmse_after" if best == _USED else columns[0].key,
+        sort_by="rmse_after" if best == USED else columns[0]["key"],
         labels=_LABELS,
         thumb="second",
         map_colours=hex_colours(signed_bar(colors, 9)),
@@ -253,31 +250,21 @@ def _head(
     )
 
 
-def _mean_errors(summary: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """The mean errors before and after by basis, the best first; hidden points if nothing else."""
-    means: dict[str, Any] = {basis: summary["mean"].get(basis) for basis in _BASES}
-    check = summary["linear"]["check"]
-    if check and not (means[_GT] or means[_HELD_OUT]):
-        stages = {stage: {"mae": check[stage]} for stage in ("before", "after")}
-        means[_HIDDEN] = {"frames": check["frames"], **stages}
-    return {basis: mean for basis, mean in means.items() if mean}
-
-
-def _tiles(
-    summary: Mapping[str, Any], means: Mapping[str, Mapping[str, Any]]
-) -> list[tuple[str, str, str]]:
+def _tiles(summary: Mapping[str, Any], means: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """The number of frames, and errors that were not measured at the points used."""
-    counts = summary["counts"]
+    counts, unit = summary["counts"], summary["unit"]
     refined = counts["done"] + counts["diverged"]
     others = [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
     tiles = [("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
-    for basis, mean in means.items():
-        for measure in _measures(basis) if basis != _USED else ():
-            before, after, gain = _changed(measure, mean)
-            label = f"{measure.title} [{summary['unit']}]"
-            tiles.append((label, f"{before} → {after}", f"gain {gain} {_BASES[basis]}"))
+    for basis, errors in errors_by_basis(means).items():
+        frames = frames_text(frames_of(errors))
+        for key in _measures(basis) if basis != USED else ():
+            before, after = errors["before"].get(key), errors["after"].get(key)
+            shown = " → ".join(format_error(key, value, "").strip() for value in (before, after))
+            remark = f"{change(key, before, after)} {BASES[basis]}, {frames}"
+            tiles.append((f"{key.upper()} [{unit}]", shown, remark))
     return tiles
 
 
@@ -305,52 +292,3 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str
     if summary["counts"]["with_warnings"]:
         facts.append(("Warnings", f"in {frames_text(summary['counts']['with_warnings'])}"))
     return facts
-
-
-def _means(basis: str, mean: Mapping[str, Any], unit: str) -> Table:
-    measures = MEASURES if basis == _GT else _measures(basis)
-    rows = [[column_title(in_unit(each, unit)), *_changed(each, mean)] for each in measures]
-    if basis == _GT:
-        coverage = [mean[stage].get("coverage") for stage in ("before", "after")]
-        rows.append(["coverage", *("–" if c is None else f"{c:.2%}" for c in coverage), ""])
-    shown = 3 if basis == _USED else 4  # a gain at the points used means nothing
-    return Table(
-        caption=f"Means over {frames_text(mean['frames'])}, {_BASES[basis]}",
-        header=["", "before", "after", "gain"][:shown],
-        rows=[row[:shown] for row in rows],
-    )
-
-
-def _measures(basis: str) -> list[Measure]:
-    return [_ERRORS["mae"]] if basis == _HIDDEN else [*_ERRORS.values()]
-
-
-def _changed(measure: Measure, mean: Mapping[str, Any]) -> tuple[str, str, str]:
-    """The mean before and after, and its gain; a gain without sign is rounded to zero."""
-    before, after = (mean[stage].get(measure.key) for stage in ("before", "after"))
-    gain, decimals, unit = _gain(before, after), 1, "%"
-    if measure.percent and before is not None and after is not None:
-        gain, decimals, unit = after - before, 2, " pt"
-    text = "–"
-    if gain is not None:
-        size = f"{100 * abs(gain):.{decimals}f}"
-        text = f"{'' if float(size) == 0 else '+' if gain > 0 else '−'}{size}{unit}"
-    return format_value(measure, before), format_value(measure, after), text
-
-
-def _baselines(mean: Mapping[str, Mapping[str, Any]] | None, unit: str) -> list[Table]:
-    """A table of the simple baselines, the network and the result; empty without --baselines."""
-    if not mean:
-        return []
-    places = {"held_out_mae": "MAE at held-out points", "mae": "MAE", "rmse": "RMSE"}
-    rows = [
-        [name, *(format_value(_ERRORS["mae"], row[key]) for key in places), f"{row['frames']:,}"]
-        for name, row in mean.items()
-    ]
-    header = ["", *(f"{title} [{unit}]" for title in places.values()), "frames"]
-    return [Table(caption="Simple baselines: means over frames", header=header, rows=rows)]
-
-
-def in_unit(measure: Measure, unit: str) -> Measure:
-    """Returns the measure of depths whose unit is not the metre, such as a model's."""
-    return replace(measure, unit=unit) if measure.unit == "m" else measure

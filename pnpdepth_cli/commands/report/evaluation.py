@@ -14,14 +14,13 @@ from pnpdepth_cli.commands.evaluation.scoring import FrameScores, filled
 from pnpdepth_cli.commands.evaluation.tables import calibration_tables, means_by_measure
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.tables import format_value, unit_of
-from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
-    Column,
     Head,
     begin_report,
     check_report_folder,
+    column,
     image_key,
     save_views,
     whole_report,
@@ -72,36 +71,34 @@ def write_eval_report(
         write_report(temporary, _head(evaluation, columns), entries(images))
 
 
-def column_of(measure: Measure, *, title: str = "", key: str = "", listed: bool) -> Column:
-    """Returns the column of a measure, with its own title and key or other ones."""
-    return Column(
-        key=key or measure.key,
-        title=title or measure.title,
-        unit=unit_of(measure),
-        decimals=measure.decimals,
-        factor=measure.shown_factor,
-        percent=measure.percent,
-        higher_is_better=measure.higher_is_better,
-        listed=listed,
-    )
-
-
 def frames_text(count: int) -> str:
     """Returns text such as `12 frames`."""
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
-def _columns(evaluation: Evaluation) -> list[Column]:
+def _columns(evaluation: Evaluation) -> list[dict[str, Any]]:
     measures = evaluation.protocol.measures
     keys = {measure.key for measure in measures}
     listed = _LISTED if keys.issuperset(_LISTED) else tuple(keys)
     return [
-        *(column_of(measure, listed=measure.key in listed) for measure in measures),
-        Column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
+        *(
+            column(
+                key=measure.key,
+                title=measure.title,
+                unit=unit_of(measure),
+                decimals=measure.decimals,
+                factor=measure.shown_factor,
+                percent=measure.percent,
+                higher_is_better=measure.higher_is_better,
+                listed=measure.key in listed,
+            )
+            for measure in measures
+        ),
+        column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
     ]
 
 
-def _head(evaluation: Evaluation, columns: list[Column]) -> Head:
+def _head(evaluation: Evaluation, columns: list[dict[str, Any]]) -> Head:
     request = evaluation.request
     without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
     fill = " (filled in)" if evaluation.protocol.is_devkit else ""
@@ -154,21 +151,21 @@ def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
     found = evaluation.uncertainty
     if found is None:
         return []
-    frames = frames_text(found.frames)
-    observed = list(zip(found.expected, found.observed, strict=True))
+    frames = frames_text(found["frames"])
+    observed = list(zip(found["expected"], found["observed"], strict=True))
     charts: list[dict[str, Any]] = [{
         "caption": f"Calibration, {frames}",
         "x_title": "errors within the interval if normal",
         "y_title": "observed",
         "lines": {"observed": observed, "normal": [(0, 0), (1, 1)]},
     }]  # fmt: skip
-    if whole := found.sparsification[0]:
+    if whole := found["sparsification"][0]:
         by_sigma, by_error = (
-            [(part, mae / whole) for part, mae in zip(found.removed, curve, strict=True)]
-            for curve in (found.sparsification, found.oracle)
+            [(part, mae / whole) for part, mae in zip(found["removed"], curve, strict=True)]
+            for curve in (found["sparsification"], found["oracle"])
         )
         charts.append({
-            "caption": f"Sparsification, {frames}: AUSE {found.ause:.4f}",
+            "caption": f"Sparsification, {frames}: AUSE {found['ause']:.4f}",
             "x_title": "pixels removed",
             "y_title": "MAE of the others",
             "lines": {"by σ": by_sigma, "by error (oracle)": by_error},
@@ -177,7 +174,7 @@ def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def _entry(
-    frame: FrameScores, evaluation: Evaluation, columns: list[Column], images: Path
+    frame: FrameScores, evaluation: Evaluation, columns: list[dict[str, Any]], images: Path
 ) -> dict[str, Any]:
     values = frame.values | {"coverage": frame.coverage}
     notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
@@ -191,7 +188,7 @@ def _entry(
         drawn = {"key": None}
     return {
         "name": frame.name,
-        "values": [values.get(column.key) for column in columns],
+        "values": [values.get(shown["key"]) for shown in columns],
         "notes": notes,
         "tag": "",
         **drawn,
@@ -201,7 +198,7 @@ def _entry(
 def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str, Any]:
     """Writes the images of a frame and returns the page's entry of them."""
     protocol, pair = evaluation.protocol, frame.pair
-    loaded = load_frame(pair, protocol, evaluation.request.scales)
+    loaded = load_frame(pair, protocol, evaluation.request)
     gt, depth = loaded.gt, loaded.depth
     if protocol.is_devkit:
         depth = filled(depth)

@@ -66,17 +66,13 @@ class FramesRequest:
     """Which bag to write as files, and where."""
 
     bag: Path
-    """A file or a folder."""
     output: Path
     """The folder for rgb/, sparse/, calib.txt, poses.txt and frames.json."""
     options: BagOptions = field(default_factory=BagOptions)
     limit: int | None = None
-    """Only the first frames; None for all."""
     overwrite: bool = False
     calib: Path | None = None
-    """The camera's calibration instead of that of the bag."""
     camera: int | None = None
-    """Which camera of `calib`."""
 
     def identity(self) -> dict[str, Any]:
         """Returns what the record of the same frames begins with."""

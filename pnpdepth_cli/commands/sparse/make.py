@@ -46,7 +46,6 @@ class SparseTarget:
     output: Path
     """Its suffix is one of `SPARSE_SUFFIXES`."""
     overlay: Path | None = None
-    """A PNG of the points on the image; None for none."""
     overwrite: bool = False
 
     @property

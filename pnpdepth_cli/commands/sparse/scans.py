@@ -39,13 +39,10 @@ class SparseDepth:
     points: SparsePoints[Any]
     """In the image, as arrays of either library."""
     record: dict[str, Any]
-    """What a record keeps of it."""
     notes: tuple[str, ...]
-    """Lines for a person."""
     scale: float | None = None
     """Integers per unit of depth in its file. None: it holds no integers."""
     kind: DepthKind | None = None
-    """Of a depth map."""
     unit: str = METRES
     camera: Camera | None = None
     """The camera of the whole image, where it came with the points."""
@@ -95,7 +92,7 @@ def read_scan_points(
         calibration = _with_pose(calibration, *pose)
     size = size or calibration.size
     if size is None:
-        raise SizeError(f"{named} does not give the image's size; give the image too")
+        raise SizeError(f"{named} does not give the image's size; give --image or --size")
     warnings = check_size(named, calibration, size, image)
     scan = read_scan(path, options.point_fields)
     if calibration.rectified:

@@ -23,11 +23,9 @@ class Parameter:
     """A parameter that can be varied."""
 
     shown: Shown
-    """Titles of its axis."""
     value: Callable[[str], Any]
     """Parses a text; raises UsageError."""
     of_points: bool = False
-    """Whether it decides the points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,4 +185,3 @@ PARAMETERS: Mapping[str, Parameter] = {
     "model": Parameter(shown=Shown(title="network"), value=str),
     "seed": Parameter(shown=Shown(title="seed of the points"), value=_seed),
 }
-"""All parameters that can be varied, in the order of the help."""

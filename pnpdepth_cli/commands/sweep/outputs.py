@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 
 Row = Mapping[str, Any]
 
-"""The measures of a sweep."""
 SCORES = tuple(f"{measure.key}_{method}" for measure in SWEPT for method in METHODS)
-"""Columns of a row."""
 _COLUMNS = (
     *(*METHODS, "refined_low", "refined_high"),
     *("gain", "gain_low", "gain_high", "gain_over_linear"),

@@ -12,7 +12,7 @@ from typing import Any
 
 from pnpdepth_cli.commands.batch.batch import Listener
 from pnpdepth_cli.commands.batch.frames import Task, find_frames, task_of
-from pnpdepth_cli.commands.batch.records import model_identity, settings_of
+from pnpdepth_cli.commands.batch.records import code_digests, model_identity, settings_of
 from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.running import read_frame, reference_frames
 from pnpdepth_cli.commands.refinement.inputs import Inputs
@@ -53,7 +53,6 @@ class SweepRequest(FrameSelection):
     """What to vary, over which frames."""
 
     studies: Sequence[Study]
-    """As `studies_of` returns them."""
     sampling: Sampling | None = None
     """Where points come from unless that is varied; None for the frames' own, or else the ground
     truth."""
@@ -62,11 +61,8 @@ class SweepRequest(FrameSelection):
     seeds: int = 1
     """Draws of the points, with consecutive seeds."""
     plots: str = "png"
-    """One of PLOT_FORMATS, or "none"."""
     cost: bool = False
-    """True to report the time of the refinement beside its error."""
     resamples: int = 2000
-    """Bootstrap samples behind the intervals."""
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -83,7 +79,6 @@ class _Network:
     """A network of the sweep, and how its cells are computed."""
 
     spec: str
-    """What the user called it."""
     refiner: Refiner
     definition: ModelDefinition
     base: RefineRequest
@@ -131,6 +126,8 @@ class _Network:
                 drawn = {"seed": seed, "sampling": sampling.record(), "files": files}
                 for settings in several:
                     decides = plain(read | drawn | {"settings": settings})
+                    if code := code_digests(settings):
+                        decides["code"] = code
                     text = json.dumps(decides, sort_keys=True)
                     runs[frame.name, seed, sampling, settings] = Run(
                         task=task, frame=frame, seed=seed, sampling=sampling, settings=settings,

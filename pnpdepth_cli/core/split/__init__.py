@@ -50,7 +50,6 @@ class Split:
     While open, the network is in eval mode and only z requires gradient.
 
     Args:
-        network: Any module.
         layer: Name of a submodule; `NAME#2` for its second call, `NAME[KEY]` for one output.
         static_graph: Promises that the network runs the same submodules in the same order for all
             arguments of the same shapes. Without a promise, it is learned anew for every frame if
@@ -205,7 +204,6 @@ class InputSplit(Split):
     branches on values of its arguments runs as a whole, unless `static_graph` promises otherwise.
 
     Args:
-        network: Any module.
         static_graph: As of `Split`.
     """
 

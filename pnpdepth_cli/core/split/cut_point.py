@@ -20,8 +20,7 @@ class LayerName:
     """A layer: `module`, `module#2` for its second call, `module[key]` for one of its outputs."""
 
     module: str
-    call: int | None = None
-    """Number of the call, from 1; None if there is one call."""
+    call: int | None = None  # number of the call, from 1; None if there is one call
     key: tuple[str, ...] | None = None
     """Path of the output in nested containers; None if there is one."""
 
@@ -45,14 +44,12 @@ class LayerName:
 class CutPoint:
     """The layer to cut at, and the submodules around it."""
 
-    layer: str
-    """The layer as the user named it."""
+    layer: str  # the layer as the user named it
     name: LayerName
     module: nn.Module
     modules: Mapping[str, nn.Module]
     """All submodules by name; one with several names comes several times."""
-    containers: frozenset[nn.Module]
-    """The submodules that contain the layer, itself included."""
+    containers: frozenset[nn.Module]  # the submodules that contain the layer, itself included
     around_hooks: frozenset[nn.Module]
     """The submodules with a hooked submodule, whose hooks would not run if they were cached."""
 
@@ -114,12 +111,7 @@ class CutPoint:
         raise LayerError(f"layer {self.layer!r} {problem}")
 
     def never_ran(self, ran: Collection[nn.Module], calls: int) -> LayerError:
-        """Returns the error of a pass that did not reach the cut.
-
-        Args:
-            ran: The submodules that ran.
-            calls: How often the layer itself was called.
-        """
+        """Returns the error of a pass that did not reach the cut."""
         if self.module in ran:
             times = f"{calls} time{'s' if calls > 1 else ''}"
             return LayerError(f"layer {self.layer!r}: it is called only {times}")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
 from pnpdepth_cli.core.split.replay import CutReached, RecordedCall, Recording, Replay, shapes_of
@@ -75,7 +75,9 @@ class Recorder:
         if (
             self.watch.can_stand_for(since, inputs, output)
             and module not in self._cut.around_hooks
-            and _same_tensors(before, tensors_in(inputs))
+            # and has not changed the lists or dicts among its inputs
+            and [(path, id(t)) for path, t in before]
+            == [(path, id(t)) for path, t in tensors_in(inputs)]
         ):
             self._drop_from(index + 1)
             call.saved = RecordedCall(module=module, cached=True).save(output)
@@ -164,8 +166,3 @@ class Recorder:
             if call.saved is not None:
                 call.saved.value = None  # the watch would hold its tensors
         del self._calls[first:]
-
-
-def _same_tensors(one: Iterable[tuple[Any, Tensor]], other: Iterable[tuple[Any, Tensor]]) -> bool:
-    """False where a call has changed the lists or dicts among its inputs."""
-    return [(path, id(tensor)) for path, tensor in one] == [(p, id(t)) for p, t in other]

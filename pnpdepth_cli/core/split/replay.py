@@ -76,10 +76,8 @@ class RecordedCall:
     """One call of a submodule that every pass makes."""
 
     module: nn.Module
-    cached: bool
-    """Whether later passes return its saved output instead of running it."""
-    copied: bool = False
-    """Whether the network changes that output in place."""
+    cached: bool  # whether later passes return its saved output instead of running it
+    copied: bool = False  # whether the network changes that output in place
     unread: frozenset[tuple[str, ...]] = frozenset()
     """Paths of the output's tensors whose values nobody reads; only their shapes are saved."""
 
@@ -100,16 +98,11 @@ class Recording:
 
     calls: tuple[RecordedCall, ...] = ()
     """The calls that are cached, or that contain the cut or calls of their own."""
-    cut: int | None = None
-    """Index of the call that is the cut; None before it was reached."""
-    path: tuple[str, ...] = ()
-    """Path of z in the output of that call."""
-    shapes: Any = None
-    """Shapes and other properties of the arguments for which this holds."""
-    static_graph: bool = False
-    """Whether it holds for all arguments of these shapes."""
-    complete: bool = False
-    """Whether the calls behind the cut are in it, too."""
+    cut: int | None = None  # index of the call that is the cut; None before it was reached
+    path: tuple[str, ...] = ()  # path of z in the output of that call
+    shapes: Any = None  # shapes and other properties of the arguments for which this holds
+    static_graph: bool = False  # whether it holds for all arguments of these shapes
+    complete: bool = False  # whether the calls behind the cut are in it, too
 
     def index(self, module: nn.Module, count: int) -> int | None:
         """Returns the index of the module's call after `count` earlier ones of a pass."""

@@ -50,10 +50,8 @@ class Watch(TorchDispatchMode):
 
     escaped: bool
     """Whether a value of a tensor (not a shape) reached Python, which may branch on it."""
-    data_dependent: bool
-    """Whether such a value depended on z."""
-    torn: bool
-    """Whether z or the tensor it stands for was read after the other had been changed."""
+    data_dependent: bool  # whether such a value depended on z
+    torn: bool  # whether z or the tensor it stands for was read after the other had been changed
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
@@ -154,13 +152,17 @@ class Watch(TorchDispatchMode):
             if self._sees_escapes and not outer:
                 with self._function_mode:
                     yield
-            elif outer and not self._sees_escapes and self._function_mode.is_innermost():
+            elif outer and not self._sees_escapes and self._mode_is_innermost():
                 with overrides._pop_mode_temporarily():
                     yield
             else:
                 yield
         finally:
             self._sees_escapes = outer
+
+    def _mode_is_innermost(self) -> bool:
+        innermost: object = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
+        return innermost is self._function_mode
 
     def note_escape(self, tensor: Tensor) -> None:
         """Notes that values of the tensor reach Python."""
@@ -237,11 +239,6 @@ class _EscapeMode(TorchFunctionMode):
             self._watch.note_escape(args[0])
         return func(*args, **(kwargs or {}))
 
-    def is_innermost(self) -> bool:
-        """Whether no other torch function mode was entered after this one."""
-        innermost: object = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
-        return innermost is self
-
 
 _NO_STORAGE = 0
 """The mark of sparse tensors, which have no storage."""
@@ -258,12 +255,9 @@ def _storage(tensor: Tensor) -> int:
 class _Facts:
     """What an operation may do, by its schema and tags."""
 
-    writes: tuple[tuple[int, str], ...]
-    """Index and name of the arguments that it changes in place."""
-    fresh: bool
-    """Whether its results are always new memory."""
-    escapes: bool
-    """Whether it gives values, or shapes that depend on values, to Python."""
+    writes: tuple[tuple[int, str], ...]  # index and name of the arguments that it changes in place
+    fresh: bool  # whether its results are always new memory
+    escapes: bool  # whether it gives values, or shapes that depend on values, to Python
 
 
 @functools.cache

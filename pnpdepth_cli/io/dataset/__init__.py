@@ -21,10 +21,7 @@ SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
 _LONGEST_PART = 255 - len("_improvement.png")
 """Bytes of a part of a name, so that the longest file name of a result has 255."""
 
-_LEADS_OUT = "leads out of the output folder"
 _DRIVE = re.compile(r"[A-Za-z]:")
-_RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])\s*(\..*)?", re.IGNORECASE)
-"""Device names that Windows reserves in every folder, with any suffix."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +29,7 @@ class Protocol:
     """The part of a frame that the paper's experiments use."""
 
     name: str
-    halved: bool = False
-    """Every second pixel in both directions (nearest neighbour) is used."""
+    halved: bool = False  # every second pixel in both directions (nearest neighbour) is used
     crop: tuple[int, int] | None = None
     """(H, W) of the crop after halving; None for the whole image."""
     anchor: Literal["centre", "bottom"] = "centre"
@@ -108,8 +104,7 @@ class Hdf5Array:
     point in the middle, to get z. None for z itself."""
     axes: tuple[int, ...]
     """Order of the axes that makes the array, without its indexed axis, (H, W) or (H, W, 3)."""
-    index: int | None = None
-    """Which element of the first axis; None for the whole array."""
+    index: int | None = None  # which element of the first axis; None for the whole array
 
     def __str__(self) -> str:
         return f"{self.path}[{self.name}{'' if self.index is None else f', {self.index}'}]"
@@ -137,39 +132,30 @@ class Neighbour:
     """Another frame of the same sequence, whose points are moved into this one."""
 
     frame: Frame
-    motion: Pose | None
-    """From the other camera's frame to this one's. None: to be estimated."""
-    poses: str
-    """Where the motion is from, for a person."""
-    apart: int
-    """Frames between the two, at least 1."""
+    motion: Pose | None  # from the other camera's frame to this one's. None: to be estimated.
+    poses: str  # where the motion is from, for a person
+    apart: int  # frames between the two, at least 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
     """One frame; parts that it does not have are None."""
 
-    name: str
-    """Unique in its data set, and fit for a file name; slashes separate folders."""
+    name: str  # unique in its data set, and fit for a file name; slashes separate folders
     image: Source | None = None
     sparse: Path | None = None
     """A depth file, a list of points, or a scan; None where points are sampled from `gt`."""
     gt: Source | None = None
-    calib: Path | None = None
-    """The calibration, as `read_calibration` takes it."""
-    camera: int | None = None
-    """Which camera of the calibration."""
+    calib: Path | None = None  # the calibration, as `read_calibration` takes it
+    camera: int | None = None  # which camera of the calibration
     calibration: Calibration | None = None
     """The calibration itself, of a data set that has one for each frame and no file of it."""
-    sparse_scale: float | None = None
-    """Codes per metre of integer sparse depth."""
-    gt_scale: float | None = None
-    """Codes per metre of integer ground truth."""
+    sparse_scale: float | None = None  # codes per metre of integer sparse depth
+    gt_scale: float | None = None  # codes per metre of integer ground truth
     protocol: Protocol = WHOLE
     pose: Pose | None = None
     """x_world = pose · (x, 1) for points in the camera's frame; of KITTI odometry camera 0's."""
-    oxts: Path | None = None
-    """The packet of KITTI's inertial system that gives the pose."""
+    oxts: Path | None = None  # the packet of KITTI's inertial system that gives the pose
     neighbours: tuple[Neighbour, ...] = ()
     window: tuple[Frame, ...] = ()
     """The frames of its window up to and with this one; empty outside of windows."""
@@ -178,8 +164,7 @@ class Frame:
     gt_other_size: bool = False
     """Whether the ground truth may have another size than the image, of the same view."""
     sparse_other_size: bool = False
-    group: str | None = None
-    """The sequence it belongs to; None derives it from the name."""
+    group: str | None = None  # the sequence it belongs to; None derives it from the name
 
     def __post_init__(self) -> None:
         for source in (self.image, self.sparse, self.gt, self.calib, *self.masks):
@@ -192,10 +177,8 @@ class Unmatched:
     """A file or folder that belongs to no frame."""
 
     path: Path
-    why: str
-    """The reason, as the end of a sentence that begins with the path."""
-    spare: bool = False
-    """False for a file of a frame that lacks a part, or cannot be read."""
+    why: str  # the reason, as the end of a sentence that begins with the path
+    spare: bool = False  # false for a file of a frame that lacks a part, or cannot be read
 
     def __post_init__(self) -> None:
         _check_no_nul(self.path)
@@ -262,7 +245,7 @@ def _walk(folder: Path, above: frozenset[str], problems: list[Unmatched]) -> Ite
 
 
 def name_problem(name: str) -> str | None:
-    """Returns why no result can be stored under a frame's name on POSIX; None if it can.
+    """Returns why no result can be stored under a frame's name; None if it can.
 
     The reason is a predicate, such as "holds a NUL character".
     """
@@ -270,25 +253,14 @@ def name_problem(name: str) -> str | None:
         return "holds a NUL character"
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts:
-        return _LEADS_OUT
+        return "leads out of the output folder"
+    if "\\" in name or _DRIVE.match(name):
+        return "holds a backslash or a drive letter, which lead out of the folder on Windows"
     if not path.parts:
         return "names no file"
     if any(len(part.encode("utf-8", "surrogateescape")) > _LONGEST_PART for part in path.parts):
         return f"is longer than {_LONGEST_PART} bytes"
     return None
-
-
-def portable_name_problem(name: str) -> str | None:
-    """Returns why a name is not fit for results on Linux, macOS or Windows; None if it is."""
-    if "\\" in name:
-        return "holds a backslash, which separates folders on Windows only; use /"
-    if _DRIVE.match(name):
-        return "begins with a drive letter"
-    for part in PurePosixPath(name).parts:
-        if _RESERVED.fullmatch(part):
-            return f"holds {part!r}, which Windows reserves"
-    problem = name_problem(name)
-    return None if problem == _LEADS_OUT else problem  # only what writes results minds
 
 
 _FRAME_NUMBER = re.compile(r"(?:^|[_\-/])\d+(?:_image_\d+)?$")

@@ -1,10 +1,8 @@
-"""Parts of a frame from their files: images, masked depth, arrays of HDF5 and MATLAB files."""
+"""Parts of a frame from their files: images, masked depth, arrays of HDF5 files."""
 
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,35 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, SizeError, UsageError
-from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Hdf5Array
+from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Hdf5Array, Source
 from pnpdepth_cli.io.depth import known_metres, load_stored
-from pnpdepth_cli.io.file_bytes import (
-    check_value_count,
-    damaged,
-    one_line,
-    read_bytes,
-    size_of_regular_file,
-)
+from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
 from pnpdepth_cli.io.rgb import read_rgb
 
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
 
-_MATLAB_TYPES = {
-    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
-}  # fmt: skip
-_MATRIX, _COMPRESSED = 14, 15
-_MOST_BYTES = 1 << 20
-"""Of a decompressed variable."""
 
-
-def read_frame_image(frame: Frame) -> NDArray[np.float32]:
-    """Returns (H, W, 3) float32 in 0..1. Raises InputError if the frame has no image."""
-    if frame.image is None:
-        raise InputError(f"frame {frame.name} has no image")
-    source = frame.image
-    rgb = rgb_of(source) if isinstance(source, Hdf5Array) else read_rgb(source).values
-    return np.ascontiguousarray(frame.protocol.apply(rgb))
+def read_image(source: Source) -> NDArray[np.float32]:
+    """Returns (H, W, 3) float32 in 0..1. Raises InputError for a file or array that is no image."""
+    return rgb_of(source) if isinstance(source, Hdf5Array) else read_rgb(source).values
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
@@ -171,50 +152,3 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
         raise
     except Exception as error:  # h5py raises many kinds for a damaged file
         raise FileFormatError(f"{path} cannot be read as HDF5 ({one_line(error)})") from error
-
-
-def read_matlab_array(path: Path, name: str) -> NDArray[np.int64]:
-    """Returns the values of a variable of a MATLAB 5 file as (N,) int64, in the file's order.
-
-    Own reader, because scipy's aborts the process on about one in a thousand damaged files.
-    Source: MAT-File Format, MathWorks, chapter "Level 5 MAT-File Format".
-
-    Raises:
-        FileFormatError: The file is damaged or not of versions 5 to 7, or lacks the variable.
-    """
-    data = read_bytes(path)
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
-    if order is None:
-        raise FileFormatError(f"{path} is no MATLAB 5 file; save it with -v7 or older")
-    try:
-        for kind, content in _elements(data[128:], order):
-            if kind == _COMPRESSED:
-                content = zlib.decompressobj().decompress(content, _MOST_BYTES)
-                kind, content = next(_elements(content, order))
-            if kind != _MATRIX:
-                continue
-            _, _, (_, variable), (kind, content) = list(_elements(content, order))[:4]
-            if variable == name.encode():
-                values = np.frombuffer(content, order + _MATLAB_TYPES[kind])
-                if not (np.abs(values) < 2.0**53).all() or (values != np.rint(values)).any():
-                    raise ValueError(f"{name} is not made of whole numbers")
-                return values.astype(np.int64)
-    except (struct.error, zlib.error, StopIteration, LookupError, ValueError) as error:
-        raise damaged(path, "MATLAB file", f"cannot be read ({error})") from error
-    raise FileFormatError(f"{path} has no {name}; it is of another kind")
-
-
-def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """The type and the content of each element; short ones have both in one word."""
-    position = 0
-    while position < len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, position)
-        if kind >> 16:
-            kind, size, begin, end = kind & 0xFFFF, kind >> 16, position + 4, position + 8
-        else:
-            begin = position + 8
-            end = begin + (size if kind == _COMPRESSED else -(-size // 8) * 8)
-        if begin + size > len(data):
-            raise ValueError(f"an element of {size:,} bytes goes beyond the end")
-        yield kind, data[begin : begin + size]
-        position = end

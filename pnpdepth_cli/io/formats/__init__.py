@@ -1,67 +1,31 @@
-"""The depth file formats: one file each, listed in `choices.FORMATS`.
+"""The depth file formats, listed in `choices.FORMATS`.
 
-A new format is one new file in this folder, or an entry point of the group `pnpdepth.formats`, that
-holds a `DepthFormat` called `FORMAT`.
+A new format is one more `DepthFormat` in `TABLE`, with its name in `choices.FORMATS`, or an entry
+point of the group `pnpdepth.formats`.
 """
 
 from __future__ import annotations
 
-import math
-import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-
-from numpy.typing import NDArray
-
 from pnpdepth_cli.choices import FORMATS
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.io.formats import arrays, images
+from pnpdepth_cli.io.formats.depth_format import KITTI_SCALE as KITTI_SCALE
+from pnpdepth_cli.io.formats.depth_format import LARGEST_CODE as LARGEST_CODE
+from pnpdepth_cli.io.formats.depth_format import SATURATED_CODE as SATURATED_CODE
+from pnpdepth_cli.io.formats.depth_format import SCALE_KEY as SCALE_KEY
+from pnpdepth_cli.io.formats.depth_format import DepthFormat as DepthFormat
+from pnpdepth_cli.io.formats.depth_format import StoredArray as StoredArray
+from pnpdepth_cli.io.formats.depth_format import check_scale as check_scale
+from pnpdepth_cli.io.formats.depth_format import eight_bits as eight_bits
 
-KITTI_SCALE = 256.0
-"""Codes per metre in the KITTI depth files, assumed for integers that do not say their own."""
-
-SCALE_KEY = "pnpdepth:scale"
-"""Key under which our own 16-bit files keep their codes per metre."""
-
-SATURATED_CODE = 65535
-"""The largest 16-bit code: what a sensor gives beyond its range, so never a measurement."""
-
-LARGEST_CODE = SATURATED_CODE - 1
-"""The largest code that is written."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StoredArray:
-    """The numbers of a depth file, as stored."""
-
-    values: NDArray[Any]
-    """Floats in metres, or integer codes; (H, W) or any shape that `is_image` allows."""
-    description: str
-    """What was read, for a person, such as "16-bit PNG"."""
-    is_image: bool = True
-    """False for NPY and NPZ, whose arrays may also be lists of points."""
-    scale: float | None = None
-    """Codes per metre that the file itself gives; None if it does not."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DepthFormat:
-    """One file format of depth images."""
-
-    name: str
-    """As messages call it, such as "PNG"."""
-    suffixes: tuple[str, ...]
-    """Of its files, in lower case; "." and the name in `choices.FORMATS` is one of them."""
-    magic: tuple[bytes, ...]
-    """What the content begins with; files are recognised by content, never by suffix."""
-    read: Callable[[Path, bytes, str | None], StoredArray]
-    """From path (for messages), content and `--channel`. Raises FileFormatError."""
-    write: Callable[[Path, NDArray[Any], Mapping[str, str]], None]
-    """(H, W) float32 metres or uint16 codes, 0 where unknown, into an existing empty file, with
-    texts by key where the format has room for them."""
-    integer: bool = False
-    """Whether files hold 16-bit integer codes, not float32 metres."""
+TABLE: dict[str, DepthFormat] = {
+    "png": images.PNG,
+    "exr": images.EXR,
+    "npy": arrays.NPY,
+    "npz": arrays.NPZ,
+    "pfm": arrays.PFM,
+    "tiff": images.TIFF,
+}
+"""The formats of this package by name."""
 
 
 def format_of_content(data: bytes) -> DepthFormat | None:
@@ -86,38 +50,6 @@ def kind_of(data: bytes) -> str | None:
         return "WEBP"
     depth_format = format_of_content(data)
     return None if depth_format is None else depth_format.name
-
-
-def eight_bits(path: Path, kind: str) -> FileFormatError:
-    """Returns the error for an 8-bit image given as depth."""
-    return FileFormatError(
-        f"{path} is an 8-bit {kind}; 8 bits cannot hold depth and it is probably an image of a "
-        "depth map, give the 16-bit PNG, EXR or NPY"
-    )
-
-
-def check_scale(scale: float | None) -> None:
-    """Raises UsageError unless the scale is None or a finite number above 0."""
-    if scale is not None and not (math.isfinite(scale) and scale > 0):
-        raise UsageError(f"--depth-scale must be a finite number above 0, not {scale:g}")
-
-
-def scale_in_text(path: Path, text: str) -> float | None:
-    """Returns the codes per metre in a text such as "pnpdepth:scale=256", None without one.
-
-    Raises:
-        FileFormatError: The text names a scale that is not a finite number above 0.
-    """
-    match = re.search(re.escape(SCALE_KEY) + r"=(\S+)", text)
-    if match is None:
-        return None
-    try:
-        check_scale(scale := float(match[1]))
-    except (ValueError, UsageError) as error:
-        raise FileFormatError(
-            f"{path} says {SCALE_KEY}={match[1][:40]}, which is no scale; write the file again"
-        ) from error
-    return scale
 
 
 DEPTH_SUFFIXES: tuple[str, ...] = tuple(s for kind in FORMATS.values() for s in kind.suffixes)

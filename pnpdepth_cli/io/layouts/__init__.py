@@ -1,7 +1,7 @@
 """Data set layouts: which one a folder is, and its frames; `TABLE` has them by name.
 
-    frames = read_frames(Path("KITTI/object"))            # layout guessed
-    frames = read_frames(Path("frames"), "pairs")         # layout named
+    layout, listing = list_frames(Path("KITTI/object"))     # layout guessed
+    layout, listing = list_frames(Path("frames"), "pairs")  # layout named
 
 A new layout is a row of `rows`, or a `Layout` in `TABLE`, with its name in `choices.LAYOUTS`; or an
 entry point of the group `pnpdepth.layouts`.
@@ -19,7 +19,7 @@ from pnpdepth_cli.io.dataset import Frame, Unmatched
 from pnpdepth_cli.io.layouts import driving, indexed, kitti, manifest, nyu, rows
 from pnpdepth_cli.io.layouts.layout import Layout
 
-__all__ = ["LAYOUTS", "Layout", "Listing", "find_layout", "list_frames", "read_frames"]
+__all__ = ["LAYOUTS", "Layout", "Listing", "find_layout", "list_frames"]
 
 TABLE: dict[str, Layout] = {
     **rows.ROWS,
@@ -40,19 +40,15 @@ TABLE: dict[str, Layout] = {
 class Listing(NamedTuple):
     """What a data set holds."""
 
-    frames: list[Frame]
-    """Complete frames, in a fixed order."""
-    broken: list[Unmatched]
-    """Files of frames that lack a part, or cannot be read."""
-    spare: list[Unmatched]
-    """Other files beside them."""
+    frames: list[Frame]  # complete frames, in a fixed order
+    broken: list[Unmatched]  # files of frames that lack a part, or cannot be read
+    spare: list[Unmatched]  # other files beside them
 
 
 def find_layout(root: Path, name: str | None = None) -> str:
     """Returns the name of the layout that a folder or file is of.
 
     Args:
-        root: The data set.
         name: The only layout to consider; None for all, in the order of `choices.LAYOUTS`.
 
     Raises:
@@ -78,7 +74,7 @@ def _match(root: Path, name: str | None) -> str | None:
 
 
 def _nearest(root: Path) -> str:
-    """What the nearest layout lacks; what all need, if no layout is near."""
+    """What the nearest layout lacks; how to make the simplest, if no layout is near."""
     needs = {name: layout.needs for name, layout in LAYOUTS.items() if layout.needs}
     present = {
         name: [p for p in patterns if any(next(root.glob(s + p), None) for s in ("", "*/", "*/*/"))]
@@ -89,8 +85,10 @@ def _nearest(root: Path) -> str:
         lacking = [pattern for pattern in needs[best] if pattern not in present[best]]
         fact = f"lacks {', '.join(lacking)}" if lacking else "has them, but not in one place"
         return f"nearest is {best!r}, which needs {', '.join(needs[best])}; the folder {fact}"
-    listed = "; ".join(f"{name} {', '.join(patterns)}" for name, patterns in needs.items())
-    return f"layouts need: {listed}; without a fixed folder: manifest (a .csv or .jsonl file)"
+    return (
+        "put images into rgb/ and their sparse depth into sparse/, with equal names, or give a"
+        f" CSV list with the columns image and sparse; known layouts: {', '.join(LAYOUTS)}"
+    )
 
 
 def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
@@ -141,21 +139,3 @@ def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
         if not found:
             raise
         return list(found), layouts[0]
-
-
-def read_frames(root: Path, name: str | None = None) -> list[Frame]:
-    """Returns the frames of a data set, in a fixed order.
-
-    Args:
-        root: The data set.
-        name: Its layout; None to guess.
-
-    Raises:
-        InputError: There is no frame, or one is incomplete.
-    """
-    layout, listing = list_frames(root, name)
-    if listing.broken:
-        raise InputError(str(listing.broken[0]))
-    if not listing.frames:
-        raise InputError(f"{root} looks like {layout!r} but has no frame in it")
-    return listing.frames

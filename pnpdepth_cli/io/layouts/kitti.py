@@ -39,7 +39,7 @@ _AS_PUBLISHED: dict[str, Any] = {
 
 
 def _of_sequence(place: Path) -> Callable[[Files], Mapping[str, Any]]:
-    """Calibration and pose; poses belong to frames by number, so a part of a sequence has its own.
+    """The pose; poses belong to frames by number, so a part of a sequence has its own.
 
     Raises:
         InputError: A frame has no row in an existing file of poses.
@@ -47,7 +47,7 @@ def _of_sequence(place: Path) -> Callable[[Files], Mapping[str, Any]]:
     folder = place.absolute()  # the parents of "." are in its absolute path
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():
-        return lambda files: {"calib": place / "calib.txt"}
+        return lambda files: {}
     poses = [as_pose(pose) for pose in read_poses(path)]
 
     def fields_of(files: Files) -> Mapping[str, Any]:
@@ -57,7 +57,7 @@ def _of_sequence(place: Path) -> Callable[[Files], Mapping[str, Any]]:
                 f"{image} has no pose: its sequence's file holds {len(poses):,} poses, by frame"
                 " number"
             )
-        return {"calib": place / "calib.txt", "pose": poses[int(image.stem)]}
+        return {"pose": poses[int(image.stem)]}
 
     return fields_of
 
@@ -67,6 +67,7 @@ ODOMETRY = row(
     below="|sequences/*/|dataset/sequences/*/",
     marks=("calib.txt",),
     name=lambda root, place, stem: f"{place.name}_{stem}",
+    calib="calib.txt",
     more=_of_sequence,
     camera=2,
     protocol=PROTOCOLS["kitti-odometry"],
@@ -89,24 +90,8 @@ def _truth_of(drive: Path, camera: str) -> Path:
     return _of_drive(drive, Path("proj_depth/groundtruth", camera), *beside)
 
 
-def _images_of(scans: Path) -> Path:
-    drive, beside = scans.parents[2], (f"{raw}{scans.parents[2].name[:10]}" for raw in _RAW)
-    return _of_drive(drive, Path(scans.name, "data"), *beside)
-
-
 def _calibration_of(drive: Path) -> Path | None:
     return next((p for p in (drive.parent, drive) if (p / _CALIBRATION).is_file()), None)
-
-
-def _scan_folders(root: Path) -> list[Path]:
-    starts = ("", "*/", "*/*/", "data_depth_velodyne/*/*/")
-    found = {p for s in starts for p in root.glob(f"{s}proj_depth/velodyne_raw/{_CAMERAS}")}
-    return sorted(path for path in found if path.is_dir())
-
-
-def _of_selection(place: Path) -> Callable[[Files], Mapping[str, Any]]:
-    shared = {"calib": place} if (place / _CALIBRATION).is_file() else {}
-    return lambda files: {} if "calib" in files else shared
 
 
 _SELECTION = row(
@@ -118,14 +103,27 @@ _SELECTION = row(
     },
     marks=("velodyne_raw",),
     name=lambda root, place, stem: stem,
-    more=_of_selection,
+    more=lambda place: (
+        lambda files: (
+            {"calib": files.get("calib", place)} if (place / _CALIBRATION).is_file() else {}
+        )
+    ),
     **_AS_PUBLISHED,
 )
 _TREE = row(
     {"sparse": "*.png", "image": "*.IMAGE", "gt": "*.png?"},
-    places=_scan_folders,
+    places=lambda root: sorted(
+        path
+        for start in ("", "*/", "*/*/", "data_depth_velodyne/*/*/")
+        for path in root.glob(f"{start}proj_depth/velodyne_raw/{_CAMERAS}")
+        if path.is_dir()
+    ),
     folders={
-        "image": _images_of,
+        "image": lambda scans: _of_drive(
+            scans.parents[2],
+            Path(scans.name, "data"),
+            *(f"{raw}{scans.parents[2].name[:10]}" for raw in _RAW),
+        ),
         "gt": lambda scans: _truth_of(scans.parents[2], scans.name),
     },
     name=_name,

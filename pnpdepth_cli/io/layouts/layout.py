@@ -36,8 +36,7 @@ Fields = Mapping[str, Any] | Unmatched | None
 class Layout:
     """How the files of a data set lie on disk."""
 
-    matches: Callable[[Path], Any]
-    """True for a folder or file of this layout."""
+    matches: Callable[[Path], Any]  # true for a folder or file of this layout
     frames: Callable[[Path], Iterable[Frame | Unmatched]]
     """The frames of a folder or file that matches, and what is in no frame."""
     needs: tuple[str, ...] = ()
@@ -91,6 +90,7 @@ def row(
     folders: Mapping[str, Callable[[Path], Path]] | None = None,
     needs: tuple[str, ...] = (),
     gaps: bool = False,
+    calib: str = "",
     more: Callable[[Path], Callable[[Files], Fields]] = lambda place: lambda files: {},
     **fields: Any,
 ) -> Layout:
@@ -109,6 +109,7 @@ def row(
         folders: From the place to the folder, of parts that lie elsewhere.
         needs: As in `Layout`, if not the folders of the parts and `marks`.
         gaps: Whether a file of the first part without a partner is spare, not broken.
+        calib: File in a place, the calibration of frames without one of their own.
         more: From a place to a function from a frame's files to its further fields.
         fields: Fields that all frames have.
     """
@@ -130,6 +131,7 @@ def row(
     def frames(root: Path) -> Iterator[Frame | Unmatched]:
         for place in find_places(root):
             fields_of = more(place)
+            shared = {"calib": place / calib} if calib and (place / calib).is_file() else {}
             for found in _joined(place, kinds, gaps):
                 if isinstance(found, Unmatched):
                     yield found
@@ -139,7 +141,7 @@ def row(
                 if isinstance(extra, Unmatched):
                     yield extra
                 elif extra is not None:
-                    values = {**files, **fields, **extra}
+                    values = {**shared, **files, **fields, **extra}
                     masks = tuple(values.pop(key) for key in files if key.startswith("mask"))
                     yield Frame(name=name(root, place, stem), masks=masks, **values)
 

@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
-from pnpdepth_cli.io.dataset import Frame, Unmatched, find_protocol, portable_name_problem
+from pnpdepth_cli.io.dataset import Frame, Unmatched, find_protocol
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout
 from pnpdepth_cli.io.remote import RemotePath, joined, local_files
@@ -35,20 +35,12 @@ def _flag(text: str) -> bool:
     return _FLAGS[text.lower()]
 
 
-def _name(text: str) -> str:
-    problem = portable_name_problem(text)
-    if problem is not None:
-        raise ValueError(f"name {one_line(text)[:60]!r} {problem}; choose another")
-    path = PurePosixPath(text)
-    return text if path.is_absolute() else path.as_posix()
-
-
 _VALUES: dict[str, Callable[[str], Any]] = {
     "camera": int,
     "sparse_scale": float,
     "gt_scale": float,
     "gt_size_ok": _flag,
-    "name": _name,
+    "name": lambda text: PurePosixPath(text).as_posix(),
     "group": str,
     "protocol": find_protocol,
 }
@@ -83,12 +75,10 @@ def _frames(root: Path) -> list[Frame | Unmatched]:
     named = _named(list(frames.values()))
     first: dict[str, Frame] = {}
     for number, frame in zip(frames, named, strict=True):
-        other = first.setdefault(frame.name.casefold(), frame)
-        if other is not frame:
-            hint = "" if other.name == frame.name else f", which some disks take for {other.name!r}"
+        if first.setdefault(frame.name.casefold(), frame) is not frame:
             raise FileFormatError(
-                f"{root}, line {number}: a second frame {one_line(frame.name)!r}{hint}; give it a"
-                " name of its own"
+                f"{root}, line {number}: a second frame {one_line(frame.name)!r}, but for capitals;"
+                " give it a name of its own"
             )
     return [*broken, *named]
 

@@ -3,8 +3,8 @@
 `nyu-h5`: one .h5 file a frame, as Ma et al. distribute NYU Depth v2 and KITTI odometry. Files as
 wide as KITTI's hold the projected scan as depth, and are cropped as the paper crops KITTI.
 
-`nyu-mat`: nyu_depth_v2_labeled.mat, the official file of NYU Depth v2. A splits.mat (testNdxs), or
-a test.txt with the numbers of its frames from 1, beside it names the test set, else all are meant.
+`nyu-mat`: nyu_depth_v2_labeled.mat, the official file of NYU Depth v2. A
+test.txt beside it, with the numbers of its frames from 1, names the test set, else all are meant.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, Hdf5Array
-from pnpdepth_cli.io.dataset.reading import read_matlab_array, shape_of
+from pnpdepth_cli.io.dataset.reading import shape_of
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Files, Layout, row
 
@@ -71,14 +71,15 @@ def _of_mat(root: Path) -> Iterator[Frame]:
 
 def _split(folder: Path, count: int) -> list[int]:
     """The numbers of the test set, sorted; empty without a file of them."""
-    text, source = folder / "test.txt", folder / "splits.mat"
-    words: Any
-    if text.is_file():
-        source, words = text, read_bytes(text).decode("utf-8", "replace").split()
-    elif source.is_file():
-        words = read_matlab_array(source, "testNdxs")[:_MOST_FRAMES]
-    else:
+    source, of_matlab = folder / "test.txt", folder / "splits.mat"
+    if not source.is_file():
+        if of_matlab.is_file():
+            raise InputError(
+                f"{of_matlab} is not read; write the numbers of its testNdxs into {source}:"
+                " print(*scipy.io.loadmat('splits.mat')['testNdxs'].ravel())"
+            )
         return []
+    words = read_bytes(source).decode("utf-8", "replace").split()
     try:
         numbers = sorted({int(word) for word in words})
     except ValueError as error:

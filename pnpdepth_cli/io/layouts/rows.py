@@ -51,24 +51,14 @@ def _below(root: Path, place: Path, stem: str) -> str:
     return (place.relative_to(root) / stem).as_posix()
 
 
-def _shared(file: str) -> Callable[[Path], Callable[[Files], Mapping[str, Any]]]:
-    """Gives each frame its place's file, unless it has a calibration of its own."""
-
-    def fields_of(place: Path) -> Callable[[Files], Mapping[str, Any]]:
-        shared = {"calib": place / file} if (place / file).is_file() else {}
-        return lambda files: {} if "calib" in files else shared
-
-    return fields_of
-
-
 def _of_void(place: Path) -> Callable[[Files], Mapping[str, Any] | None]:
-    """The calibration; None for a frame that is not of the test split, where that is listed."""
-    shared, split = _shared("K.txt")(place), place.parent.parent / "test_image.txt"
+    """None for a frame that is not of the test split, where that is listed."""
+    split = place.parent.parent / "test_image.txt"
     if place.parent.name != "data" or not split.is_file():
-        return shared
+        return lambda files: {}
     words = read_bytes(split).decode("utf-8", "replace").split()
     wanted = {path.stem for path in map(Path, words) if path.parts[-3:-2] == (place.name,)}
-    return lambda files: shared(files) if files["image"].stem in wanted else None
+    return lambda files: {} if files["image"].stem in wanted else None
 
 
 def _synthia_cameras(root: Path) -> list[Path]:
@@ -79,33 +69,19 @@ def _synthia_cameras(root: Path) -> list[Path]:
             cameras += sorted(p for p in rgb.glob("Stereo_*/Omni_*") if p.is_dir())
             # RGB and Depth are common names: numbers and size distinguish SYNTHIA-RAND
             images = (p for p in sorted(rgb.glob("*.png")) if re.fullmatch(r"\d{7}", p.stem))
-            first = next(images, None)
-            if first is not None and _has_synthias_size(first):
-                cameras.append(rgb)
+            if (first := next(images, None)) is not None:
+                with first.open("rb") as file:
+                    header = file.read(24)
+                # A file that is no PNG is reported when it is read.
+                if header[16:] == _SYNTHIA_HEADER or header[:4] != b"\x89PNG":
+                    cameras.append(rgb)
     return cameras
-
-
-def _has_synthias_size(image: Path) -> bool:
-    """False for a PNG of another size; a file that is no PNG is reported when it is read."""
-    with image.open("rb") as file:
-        header = file.read(24)
-    return header[16:] == _SYNTHIA_HEADER or header[:4] != b"\x89PNG"
 
 
 def _synthia_depth(camera: Path) -> Path:
     rgb = camera if camera.name == "RGB" else camera.parents[1]
     depth = rgb.with_name("Depth") / camera.relative_to(rgb)
     return depth / "Depth" if camera == rgb and (depth / "Depth").is_dir() else depth
-
-
-def _synthia_name(root: Path, camera: Path, stem: str) -> str:
-    return "_".join(part for part in (*camera.relative_to(root).parts, stem) if part != "RGB")
-
-
-def _hypersim_cameras(root: Path) -> list[Path]:
-    starts = ("", "images/", "*/images/", "*/*/images/")
-    found = (p for start in starts for p in root.glob(f"{start}scene_cam_*{_PREVIEW}"))
-    return sorted(p for p in found if p.is_dir())
 
 
 def _camera_of(previews: Path) -> str:
@@ -119,14 +95,8 @@ def _hypersim_name(root: Path, previews: Path, stem: str) -> str:
 def _of_hypersim(previews: Path) -> Callable[[Files], Mapping[str, Any]]:
     """Depth from the array, and the group."""
     group = f"{previews.parents[1].name}/{_camera_of(previews)}"
-
-    def fields_of(files: Files) -> Mapping[str, Any]:
-        depth = Hdf5Array(
-            path=files["gt"], name="dataset", axes=(0, 1), focal_px=_HYPERSIM_FOCAL_PX
-        )
-        return {"gt": depth, "group": group}
-
-    return fields_of
+    array: dict[str, Any] = {"name": "dataset", "axes": (0, 1), "focal_px": _HYPERSIM_FOCAL_PX}
+    return lambda files: {"gt": Hdf5Array(path=files["gt"], **array), "group": group}
 
 
 ROWS: dict[str, Layout] = {
@@ -135,7 +105,7 @@ ROWS: dict[str, Layout] = {
         below="|seq-*/",
         marks=("frame-*.color.*",),
         name=_joined("_"),
-        more=_shared("camera-intrinsics.txt"),
+        calib="camera-intrinsics.txt",
         gt_scale=1000.0,
     ),
     "arkitscenes": row(
@@ -159,7 +129,12 @@ ROWS: dict[str, Layout] = {
     ),
     "hypersim": row(
         {"image": r"(frame\.\d+)\.tonemap.jpg", "gt": r"(frame\.\d+)\.depth_meters.hdf5"},
-        places=_hypersim_cameras,
+        places=lambda root: sorted(
+            path
+            for start in ("", "images/", "*/images/", "*/*/images/")
+            for path in root.glob(f"{start}scene_cam_*{_PREVIEW}")
+            if path.is_dir()
+        ),
         folders={"gt": lambda camera: camera.with_name(_camera_of(camera) + _GEOMETRY)},
         needs=(f"images/scene_cam_*{_PREVIEW}", f"images/scene_cam_*{_GEOMETRY}"),
         name=_hypersim_name,
@@ -179,7 +154,7 @@ ROWS: dict[str, Layout] = {
     "image-depth": row(
         {"image": "image|images/**.IMAGE", "gt": "depth/**.DEPTH"},
         name=_below,
-        more=_shared("calib.txt"),
+        calib="calib.txt",
     ),
     "kitti-object": row(
         {"image": "image_2/*.IMAGE", "sparse": "velodyne/*.bin", "calib": "calib/*.txt"},
@@ -195,7 +170,7 @@ ROWS: dict[str, Layout] = {
             "calib": "calib/**.CALIB?",
         },
         name=_below,
-        more=_shared("calib.txt"),
+        calib="calib.txt",
     ),
     "scannet": row(
         {"image": "color/*.IMAGE", "gt": "depth/*.png"},
@@ -210,7 +185,9 @@ ROWS: dict[str, Layout] = {
         places=_synthia_cameras,
         folders={"gt": _synthia_depth},
         needs=("RGB", "Depth"),
-        name=_synthia_name,
+        name=lambda root, camera, stem: "_".join(
+            part for part in (*camera.relative_to(root).parts, stem) if part != "RGB"
+        ),
         gt_scale=100.0,
     ),
     "void": row(
@@ -222,6 +199,7 @@ ROWS: dict[str, Layout] = {
         below="|*/|data/*/|*/data/*/",
         marks=("sparse_depth", "ground_truth"),
         name=_below,
+        calib="K.txt",
         more=_of_void,
         sparse_scale=256.0,
         gt_scale=256.0,

@@ -55,7 +55,7 @@ def _unary(name: str) -> Operator:
 
 
 def _binary(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
-    return lambda node, i: function(i[0], _broadcast_as_before_7(node, i[0], i[1]))
+    return lambda _, i: function(i[0], i[1])
 
 
 def _folded(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
@@ -90,15 +90,6 @@ register(
 )
 
 
-def _broadcast_as_before_7(node: Node, a: Tensor, b: Tensor) -> Tensor:
-    """Before opset 7, `axis` is the dimension of a where those of b start."""
-    axis = node.get("axis")
-    if node.opset >= 7 or axis is None or not node.get("broadcast"):
-        return b
-    axis %= a.ndim
-    return b.reshape(*b.shape, *[1] * (a.ndim - axis - b.ndim))
-
-
 @operator("IsInf")
 def is_infinite(node: Node, inputs: Inputs) -> Tensor:
     above = torch.isposinf(inputs[0]) & bool(node.get("detect_positive", 1))
@@ -120,8 +111,6 @@ def clip(node: Node, inputs: Inputs) -> Tensor:
 @operator("PRelu")
 def prelu(node: Node, inputs: Inputs) -> Tensor:
     x, slope = inputs
-    if node.opset < 7 and slope.ndim == 1 and len(slope) > 1:
-        slope = slope.reshape(-1, *[1] * (x.ndim - 2))
     return torch.where(x < 0, x * slope, x)
 
 

@@ -1,16 +1,15 @@
 """An ONNX graph as a torch module whose submodules are the graph's nodes, under their own names.
 
-Nodes that the output does not need are left out. What depends on no input is computed once, when
+What depends on no input is computed once, when
 the module is made. Arithmetic on shapes is no layer; every other node is a submodule, so that the
 network can be cut at it.
 """
 
 from __future__ import annotations
 
-import math
-from collections import Counter
+import functools
+from collections import Counter, deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from pnpdepth_cli.models.onnx import (  # noqa: F401  (each registers its operat
 )
 from pnpdepth_cli.models.onnx.limits import SizeLimit
 from pnpdepth_cli.models.onnx.table import HOST_INPUTS, OPERATORS, Node, Unsupported
+from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
@@ -89,21 +89,6 @@ class OnnxNode(nn.Module):
             raise ModelError(f"ONNX node {self.node.name!r}: {reason}") from None
 
 
-@dataclass(frozen=True)
-class _Step:
-    """One node, in the order in which they run, and the names of the values around it.
-
-    on_shapes: True for arithmetic on the shapes of tensors, which stays on the CPU. last_read:
-    values that no later step reads.
-    """
-
-    run: OnnxNode
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    on_shapes: bool
-    last_read: tuple[str, ...] = ()
-
-
 class OnnxGraph(nn.Module):
     """An ONNX model as a module: called with the graph's inputs, it returns its outputs.
 
@@ -130,17 +115,13 @@ class OnnxGraph(nn.Module):
         self.output_names = tuple(o.name for o in graph.output)
         self._stored = sum(constant.numel() for constant in constants.values())
         nodes = zip(_names(graph.node), graph.node, strict=True)
-        self._steps = _with_ends(self._steps_of(nodes, opset, constants, path), self.output_names)
+        self._steps = with_ends(self._steps_of(nodes, opset, constants, path), self.output_names)
         self._constants = {n: constants[n] for n in self.output_names if n in constants}
         self._allowed: set[tuple[torch.Size, ...]] = set()  # sizes of inputs
-        for step in self._steps:
-            if not step.on_shapes:
-                # Not add_module, which refuses the dots that node names have.
-                self._modules[step.run.node.name] = step.run
 
     def _steps_of(
         self, nodes: Iterable[tuple[str, Any]], opset: int, constants: dict[str, Tensor], path: Path
-    ) -> list[_Step]:
+    ) -> list[Step]:
         shapes: set[str] = set()
         steps = []
         largest = max(_CONSTANT_ELEMENTS, _CONSTANT_GROWTH * self._stored)
@@ -160,43 +141,49 @@ class OnnxGraph(nn.Module):
             on_shapes = node.op in _TO_SHAPES or all(n in shapes for n in handed_in)
             if on_shapes:
                 shapes.update(filter(None, proto.output))
-            steps.append(_Step(module, handed_in, tuple(proto.output), on_shapes))
+            else:
+                # Not add_module, which refuses the dots that node names have.
+                self._modules[name] = module
+            steps.append(
+                Step(
+                    run=functools.partial(self._run, module, on_shapes),
+                    arguments=[Value(n) for n in handed_in],
+                    outputs=proto.output,
+                    name=name,
+                )
+            )
         return steps
 
     def forward(self, *inputs: Tensor) -> Any:
         """Returns the output, or several outputs by name."""
         sizes = tuple(one.shape for one in inputs)
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
+        self._device = inputs[0].device
         if sizes in self._allowed:
-            self._run(values, inputs[0].device)
+            deque(run_steps(self._steps, values), maxlen=0)
         else:
             elements = self._stored + sum(one.numel() for one in inputs)
             largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * elements)
             with SizeLimit(largest):
-                self._run(values, inputs[0].device, most=2 * largest)
+                for step in run_steps(self._steps, values):
+                    if sum(value.numel() for value in values.values()) > 2 * largest:
+                        raise ModelError(
+                            f"ONNX node {step.name!r}: more than {2 * largest:,}"
+                            " elements are needed at a time, far more than image and weights have"
+                        )
             self._allowed.add(sizes)
         outputs = {n: values[n] if n in values else self._constants[n] for n in self.output_names}
         return outputs if len(outputs) > 1 else outputs[self.output_names[0]]
 
-    def _run(self, values: dict[str, Tensor], device: torch.device, most: float = math.inf) -> None:
-        """Adds the results to the values, of which so many elements may be needed at a time."""
-        for step in self._steps:
-            arguments = [values[name] for name in step.inputs]
-            if not step.on_shapes:
-                arguments = [
-                    value.to("cpu" if on_host else device)
-                    for value, on_host in zip(arguments, step.run.handed_in_on_host, strict=True)
-                ]
-            result = step.run(*arguments)
-            results = result if isinstance(result, tuple) else (result,)
-            values.update(zip(step.outputs, results, strict=False))
-            if sum(value.numel() for value in values.values()) > most:
-                raise ModelError(
-                    f"ONNX node {step.run.node.name!r}: more than {most:,} elements are needed at a"
-                    " time, far more than image and weights have"
-                )
-            for name in step.last_read:
-                del values[name]
+    def _run(self, module: OnnxNode, on_shapes: bool, *inputs: Tensor) -> Sequence[Tensor]:
+        """The node's outputs. Arithmetic on shapes stays on the CPU."""
+        if not on_shapes:
+            inputs = tuple(
+                value.to("cpu" if on_host else self._device)
+                for value, on_host in zip(inputs, module.handed_in_on_host, strict=True)
+            )
+        result = module(*inputs)
+        return result if isinstance(result, tuple) else (result,)
 
 
 def _folded(
@@ -214,18 +201,6 @@ def _folded(
             f" {describe(error)[:160]}"
         ) from None
     return dict(zip(outputs, result if isinstance(result, tuple) else (result,), strict=False))
-
-
-def _with_ends(steps: list[_Step], outputs: Sequence[str]) -> list[_Step]:
-    """The steps that the outputs need, each with the values that no later step reads."""
-    needed, kept = set(outputs), []
-    for step in reversed(steps):
-        if needed.intersection(step.outputs):
-            # Going backwards, the first step that reads a value is its last reader.
-            ends = {n for n in (*step.inputs, *step.outputs) if n and n not in needed}
-            needed.update(step.inputs)
-            kept.append(replace(step, last_read=tuple(sorted(ends))))
-    return kept[::-1]
 
 
 def _check_operators(nodes: Sequence[Any], path: Path) -> None:

@@ -27,7 +27,7 @@ MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
 
 _HALF_MISMATCH = 1e-2  # half precision itself is no better
-_NEWEST_OPSET = 24
+_OPSETS = range(7, 25)  # onnxruntime runs none that is older
 _MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
 _ASSUMED_MULTIPLE = 32
 
@@ -147,10 +147,10 @@ def _read(file: Path) -> Any:
         raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
     if not model.graph.node:
         raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
-    if _opset(model) > _NEWEST_OPSET:
+    if _opset(model) not in _OPSETS:
         raise ModelError(
-            f"ONNX file {file} is of opset {_opset(model)}, newer than {_NEWEST_OPSET}; export an"
-            " older one"
+            f"ONNX file {file} is of opset {_opset(model)}; export it with one from"
+            f" {_OPSETS[0]} to {_OPSETS[-1]}"
         )
     return model
 

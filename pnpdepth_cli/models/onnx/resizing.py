@@ -31,8 +31,6 @@ def resize(node: Node, inputs: Inputs) -> Tensor:
         mode = {"bilinear": "linear"}.get(node.get("mode"), node.get("mode", "nearest"))
         more = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "simple"}
         factors = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
-        if factors is None:  # the first version had two attributes
-            factors = [1.0, 1.0, node.get("height_scale"), node.get("width_scale")]
         return _resized(x, replace(node, attributes={"mode": mode, **more}), factors, None)
     axes = [a % x.ndim for a in node.get("axes", range(x.ndim))]
     if sizes is not None and sizes.numel():

@@ -1,7 +1,8 @@
 """The table of the ONNX operators that depth networks use, each as the standard defines it.
 
 The functions register themselves with `@operator` (https://onnx.ai/onnx/operators). Every version
-of an operator is covered: an attribute that later became an input is read as either.
+of an operator from opset 7 on is covered: an attribute that later became an input is read as
+either.
 """
 
 from __future__ import annotations

@@ -14,7 +14,8 @@ from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.commands.batch.batch import plan_batch
 from pnpdepth_cli.commands.batch.request import LOCAL, BatchRequest, ClusterOptions
 from pnpdepth_cli.errors import OutputError
-from pnpdepth_cli.io.remote import forget_stores, path_of
+from pnpdepth_cli.io import remote
+from pnpdepth_cli.io.remote import path_of
 from tests.commands.batches import (
     NAMES,
     RecordingListener,
@@ -219,11 +220,11 @@ def test_the_command_names_what_is_wrong_with_an_address(
     )  # fmt: skip
     assert "no such bucket" in ended(good, "s3://no-such-bucket-here/out")[1]
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    forget_stores()
+    remote._file_system.cache_clear()
     assert "cannot be reached (Could not connect" in ended(good, out)[1]
     monkeypatch.setattr("fsspec.filesystem", missing)
-    forget_stores()
+    remote._file_system.cache_clear()
     assert ended(good, out) == (
         2, "s3:// needs fsspec and s3fs: pip install 'pnpdepth[remote]'",
     )  # fmt: skip
-    forget_stores()
+    remote._file_system.cache_clear()

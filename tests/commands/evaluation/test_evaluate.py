@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, Evaluation, evaluate
-from pnpdepth_cli.commands.evaluation.frames import Scales
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.tables import worst
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.sensors import SamplePattern, sample_points
 
 
 def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
@@ -27,14 +25,7 @@ def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
 
 
 def scored(root: Path, **options: Any) -> Evaluation:
-    changes = {
-        name: options.pop(name)
-        for name in list(options)
-        if name not in {each.name for each in fields(EvalRequest)}
-    }
-    return evaluate(
-        EvalRequest(prediction=root / "out", ground_truth=root / "gt", changes=changes, **options)
-    )
+    return evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **options))
 
 
 @pytest.fixture
@@ -238,7 +229,7 @@ def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
         (tmp_path / folder).mkdir()
         cv2.imwrite(str(tmp_path / folder / "a.png"), codes)
     assert scored(tmp_path).mean["rmse"] == 0
-    by_option = scored(tmp_path, scales=Scales(prediction=1000.0, truth=1000.0))
+    by_option = scored(tmp_path, pred_scale=1000.0, gt_scale=1000.0)
     assert by_option.mean["mae"] == 0
     assert by_option.frames[0].kinds["gt"].scale == 1000
     nyu = scored(tmp_path, protocol="nyu-eigen", crop="none")
@@ -278,17 +269,17 @@ def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(
         else:
             depth_file(tmp_path / folder / "a.npy", depth)
     option, field = {
-        "gt": ("--gt-scale", "truth"),
-        "out": ("--pred-scale", "prediction"),
-        "sparse": ("--sparse-scale", "sparse"),
+        "gt": ("--gt-scale", "gt_scale"),
+        "out": ("--pred-scale", "pred_scale"),
+        "sparse": ("--sparse-scale", "sparse_scale"),
     }[side]
     inputs = {"sparse": tmp_path / "sparse"} if side == "sparse" else {}
     with pytest.raises(InputError) as error:
         scored(tmp_path, **inputs)
     assert f"{option} {codes} (now 256) would remove it, {option} 256 keeps it" in str(error.value)
-    right = scored(tmp_path, scales=Scales(**{field: float(codes)}), **inputs)
+    right = scored(tmp_path, **{field: float(codes)}, **inputs)
     assert right.mean["rmse"] == 0
-    wrong = scored(tmp_path, scales=Scales(**{field: 256.0}), **inputs)
+    wrong = scored(tmp_path, **{field: 256.0}, **inputs)
     assert any("a scale is probably wrong" in note for note in wrong.notes)
 
 
@@ -326,10 +317,16 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
     (two / "out" / "a.json").write_text(json.dumps(record))
     assert scored(two).frames[0].leaked is None
     (two / "out" / "a.json").write_text(json.dumps(sampled))
-    with pytest.raises(
-        InputError, match=r"cannot be sampled again as its record says .*; give them with --sparse"
-    ):
+    with pytest.raises(InputError, match="give it with --sparse; `pnpdepth sample` draws"):
         scored(two, exclude_sparse=True)
+
+
+def test_a_prediction_in_model_units_is_warned_of_unless_it_is_scaled(two: Path) -> None:
+    (two / "out" / "a.json").write_text('{"unit": "model units"}')
+    warning = "warning: 1 predictions are in model units, not in metres"
+    assert any(note.startswith(warning) for note in scored(two).notes)
+    depth_file(two / "out" / "ü b_depth.npy", [[8, 9]])
+    assert not any("model units" in note for note in scored(two, scale_by="median").notes)
 
 
 def test_a_smaller_prediction_is_resized_only_on_request(tmp_path: Path) -> None:
@@ -414,13 +411,11 @@ def test_predictions_of_kittis_benchmark_crop_are_aligned_with_the_frame(tmp_pat
 
 REFUSED = [
     ({"layout_protocol": "whole"}, "--layout-protocol whole is for data sets"),
-    ({"scales": Scales(truth=0.0)}, "--gt-scale"),
-    ({"scales": Scales(prediction=math.nan)}, "--pred-scale"),
-    ({"workers": 0}, "--workers"),
+    ({"gt_scale": 0.0}, "--gt-scale"),
+    ({"pred_scale": math.nan}, "--pred-scale"),
     ({"groups": ("edge",)}, "unknown group of measures 'edge'; did you mean 'edges'"),
     ({"groups": ("area",), "average": "pooled"}, "--average pooled does not apply"),
     ({"groups": ("area",), "protocol": "kitti-devkit"}, "--measures does not apply to kitti-"),
-    ({"resamples": -1}, "--bootstrap"),
 ]
 
 
@@ -471,26 +466,3 @@ def test_measures_of_the_scene_need_intrinsics(sequences: Path) -> None:
     assert 0 < result.mean["normal_angle"] < 90
     with pytest.raises(InputError, match="--measures distance needs the sparse depth of frame"):
         scored(sequences, groups=("distance",))
-
-
-def test_points_sampled_from_the_ground_truth_are_excluded_as_they_were_drawn(
-    tmp_path: Path,
-) -> None:
-    gt = np.random.default_rng(0).uniform(2, 9, (20, 30)).astype(np.float32)
-    points = sample_points(gt, SamplePattern(count=50), seed=7)
-    x, y = np.rint(points.xy).astype(int).T
-    depth = gt + 1
-    depth[y, x] = gt[y, x]  # copies the points
-    depth_file(tmp_path / "gt" / "a.npy", gt)
-    depth_file(tmp_path / "out" / "a_depth.npy", depth)
-    sampling = {"sampled_from": "gt/a.npy", **asdict(SamplePattern(count=50)), "seed": 7}
-    record = {"inputs": {"sparse": sampling}, "points": {"used": 50}}
-    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
-    assert scored(tmp_path).mean["mae"] == pytest.approx(1 - 50 / 600, rel=1e-5)
-    result = scored(tmp_path, exclude_sparse=True)
-    assert result.frames[0].pixels == 550
-    assert result.mean["mae"] == pytest.approx(1, rel=1e-5)
-    record["points"]["used"] = 51
-    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
-    with pytest.raises(InputError, match="it is of another ground truth; give them with --sparse"):
-        scored(tmp_path, exclude_sparse=True)

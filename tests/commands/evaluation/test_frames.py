@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, evaluate
+from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.frames import scaled
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.scoring import (
     FrameUncertainty,
     frame_uncertainty,
@@ -88,10 +89,10 @@ def test_a_right_deviation_is_calibrated_and_one_of_half_the_size_is_not() -> No
     half = summarise_uncertainty([uncertain(0.5)])
     assert right is not None
     assert half is not None
-    assert (right.frames, right.pixels) == (3, 3 * 200 * 200)
-    within = right.within_1_sigma, right.within_2_sigma, half.within_1_sigma
+    assert (right["frames"], right["pixels"]) == (3, 3 * 200 * 200)
+    within = right["within_1_sigma"], right["within_2_sigma"], half["within_1_sigma"]
     assert within == pytest.approx((0.683, 0.954, 0.383), abs=0.01)
-    assert right.observed == pytest.approx(right.expected, abs=0.01)
+    assert right["observed"] == pytest.approx(right["expected"], abs=0.01)
 
 
 def test_sparsification_is_by_definition() -> None:
@@ -108,7 +109,7 @@ def test_sparsification_is_by_definition() -> None:
     assert total is not None
     assert none is not None
     area = np.trapezoid(worst.sparsification - worst.oracle, np.arange(20) / 20)
-    assert (total.ause, none.ause) == pytest.approx((area / error.mean(), 0))
+    assert (total["ause"], none["ause"]) == pytest.approx((area / error.mean(), 0))
 
 
 def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
@@ -116,8 +117,8 @@ def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
     write_depth(tmp_path / "gt" / "a.npy", GT)
     write_depth(tmp_path / "out" / "a_depth.npy", (GT + RNG.normal(0, 0.1, GT.shape)).astype("f4"))
-    write_depth(tmp_path / "out" / "a_sigma.exr", np.full(GT.shape, 0.1, np.float32))
+    write_depth(tmp_path / "out" / "a_sigma.npy", np.full(GT.shape, 0.1, np.float32))
     result = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "gt"))
     assert result.uncertainty is not None
-    assert result.uncertainty.within_1_sigma == pytest.approx(0.683, abs=0.03)
+    assert result.uncertainty["within_1_sigma"] == pytest.approx(0.683, abs=0.03)
     assert not any("have no ground truth" in note for note in result.notes)

@@ -105,14 +105,6 @@ def test_the_errors_are_those_of_the_loops_digit_for_digit(
     )
 
 
-def test_an_empty_row_between_others_is_left_out_of_the_fill() -> None:
-    depth = np.array([[2, 2], [0, 0], [4, 4]], F)
-    assert fill_background(depth)[1].tolist() == [-1, -1]
-    errors = devkit_errors(depth, np.full((3, 2), 2, F))
-    assert errors["mae"] == pytest.approx((0 + 3 + 2) / 3)
-    assert math.isnan(errors["log_mae"])
-
-
 def test_the_figures_are_those_of_the_official_program() -> None:
     """Printed by evaluate_depth of the kit (g++ -O3) for the sample's scan and its ground truth."""
     predicted = read_depth(SAMPLES / "street" / "sparse.png").values

@@ -47,7 +47,7 @@ def test_a_mean_counts_frames_alike_or_pixels_alike_and_skips_what_is_lacking() 
     assert totals.tolist() == [[[3], [1]], [[7], [2]]]
     generator = torch.Generator().manual_seed(0)
     frames = [torch.rand(2, n, generator=generator) + 1 for n in (3, 50)]
-    sums = np.array([error_sums(p, g)[0].tolist() for p, g in frames])
+    sums = np.array([error_sums(p, g).tolist() for p, g in frames])
     expected = score(*torch.cat(frames, dim=1))
     mean = FrameTable.of_pixels(sums, ["rmse", "delta1"]).mean()
     assert mean == pytest.approx([expected.rmse, expected.delta1], rel=1e-12)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pnpdepth_cli.commands.networks.convert import convert_checkpoint
+from pnpdepth_cli.commands.networks.weights import convert_checkpoint
 from pnpdepth_cli.errors import CheckpointError, UsageError
 
 

@@ -12,7 +12,6 @@ import torch
 from PIL import Image
 
 from pnpdepth_cli.commands.refinement.inputs import Inputs
-from pnpdepth_cli.commands.refinement.output_files import Outputs
 from pnpdepth_cli.commands.refinement.outputs import output_scale, within_range
 from pnpdepth_cli.commands.refinement.request import parse_codes_per_metre
 from pnpdepth_cli.core.refine import Refinement
@@ -22,7 +21,7 @@ from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.points import SparsePoints
 from tests.commands.frames import frame_on_disk, run
 
-PNG = Outputs(depth=Path("depth.png"))
+PNG = {"depth": Path("depth.png")}
 
 
 def inputs_at(*depths: float, scale: float | None = None) -> Inputs:
@@ -58,7 +57,7 @@ def refined_to(*depths: float, inputs: Inputs) -> Refined:
 def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points(
     depths: tuple[float, ...], scale: float | None, expected: float
 ) -> None:
-    assert output_scale(PNG, inputs_at(*depths, scale=scale)) == expected
+    assert output_scale(inputs_at(*depths, scale=scale)) == expected
 
 
 def test_depths_beyond_16_bits_are_clipped_and_counted() -> None:
@@ -68,7 +67,7 @@ def test_depths_beyond_16_bits_are_clipped_and_counted() -> None:
     assert clipped.after.tolist() == [[0.0, 1 / 256, 50.0, 65534 / 256]]
     assert len(clipped.notes) == 2
     assert "1 of 4 pixels clipped to 256.0 m, the largest" in clipped.notes[0]
-    assert within_range(Outputs(depth=Path("depth.exr")), inputs, frame) is frame
+    assert within_range({"depth": Path("depth.exr")}, inputs, frame) is frame
     plain = replace(frame, after=np.full((1, 4), 50, np.float32))
     assert within_range(PNG, inputs, plain) is plain
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.report.evaluation import _charts, write_eval_report
 from pnpdepth_cli.errors import StorageError
 from pnpdepth_cli.io.depth import write_depth
@@ -133,7 +134,7 @@ def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
     assert by_sigma[0] == by_error[0] == 1
     assert 1 > by_sigma[0.5] > by_error[0.5] > 0
     area = np.trapezoid([by_sigma[x] - by_error[x] for x in by_sigma], list(by_sigma))
-    assert area == pytest.approx(result.uncertainty.ause)
+    assert area == pytest.approx(result.uncertainty["ause"])
 
 
 def test_what_the_development_kit_fills_in_is_shown_filled(root: Path) -> None:

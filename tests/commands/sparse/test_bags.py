@@ -18,11 +18,11 @@ from pnpdepth_cli.commands.sparse.scans import read_scan_points
 from pnpdepth_cli.errors import FileFormatError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.layouts import read_frames
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from tests.bags import HEIGHT, IMAGES, POINTS, WIDTH, write_bag
 from tests.commands.frames import frame_on_disk
+from tests.data_sets import read_frames
 
 KINDS = ("ros1.bag", "ros2", "drive.mcap")
 

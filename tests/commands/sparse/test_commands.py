@@ -240,7 +240,8 @@ def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(
     camera = camera_of(read_calibration(folder, 2))
     row, column = np.nonzero(theirs)
     xy = np.column_stack([column, row]).astype(np.float64)
-    points = camera.to_scanner(camera.unproject(xy, theirs[row, column] / 256))
+    points = camera.unproject(xy, theirs[row, column] / 256)
+    points = (points - camera.translation) @ camera.rotation
     scan = tmp_path / "scan.bin"
     np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(scan)
     project_scan(

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pnpdepth_cli.commands.evaluation.evaluate import EvalRequest, evaluate
+from pnpdepth_cli.commands.evaluation.evaluate import evaluate
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.sweep.axes import read_axis, studies_of
 from pnpdepth_cli.commands.sweep.points import read_sampling
 from pnpdepth_cli.commands.sweep.sweep import SweepRequest, run_sweep

@@ -111,15 +111,6 @@ def test_torch_transformer_layers_with_their_fast_path_come_out_the_same(
             assert split.static_graph == (kind is not LooksAtValues)
 
 
-@pytest.mark.slow
-def test_a_compiled_network_can_be_cut() -> None:
-    network, x = build("unet"), image()
-    whole = plain(network, x)
-    compiled = torch.compile(network, backend="eager")
-    with Split(compiled, "_orig_mod.bottleneck") as split, torch.no_grad():
-        assert torch.equal(split.rear(split.front(x)), whole)
-
-
 class ChoosesByValue(nn.Module):
     """In front of the cut, one of two branches; the second changes what the first only reads."""
 
@@ -251,17 +242,6 @@ def test_nothing_of_a_image_stays_in_memory_after_the_split_closes() -> None:
     del split
 
 
-def test_an_exception_holds_nothing_once_it_is_dropped() -> None:
-    network, x = build("unet"), image()
-    with torch.no_grad(), Split(network, "bottleneck") as split:
-        kept = weakref.ref(split.front(x))
-        with pytest.raises(ModelError):
-            split.rear(torch.zeros(1))
-    del split
-    gc.collect()
-    assert kept() is None
-
-
 # ------------------------------------------------------------------ z
 
 
@@ -276,18 +256,6 @@ def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
         assert z.grad is not None
         assert bool((z.grad != 0).any())
     assert all(parameter.grad is None for parameter in network.parameters())
-
-
-def test_an_in_place_operation_behind_the_cut_changes_neither_z_nor_the_arguments() -> None:
-    network, x = InPlace(), image()
-    x_before = x.clone()
-    with Split(network, "b") as split, torch.no_grad():
-        z = split.front(x)
-        z_before = z.clone()
-        split.rear(z)
-        split.rear(z)
-    assert torch.equal(z, z_before)
-    assert torch.equal(x, x_before)
 
 
 def test_z_is_safe_where_the_cut_layer_gives_back_its_own_input() -> None:
@@ -524,25 +492,6 @@ def test_a_hook_that_changes_an_output_is_obeyed() -> None:
     for layer in ("a", "b"):
         with Split(network, layer) as split, torch.no_grad():
             assert torch.equal(split.rear(split.front(x)), plain(network, x))
-
-
-def test_keyword_arguments_and_more_than_one_argument_reach_the_network() -> None:
-    class Network(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.image, self.points, self.head = conv(3, 2), conv(1, 2), conv(4, 1)
-
-        def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
-            rgb.mul_(2), sparse.add_(1)
-            return self.head(torch.cat([self.image(rgb), self.points(sparse)], 1)) + sparse
-
-    network, x = Network(), image()
-    with torch.no_grad():
-        whole = network(x.clone(), x[:, :1].clone())
-        with Split(network, "points") as split:
-            z = split.front(x, x[:, :1])
-            assert torch.equal(split.rear(z), whole)
-            assert torch.equal(split.rear(z), whole)
 
 
 def test_what_a_rear_gives_is_not_touched_by_the_next() -> None:

@@ -114,10 +114,9 @@ def _ddad(folder: Path, image: bytes) -> list[Seed]:
 
 
 def _with_h5py(folder: Path, image: bytes, depth: np.ndarray) -> list[Seed]:
-    """HDF5 as ground truth, and MATLAB files; none if h5py is not installed."""
+    """HDF5 as ground truth; none if h5py is not installed."""
     try:
         import h5py
-        from scipy.io import savemat
     except ImportError:
         return []
     seeds = []
@@ -136,8 +135,8 @@ def _with_h5py(folder: Path, image: bytes, depth: np.ndarray) -> list[Seed]:
         (file,) = [p for p in (folder / name).rglob("*") if p.suffix in (".h5", ".hdf5", ".mat")]
         command = ("eval", prediction.parents[frame.count("/")].name, name)
         seeds.append(Seed(file=file.relative_to(folder).as_posix(), command=command))
-    savemat(folder / "labeled/splits.mat", {"testNdxs": np.array([[2]], np.uint16)})
-    return [*seeds, *_indices("labeled/splits.mat", options=_SAMPLED)]
+    (folder / "labeled/test.txt").write_text("2\n")
+    return [*seeds, *_indices("labeled/test.txt", options=_SAMPLED)]
 
 
 def _write_h5(h5py: object, path: Path) -> None:

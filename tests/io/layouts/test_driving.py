@@ -15,8 +15,8 @@ from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.layouts import find_layout, list_frames, read_frames
-from tests.data_sets import PINHOLE, ddad_scene, nuscenes
+from pnpdepth_cli.io.layouts import find_layout, list_frames
+from tests.data_sets import PINHOLE, ddad_scene, nuscenes, read_frames
 
 
 def request_of(root: Path, **more: Any) -> BatchRequest:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from pathlib import Path
@@ -11,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.commands.batch.frames import task_of
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
@@ -21,13 +19,8 @@ from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, find_protocol
 from pnpdepth_cli.io.dataset.reading import (
     masked,
     moved_to,
-    read_frame_image,
 )
-from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames, read_frames
-from tests.commands.frames import frame_on_disk
-from tests.commands.scan_frames import HEIGHT as SCAN_HEIGHT
-from tests.commands.scan_frames import WIDTH as SCAN_WIDTH
-from tests.commands.scan_frames import scan_on_disk
+from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames
 from tests.data_sets import (
     BENCHMARKS,
     DRIVE,
@@ -41,6 +34,7 @@ from tests.data_sets import (
     ground_truth,
     image,
     mask,
+    read_frames,
     tum,
     void,
 )
@@ -95,16 +89,6 @@ def test_a_listing_has_the_files_of_no_frame(tmp_path: Path) -> None:
     ]
     spare = ["a.png", "d.png", "a.exr", "e.exr", "a.json", "f.txt"]
     assert [lost.path.name for lost in listing.spare] == spare
-
-
-def test_folders_in_pairs_go_with_folders_of_the_same_name(tmp_path: Path) -> None:
-    for part in ("rgb", "sparse"):
-        touch(*(tmp_path / part / file for file in ("x.png", "one/x.png", "two/deep/x.png")))
-    touch(tmp_path / "gt/one/x.exr")
-    frames = {frame.name: frame for frame in read_frames(tmp_path)}
-    assert list(frames) == ["one/x", "two/deep/x", "x"]
-    assert frames["two/deep/x"].sparse == tmp_path / "sparse/two/deep/x.png"
-    assert [name for name, frame in frames.items() if frame.gt] == ["one/x"]
 
 
 def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
@@ -275,16 +259,6 @@ def test_a_line_of_tum_that_means_nothing_is_named(
         read_frames(tmp_path)
 
 
-def test_tum_pairs_long_lists_without_a_matrix_of_all_times(tmp_path: Path) -> None:
-    count = 6_000  # every image with every depth would be 300 MB
-    for name, offset in (("rgb", 0.0), ("depth", 0.005)):
-        lines = (f"{n / 30 + offset:.6f} {name}/{n}.png\n" for n in range(count))
-        (tmp_path / f"{name}.txt").write_text("".join(lines))
-    frames = read_frames(tmp_path)
-    assert len(frames) == count
-    assert all(frame.image.stem == frame.gt.stem for frame in frames)  # type: ignore[union-attr]
-
-
 def test_synthias_sequences_pair_each_camera_with_its_depth(tmp_path: Path) -> None:
     sequence = tmp_path / "SYNTHIA-SEQS-01-DAWN"
     for folder in (sequence, tmp_path / "SYNTHIA-SEQS-02-FALL"):
@@ -407,19 +381,15 @@ def test_the_parent_of_data_sets_of_one_layout_has_their_frames(tmp_path: Path) 
 
 
 def test_what_is_no_data_set_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"layouts need: .*; pairs rgb, sparse; ") as caught:
+    with pytest.raises(InputError, match=r"images into rgb/ .* known layouts: .*pairs") as caught:
         find_layout(tmp_path)
-    assert len(str(caught.value)) < 2000
+    assert len(str(caught.value).removeprefix(str(tmp_path))) < 400
     with pytest.raises(InputError, match=r"does not look like 'tum', which needs rgb\.txt, depth"):
         read_frames(tmp_path, "tum")
     with pytest.raises(InputError, match="no such folder"):
         read_frames(tmp_path / "lost")
     with pytest.raises(UsageError, match="unknown layout 'nyu'; did you mean"):
         read_frames(tmp_path, "nyu")
-    for folder in ("rgb", "sparse"):
-        (tmp_path / folder).mkdir()
-    with pytest.raises(InputError, match="has no frame"):
-        read_frames(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -465,39 +435,3 @@ def test_pixel_coordinates_move_as_the_image_is_cut(name: str) -> None:
     there = protocol.in_crop(part[row, column][None].astype(np.float32), (480, 1240))
     # the kept pixel is one quarter of a new one away from its centre where pixels are halved
     np.testing.assert_allclose(there[0], [column, row], atol=0.26)
-
-
-def test_the_shared_frames_are_recognised(shared_data: Path) -> None:
-    objects = read_frames(shared_data / "kitti_object")
-    assert [f.name for f in objects] == [f"00000{i}" for i in range(4)]
-    completion = read_frames(shared_data / "kitti_dc")
-    assert {frame.calib for frame in completion} == {shared_data / "kitti_dc"}
-    truth = ground_truth(completion[0])
-    assert truth.shape == (375, 1242)
-    assert 0.15 < np.mean(truth > 0) < 0.25
-    scenes = read_frames(shared_data / "7scenes")
-    assert len(scenes) == 50
-    assert read_frame_image(scenes[0]).shape == (480, 640, 3)
-    assert 0.5 < np.median(ground_truth(scenes[0])) < 4
-
-
-def test_points_are_sampled_from_the_scan_that_is_the_ground_truth(tmp_path: Path) -> None:
-    scene = scan_on_disk(tmp_path)
-    sequence = tmp_path / "sequences" / "00"
-    touch(sequence / "image_2" / "000000.png", sequence / "velodyne" / "000000.bin")
-    shutil.copy(scene.image, sequence / "image_2" / "000000.png")
-    shutil.copy(scene.scan, sequence / "velodyne" / "000000.bin")
-    (sequence / "calib.txt").write_text(
-        "P2: 60 0 31.5 0 0 60 23.5 0 0 0 1 0\nTr: 0 -1 0 0.1 0 0 -1 -0.05 1 0 0 -0.2\n"
-    )
-    frame = frame_on_disk(tmp_path)
-    options = ["--sample", "50", "--layout", "kitti-odometry", "--protocol", "whole"]
-    network = ["--iterations", "1", "--model", str(frame.model)]
-    network += ["--checkpoint", str(frame.checkpoint)]
-    with pytest.raises(SystemExit) as ended:
-        main(["batch", str(tmp_path / "sequences"), "-o", str(tmp_path / "o"), *options, *network])
-    assert ended.value.code == 0
-    (row,) = json.loads((tmp_path / "o" / "summary.json").read_text())["frames"]
-    assert row["points"]["used"] == 50
-    assert row["size"] == [SCAN_WIDTH, SCAN_HEIGHT]
-    assert 50 < row["scores"]["after"]["pixels"] <= 150

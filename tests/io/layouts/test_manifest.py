@@ -9,7 +9,7 @@ import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, name_problem
-from pnpdepth_cli.io.layouts import read_frames
+from tests.data_sets import read_frames
 from tests.empty_files import touch
 
 
@@ -100,26 +100,7 @@ def test_two_names_of_one_file_are_refused(tmp_path: Path, first: str, second: s
         frames_named(tmp_path, first, second)
 
 
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [
-        ("a\0b", "NUL"),
-        ("a\\b", "backslash"),
-        ("C:/frames/a", "drive letter"),
-        ("con", "which Windows reserves"),
-        ("x/NUL.tar/y", "which Windows reserves"),
-        ("Com1", "which Windows reserves"),
-        (".", "names no file"),
-        ("n" * 240, "longer than 239 bytes"),
-        ("x/" + "é" * 120, "longer than 239 bytes"),
-    ],
-)
-def test_a_name_that_is_fit_for_no_file_is_refused(tmp_path: Path, name: str, why: str) -> None:
-    with pytest.raises(FileFormatError, match=rf"line 1: .*{why}"):
-        frames_named(tmp_path, name)
-
-
-def test_other_names_stay_but_for_dots_and_double_slashes(tmp_path: Path) -> None:
+def test_names_stay_but_for_dots_and_double_slashes(tmp_path: Path) -> None:
     names = ["console", "nullable", "a.con", "n" * 239, "x/y", "é"]
     assert [frame.name for frame in frames_named(tmp_path, *names)] == names
     assert [frame.name for frame in frames_named(tmp_path, "./s", "x//y/.")] == ["s", "x/y"]
@@ -129,11 +110,15 @@ def test_other_names_stay_but_for_dots_and_double_slashes(tmp_path: Path) -> Non
     ("name", "problem"),
     [
         *((name, "leads out of the output folder") for name in ("../a", "/a", "x/../../a")),
+        *((name, "on Windows") for name in ("a\\b", "C:/frames/a")),
+        ("a\0b", "NUL"),
+        (".", "names no file"),
         ("n" * 240, "is longer than 239 bytes"),
-        ("C:con", None),  # a name that this system has
+        ("x/" + "é" * 120, "is longer than 239 bytes"),
     ],
 )
-def test_a_name_that_leads_elsewhere_or_is_too_long_has_no_results(
-    name: str, problem: str | None
+def test_a_name_that_leads_elsewhere_or_is_none_of_a_file_has_no_results(
+    name: str, problem: str
 ) -> None:
-    assert name_problem(name) == problem
+    assert problem in (name_problem(name) or "")
+    assert name_problem("n" * 239) is None

@@ -1,36 +1,35 @@
-"""NYU Depth v2, and what is read of HDF5 and MATLAB files: whole, damaged, and lying."""
+"""NYU Depth v2, and what is read of HDF5 files: whole, damaged, and lying."""
 
 from __future__ import annotations
 
-import tracemalloc
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.dataset import Hdf5Array
-from pnpdepth_cli.io.dataset.reading import (
-    depth_of,
-    read_frame_image,
-    read_matlab_array,
-    shape_of,
-)
-from pnpdepth_cli.io.layouts import list_frames, read_frames
-from tests.data_sets import ground_truth, nyu_h5, nyu_mat
+from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.dataset import Frame, Hdf5Array
+from pnpdepth_cli.io.dataset.reading import depth_of, read_image, shape_of
+from pnpdepth_cli.io.layouts import list_frames
+from tests.data_sets import ground_truth, nyu_h5, nyu_mat, read_frames
+from tests.empty_files import touch
 
 h5py = pytest.importorskip("h5py")
+
+
+def image_of(frame: Frame) -> np.ndarray:
+    assert frame.image is not None
+    return frame.protocol.apply(read_image(frame.image))
 
 
 def test_nyu_frames_come_halved_and_cropped_to_228_by_304(tmp_path: Path) -> None:
     nyu_h5(tmp_path / "h5")
     frame = read_frames(tmp_path / "h5")[1]
-    assert read_frame_image(frame).shape == (228, 304, 3)
+    assert image_of(frame).shape == (228, 304, 3)
     assert ground_truth(frame).tolist() == np.full((228, 304), 9.0).tolist()
     nyu_mat(tmp_path / "mat")
     frame = read_frames(tmp_path / "mat")[2]
-    np.testing.assert_array_equal(read_frame_image(frame), np.float32(2) / np.float32(255))
+    np.testing.assert_array_equal(image_of(frame), np.float32(2) / np.float32(255))
     # columns 8 … 311 of every second pixel, 1 3 5 …: column c holds 2 c + 2 metres
     want = 2 * np.arange(8, 312) + 2
     assert (ground_truth(frame) == want).all()
@@ -42,17 +41,16 @@ def test_kitti_in_files_of_the_same_kind_is_cut_as_kitti_is(tmp_path: Path) -> N
         file["rgb"], file["depth"] = np.zeros((3, 376, 1241), np.uint8), depth
     (frame,) = read_frames(tmp_path)
     assert frame.protocol.name == "kitti-odometry"
-    assert read_frame_image(frame).shape == (228, 912, 3)
+    assert image_of(frame).shape == (228, 912, 3)
     np.testing.assert_array_equal(ground_truth(frame), depth[148:, 164:1076])
 
 
-@pytest.mark.parametrize("kind", ["txt", "mat"])
-def test_the_official_file_is_split_by_the_file_beside_it(tmp_path: Path, kind: str) -> None:
+def test_the_official_file_is_split_by_the_file_beside_it(tmp_path: Path) -> None:
     nyu_mat(tmp_path)
-    if kind == "txt":
-        (tmp_path / "test.txt").write_text("2\n4\n")
-    else:
-        write(tmp_path / "splits.mat", testNdxs=np.array([[2], [4]], np.uint16))
+    touch(tmp_path / "splits.mat")
+    with pytest.raises(InputError, match=r"splits\.mat is not read; write the numbers"):
+        read_frames(tmp_path)
+    (tmp_path / "test.txt").write_text("2\n4\n")
     frames = read_frames(tmp_path)
     assert [frame.name for frame in frames] == ["0002", "0004"]
     assert [frame.image.index for frame in frames] == [1, 3]  # type: ignore[union-attr]
@@ -106,38 +104,3 @@ def test_a_small_file_cannot_claim_a_billion_frames_or_values(tmp_path: Path) ->
         list_frames(tmp_path)
     with pytest.raises(FileFormatError, match="10,000,000,000 values"):
         depth_of(Hdf5Array(path=path, name="depth", axes=(0, 1)))
-
-
-def write(path: Path, *, compressed: bool = False, **variables: Any) -> Path:
-    from scipy.io import savemat
-
-    savemat(path, variables, do_compression=compressed)
-    return path
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-@pytest.mark.parametrize("kind", ["u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"])
-def test_whole_numbers_that_scipy_wrote_are_read(
-    kind: str, compressed: bool, tmp_path: Path
-) -> None:
-    numbers, other = np.array([[1], [2], [100]], kind), np.ones((3, 4))
-    path = write(tmp_path / "a.mat", compressed=compressed, trainNdxs=other, testNdxs=numbers)
-    assert read_matlab_array(path, "testNdxs").tolist() == [1, 2, 100]
-    with pytest.raises(FileFormatError, match="has no valNdxs"):
-        read_matlab_array(path, "valNdxs")
-
-
-@pytest.mark.parametrize("content", [[0.5], [np.nan], [1e300], ["text"]])
-def test_what_is_no_list_of_whole_numbers_is_refused(content: Any, tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mat", a=np.array(content))
-    with pytest.raises(FileFormatError, match=r"\A.*\Z"):
-        read_matlab_array(path, "a")
-
-
-def test_a_variable_that_decompresses_to_much_more_takes_no_memory(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mat", compressed=True, a=np.ones(8_000_000, np.uint8))
-    tracemalloc.start()
-    with pytest.raises(FileFormatError, match="goes beyond the end"):
-        read_matlab_array(path, "a")
-    assert tracemalloc.get_traced_memory()[1] < 4e6
-    tracemalloc.stop()

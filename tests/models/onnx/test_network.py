@@ -19,7 +19,6 @@ from onnx import helper, numpy_helper
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import LayerError, ModelError, UsageError
-from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.onnx import graph
 from pnpdepth_cli.models.onnx.table import OPERATORS
@@ -81,52 +80,6 @@ def test_an_incorrect_conversion_is_refused(
     network = load_network(str(write_network(tmp_path / "net.onnx")), None)
     with pytest.raises(ModelError, match="by torch differs from onnxruntime's by"):
         network.verified((image(1, 3, 32, 48),))
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_an_inverse_depth_of_either_sign_is_aligned_and_refined(
-    tmp_path: Path, sign: float
-) -> None:
-    network = load_network(str(write_network(tmp_path / "net.onnx", sign=sign)), None)
-    with torch.no_grad():
-        raw = network.module(image(1, 3, 32, 48))
-    chosen = torch.randperm(32 * 48, generator=torch.Generator().manual_seed(1))[:80]
-    near = raw.abs().flatten()[chosen]
-    true = 1 / (near - 0.9 * near.min())
-    points = SparsePoints(
-        xy=torch.stack([chosen % 48, chosen // 48], dim=1).float(), depth=true, size=(32, 48)
-    )
-    depth_of = AlignedDepth(network, points, "auto")
-    with Split(network.module, network.definition.layers[0]) as split:
-        result = refine(
-            split, (image(1, 3, 32, 48),), points, Settings(iterations=3),
-            depth_of=depth_of,
-        )  # fmt: skip
-    assert depth_of.alignment is not None
-    assert (depth_of.alignment.space, depth_of.alignment.kind) == ("inverse", "affine")
-    assert depth_of.alignment.falling == (sign > 0)
-    assert torch.allclose(points.sample(result.before), true, rtol=1e-3)
-
-
-def test_fastdepth_reproduces_its_published_prediction_and_is_refined(shared_data: Path) -> None:
-    network = load_network(str(shared_data / "weights" / "fastdepth_nyu.onnx"), None)
-    nyu = shared_data / "nyu"
-    rgb = torch.from_numpy(np.load(nyu / "rgb.npy").transpose(2, 0, 1)[None]).float()
-    published = torch.from_numpy(np.load(nyu / "pred.npy"))
-    gt = torch.from_numpy(np.load(nyu / "depth.npy")).float().reshape(224, 224)
-    with torch.no_grad():
-        assert float((network.module(rgb) - published).abs().mean()) < 1e-5
-    assert network.verified((rgb,))
-    chosen = torch.randperm(224 * 224, generator=torch.Generator().manual_seed(0))[:200]
-    points = SparsePoints(
-        xy=torch.stack([chosen % 224, chosen // 224], dim=1).float(),
-        depth=gt.flatten()[chosen], size=(224, 224),
-    )  # fmt: skip
-    settings = Settings(iterations=5, lr="3%", update="adam")
-    with Split(network.module, network.definition.layers[0]) as split:
-        result = refine(split, (rgb,), points, settings, depth_of=network.depth_of)
-    before, after = (float((d[0, 0] - gt).abs().mean()) for d in (result.before, result.after))
-    assert after < 0.8 * before
 
 
 def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:

@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -179,14 +177,11 @@ def test_a_definition_may_rename_what_a_published_file_holds(tmp_path: Path) -> 
     assert equal(loaded(tmp_path / "w.pth", **rename)[0], weights())
 
 
-def test_the_data_of_the_training_and_what_was_not_run_are_reported(tmp_path: Path) -> None:
-    for data, shown in (("kitti", "kitti"), ("a" * 10**5, "a" * 60 + "…")):
-        args = argparse.Namespace(data=data, lr=0.1, secret="x")
-        torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
-        assert loaded(tmp_path / "w.pth")[1] == [
-            "checkpoint w.pth: its pickle names argparse.Namespace; nothing of it was run",
-            f"checkpoint w.pth: trained with data {shown}",
-        ]
+def test_what_was_not_run_is_reported(tmp_path: Path) -> None:
+    torch.save({"args": argparse.Namespace(), "state_dict": weights()}, tmp_path / "w.pth")
+    assert loaded(tmp_path / "w.pth")[1] == [
+        "checkpoint w.pth: its pickle names argparse.Namespace; nothing of it was run"
+    ]
 
 
 @pytest.mark.parametrize("save", [torch.save, save_older])
@@ -296,19 +291,33 @@ def test_a_pointer_to_a_file_that_was_not_fetched_is_named(tmp_path: Path) -> No
     assert "is a Git LFS pointer" in refused(tmp_path / "w.pth.tar")
 
 
+@pytest.mark.parametrize(
+    ("save", "suffix"),
+    [
+        (torch.save, ".pth"),
+        (save_older, ".pth"),
+        (save_file, ".safetensors"),
+        (save_layers, ".npy"),
+        (save_numbered, ".npz"),
+    ],
+)
+def test_a_file_cut_anywhere_is_refused(
+    save: Callable[[Any, Path], None], suffix: str, tmp_path: Path
+) -> None:
+    path = tmp_path / f"w{suffix}"
+    save(weights(), path)
+    whole = path.read_bytes()
+    for length in range(0, len(whole) - 1, max(1, len(whole) // 60)):
+        path.write_bytes(whole[:length])
+        assert f"w{suffix} cannot be read" in refused(path)
+
+
 def test_garbage_is_refused(tmp_path: Path) -> None:
     garbage = [b"", b"\0" * 50, b"not a checkpoint\n", b"\x80\x02}q\0.", b"PK\x03\x04"]
     for content in garbage:
         for suffix in (".pth", ".safetensors", ".npy", ".npz", ".index"):
             (tmp_path / f"w{suffix}").write_bytes(content)
             refused(tmp_path / f"w{suffix}")
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
-@given(content=st.binary(max_size=200), suffix=st.sampled_from([".pth", ".safetensors", ".npz"]))
-def test_any_other_bytes_are_refused(content: bytes, suffix: str, tmp_path: Path) -> None:
-    (tmp_path / f"fuzz{suffix}").write_bytes(content)
-    refused(tmp_path / f"fuzz{suffix}")
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
 from tests.models.weights.files import (
@@ -206,32 +204,3 @@ def test_an_archive_that_inflates_beyond_its_directory_takes_no_memory(
     with_directory_size(path, 100)
     with little(megabytes=30):
         refused(path)
-
-
-@pytest.mark.parametrize("suffix", ["npy", "npz"])
-def test_a_file_cut_anywhere_is_refused(suffix: str, tmp_path: Path) -> None:
-    path = tmp_path / f"x.{suffix}"
-    if suffix == "npy":
-        write_npy(path, layers())
-    else:
-        np.savez(path, **layers()["conv1"])
-    whole = path.read_bytes()
-    for length in range(0, len(whole) - 1, max(1, len(whole) // 60)):
-        path.write_bytes(whole[:length])
-        refused(path)
-
-
-HEADER = st.text(alphabet="{}[]()'\":,. \ndescrfotashp|O<4i-L0", max_size=80).map(
-    lambda text: b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
-)
-
-
-@given(data=st.binary(max_size=200), header=HEADER, kind=st.sampled_from(["header", "pickle"]))
-@settings(
-    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-def test_any_other_bytes_are_refused(data: bytes, header: bytes, kind: str, tmp_path: Path) -> None:
-    path = npy_of(tmp_path / "fuzz.npy", data)
-    if kind == "header":
-        path.write_bytes(header + data)
-    refused(path)
