@@ -133,24 +133,6 @@ def test_activations_of_old_and_new_opsets() -> None:
     check("Softmax", [X], opset=11, axis=2)
 
 
-@pytest.mark.parametrize(
-    ("op", "shape", "more", "expected"),
-    [
-        ("PRelu", (4,), {}, lambda x, y: np.where(x < 0, x * y[:, None, None], x)),
-        ("Sub", (4, 7), {"axis": 1, "broadcast": 1}, lambda x, y: x - y[..., None]),
-        ("Mul", (4,), {"axis": -3, "broadcast": 1}, lambda x, y: x * y[:, None, None]),
-        ("Add", (7, 6), {"broadcast": 1}, np.add),
-        ("Div", (1, 4, 7, 6), {"axis": 0}, np.divide),
-    ],
-)
-def test_before_opset_7_which_onnxruntime_lacks_a_smaller_input_begins_at_an_axis(
-    op: str, shape: tuple[int, ...], more: dict[str, Any], expected: Any
-) -> None:
-    y = normal(*shape)
-    ours = OnnxGraph(model_of(op, [X, y], 6, 1, **more), Path("x.onnx"))(torch.from_numpy(X))
-    assert np.array_equal(ours.numpy(), expected(X, y))
-
-
 def test_matrices() -> None:
     check("MatMul", [normal(2, 3, 5), normal(5, 4)])
     check("Gemm", [normal(3, 5), normal(4, 5), normal(4)], transB=1, alpha=0.5, beta=2.0)
