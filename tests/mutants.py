@@ -4,21 +4,23 @@
 
 One expression of a file is changed: a comparison, an arithmetic operator, a constant, `and`, a
 returned value, min, any, floor, mean and the like. In a temporary copy of the tree the test files
-that mirror the module run first, then those that import it. A test that fails with the mutant and
-passes without it kills it; so does a run without end. Prints a table by package, and each survivor
-with its place and change.
+that mirror the module or import it run first, then the others of its folder. A test that fails with
+the mutant and passes without it kills it; so does a run without end. Prints a table by package, and
+each survivor with its place and change.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import compileall
 import copy
+import multiprocessing
 import os
 import random
 import re
+import resource
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -34,8 +36,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("pnpdepth_cli", "model_zoo_defs")
-ALARM_S = 90.0
-"""After the limit of a mutant, its tests are ended: it hangs."""
+HANGS_S = 10
+"""Seconds of processor time after a mutant's limit at which its tests are ended."""
 
 _ORDER = "Lt LtE Gt,LtE Lt Gt,Gt GtE Lt,GtE Gt Lt,FloorDiv Mult,Mod Mult,Pow Mult"
 _PAIRS = "Eq NotEq,In NotIn,Is IsNot,Add Sub,Mult Div,BitAnd BitOr,And Or"
@@ -123,8 +125,8 @@ def mutants(only: str) -> list[Mutant]:
     return found
 
 
-def matching_tests(file: Path) -> list[str]:
-    """Returns the test files that mirror a module, then those that import it."""
+def matching_tests(file: Path) -> list[list[str]]:
+    """Returns the test files that mirror a module or import it, and the others of its folder."""
     parts = file.parts[1:-1] if file.parts[0] == "pnpdepth_cli" else file.parts[:1]
     folder = ROOT.joinpath("tests", *parts)
     module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
@@ -132,11 +134,11 @@ def matching_tests(file: Path) -> list[str]:
     imports = re.compile(rf"{module}\b|from {parent} import [^)\n]*\b{last}\b")
     tests = sorted((ROOT / "tests").rglob("test_*.py"))
     importing = [path for path in tests if imports.search(path.read_text("utf-8"))]
-    mirror = sorted(folder.glob(f"test_{file.stem}*.py"))
+    first = dict.fromkeys([*sorted(folder.glob(f"test_{file.stem}*.py")), *importing])
     while not (near := sorted(folder.glob("test_*.py"))):  # such as io/formats, tested in io
         folder = folder.parent
-    chosen = dict.fromkeys([*mirror, *importing]) or near
-    return [path.relative_to(ROOT).as_posix() for path in chosen]
+    chosen = ([*first], [path for path in near if path not in first])
+    return [[path.relative_to(ROOT).as_posix() for path in paths] for paths in chosen if paths]
 
 
 class Trees:
@@ -148,57 +150,85 @@ class Trees:
         ignored = shutil.ignore_patterns(".*", "__pycache__", "out", "dist", "build", "site")
         for number in range(arguments.jobs):
             shutil.copytree(ROOT, folder / str(number), ignore=ignored)
+            compileall.compile_dir(folder / str(number), quiet=2)  # never of a mutant
             self._free.put(folder / str(number))
 
     def outcome(self, mutant: Mutant) -> str:
         """Returns `survived`, or what killed the mutant."""
         tree, broken = self._free.get(), list[str]()
-        file, tests = tree / mutant.file, matching_tests(mutant.file)
+        file = tree / mutant.file
         original = file.read_bytes()
+        mutated = original[: mutant.start] + mutant.text + original[mutant.end :]
         try:
-            while True:  # a test that fails without the mutant too is left out
-                file.write_bytes(original[: mutant.start] + mutant.text + original[mutant.end :])
-                failed = self._failed(tree, tests, broken)
-                if failed in ("", "time") or self._sound.get(failed):
-                    return failed or "survived"
-                file.write_bytes(original)
-                self._sound[failed] = not self._failed(tree, [failed], [])
-                if self._sound[failed]:
-                    return failed
-                broken.append(failed)
+            for tests in matching_tests(mutant.file):
+                file.write_bytes(mutated)
+                while failed := self._failed(tree, tests, broken):
+                    if failed == "time" or self._passes_without(failed, tree, file, original):
+                        return failed
+                    broken.append(failed)
+                    file.write_bytes(mutated)
+            return "survived"
         finally:
             file.write_bytes(original)
             self._free.put(tree)
 
+    def _passes_without(self, test: str, tree: Path, file: Path, original: bytes) -> bool:
+        if test not in self._sound:
+            file.write_bytes(original)
+            self._sound[test] = not self._failed(tree, [test], [])
+        return self._sound[test]
+
     def _failed(self, tree: Path, tests: list[str], without: list[str]) -> str:
         """The first test that fails, `time` if it does not end, or an empty text."""
-        options = ["-p", "no:cacheprovider", "-p", "tests.mutants", "-x", "-q", "-rfE", "--tb=no"]
-        options += ["-m", self._arguments.marked, *(f"--deselect={name}" for name in without)]
-        data = os.environ.get("PNPDEPTH_TEST_DATA", str(ROOT.parent / "shared" / "data"))
-        limit = self._arguments.limit
-        changes = {"PYTHONPATH": str(tree), "PNPDEPTH_TEST_DATA": data}
-        changes |= {"PNPDEPTH_MUTANT_LIMIT": str(limit), "PYTHONDONTWRITEBYTECODE": "1"}
-        command = [sys.executable, "-m", "pytest", *options, *tests]
-        how = {"capture_output": True, "text": True, "stdin": subprocess.DEVNULL}
-        try:
-            done = subprocess.run(  # type: ignore[call-overload]
-                command, cwd=tree, env=os.environ | changes, timeout=limit + ALARM_S, **how
-            )
-        except subprocess.TimeoutExpired:
+        options = ["-p", "no:cacheprovider", "-p", "tests.mutants", "--assert=plain", "--tb=no"]
+        options += ["-x", "-q", "-rfE", "-m", self._arguments.marked]
+        options += [*(f"--deselect={name}" for name in without), *tests]
+        printed, limit = tree / "printed.txt", self._arguments.limit
+        process = _FORKS.Process(target=_run_tests, args=(printed, limit, options))
+        process.start()
+        process.join(20 * limit)
+        if process.is_alive() or (process.exitcode or 0) < 0:
+            process.kill()
             return "time"
-        if done.returncode in (0, 5):  # 5: no test is left
+        if process.exitcode in (0, 5):  # 5: no test is left
             return ""
-        named = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+        named = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", printed.read_text(), re.MULTILINE)
         return named[1] if named else tests[0]
 
 
-_STARTED = time.monotonic()
+_FORKS = multiprocessing.get_context("forkserver")
+_LIBRARIES = (
+    *("pytest", "hypothesis.extra.numpy", "torch", "safetensors.torch", "cv2", "PIL.Image"),
+    *("scipy.interpolate", "scipy.ndimage", "scipy.spatial", "scipy.stats", "click", "rich.table"),
+)
+_FORKS.set_forkserver_preload([*_LIBRARIES])
+
+
+def _run_tests(printed: Path, limit: float, arguments: list[str]) -> None:
+    """Ends the process, forked where the libraries are imported already, with pytest's exit code.
+
+    It runs in the folder of `printed`, where pytest's output goes.
+    """
+    for name in [name for name in sys.modules if name.partition(".")[0] == "tests"]:
+        del sys.modules[name]  # of the tree that the mutants were chosen in
+    with printed.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os.chdir(printed.parent)
+    sys.path[:0] = [str(printed.parent)]
+    sys.dont_write_bytecode = True
+    data = os.environ.get("PNPDEPTH_TEST_DATA", str(ROOT.parent / "shared" / "data"))
+    os.environ |= {"PYTHONPATH": str(printed.parent), "PNPDEPTH_TEST_DATA": data}
+    os.environ |= {"PNPDEPTH_MUTANT_LIMIT": str(limit), "PYTHONDONTWRITEBYTECODE": "1"}
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    resource.setrlimit(resource.RLIMIT_CPU, (int(limit) + HANGS_S,) * 2)
+    sys.exit(int(pytest.main(arguments)))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skips the tests that begin after the limit, where pytest has this file as its plugin."""
     limit = float(os.environ.get("PNPDEPTH_MUTANT_LIMIT", "inf"))
-    if time.monotonic() - _STARTED > limit:
+    if time.process_time() > limit:
         pytest.skip("no time left for this mutant")
 
 
@@ -210,7 +240,7 @@ def main() -> None:
         ("--seed", 0, "of the choice of mutants"),
         ("--only", "", "a file or folder, from the root of the tree"),
         ("--jobs", 1, "mutants at once"),
-        ("--limit", 120.0, "seconds of tests for a mutant"),
+        ("--limit", 40.0, "seconds of processor time for a mutant's tests"),
         ("--marked", "not slow", "pytest's -m"),
     ):
         parser.add_argument(name, type=type(default), default=default, help=text)

@@ -130,6 +130,14 @@ def test_help_imports_neither_torch_nor_numpy_nor_rich() -> None:
     assert shown.count("Usage: pnpdepth") == 1 + len(commands)
 
 
-@pytest.mark.parametrize("module", ["pnpdepth_cli", "pnpdepth_cli.points"])
-def test_an_import_is_light(module: str) -> None:
-    imports_nothing_of("torch numpy", f"import {module}")
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [
+        *((module, "torch numpy") for module in ("pnpdepth_cli", "pnpdepth_cli.points")),
+        ("pnpdepth_cli.models.definition", "torch"),
+        ("pnpdepth_cli.io.depth, pnpdepth_cli.io.rgb", "OpenEXR PIL torch scipy"),
+        ("pnpdepth_cli.io.visualisation, pnpdepth_cli.io.record", "OpenEXR PIL torch scipy"),
+    ],
+)
+def test_an_import_is_light(module: str, heavy: str) -> None:
+    imports_nothing_of(heavy, f"import {module}")

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -26,9 +27,13 @@ def network() -> pnp.Network:
     return pnp.load_network("compact")
 
 
+PART = slice(0, 128), slice(0, 160)
+
+
 @pytest.fixture(scope="module")
 def frame() -> Frame:
-    return read_rgb(SAMPLE / "rgb.png").values, read_depth(SAMPLE / "sparse.png").values
+    """A part of the sample."""
+    return read_rgb(SAMPLE / "rgb.png").values[PART], read_depth(SAMPLE / "sparse.png").values[PART]
 
 
 def test_the_public_names_are_these() -> None:
@@ -50,12 +55,14 @@ def test_arrays_are_refined_as_the_command_refines_files(
     from pnpdepth_cli.cli.main import main
 
     refined = pnp.refine(network, *frame)
-    files = [str(SAMPLE / "rgb.png"), "--sparse", str(SAMPLE / "sparse.png")]
+    files = [str(tmp_path / "rgb.png"), "--sparse", str(tmp_path / "sparse.npy")]
+    cv2.imwrite(files[0], np.rint(frame[0][:, :, ::-1] * 255))
+    np.save(files[2], frame[1])
     with pytest.raises(SystemExit) as ended:
         main(["refine", *files, "-o", str(tmp_path / "depth.npy")])
     assert ended.value.code in (None, 0)
     assert np.array_equal(refined.depth, np.load(tmp_path / "depth.npy"))
-    truth = read_depth(SAMPLE / "gt.png").values
+    truth = read_depth(SAMPLE / "gt.png").values[PART]
     assert pnp.score(refined.depth, truth).mae < pnp.score(refined.before, truth).mae
 
 
@@ -65,14 +72,16 @@ def test_a_refiner_stays_open_and_takes_maps_rows_and_points_alike(
     rgb, sparse = frame
     y, x = np.nonzero(sparse)
     rows = np.stack([x, y, sparse[y, x]], axis=1)
+    unknown = np.array([[np.nan, 3, 2], [3, np.nan, 2], [3, 3, np.nan], [3, 3, 0], [3, 3, np.inf]])
     points = pnp.SparsePoints(
         xy=torch.from_numpy(rows[:, :2].astype(np.float32)),
         depth=torch.from_numpy(rows[:, 2].astype(np.float32)),
         size=sparse.shape,
     )
+    maps = (sparse, sparse, np.concatenate([unknown, rows]), points)
     before = {name: value.clone() for name, value in network.module.state_dict().items()}
     with pnp.Refiner(network, pnp.Settings(iterations=1)) as refiner:
-        depths = [refiner.refine(rgb, given).depth for given in (sparse, sparse, rows, points)]
+        depths = [refiner.refine(rgb, given).depth for given in maps]
     assert all(np.array_equal(depths[0], depth) for depth in depths[1:])
     assert all(torch.equal(before[n], v) for n, v in network.module.state_dict().items())
     assert not any("forward" in module.__dict__ for module in network.module.modules())
@@ -156,6 +165,7 @@ def test_every_unambiguous_form_of_an_image_is_read_alike(
     form: Callable[[NDArray[Any]], Any],
 ) -> None:
     grey = np.random.default_rng(0).integers(0, 256, (6, 8, 1), np.uint8)
+    grey[0, 0] = 0  # the darkest belongs to 0..255 too
     rgb = grey.repeat(3, axis=2)
     rows = [[1.0, 2, 3]]
     expected = frame_of_arrays(rgb, rows).rgb

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -202,6 +203,15 @@ def test_morphological_of_few_points_is_that_of_a_smaller_image() -> None:
     tenfold = [(10 * x + 4.5, 10 * y + 4.5) for x, y in xy]
     large = morphological(points_at(tenfold, depth, (320, 320)))
     assert torch.allclose(large[4::10, 4::10], small, atol=0.2)
+
+
+def test_morphological_takes_a_point_outside_the_frame_as_one_of_its_outermost_pixels() -> None:
+    points = scattered(300, on_grid=True)
+    last = torch.tensor([59.0, 39.0])
+    xy = torch.where(points.xy == 0, -7.0, torch.where(points.xy == last, 70.0, points.xy))
+    assert (xy < 0).any(dim=0).all()
+    assert (xy > last).any(dim=0).all()
+    assert torch.equal(morphological(replace(points, xy=xy)), morphological(points))
 
 
 def test_the_last_results_of_a_few_coordinates_are_remembered_and_those_of_many_are_not(

@@ -136,9 +136,9 @@ def _counted(forward: Any, calls: list[int]) -> Any:
 
 def test_the_steps_are_those_of_running_the_whole_network_every_time() -> None:
     network = TwoInputs()
-    result = refined(network)
+    result = refined(network, at=points(60))
     assert result.kept == SETTINGS.iterations
-    assert torch.allclose(result.after, naive(network, points()), rtol=1e-6, atol=0)
+    assert torch.allclose(result.after, naive(network, points(60)), rtol=1e-6, atol=0)
     assert len(result.losses) == SETTINGS.iterations
 
 
@@ -252,17 +252,46 @@ def test_a_few_points_leave_the_plain_depth(count: int) -> None:
 @pytest.mark.parametrize("fraction", [0.1, 0.3, 0.5, 0.8])
 @pytest.mark.parametrize("count", [2, 5, 40])
 def test_a_mask_hides_some_and_shows_some(kind: str, fraction: float, count: int) -> None:
-    masks = _masks(points(count), kind, fraction)
-    for _ in range(7):
-        assert 0 < int(masks.next().sum()) < count
+    row = SparsePoints(
+        xy=torch.arange(count)[:, None] * torch.tensor([0.3, 0.0]) + 1,
+        depth=torch.ones(count),
+        size=(16, 16),
+    )
+    for at in (points(count), row):
+        masks = _masks(at, kind, fraction)
+        for _ in range(7):
+            assert 0 < int(masks.next().sum()) < count
 
 
-@pytest.mark.parametrize(("fraction", "parts"), [(0.5, 2), (0.34, 3), (0.25, 4)])
-def test_every_point_is_hidden_once_before_any_is_hidden_again(fraction: float, parts: int) -> None:
+@pytest.mark.parametrize(
+    ("fraction", "sizes"), [(0.5, [20, 20]), (0.34, [13, 13, 14]), (0.25, [10] * 4)]
+)
+def test_every_point_is_hidden_once_before_any_is_hidden_again(
+    fraction: float, sizes: list[int]
+) -> None:
     masks = _masks(points(40), "points", fraction)
     for _ in range(2):
-        hidden = sum(masks.next().int() for _ in range(parts))
-        assert torch.equal(hidden, torch.ones(40, dtype=torch.int))  # type: ignore[arg-type]
+        hidden = torch.stack([masks.next() for _ in sizes]).int()
+        assert hidden.sum(dim=0).tolist() == [1] * 40
+        assert sorted(hidden.sum(dim=1).tolist()) == sizes
+
+
+@pytest.mark.parametrize(("kind", "rows", "columns"), [("blocks", 16, 8), ("lines", 2, 64)])
+def test_a_block_or_a_line_is_hidden_as_a_whole_and_lies_elsewhere_each_time(
+    kind: str, rows: int, columns: int
+) -> None:
+    y, x = torch.meshgrid(torch.arange(128.0), torch.arange(64.0), indexing="ij")
+    xy = torch.stack([x.flatten(), y.flatten()], 1)
+    masks = _masks(SparsePoints(xy=xy, depth=torch.ones(len(xy)), size=(128, 64)), kind, 0.5)
+    starts = set()
+    for _ in range(4):
+        hidden, _ = masks.next().reshape(128, 64), masks.next()
+        down = (hidden[1:] != hidden[:-1]).any(dim=1).nonzero().flatten() % rows
+        across = (hidden[:, 1:] != hidden[:, :-1]).any(dim=0).nonzero().flatten() % columns
+        assert len(down.unique()) == 1
+        assert len(across.unique()) == (kind == "blocks")
+        starts.add((*down.unique().tolist(), *across.unique().tolist()))
+    assert len(starts) > 1
 
 
 def _masks(at: SparsePoints, kind: str, fraction: float) -> Masks:

@@ -165,7 +165,7 @@ def test_an_image_whose_edges_lie_where_depth_changes_by_chance_is_used_by_half(
 
 @pytest.mark.parametrize(
     ("off", "hidden", "half_linear"),
-    [(0.30, 80, True), (0.30, 30, True), (0.30, 10, False), (0.0, 80, False)],
+    [(0.30, 80, True), (0.30, 20, True), (0.30, 19, False), (0.0, 80, False)],
 )
 def test_a_method_that_is_worse_beyond_chance_gives_half_to_linear_interpolation(
     monkeypatch: pytest.MonkeyPatch, off: float, hidden: int, half_linear: bool

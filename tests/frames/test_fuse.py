@@ -164,6 +164,21 @@ def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
     assert len(clean.points) == 60
 
 
+@pytest.mark.parametrize("count", [FEW_POINTS - 1, FEW_POINTS])
+@pytest.mark.parametrize(("alone", "beside"), [(False, True), (True, False), (True, True)])
+def test_outliers_among_few_points_are_those_beside_the_network_and_else_those_of_either_check(
+    count: int, alone: bool, beside: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame, bad = spoiled(frame_in_memory(count))
+    found = iter([bad & alone, bad & beside])
+    monkeypatch.setattr(fuse, "outliers", lambda *_: next(found))
+    with Fusion([member(Brightness)]) as fusion:
+        inliers, user = fusion.without_outliers(frame)
+    expected = frame.points.select(~(bad & (beside or count >= FEW_POINTS)))
+    assert torch.equal(inliers.points.xy, expected.xy)
+    assert torch.equal(user.used.xy, expected.xy)
+
+
 def test_steps_by_hidden_points_are_made_while_there_is_time() -> None:
     network = load_network("compact", None)
     settings = Settings(iterations=0)

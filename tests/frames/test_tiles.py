@@ -165,10 +165,10 @@ def test_tiles_with_too_few_points_have_the_depth_of_the_whole_frame() -> None:
 
 
 def test_a_divergence_in_one_tile_is_one_of_the_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    error, calls = DivergedError("in the first tile"), list[int]()
+    error, calls = DivergedError("in the first tile"), list[tuple[int, int]]()
 
     def diverging(*arguments: Any, **more: Any) -> Refined:
-        calls.append(len(calls))
+        calls.append(arguments[3].size)
         refined = refine_frame(*arguments, **more)
         return replace(refined, diverged=error) if len(calls) == 2 else refined
 
@@ -176,7 +176,7 @@ def test_a_divergence_in_one_tile_is_one_of_the_frame(monkeypatch: pytest.Monkey
     refined = tiled(OneNumber(), PLAIN, everywhere((64, 150)))
     assert refined.diverged is error
     assert refined.notes[-1] == "tiles: 3 of 64×64 pixels"
-    assert len(calls) == 4  # the whole frame, and three tiles
+    assert calls == [(27, 64), *[(64, 64)] * 3]  # the whole frame reduced, and three tiles
 
 
 def test_propagation_follows_once_over_all_tiles() -> None:

@@ -189,6 +189,7 @@ def test_nine_numbers_are_intrinsics_alone(tmp_path: Path) -> None:
     assert facts(got)[0] == [[585, 0, 320], [0, 585, 240], [0, 0, 1]]
     assert not got.has_pose
     assert got.rotation.tolist() == np.eye(3).tolist()
+    assert got.translation.tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(

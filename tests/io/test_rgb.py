@@ -205,7 +205,10 @@ def photo(path: Path, tags: dict[int, object]) -> Path:
         # of equal diagonal field of view on film
         *((name, {0xA405: 50}, 50 / math.hypot(36, 24) * 500) for name in ("a.jpg", "a.webp")),
         # 5 mm and 100 pixels per mm on an image that was 800 pixels wide when it was taken
-        ("a.jpg", {0x920A: 5.0, 0xA20E: 1000.0, 0xA210: 3, 0xA002: 800, 0xA003: 600}, 250),
+        *(
+            ("a.jpg", {0x920A: 5.0, 0xA20E: n, 0xA210: unit, 0xA002: 800, 0xA003: 600}, 250)
+            for n, unit in ((2540.0, 2), (1000.0, 3), (100.0, 4), (0.1, 5))
+        ),
         ("a.jpg", {}, None),
         ("a.jpg", {0xA405: 0}, None),
         ("a.jpg", {0xA405: 5000}, None),

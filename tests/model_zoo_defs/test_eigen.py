@@ -11,6 +11,7 @@ from torch import Tensor
 
 from model_zoo_defs.eigen import Eigen, definitions, read_two_files
 from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 
@@ -106,13 +107,13 @@ def test_two_files_for_one_part_are_named() -> None:
 
 def test_both_sizes_have_the_published_shapes_and_the_papers_outputs() -> None:
     with torch.device("meta"):
-        for name, size, shapes in (
-            ("eigen", (55, 74), PUBLISHED),
-            ("eigen-kitti", (41, 142), PUBLISHED | PUBLISHED_KITTI),
+        for name, size, output, shapes in (
+            ("eigen", (228, 304), (55, 74), PUBLISHED),
+            ("eigen-kitti", (172, 576), (41, 142), PUBLISHED | PUBLISHED_KITTI),
         ):
             definition = definitions[name]
             network = definition.build()
             own = {n: tuple(t.shape) for n, t in network.state_dict().items()}
             assert {n: shape for n, shape in own.items() if n.endswith("weight")} == shapes
-            rgb = torch.empty(1, 3, definition.size.height, definition.size.width)
-            assert network(rgb).shape == (1, 1, *size)
+            assert definition.size == Fixed(*size)
+            assert network(torch.empty(1, 3, *size)).shape == (1, 1, *output)

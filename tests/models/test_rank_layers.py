@@ -102,7 +102,17 @@ def test_few_points_want_a_deep_layer_and_many_a_late_one(
 def test_the_best_of_eight_layers_is_found_by_measuring_few(
     network: Network, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    fields = {"a": 60, "b": 60, "broken": None, "c": 44, "d": 30, "e": 16, "f": 5, "g": 2}
+    fields = {
+        "a": 60,
+        "b": 60,
+        "broken": None,
+        "c": 44,
+        "d": 30,
+        "e": 16,
+        "f": 5,
+        "g": 2,
+        "last": None,
+    }
     measured: list[str] = []
 
     def measure(network: Network, name: str, *_: object, **__: object) -> MeasuredLayer:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -80,3 +82,27 @@ def test_the_scanner_in_front_of_the_camera_needs_no_parallax_to_be_defined() ->
     scanner = np.array([640.0, 480.0, 2.0])
     hidden = hidden_points(xy, depth, SIZE, focal_px=700.0, scanner=scanner)
     assert hidden.tolist() == [False, True, False, False]
+
+
+@pytest.mark.parametrize("focal_px", [240.0, 300.0])
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.3, -0.1, -0.2)])
+def test_a_point_is_hidden_by_a_nearer_one_beside_its_beam(
+    origin: tuple[float, float, float], focal_px: float
+) -> None:
+    rng = np.random.default_rng(0)
+    pixels = rng.permutation(24 * 32)[:200]
+    xy = np.column_stack([pixels % 32, pixels // 32]) + rng.uniform(-0.49, 0.49, (200, 2))
+    depth = rng.choice([2.0, 2.1, 3.0, 5.0, 20.0], 200)
+    scanner = np.array([[focal_px, 0, 15.5], [0, focal_px, 11.5], [0, 0, 1]]) @ origin
+    expected = np.zeros(200, bool)
+    reach, margin = max(1, round(np.radians(0.8) * focal_px)), np.radians(0.24) * focal_px
+    for (i, far), (j, near) in itertools.product(enumerate(depth), repeat=2):
+        apart = np.floor(xy[j] + 0.5) - np.floor(xy[i] + 0.5)
+        if near < 0.92 * far and np.abs(apart).max() <= reach:
+            along = (near - scanner[2]) / (far - scanner[2])  # of the beam, from the scanner
+            passes = ((1 - along) * scanner[:2] + along * far * xy[i]) / near
+            beam = passes - xy[i] if 0 < along < 1 else np.zeros(2)
+            expected[i] |= np.hypot(*(apart - beam / 2)) <= margin + 0.75 * np.hypot(*beam)
+    hidden = hidden_points(xy, depth, (24, 32), focal_px=focal_px, scanner=scanner)
+    assert hidden.tolist() == expected.tolist()
+    assert 0.1 < expected.mean() < 0.9

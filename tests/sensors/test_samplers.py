@@ -165,11 +165,11 @@ def test_noise_that_makes_no_sense_is_refused(name: str, value: float) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("noise", [SampleNoise(metres=1e300), SampleNoise(relative=1e308)])
-def test_noise_never_makes_an_infinite_depth(noise: SampleNoise) -> None:
-    depth = np.full((20, 20), 5, np.float32)
-    try:
-        points = sample_points(depth, SamplePattern(count=100), 0, noise=noise)
-    except NoPointsError:
-        return
-    assert np.isfinite(points.depth).all()
+def test_depths_that_noise_puts_too_far_are_dropped_and_no_others() -> None:
+    depth = np.full((20, 20), 2e9, np.float32)
+    for noise in (SampleNoise(metres=1e300), SampleNoise(relative=1e308), SampleNoise(metres=1)):
+        with pytest.raises(NoPointsError, match="noise put it too far"):
+            sample_points(depth, SamplePattern(count=100), 0, noise=noise)
+    noise = SampleNoise(jitter_px=0.1, outliers=0.5)
+    kept = sample_points(depth, SamplePattern(count=100), 0, noise=noise)
+    assert (kept.depth == 2e9).all()

@@ -64,6 +64,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("paper", {"max_depth": float("nan")}, "--max-depth"),
     ("paper", {"crop": "center"}, "X,Y,WIDTH,HEIGHT"),
     ("paper", {"crop": "0,0,0,5"}, "X,Y,WIDTH,HEIGHT"),
+    ("paper", {"crop": "-1,0,4,4"}, "X,Y,WIDTH,HEIGHT"),
     ("paper", {"thresholds": (1.0, 1.0, 1.0)}, "above 1"),
     ("kitti-devkit", {"average": "pooled"}, "--average"),
     ("kitti-devkit", {"thresholds": (1.01, 1.02, 1.03)}, "--delta"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import NoPointsError
@@ -32,6 +33,14 @@ def test_0_to_1_is_kept_unless_clearly_beaten(
     errors: dict[str, float], expected: tuple[str, str | None]
 ) -> None:
     assert chosen_input_range(errors) == expected
+
+
+def test_the_ranges_are_those_of_their_names() -> None:
+    ends = np.array([[0.0], [1.0]])
+    ranges = {name: (ends - how.mean) / how.std for name, how in NORMALISATIONS.items()}
+    for name, (low, high) in {"unit": (0, 1), "symmetric": (-1, 1), "bytes": (0, 255)}.items():
+        assert ranges[name].tolist() == [[low] * 3, [high] * 3]
+    assert ranges["imagenet"][1].round(3).tolist() == [2.249, 2.429, 2.64]  # as is often printed
 
 
 def set_errors(monkeypatch: pytest.MonkeyPatch, error: Callable[[Network, Frame], float]) -> None:

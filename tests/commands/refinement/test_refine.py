@@ -201,9 +201,11 @@ def test_the_networks_crop_leaves_the_rest_unknown_and_refuses_points_only_there
     model = frame.folder / "cropped.py"
     text = frame.model.read_text().replace("Multiple(4)", "Fixed(32, 32, fit='crop')")
     model.write_text(text.replace("Multiple,", "Fixed,"))
-    run(frame, model=str(model), output=frame.folder / "d.npy")
+    record = run(frame, model=str(model), output=frame.folder / "d.npy", gt=frame.gt).record
     known = np.load(frame.folder / "d.npy") > 0
     assert (known == ((np.arange(62) >= 8) & (np.arange(62) < 54))).all()
+    scored = np.count_nonzero(known & (read_depth(frame.gt).values > 0))
+    assert record["linear"]["scores"]["pixels"] == record["scores"]["after"]["pixels"] == scored
     left = frame.folder / "left.csv"
     left.write_text("1 5 2.0\n2 9 2.0\n")
     with pytest.raises(NoPointsError, match="none of the 2 sparse points"):
@@ -222,6 +224,7 @@ BAD = [
     ({"lr": "fast"}, UsageError, "lr must be a step size above 0"),
     ({"holdout": 1.0}, UsageError, "--holdout must be a fraction"),
     ({"layer": "1.5"}, UsageError, "between 0 and 1"),
+    ({"layer": "-0.5"}, UsageError, "between 0 and 1"),
     ({"layer": "midle"}, LayerError, "did you mean middle"),
     ({"layer": "unused"}, LayerError, "never runs"),
     ({"image": None}, PnpDepthError, "takes an rgb image"),

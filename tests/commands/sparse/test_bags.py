@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import resource
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 pytest.importorskip("rosbags")
 
 from pnpdepth_cli.cli.main import main
-from pnpdepth_cli.commands.sparse.frames import FramesRequest, write_frames
+from pnpdepth_cli.commands.sparse.frames import RECORD, FramesRequest, write_frames
 from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
 from pnpdepth_cli.commands.sparse.scans import read_scan_points
 from pnpdepth_cli.errors import FileFormatError, OutputError, PnpDepthError, UsageError
@@ -98,7 +99,9 @@ def test_a_bag_without_calibration_gets_a_note_that_names_it(tmp_path: Path) -> 
 
 def test_frames_of_a_bag_are_replaced_and_other_folders_left_alone(tmp_path: Path) -> None:
     bag, folder = write_bag(tmp_path / "drive.mcap"), tmp_path / "frames"
+    folder.mkdir()
     written(bag, folder)
+    assert json.loads((folder / RECORD).read_text())["calib"] is None
     with pytest.raises(OutputError, match="holds the frames of a bag; --overwrite"):
         written(bag, folder)
     written(bag, folder, limit=1, overwrite=True)

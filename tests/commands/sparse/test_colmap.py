@@ -132,6 +132,14 @@ def test_depth_is_in_model_units_or_with_a_scale_in_metres(
     assert np.log2(scale) % 1 == 0
 
 
+def test_the_scale_of_the_codes_is_that_of_the_model_whatever_lies_far_out(project: Path) -> None:
+    scale = read(project).scale
+    first = "9 9 9 0.5 1 0 2 0 3 0"
+    change(project, "points3D.txt", first, f"{first}\n99 1e9 0 0 9 9 9 9")
+    change(project, "images.txt", "0.2 0 0 1 c.png", "2e9 0 0 1 c.png")
+    assert read(project).scale == scale == 1024
+
+
 def test_what_does_not_fit_a_model_is_refused(tmp_path: Path, project: Path) -> None:
     frame = frame_on_disk(tmp_path, HEIGHT, WIDTH)
     with pytest.raises(UsageError, match="in metres but the sparse depth in model units; give"):
@@ -145,6 +153,8 @@ def test_what_does_not_fit_a_model_is_refused(tmp_path: Path, project: Path) -> 
 def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) -> None:
     change(project, "points3D.txt", "9 9 9 0.5 1 0 2 0 3 0", "9 9 9 2.5 1 0 2 0 3 0")
     change(project, "points3D.txt", "9 9 9 0.5 1 1 2 1 3 1", "9 9 9 0.5 1 1 2 1")
+    change(project, "points3D.txt", "9 9 9 0.5 1 2 2 2 3 2", "9 9 9 2 1 2 2 2 3 2")
+    change(project, "images.txt", "5 5 -1", "5 5 99")  # a point that the model has no longer
     points = read(project).points
     assert points.dropped["seen in fewer than 3 images"] == 1
     assert points.dropped["with a reprojection error above 2 px"] == 1
@@ -163,9 +173,15 @@ def test_points_behind_the_camera_are_counted_and_a_model_of_nothing_else_refuse
     project: Path,
 ) -> None:
     points = project / "sparse" / "0" / "points3D.txt"
-    first, *others = points.read_text().splitlines(keepends=True)
-    points.write_text("".join([first.replace(first.split()[3], "-4"), *others]))
-    assert read(project).points.dropped["behind the camera"] == 1
+    behind, beside, near, *others = points.read_text().splitlines(keepends=True)
+    behind, beside, near = (
+        " ".join([line.split()[0], "0", "0", z, *line.split()[4:]]) + "\n"
+        for line, z in ((behind, "-4"), (beside, "0"), (near, "0.5"))
+    )
+    points.write_text("".join([behind, beside, near, *others]))
+    seen = read(project).points
+    assert seen.dropped["behind the camera"] == 2
+    assert seen.depth.min() == 0.5
     change(project, "images.txt", "1 1 0 0 0 0.0 0 0 1", "1 1 0 0 0 0.0 0 -9 1")
     with pytest.raises(InputError, match=r"all 40 points of 'a\.png' .* are behind its camera"):
         read(project)

@@ -55,7 +55,14 @@ def test_a_projected_scan_lands_where_it_was_made_to_in_every_format(
     frame: ScanOnDisk, suffix: str
 ) -> None:
     record = projected(frame, f"sparse{suffix}")
-    assert record["points"]["count"] == 150
+    assert record["size"] == [64, 48]
+    assert record["points"] == {
+        "count": 150,
+        "fraction_of_pixels": 150 / (64 * 48),
+        "nearest": pytest.approx(frame.depth.min()),
+        "farthest": pytest.approx(frame.depth.max()),
+        "dropped": record["points"]["dropped"],
+    }
     assert json.loads((frame.folder / "sparse.json").read_text()) == json.loads(json.dumps(record))
     if suffix == ".csv":
         got = read_sparse(frame.folder / "sparse.csv", size=(60, 100)).points

@@ -308,6 +308,15 @@ ACTIVATION_BOMBS = {
         helper.make_node("Reshape", ["long", "m"], ["a2"]),
         helper.make_node("MatMul", ["a1", "a2"], ["big"]),
     ],
+} | {
+    f"{op} of {axes} axes": [
+        size_of(1, 1, *[1] * (axes - 1), -1), helper.make_node("Reshape", ["depth", "n"], ["a1"]),
+        constant("w", np.ones((1, 1, *[1] * axes), np.float32)),
+        helper.make_node(op, ["a1", "w"], ["big"], **more),
+    ]
+    for axes in (1, 2, 3)
+    for op, more in (("ConvTranspose", {"strides": [10**7] * axes}),
+                     ("Conv", {"pads": [10**9 // 10 ** (2 * axes - 2), *[10] * (2 * axes - 1)]}))
 }  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from pathlib import Path  # noqa: E402
 
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
+from pnpdepth_cli.errors import ModelError  # noqa: E402
 from pnpdepth_cli.models.onnx.graph import OnnxGraph  # noqa: E402
 from pnpdepth_cli.models.onnx.table import OPERATORS  # noqa: E402
 
@@ -74,7 +75,7 @@ UNARY = [
     ("Softplus", {}), ("Softsign", {}), ("Mish", {}), ("Erf", {}), ("Exp", {}), ("Abs", {}),
     ("Neg", {}), ("Floor", {}), ("Ceil", {}), ("Round", {}), ("Sign", {}), ("Sin", {}), ("Cos", {}),
     ("Tan", {}), ("Atan", {}), ("Sinh", {}), ("Cosh", {}), ("Identity", {}), ("IsNaN", {}),
-    ("IsInf", {}), ("Softmax", {"axis": 1}), ("LogSoftmax", {}), ("Flatten", {"axis": 2}),
+    ("Softmax", {"axis": 1}), ("LogSoftmax", {}), ("Flatten", {"axis": 2}),
     ("Flatten", {"axis": -1}), ("Transpose", {"perm": [0, 2, 3, 1]}), ("Transpose", {}),
     ("GlobalAveragePool", {}), ("GlobalMaxPool", {}), ("LRN", {"size": 3, "alpha": 0.01}),
     ("Shape", {"start": 1}),
@@ -126,6 +127,8 @@ def test_activations_of_old_and_new_opsets() -> None:
     check("Clip", [X, None, np.array(0.5, F32)])
     check("Clip", [X, np.array(2, F32), np.array(1, F32)])
     check("PRelu", [X, normal(4, 1, 1)])
+    for detect in ({"detect_negative": 0}, {"detect_positive": 0}):
+        check("IsInf", [np.array([np.inf, -np.inf, 1], F32)], **detect)
     check("Softmax", [X], opset=9)
     check("Softmax", [X], opset=11, axis=2)
 
@@ -356,6 +359,36 @@ def test_picking_and_putting_back() -> None:
     grid = np.clip(normal(1, 3, 3, 2), -1, 1)
     for mode, corners in (("linear", 0), ("linear", 1), ("nearest", 0)):
         check("GridSample", [X, grid], opset=20, mode=mode, align_corners=corners)
+
+
+INDEX = np.array([[0, 1]], I64)
+
+
+@pytest.mark.parametrize(
+    ("op", "inputs", "outputs", "more", "message"),
+    [
+        ("ArgMin", [X], 1, {"select_last_index": 1}, "select_last_index"),
+        ("MaxPool", [X], 2, {"kernel_shape": [2, 2]}, "its second output, the indices"),
+        ("AveragePool", [X[0]], 1, {"kernel_shape": [2]}, "other than two spatial axes"),
+        ("AveragePool", [X], 1, {"kernel_shape": [2, 2], "dilations": [2, 1]}, "dilations"),
+        ("BatchNormalization", [X, *[normal(4)] * 4], 1, {"training_mode": 1}, "eval mode"),
+        ("LayerNormalization", [X, normal(6)], 2, {}, "its second and third output"),
+        ("Resize", [X, None, None], 1, {}, "neither scales nor sizes"),
+        ("Resize", [X, None, np.full(4, 2, F32)], 1, {"mode": "area"}, "mode area"),
+        ("Pad", [X, np.ones(8, I64)], 1, {"mode": "mirror"}, "mode mirror"),
+        ("Cast", [X], 1, {"to": TensorProto.STRING}, "data type 8"),
+        ("GatherND", [X, INDEX], 1, {"batch_dims": 1}, "batch_dims"),
+        ("ScatterND", [X, INDEX, normal(1, 7, 6)], 1, {"reduction": "mul"}, "reduction mul"),
+        ("ScatterElements", [normal(4, 2), INDEX, X], 1, {"reduction": "add"}, "reduction add"),
+    ],
+)
+def test_what_an_operator_does_not_cover_is_refused_by_its_name(
+    op: str, inputs: list[Any], outputs: int, more: dict[str, Any], message: str
+) -> None:
+    model = model_of(op, inputs, 17, outputs, **more)
+    with pytest.raises(ModelError, match=message) as caught:
+        OnnxGraph(model, Path("x.onnx"))(torch.from_numpy(inputs[0]))
+    assert op in str(caught.value)
 
 
 def test_every_operator_in_the_table_is_tested_here() -> None:
