@@ -215,6 +215,11 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     notes = []
     if names:
         notes = [f"checkpoint {path.name}: its pickle names {_some(names)}; nothing of it was run"]
+    arguments = content.get("args") if isinstance(content, Mapping) else None
+    arguments = getattr(arguments, "state", arguments)
+    if isinstance(arguments, Mapping) and isinstance(data := arguments.get("data"), str):
+        # Weights for other data may fit all the same.
+        notes.append(f"checkpoint {path.name}: trained with data {_short(data)}")
     return _state_in(content, path), notes
 
 

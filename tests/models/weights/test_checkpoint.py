@@ -177,11 +177,14 @@ def test_a_definition_may_rename_what_a_published_file_holds(tmp_path: Path) -> 
     assert equal(loaded(tmp_path / "w.pth", **rename)[0], weights())
 
 
-def test_what_was_not_run_is_reported(tmp_path: Path) -> None:
-    torch.save({"args": argparse.Namespace(), "state_dict": weights()}, tmp_path / "w.pth")
-    assert loaded(tmp_path / "w.pth")[1] == [
-        "checkpoint w.pth: its pickle names argparse.Namespace; nothing of it was run"
-    ]
+def test_the_data_of_the_training_and_what_was_not_run_are_reported(tmp_path: Path) -> None:
+    for data, shown in (("kitti", "kitti"), ("a" * 10**5, "a" * 60 + "…")):
+        args = argparse.Namespace(data=data, lr=0.1, secret="x")
+        torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
+        assert loaded(tmp_path / "w.pth")[1] == [
+            "checkpoint w.pth: its pickle names argparse.Namespace; nothing of it was run",
+            f"checkpoint w.pth: trained with data {shown}",
+        ]
 
 
 @pytest.mark.parametrize("save", [torch.save, save_older])
