@@ -136,6 +136,7 @@ def test_neither_a_dry_run_nor_one_with_nothing_to_do_needs_torch(root: Path) ->
         assert "all of them done already" in done.stderr
 
 
+@pytest.mark.slow
 def test_ctrl_c_finishes_the_frame_prints_how_to_continue_and_exits_130(
     root: Path, tmp_path: Path
 ) -> None:

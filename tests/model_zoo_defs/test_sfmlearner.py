@@ -86,6 +86,7 @@ def reference(rgb: Tensor, w: dict[str, Tensor]) -> Tensor:
     return disparity
 
 
+@pytest.mark.slow
 def test_the_published_file_loads_and_gives_what_its_tensors_say(tmp_path: Path) -> None:
     state = weights(published())
     path = tmp_path / "dispnet_model_best.pth.tar"
