@@ -39,7 +39,7 @@ from pnpdepth_cli.frames.frame import (
     registration_to_make,
 )
 from pnpdepth_cli.frames.fuse import Fusion, Member
-from pnpdepth_cli.frames.refine import refine_frame, refine_frames
+from pnpdepth_cli.frames.refine import refine_frames
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
 from pnpdepth_cli.frames.tiles import refine_tiled
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
@@ -187,12 +187,20 @@ class Refiner:
             until = None if seconds is None else time.monotonic() + seconds
             refined = refine_default(opened, frame, seed=seed, until=until)
         else:
-            settings = self.settings
-            refine = refine_frame if settings.tile is None else refine_tiled
-            refined = refine(
-                self.network, opened, settings, frame,
-                propagation=settings.propagate, on_iteration=on_iteration,
-            )  # fmt: skip
+            settings, propagation = self.settings, self.settings.propagate
+            if settings.tile is None:
+                (result,) = refine_frames(
+                    self.network, opened, settings, (frame,),
+                    propagation=propagation, on_iteration=on_iteration,
+                )  # fmt: skip
+                if isinstance(result, PnpDepthError):
+                    raise result
+                refined = result
+            else:
+                refined = refine_tiled(
+                    self.network, opened, settings, frame,
+                    propagation=propagation, on_iteration=on_iteration,
+                )  # fmt: skip
             if self._check:
                 refined = self._checked(frame, refined)
         if self._uncertainty:
