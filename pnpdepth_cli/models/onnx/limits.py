@@ -8,14 +8,16 @@ ConstantOfShape, Tile, Pad, Expand and many other operators can turn a few bytes
 from __future__ import annotations
 
 import functools
+import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._pytree import tree_flatten, tree_map_only
+from torch.utils._pytree import tree_flatten
 
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.onnx.table import Unsupported
@@ -82,33 +84,86 @@ class SizeLimit(TorchFunctionMode):
     ) -> Any:
         """Runs the operation if its result fits; see TorchFunctionMode."""
         kwargs = kwargs or {}
-        if getattr(func, "__name__", "") not in _READS_VALUES:
-            self._refuse(_elements_in(_without_values(func, args, kwargs)))
+        self._refuse(_elements_at_most(func, args, kwargs))
         result = func(*args, **kwargs)
         elements = sum(part.numel() for part in _tensors_in(result) if part._base is None)
         self._left -= elements
         self._refuse(elements)
         return result
 
-    def _refuse(self, elements: int) -> None:
+    def _refuse(self, elements: float) -> None:
         if elements > self._largest or self._left < 0:
             raise Unsupported(f"a result of {elements:.3g} elements")
 
 
-_READS_VALUES = ("to", "item", "tolist", "__bool__")
-"""Methods that need the values of their tensor, and make none that is larger."""
+def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any]) -> float:
+    """An upper bound on the elements of the result.
+
+    Most functions give no more than their tensors broadcast together; `_GROWING` has the others
+    that operators call.
+    """
+    growing = _GROWING.get(getattr(func, "__name__", ""))
+    if growing is not None:
+        return growing(*args, **kwargs)
+    return _broadcast([tensor.shape for tensor in _tensors_in((args, kwargs))])
 
 
-def _without_values(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    """What the operation returns, as tensors of the meta device, which have no memory."""
-    args, kwargs = tree_map_only(Tensor, lambda tensor: tensor.to("meta"), (args, kwargs))
-    if "device" in kwargs or getattr(func, "__name__", "") in ("arange", "ones", "zeros"):
-        kwargs["device"] = "meta"
-    return func(*args, **kwargs)
+def _broadcast(shapes: list[torch.Size]) -> int:
+    sides = itertools.zip_longest(*(reversed(shape) for shape in shapes), fillvalue=1)
+    return math.prod(max(along) for along in sides)
 
 
-def _elements_in(value: Any) -> int:
-    return max((tensor.numel() for tensor in _tensors_in(value)), default=0)
+def _of_convolution(
+    x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: list[int], *_: Any
+) -> int:
+    sides = [n + 2 * p for n, p in zip(x.shape[2:], padding, strict=True)]
+    return len(x) * len(weight) * math.prod(sides)
+
+
+def _of_transposed(x: Tensor, weight: Tensor, bias: Any, stride: list[int], *rest: Any) -> int:
+    *_, groups, dilation = rest
+    parts = zip(x.shape[2:], stride, weight.shape[2:], dilation, strict=True)
+    sides = [int(n * s + k * d) for n, s, k, d in parts]
+    return len(x) * weight.shape[1] * int(groups) * math.prod(sides)
+
+
+def _of_product(a: Tensor, b: Tensor) -> int:
+    if min(a.ndim, b.ndim) < 2:
+        return max(a.numel(), b.numel())
+    return _broadcast([a.shape[:-2], b.shape[:-2]]) * a.shape[-2] * b.shape[-1]
+
+
+def _of_range(start: float, end: float, step: float = 1) -> float:
+    return abs((end - start) / step) + 1 if step else math.inf
+
+
+def _of_item(x: Tensor, index: Any) -> int:
+    parts = index if isinstance(index, tuple) else (index,)
+    if not all(isinstance(part, Tensor) for part in parts):
+        return x.numel()
+    return _broadcast([part.shape for part in parts]) * x.shape[len(parts) :].numel()
+
+
+_GROWING: dict[str, Callable[..., float]] = {
+    **{f"conv{axes}d": _of_convolution for axes in (1, 2, 3)},
+    **{f"conv_transpose{axes}d": _of_transposed for axes in (1, 2, 3)},
+    **dict.fromkeys(("matmul", "__matmul__"), _of_product),
+    **dict.fromkeys(("cat", "stack"), lambda tensors, *_, **__: sum(map(torch.numel, tensors))),
+    **dict.fromkeys(("ones", "zeros"), lambda *sides, **_: math.prod(sides)),
+    "einsum": lambda by, *tensors: torch.einsum(by, *(t.to("meta") for t in tensors)).numel(),
+    "grid_sample": lambda x, grid, **_: x.shape[:2].numel() * grid.numel(),
+    "interpolate": lambda x, size, **_: x.shape[:2].numel() * math.prod(size),
+    "index_select": lambda x, axis, at: x.numel() // max(1, x.shape[axis]) * at.numel(),
+    "__getitem__": _of_item,
+    "expand": lambda _, *sizes: math.prod(sizes[0] if len(sizes) == 1 else sizes),
+    "repeat": lambda x, times: x.numel() * math.prod(times),
+    "repeat_interleave": lambda x, times: x.numel() * times,
+    "arange": lambda *ends, **_: _of_range(*(ends if len(ends) > 1 else (0, *ends))),
+    "pad": lambda x, pads, **_: math.prod(
+        n + sum(pads[2 * at : 2 * at + 2]) for at, n in enumerate(reversed(x.shape))
+    ),
+}
+"""Functions whose result may be far larger than their tensors."""
 
 
 def _tensors_in(value: Any) -> list[Tensor]:
