@@ -112,9 +112,32 @@ class Evidence:
         return self.log_likelihood(1.0)
 
     def log_likelihood(self, zoom: float) -> Floats:
-        """Returns (rows, columns): of each shift, in pixels of the reduced image."""
+        """Returns (rows, columns): of each shift, in pixels of the reduced image.
+
+        The sum over the pairs of weight × mean edge strength between their ends; 0 is assumed
+        outside of the image.
+        """
+        reach, padded, between, weights = self._drawn
+        centre = np.array(self.edges.shape[::-1]) / 2
+        rows, columns = self.edges.shape + 2 * reach
+        x, y = np.floor((between - centre) * zoom + centre).astype(np.intp).T
+        x, y = x + reach[1], y + reach[0]
+        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+        drawn = np.bincount((y * columns + x)[inside], weights[inside], rows * columns)
+        template = drawn.reshape(rows, columns).astype(np.float32)
         factor = _WEIGHT * min(1.0, _INDEPENDENT / float(np.linalg.norm(self.weight)))
-        return factor * _correlation(self.edges, self.ends, self.weight, zoom)
+        return factor * cv2.matchTemplate(padded, template, cv2.TM_CCORR).astype(np.float64)
+
+    @functools.cached_property
+    def _drawn(self) -> tuple[NDArray[np.intp], Image, Floats, Floats]:
+        """What all zooms share: the largest shift, the edges with a border, and samples of the
+        pairs, (M · steps, 2), with their weights."""
+        reach = np.rint(_LARGEST_SHIFT * np.array(self.edges.shape)).astype(np.intp)
+        top, left = (int(n) for n in 2 * reach)
+        padded = cv2.copyMakeBorder(self.edges, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
+        step = ((np.arange(_STEPS) + 0.5) / _STEPS)[None, :, None]
+        between = (self.ends[:, :1] * (1 - step) + self.ends[:, 1:] * step).reshape(-1, 2)
+        return reach, np.asarray(padded), between, np.repeat(self.weight / _STEPS, _STEPS)
 
 
 def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
@@ -263,28 +286,3 @@ def _depth_edges(at: Floats, log_depth: Floats, pairs: NDArray[np.intp]) -> Floa
         return None
     clipped = (rest / rest.std()).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
     return np.asarray(clipped - clipped.mean(), np.float64)
-
-
-def _correlation(edges: Image, ends: Floats, weight: Floats, zoom: float) -> Floats:
-    """(rows, columns) sum of weight × mean edge strength between the ends of each pair.
-
-    Args:
-        edges: (h, w), 0 is assumed outside.
-        ends: (M, 2, 2) the two ends of each pair, x and y.
-        weight: (M,) of each pair.
-        zoom: Of the image.
-    """
-    shape = np.array(edges.shape)
-    reach = np.rint(_LARGEST_SHIFT * shape).astype(int)
-    step = ((np.arange(_STEPS) + 0.5) / _STEPS)[None, :, None]
-    between = (ends[:, :1] * (1 - step) + ends[:, 1:] * step).reshape(-1, 2)
-    weights = np.repeat(weight / _STEPS, _STEPS)
-    top, left = (int(n) for n in 2 * reach)
-    padded = cv2.copyMakeBorder(edges, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
-    centre, (rows, columns) = shape[::-1] / 2, shape + 2 * reach
-    x, y = np.floor((between - centre) * zoom + centre).astype(np.intp).T
-    x, y = x + reach[1], y + reach[0]
-    inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-    drawn = np.bincount((y * columns + x)[inside], weights[inside], rows * columns)
-    template = drawn.reshape(rows, columns).astype(np.float32)
-    return np.asarray(cv2.matchTemplate(padded, template, cv2.TM_CCORR), np.float64)

@@ -219,7 +219,7 @@ def slanted_frame(folder: Path, name: str, shift: float, distortion: tuple[float
     path.unlink()
     write_depth(path.with_suffix(".npy"), depth.reshape(HEIGHT, WIDTH).astype(np.float32))
     pose = np.column_stack([np.eye(3), [shift, 0, 0]])
-    found = FrameCamera(camera=camera, source="made up", pose=pose)
+    found = FrameCamera(camera=camera, source="test", pose=pose)
     record = json.loads((folder / f"{name}.json").read_text())
     record |= {"camera": found.record(), "size": [WIDTH, HEIGHT]}
     (folder / f"{name}.json").write_text(json.dumps(record))
