@@ -15,7 +15,7 @@ from pnpdepth_cli.commands.batch.running import registering
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.completion.image_registration import estimated, evidence
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.frames.frame import Refined, tensor_of
+from pnpdepth_cli.frames.frame import Refined, Register, tensor_of
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.depth import read_depth
@@ -37,6 +37,7 @@ class EvalFrame:
     rgb: NDArray[np.float32]
     gt: Depth
     sensor: Depth | None = None
+    register: Register = None
 
 
 def kitti_dc(root: Path) -> Iterator[EvalFrame]:
@@ -158,7 +159,7 @@ REGISTRATIONS = ("off", "frame", "set")
 def registered(
     frames: Sequence[EvalFrame], count: int | None, seed: int, how: str
 ) -> list[EvalFrame]:
-    """The frames with their images moved into the frame of these points, as the program does."""
+    """The frames with how their images are moved into the frame of these points by the program."""
     if how == "off":
         return list(frames)
     known = []
@@ -169,10 +170,7 @@ def registered(
         found = [estimated(registering(known, 0))] * len(frames)
     else:
         found = [estimated([each]) for each in known]
-    return [
-        frame if one is None else replace(frame, rgb=one.applied(frame.rgb))
-        for frame, one in zip(frames, found, strict=True)
-    ]
+    return [replace(frame, register=one) for frame, one in zip(frames, found, strict=True)]
 
 
 def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> Inputs:
@@ -183,7 +181,7 @@ def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> I
 def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Inputs:
     """The frame with points of its ground truth, or with all points of its LiDAR (None)."""
     points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
-    return frame_inputs(frame.rgb, points, frame.gt)
+    return replace(frame_inputs(frame.rgb, points, frame.gt), register=frame.register)
 
 
 def refined(network: Network, layer: str, settings: Settings, inputs: Inputs) -> Refined:
