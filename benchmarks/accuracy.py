@@ -5,8 +5,8 @@ metres, CPU seconds, and the fraction of frames whose MAE is above that of linea
 network as it is and aligned with the points, refined at the paper's setting, with the settings of
 its definition and by hidden points, every baseline, and what `refine` gives without options. All
 are scored on the same pixels. Points are drawn from the ground truth; KITTI's are its own LiDAR's.
-`--outliers 0.2` gives that fraction of the points random depths. `--sigma` adds the fraction of the
-ground truth within ± σ. Constants were chosen on even frames: `--every 2 --first 1` takes odd ones.
+`--outliers 0.2` gives that fraction of the points random depths. Constants were chosen on even
+frames: `--every 2 --first 1` takes odd ones.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.frames.frame import DepthMap, is_dense
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.settings import PAPER, Settings
 
@@ -79,7 +78,7 @@ def measure(
     """MAE, RMSE and CPU seconds of everything on one frame."""
     inputs = drawn_inputs(frame, count, seed)
     inputs = replace(inputs, points=with_outliers(inputs.points, args.outliers, seed))
-    depths, seconds, within = dict[str, torch.Tensor](), dict[str, float](), float("nan")
+    depths, seconds = dict[str, torch.Tensor](), dict[str, float]()
 
     def timed(name: str, depth: Callable[[], torch.Tensor]) -> None:
         start = time.process_time()
@@ -98,13 +97,9 @@ def measure(
     default = by_default(network, inputs)
     seconds["default"] = time.process_time() - start
     depths["default"] = torch.from_numpy(default.after)
-    if args.sigma:
-        known = (frame.gt > 0) & (default.after > 0)
-        error = np.abs(frame.gt - default.after)[known]
-        within = float((error <= with_uncertainty(default).sigma[known]).mean())
     scores = errors_of(depths, torch.from_numpy(frame.gt))
     return {
-        name: {"mae": mae, "rmse": rmse, "cpu_s": seconds[name], "within": within}
+        name: {"mae": mae, "rmse": rmse, "cpu_s": seconds[name]}
         for name, (mae, rmse) in scores.items()
     }
 
@@ -124,9 +119,8 @@ def print_case(head: tuple[object, ...], frames: list[dict[str, dict[str, float]
     for name in frames[0]:
         mean = {k: float(np.mean([each[name][k] for each in frames])) for k in frames[0][name]}
         worse = np.mean([each[name]["mae"] > each["linear"]["mae"] for each in frames])
-        within = "" if np.isnan(mean["within"]) or name != "default" else f"{mean['within']:.0%}"
         cells = (f"{mean['mae']:.4f}", f"{mean['rmse']:.4f}", f"{mean['cpu_s']:.2f}")
-        print_row(*head, len(frames), name, *cells, f"{worse:.0%}", within)
+        print_row(*head, len(frames), name, *cells, f"{worse:.0%}")
 
 
 def main() -> None:
@@ -142,10 +136,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--outliers", type=float, default=0.0)
     parser.add_argument("--registration", choices=REGISTRATIONS, default="off")
-    parser.add_argument("--sigma", action="store_true", help="the standard deviation's coverage")
     parser.add_argument("--json", type=Path, help="everything, to this file")
     args = parser.parse_args()
-    head = ("network", "set", "points", "frames", "method", "MAE", "RMSE", "CPU s", "worse", "± σ")
+    head = ("network", "set", "points", "frames", "method", "MAE", "RMSE", "CPU s", "worse")
     print_row(*head, head=True)
     everything = []
     for name in args.networks:

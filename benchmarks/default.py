@@ -6,6 +6,11 @@ the networks fused, z updated, the residual propagated), and its result. All are
 pixels, those with ground truth. `worse` is the fraction of frames where the MAE of the result is
 above that of linear interpolation, `moved` the fraction where the check moved it.
 
+A second table has the fractions of the ground truth within multiples of `--uncertainty`'s standard
+deviation, the fraction of frames with at least 60 % within one and 90 % within two, and what its
+mask does with errors above a quarter of the depth: as it is, and if the least certain twentieth of
+the ground truth is masked instead.
+
 Constants of the default were chosen on the even frames of each set (`--half even`); the odd ones
 are for reporting.
 """
@@ -26,6 +31,7 @@ from benchmarks.frames import (
     MORE_SETS,
     REGISTRATIONS,
     SETS,
+    Depth,
     EvalFrame,
     by_default,
     drawn_inputs,
@@ -36,6 +42,8 @@ from benchmarks.frames import (
     without_occluded,
 )
 from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.frames.frame import Refined
+from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network
 
 COUNTS = (20, 100, 500)
@@ -48,10 +56,18 @@ NETWORKS = {
     ),
     "tum_fr1_rpy": ("fastdepth", "compact"),
     "tum_fr3_cabinet": ("fastdepth", "compact"),
+    "nyu": ("fastdepth", "compact"),
 }
-"""By set; nothing was chosen on the last two."""
+"""By set; nothing was chosen on the last three."""
 STAGES = ("linear", "aligned", "fused", "updated", "propagated", "result")
+MULTIPLES = (1, 2, 3, 4)
+LARGE_ERROR = 0.25  # of the depth
+MASKED = 0.05  # of the ground truth
 HEAD = ("network", "set, runs", "points", *STAGES, "result / linear", "worse", "moved", "CPU s")
+UNCERTAINTY_HEAD = (
+    *("network", "set, runs", "points", *(f"within ± {k} σ" for k in MULTIPLES), "≥ 60, ≥ 90 %"),
+    *("large errors", "of these masked", "kept", "masked at 95 % kept"),
+)
 
 
 def cases(args: argparse.Namespace) -> Iterator[tuple[str, str, int | None]]:
@@ -79,7 +95,39 @@ def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) ->
         "errors": errors_of(depths, torch.from_numpy(frame.gt)),
         "cpu_s": seconds,
         "moved": not np.array_equal(refined.after, refined.stages["propagated"]),
+        "uncertainty": uncertainty(with_uncertainty(refined), frame.gt),
     }
+
+
+def uncertainty(refined: Refined, gt: Depth) -> dict[str, Any]:
+    """Fractions of the ground truth, and of large errors: `caught` by the mask, `ranked` by σ."""
+    assert refined.sigma is not None
+    assert refined.valid is not None
+    known = (gt > 0) & (refined.after > 0)
+    error, sigma = np.abs(gt - refined.after)[known], refined.sigma[known]
+    relative, large = sigma / refined.after[known], error > LARGE_ERROR * gt[known]
+    masked, uncertain = ~refined.valid[known], relative > np.quantile(relative, 1 - MASKED)
+    return {
+        "within": [float((error <= multiple * sigma).mean()) for multiple in MULTIPLES],
+        "large": float(large.mean()),
+        "caught": float(masked[large].mean()) if large.any() else None,
+        "ranked": float(uncertain[large].mean()) if large.any() else None,
+        "kept": float(1 - masked.mean()),
+    }
+
+
+def uncertainty_cells(rows: list[dict[str, Any]]) -> list[str]:
+    """The cells of a case in the second table."""
+    of = [row["uncertainty"] for row in rows]
+    within = np.array([each["within"] for each in of])
+    held = ((within[:, 0] >= 0.6) & (within[:, 1] >= 0.9)).mean()
+
+    def mean(name: str) -> str:
+        values = [each[name] for each in of if each[name] is not None]
+        return f"{np.mean(values):.1%}" if values else ""
+
+    masks = (mean(name) for name in ("large", "caught", "kept", "ranked"))
+    return [*(f"{value:.0%}" for value in within.mean(axis=0)), f"{held:.0%}", *masks]
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -116,7 +164,7 @@ def main() -> None:
     args = parser.parse_args()
     print_row(*HEAD, head=True)
     networks: dict[str, Network] = {}
-    everything = []
+    everything, second = [], list[tuple[Any, ...]]()
     for name, set_name, count in cases(args):
         network = networks.setdefault(name, opened(name, args.data))
         frames = frames_of(set_name, args.data, args.half, args.frames)
@@ -127,8 +175,10 @@ def main() -> None:
         ]
         of = summary(rows)
         *errors, result = (f"{mae:.4f} / {rmse:.3f}" for mae, rmse in map(of["mean"].get, STAGES))
+        case = (name, f"{set_name}, {of['frames']}", count or "LiDAR")
+        second.append((*case, *uncertainty_cells(rows)))
         print_row(
-            *(name, f"{set_name}, {of['frames']}", count or "LiDAR", *errors, f"**{result}**"),
+            *(*case, *errors, f"**{result}**"),
             f"{of['mean']['result'][0] / of['mean']['linear'][0]:.3f}",
             *(f"{of['worse']:.0%}", f"{of['moved']:.0%}", f"{of['cpu_s']:.1f}"),
         )
@@ -136,6 +186,10 @@ def main() -> None:
         everything.append({"cell": cell, "summary": of, "frames": rows})
         if args.json:
             args.json.write_text(json.dumps(everything, indent=1))
+    print()
+    print_row(*UNCERTAINTY_HEAD, head=True)
+    for cells in second:
+        print_row(*cells)
 
 
 if __name__ == "__main__":

@@ -37,14 +37,17 @@ CALIBRATION_RANGE = (0.01, 1000.0)
 VALID_SIGMA = 0.25
 """Depth with a larger standard deviation, as a fraction of it, is not valid."""
 
-# Fitted to 21 refinements of 7-Scenes, ICL-NUIM and even KITTI frames by the pinball losses of the
-# 68 and 95 % quantiles.
+# Exponents are fitted to 21 refinements of 7-Scenes, ICL-NUIM and even KITTI frames by the pinball
+# losses of the 68 and 95 % quantiles; the factors to 78 refinements of even frames of these sets.
 _EXPONENTS = (0.58, 0.10, 0.42, 0.18)
 _LEAST = 0.003  # of log depth, added to each difference
 _MEAN_OF, _AMONG = 3, 8  # nearest points
 _WINDOW = 9  # pixels
 _WITHIN = (0.68, 0.95)  # of normal errors within one and two standard deviations
-_TAIL = 0.45  # weight of the second in the scale: both cannot hold where tails are heavy
+_TAIL = 0.75  # weight of the second in the scale: both cannot hold where tails are heavy
+_TYPICAL, _PER_POINT = 1.75, -0.18  # factor with 100 points, and its power of their number
+_MOST_POINTS = 500  # more change nothing
+_TYPICAL_WEIGHT = 20  # hidden points that the typical factor counts as
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point are valid
 _BEYOND_HULL = 2.0  # typical distances to the nearest point, outside the hull of the points
 _SAMPLED = 4000  # pixels, for the typical distance
@@ -55,11 +58,12 @@ def with_uncertainty(frame: Refined) -> Refined:
     points, depth = frame.used, frame.after
     network = torch.from_numpy(frame.before)
     shape = relative_shape(points, network, torch.from_numpy(depth))
-    factor, note = 1.0, "uncertainty: too few points to calibrate it with"
+    residual = sigma = torch.empty(0)
+    note = "uncertainty: too few points to calibrate it with"
     if frame.check is not None:
         residual, sigma = _calibrating(frame.check)
-        factor = calibration(residual, sigma)
         note = f"uncertainty: calibrated with {len(residual):,} hidden points"
+    factor = calibration(residual, sigma, len(points))
     sigma_m = (factor * shape.numpy() * depth).astype(np.float32)
     valid = valid_depth(points, depth, sigma_m)
     if not valid.all():
@@ -114,28 +118,30 @@ def relative_shape(
     return logarithm.exp().reshape(depth.shape).float()
 
 
-def calibration(residual: Tensor, sigma: Tensor) -> float:
+def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
     """Returns the factor of sigma that brings residuals within ± one and ± two sigma.
 
     The geometric mean, with weights, of the factors with which 68 % lie within ± one and 95 %
     within ± two sigma; they agree for normal errors. Ranks are those of split conformal prediction
-    (Lei et al., "Distribution-free predictive inference for regression", 2018).
+    (Lei et al., "Distribution-free predictive inference for regression", 2018). Few residuals give
+    an uncertain factor, so it is averaged with the typical one for that number of points.
 
     Args:
         residual: (M,) true − predicted at points held out of refinement and propagation.
         sigma: (M,) their standard deviations, in the same unit.
-
-    Returns:
-        The factor; 1.0 without any finite residual.
+        points: Number of points that the depth was fitted to.
     """
+    typical = _TYPICAL * math.pow(min(max(points, 1), _MOST_POINTS) / 100, _PER_POINT)
     ratio = (residual.double().abs() / sigma.double()).flatten()
     ratio = ratio[ratio.isfinite()].sort().values
     if not len(ratio):
-        return 1.0
+        return typical
     ranks = [min(math.ceil(part * (len(ratio) + 1)), len(ratio)) - 1 for part in _WITHIN]
     one, two = (max(float(ratio[rank]), 1e-12) for rank in ranks)
+    of_residuals = (1 - _TAIL) * math.log(one) + _TAIL * math.log(two / 2)
+    weight = len(ratio) / (len(ratio) + _TYPICAL_WEIGHT)
     low, high = CALIBRATION_RANGE
-    factor = math.exp((1 - _TAIL) * math.log(one) + _TAIL * math.log(two / 2))
+    factor = math.exp(weight * of_residuals + (1 - weight) * math.log(typical))
     return min(max(factor, low), high)
 
 

@@ -12,16 +12,25 @@ from pnpdepth_cli.points import SparsePoints
 
 def test_normal_residuals_are_calibrated_to_their_standard_deviation() -> None:
     residual = torch.randn(20000, generator=torch.Generator().manual_seed(0)) * 3
-    factor = calibration(residual, torch.ones(20000))
+    factor = calibration(residual, torch.ones(20000), 500)
     assert factor == pytest.approx(3, rel=0.03)
-    assert calibration(2 * residual, torch.ones(20000)) == pytest.approx(2 * factor)
-    assert calibration(residual[:0], residual[:0]) == 1.0
+    assert calibration(2 * residual, torch.ones(20000), 500) == pytest.approx(2 * factor, rel=1e-3)
+
+
+def test_few_residuals_are_averaged_with_the_typical_factor() -> None:
+    ones = torch.ones(20)
+    alone = calibration(ones[:0], ones[:0], 100)
+    assert alone == pytest.approx(1.75)
+    assert calibration(ones[:0], ones[:0], 20) > alone > calibration(ones[:0], ones[:0], 500)
+    assert calibration(ones[:0], ones[:0], 9999) == calibration(ones[:0], ones[:0], 500)
+    of_residuals = 7 * 0.5**0.75  # all ratios are 7: 68 % within 7 σ, 95 % within 2 · 3.5 σ
+    assert calibration(7 * ones, ones, 100) == pytest.approx((of_residuals * alone) ** 0.5)
 
 
 def test_heavy_tails_are_between_the_factors_of_one_and_of_two_sigma() -> None:
     generator = torch.Generator().manual_seed(0)
     residual = torch.randn(20000, generator=generator) / torch.rand(20000, generator=generator)
-    factor = calibration(residual, torch.ones(20000))
+    factor = calibration(residual, torch.ones(20000), 500)
     within_one = float((residual.abs() <= factor).double().mean())
     within_two = float((residual.abs() <= 2 * factor).double().mean())
     assert 0.68 < within_one < 0.95
