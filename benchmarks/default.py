@@ -57,8 +57,9 @@ NETWORKS = {
     "tum_fr1_rpy": ("fastdepth", "compact"),
     "tum_fr3_cabinet": ("fastdepth", "compact"),
     "nyu": ("fastdepth", "compact"),
+    "realsense": ("fastdepth", "compact"),  # its colour is not registered
 }
-"""By set; nothing was chosen on the last three."""
+"""By set; nothing was chosen on the last four."""
 STAGES = ("linear", "aligned", "fused", "updated", "propagated", "result")
 MULTIPLES = (1, 2, 3, 4)
 LARGE_ERROR = 0.25  # of the depth
