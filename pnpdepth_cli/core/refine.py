@@ -211,6 +211,11 @@ class _FrameRefinement:
         at_points = self._points.sample(depth)
         with wrap_user_errors(f"loss {self._settings.loss!r}"):
             loss = self._loss(at_points, self._points.depth)
+            if loss.numel() != 1:
+                raise ModelError(
+                    f"loss {self._settings.loss!r} gives {tuple(loss.shape)}, not a scalar; add"
+                    " .mean()"
+                )
         if self._settings.proximity and self._first is not None:
             loss = loss + self._settings.proximity * proximity_loss(depth, self._first)
         if self._settings.iterations and not bool(loss.isfinite()):
@@ -240,7 +245,7 @@ class _FrameRefinement:
             gradient = blurred(gradient, self._points, self._settings.blur)
             of_z = gradient if self._channels is None else self._channels.gradient(gradient)
             with wrap_user_errors(f"update rule {self._settings.update!r}"):
-                direction = self._update(of_z)
+                direction = self._update(of_z).reshape(of_z.shape)
             if self._channels is not None:
                 direction = self._channels.change_of_z(direction)
             if self._settings.line_search:
