@@ -7,6 +7,7 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from safetensors.torch import save_file
 
@@ -48,7 +49,7 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
     network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--align", "none"]
     method = ["--loss", "charbonnier", "--update", "rmsprop", "--lr", "1%"]
-    more = ["--propagate", "median", "--baselines"]
+    more = ["--propagate", "median", "--baselines", "--fov", "60"]
     output = ["--format", "raw", "-o", "out", "--json"]
     record = json.loads(run(["refine", *files, *network, *method, *more, *output], package))
     assert record["model"]["name"] == "my-net"
@@ -71,9 +72,14 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     output[-2] = "by_file"
     again = json.loads(run(["refine", *files, *network, *by_file, *output], package))
     assert again["loss"] == record["loss"]
-    scores = run(["eval", "out/rgb_depth.raw", "indoor/gt.png", "--json"], package)
-    measured = {each["key"]: each for each in json.loads(scores)["measures"]}
-    assert {"rmse", "mae"} <= set(measured)
+    measures = ["--measures", "median-error", "--json"]
+    scores = json.loads(run(["eval", "out/rgb_depth.raw", "indoor/gt.png", *measures], package))
+    assert {"rmse", "median_error"} <= {each["key"] for each in scores["measures"]}
+    assert scores["mean"]["median_error"] < scores["mean"]["mae"]
+    run(["export", "out", "--to", "arrays", "-o", "exported"], package)
+    raw = (package / "out" / "rgb_depth.raw").read_bytes()
+    depth = np.load(package / "exported" / "rgb.npy")
+    np.testing.assert_array_equal(depth.ravel(), np.frombuffer(raw, "<f4", offset=12))
 
 
 def test_the_layout_of_the_page_lists_frames(package: Path) -> None:

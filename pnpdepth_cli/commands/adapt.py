@@ -20,11 +20,11 @@ from scipy.stats import ttest_1samp
 from torch import Tensor, nn
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.choices import LOSSES, UPDATES
+from pnpdepth_cli.choices import UPDATES
 from pnpdepth_cli.commands.batch.frames import Task, task_of
 from pnpdepth_cli.commands.batch.request import AdaptRequest
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
-from pnpdepth_cli.core.losses import Loss
+from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.masks import Masks
 from pnpdepth_cli.core.split import InputSplit
 from pnpdepth_cli.core.update_rules import SCHEDULES, Update, step_size
@@ -223,7 +223,7 @@ class _Adaptation:
     def _loss(self, frame: FrameOfPoints, hidden: Tensor) -> Tensor:
         output = frame.predict_in_steps(frame.inliers.select(~hidden))
         hidden_points = frame.inliers.select(hidden)
-        loss: Loss = LOSSES[self._settings.loss]
+        loss = checked_loss(self._settings.loss)
         return loss(hidden_points.sample(frame.depth_of(output)), hidden_points.depth)
 
     @contextmanager

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.choices import LOSSES
 from pnpdepth_cli.commands.stopwatch import versions
+from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import NoPointsError
@@ -117,7 +117,7 @@ def _parts(
 ) -> dict[str, Callable[[], object]]:
     """The network, its front and rear, and the refinement; tensors in, tensors out."""
     network, arguments, no_grad = prepared.network, prepared.arguments, torch.no_grad()
-    reader, loss_of = prepared.depth_reader(settings), LOSSES[settings.loss]
+    reader, loss_of = prepared.depth_reader(settings), checked_loss(settings.loss)
     z = no_grad(split.front)(*arguments)
 
     def rear_and_gradient() -> Tensor | None:

@@ -82,6 +82,7 @@ class Alignment:
         fitted = {"none": "not fitted", "affine": "fitted by scale and shift"}.get(
             self.kind, f"fitted by {self.kind}"
         )
+        read_as = f"negated {read_as}" if self.scale < 0 else read_as
         return f"the network's output is read as {read_as} (larger is {sense}), {fitted}"
 
 

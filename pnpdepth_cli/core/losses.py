@@ -12,6 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from pnpdepth_cli.choices import LOSSES
+from pnpdepth_cli.core.user_code import wrap_user_errors
+from pnpdepth_cli.errors import ModelError
+
 Loss = Callable[[Tensor, Tensor], Tensor]
 
 TABLE: dict[str, Loss] = {}
@@ -31,6 +35,21 @@ gave equal ones, but larger ones where a fifth of the points were outliers."""
 def loss(name: str) -> Callable[[Loss], Loss]:
     """Enters the decorated function in the table."""
     return lambda function: TABLE.setdefault(name, function)
+
+
+def checked_loss(name: str) -> Loss:
+    """Returns a loss of `LOSSES`; it raises ModelError where it fails or its value is no scalar."""
+    function: Loss = LOSSES[name]
+
+    def checked(predicted: Tensor, true: Tensor) -> Tensor:
+        with wrap_user_errors(f"loss {name!r}"):
+            value = function(predicted, true)
+            if value.numel() != 1:
+                shape = tuple(value.shape)
+                raise ModelError(f"loss {name!r} gives {shape}, not a scalar; add .mean()")
+        return value
+
+    return checked
 
 
 @loss("l1")

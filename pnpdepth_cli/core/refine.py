@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.core.losses import Loss, proximity_loss
+from pnpdepth_cli.choices import UPDATES
+from pnpdepth_cli.core.losses import checked_loss, proximity_loss
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
 from pnpdepth_cli.core.update_rules import SCHEDULES, Channels, Update, blurred, step_size
@@ -190,7 +190,7 @@ class _FrameRefinement:
     ) -> None:
         self._settings, self._points, self._depth_of = settings, points, depth_of
         self._step, self._halvings = step_size(settings.lr, z0), 0
-        self._loss: Loss = LOSSES[settings.loss]
+        self._loss = checked_loss(settings.loss)
         self._update: Update = UPDATES[settings.update]()
         self._channels = Channels(z0) if settings.parameters == "channels" else None
         self._best: tuple[Tensor, Tensor] | None = None  # z of the lowest loss and its direction
@@ -209,8 +209,7 @@ class _FrameRefinement:
             self.error = error
             return None
         at_points = self._points.sample(depth)
-        with wrap_user_errors(f"loss {self._settings.loss!r}"):
-            loss = self._loss(at_points, self._points.depth)
+        loss = self._loss(at_points, self._points.depth)
         if self._settings.proximity and self._first is not None:
             loss = loss + self._settings.proximity * proximity_loss(depth, self._first)
         if self._settings.iterations and not bool(loss.isfinite()):
@@ -240,7 +239,7 @@ class _FrameRefinement:
             gradient = blurred(gradient, self._points, self._settings.blur)
             of_z = gradient if self._channels is None else self._channels.gradient(gradient)
             with wrap_user_errors(f"update rule {self._settings.update!r}"):
-                direction = self._update(of_z)
+                direction = self._update(of_z).reshape(of_z.shape)
             if self._channels is not None:
                 direction = self._channels.change_of_z(direction)
             if self._settings.line_search:

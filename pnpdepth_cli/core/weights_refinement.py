@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.core.losses import Loss
+from pnpdepth_cli.choices import UPDATES
+from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.masks import SET_ASIDE, Masks, set_aside
 from pnpdepth_cli.core.refine import DepthOf, OnIteration, Refinement, bad_prediction
 from pnpdepth_cli.core.update_rules import SCHEDULES, Update, step_size
@@ -95,7 +95,7 @@ class _WeightsRefinement:
 
     def __init__(self, frame: FrameOfPoints, weights: MovingWeights, settings: Settings) -> None:
         self._frame, self._weights, self._settings = frame, weights, settings
-        self._loss: Loss = LOSSES[settings.loss]
+        self._loss = checked_loss(settings.loss)
         generator = torch.Generator().manual_seed(settings.seed)
         fraction = SET_ASIDE if settings.masked else 0.0
         aside = set_aside(frame.inliers, fraction, generator)

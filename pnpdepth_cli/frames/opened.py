@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.choices import LOSSES
+from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import Refinement, refine_from
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.split.tensors import tensors_in
@@ -153,7 +153,7 @@ class OpenNetwork:
             self._output = output
         depth = reader(output).detach()
         at_points = prepared.points.sample(depth)
-        loss = float(LOSSES[settings.loss](at_points, prepared.points.depth))
+        loss = float(checked_loss(settings.loss)(at_points, prepared.points.depth))
         return Refinement(before=depth, after=depth, losses=(loss,), step=0.0, kept=0)
 
     @contextmanager

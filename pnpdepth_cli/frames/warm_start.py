@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.choices import LOSSES
+from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import Refinement, refine_from
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.weights import MovingWeights
@@ -90,7 +90,7 @@ def _with_z(
 
 
 def _loss(frame: PreparedFrame, settings: Settings, depth: Tensor) -> float:
-    return float(LOSSES[settings.loss](frame.points.sample(depth), frame.points.depth))
+    return float(checked_loss(settings.loss)(frame.points.sample(depth), frame.points.depth))
 
 
 def _with_weights(

@@ -47,6 +47,9 @@ class DepthKind(NamedTuple):
     scale: float | None  # codes per metre; None for floats
     assumed: bool  # true if neither the file nor the user nor the data set states the scale
 
+    def __str__(self) -> str:
+        return self.source + ", assumed" * self.assumed
+
 
 @dataclass(frozen=True, kw_only=True)
 class DepthImage:

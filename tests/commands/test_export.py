@@ -214,7 +214,7 @@ def change(path: Path, **entries: Any) -> None:
     ("entries", "error", "message"),
     [
         ({"camera": None}, InputError, "a_depth.exr lacks a record with its camera"),
-        ({"inputs": {}}, InputError, "a_depth.exr lacks its image"),
+        ({"inputs": {}}, InputError, "a_depth.exr lacks its image; run this in the"),
         ({"unit": "m"}, InputError, "in different units"),
         ({"inputs": {"sparse": {"image": "b.png"}}}, InputError, "two frames have one image name"),
         ({"size": [9, 9]}, SizeError, "--protocol whole"),

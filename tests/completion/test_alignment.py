@@ -143,3 +143,7 @@ def test_the_decision_reads_as_a_sentence() -> None:
     assert str(align(5 / d, points_of(d), ("inverse",), "scale")) == (
         "the network's output is read as inverse depth (larger is nearer), fitted by scale"
     )
+    assert str(align(9 - 5 / d, points_of(d), ("inverse",), "affine")) == (
+        "the network's output is read as negated inverse depth (larger is farther), fitted by scale"
+        " and shift"
+    )

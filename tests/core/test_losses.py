@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from math import inf, isfinite, log
+from pathlib import Path
 
 import pytest
 import torch
 
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.core.losses import MIN_CAUCHY_SCALE, MIN_DEPTH, cauchy, proximity_loss
+from pnpdepth_cli.core.losses import (
+    MIN_CAUCHY_SCALE,
+    MIN_DEPTH,
+    cauchy,
+    checked_loss,
+    proximity_loss,
+)
+from pnpdepth_cli.errors import ModelError
 
 PREDICTED, TRUE = torch.tensor([1.0, 2.0, 4.0, 10.0]), torch.tensor([1.0, 2.5, 2.0, 5.0])
 # errors 0, ½, 2, 5; c of berhu = 1, so ½ is linear there and 2 and 5 are quadratic
@@ -28,6 +36,13 @@ BY_HAND = {
 @pytest.mark.parametrize("name", LOSSES)
 def test_a_loss_has_the_value_worked_out_by_hand(name: str) -> None:
     assert float(LOSSES[name](PREDICTED, TRUE)) == pytest.approx(BY_HAND[name], rel=1e-6)
+
+
+def test_a_loss_of_a_file_that_gives_no_scalar_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "own.py"
+    file.write_text("def loss(predicted, true):\n    return predicted - true\n")
+    with pytest.raises(ModelError, match=r"own.py' gives \(4,\), not a scalar; add .mean\(\)$"):
+        checked_loss(str(file))(TRUE, TRUE)
 
 
 @pytest.mark.parametrize("name", LOSSES)

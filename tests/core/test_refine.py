@@ -393,6 +393,27 @@ def test_a_layer_without_a_gradient_back_to_it_is_refused_on_one_line(
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({"loss": "def loss(p, t): return p - t"}, r"gives \(\d+,\), not a scalar; add .mean"),
+        ({"loss": "def loss(p, t): return 0"}, "loss .* raises AttributeError"),
+        (
+            {"update": "def update_rule(): return lambda gradient: gradient.sum()"},
+            "update rule .* raises RuntimeError",
+        ),
+    ],
+)
+def test_a_loss_or_rule_of_a_file_that_gives_the_wrong_shape_is_refused_on_one_line(
+    files: dict[str, str], message: str, tmp_path: Path
+) -> None:
+    (name, text), file = *files.items(), tmp_path / "own.py"
+    file.write_text(text)
+    with pytest.raises(ModelError, match=message) as error:
+        refined(build("resnet"), "layer2", Settings(**{name: str(file)}))
+    assert "\n" not in str(error.value)
+
+
 # ------------------------------------------------------------------ several frames at once
 
 

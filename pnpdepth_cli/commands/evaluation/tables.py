@@ -60,7 +60,7 @@ def means_row(evaluation: Evaluation, name: str, columns: Sequence[str] | None) 
         cells = [f"{cell} ({end})" for cell, end in zip(cells, ends, strict=True)]
     scored = f"{len(evaluation.scored):,} of {len(evaluation.frames):,}"
     assumed = {
-        f"{side}: {kind.source}, assumed"
+        f"{side}: {kind}"
         for side, kinds in kinds_of(evaluation.frames).items()
         for kind, _ in kinds
         if kind.assumed

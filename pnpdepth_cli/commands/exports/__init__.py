@@ -132,10 +132,10 @@ def export_results(
 def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     record, camera, image = result.record, result.camera, result.image
     if camera is None or image is None:
-        lacks = "a record with its camera" if camera is None else "its image, which was moved"
-        raise InputError(
-            f"{result.depth} lacks {lacks}; refine it again with a COLMAP model, --calib or --fov"
-        )
+        lacks = "its image; run this in the folder where it was refined, or refine it again"
+        if camera is None:
+            lacks = "a record with its camera; refine it with a COLMAP model, --calib or --fov"
+        raise InputError(f"{result.depth} lacks {lacks}")
     if export.needs_pose and camera.pose is None:
         raise InputError(
             f"{result.depth} has no pose in its record; refine it with a COLMAP model, as"

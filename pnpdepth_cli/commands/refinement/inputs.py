@@ -42,6 +42,7 @@ _LEAK_FRACTION = 0.5  # of the ground truth's pixels equal to the sparse depth g
 _FAR = 1000.0  # times the median depth; no point of an image is farther
 _OTHER_SCALE = 1.5  # ratio of ground truth to sparse depth that no noise explains
 _MIN_COMPARED = 10  # fewer points decide nothing
+_SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, have x and y swapped
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,7 +208,7 @@ def _read_ground_truth(
         noun="pixels",
         option="--gt-scale",
     )
-    record = _file_record(source) | {"read_as": truth.source}
+    record = _file_record(source) | {"read_as": str(truth.kind)}
     return replace(truth, values=values), record, [f"gt: {described}"]
 
 
@@ -285,7 +286,8 @@ def _read_points(
             f" {size[1]}×{size[0]}; --set sparse-size-ok maps the points if both show the same view"
         )
     described = describe_range(depth, sparse.source, assumed_scale=sparse.assumed_scale)
-    notes, record = [f"sparse: {described}"], _file_record(path) | {"read_as": sparse.source}
+    kind = DepthKind(sparse.source, sparse.scale, sparse.assumed_scale)
+    notes, record = [f"sparse: {described}"], _file_record(path) | {"read_as": str(kind)}
     hidden = None if keep_occluded else occluded_in_map(visible)
     if hidden is not None and hidden.any():
         visible, count = visible.select(~hidden), int(hidden.sum())
@@ -302,14 +304,21 @@ def _read_points(
     return SparseDepth(
         points=points,
         scale=sparse.scale,
-        kind=DepthKind(sparse.source, sparse.scale, sparse.assumed_scale),
+        kind=kind,
         record=record,
         notes=tuple(notes),
     )
 
 
 def _inside(path: Path, points: SparsePoints) -> SparsePoints:
-    inside = points.cropped(0, 0, *points.size)
+    height, width = points.size
+    inside = points.cropped(0, 0, height, width)
+    outside = len(points) - len(inside)
+    if outside > _SWAPPED * len(points) and len(points.cropped(0, 0, width, height)) == len(points):
+        raise SizeError(
+            f"{path}: {outside:,} of {len(points):,} points are outside the {width}×{height} image,"
+            f" but all are inside {height}×{width}: swap x and y, or turn the image by 90°"
+        )
     if not len(inside):
         raise NoPointsError(f"{path}: none of its {len(points)} points lies in the image")
     return inside

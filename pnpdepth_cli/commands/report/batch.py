@@ -277,6 +277,7 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str
     ]
     if summary["method"]["kind"] == "default":
         facts.append(("Refinement", "networks refined, fused and propagated (the default method)"))
+        facts.append(("Before", "the network's depth, aligned with the points"))
     elif first is not None:
         used = first["settings"]
         refined = f"{used['iterations']} updates of z at {used['layer']}"

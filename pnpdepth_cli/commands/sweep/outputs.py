@@ -171,12 +171,16 @@ def study_table(study: Row, record: Row) -> Table:
                 *[_text(cell.get("time_s"), ".3g")] * timed,
             ]
         )
+    draws = "1 draw" if record["seeds"] == 1 else f"{record['seeds']} draws"
+    caption = (
+        f"{' × '.join(study['parameters'])}: means over frames, of {draws} of the points each; MAE"
+        " in metres, gains over plain in %"
+    )
     return Table(
         header=[*study["parameters"], "points used", "frames", *METHODS, "95 %", "gain", "95 %",
                 "RMSE gain", "MRE gain", "δ1 gain", *["time [s]"] * timed],
         rows=rows,
-        caption=f"{' × '.join(study['parameters'])}: means over frames, of {record['seeds']} draws"
-        " of the points each; MAE in metres, gains over plain in %",
+        caption="; ".join([caption, *record["assumed"]]),
     )  # fmt: skip
 
 

@@ -86,6 +86,8 @@ class _Network:
     sampling: Sampling
     """The points where nothing is varied."""
     seeds: int
+    assumed: tuple[str, ...]
+    """Kinds of depth files whose scale is assumed, in the frame that it was resolved on."""
 
     def settings(self, cell: Cell) -> Settings:
         """Returns how a cell refines. Raises UsageError if parameters contradict each other."""
@@ -327,6 +329,11 @@ def _network(
         base=base,
         sampling=sampling,
         seeds=request.seeds,
+        assumed=tuple(
+            f"{side}: {inputs.record[side]['read_as']}"
+            for side in ("gt", "sparse")
+            if inputs.record[side].get("read_as", "").endswith("assumed")
+        ),
     )
     own = network.settings({})
     listener.say(
@@ -375,6 +382,7 @@ def _write(
         **({"more_models": [model_record(n.refiner.network, n.spec) for n in others]}
            if others else {}),
         "frames": list(names),
+        "assumed": list(first.assumed),
         "seeds": request.seeds,
         "base": asdict(first.settings({})) | asdict(first.sampling),
         "studies": studies,

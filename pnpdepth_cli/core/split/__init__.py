@@ -43,9 +43,9 @@ _BEFORE_ALL_CALLS = -1
 class Split:
     """A network cut at a layer, as a context manager; on exit the network is as before.
 
-    with Split(network, "decoder.up1") as split:
-        z = split.front(rgb)        # once for each frame
-        output = split.rear(z)      # many times; differentiable in z
+        with Split(network, "decoder.up1") as split:
+            z = split.front(rgb)        # once for each frame
+            output = split.rear(z)      # many times; differentiable in z
 
     While open, the network is in eval mode and only z requires gradient.
 

@@ -80,7 +80,8 @@ def _nearest(root: Path) -> str:
         name: [p for p in patterns if any(next(root.glob(s + p), None) for s in ("", "*/", "*/*/"))]
         for name, patterns in needs.items()
     }
-    best = max(needs, key=lambda name: len(present[name]) / len(needs[name]))
+    here = {name: sum(any(root.glob(p)) for p in patterns) for name, patterns in needs.items()}
+    best = max(needs, key=lambda name: (len(present[name]) / len(needs[name]), here[name]))
     if present[best]:
         lacking = [pattern for pattern in needs[best] if pattern not in present[best]]
         fact = f"lacks {', '.join(lacking)}" if lacking else "has them, but not in one place"

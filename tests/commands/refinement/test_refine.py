@@ -181,6 +181,13 @@ def test_a_point_between_pixels_is_enough_and_points_outside_are_counted(
     assert record["sparse_error"]["after"]["mae"] < record["sparse_error"]["before"]["mae"]
 
 
+def test_a_list_of_points_with_x_and_y_swapped_is_refused(frame: FrameOnDisk) -> None:
+    points = frame.folder / "points.csv"
+    points.write_text("10,5,2\n20,50,2\n45,61,3\n")  # of an image of 62×46
+    with pytest.raises(SizeError, match=r"2 of 3 points are outside .* inside 46×62: swap x and y"):
+        run(frame, sparse=points)
+
+
 def test_a_divergence_writes_the_last_good_depth_and_is_reported(frame: FrameOnDisk) -> None:
     model = frame.folder / "bad.py"
     text = frame.model.read_text().replace(

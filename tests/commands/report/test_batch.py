@@ -140,6 +140,13 @@ def test_a_failed_frame_is_listed_with_its_reason(root: Path, report: Path) -> N
     assert len(page_data(report)["without"]) == 4
 
 
+def test_a_report_of_the_default_method_says_what_was_before(root: Path, report: Path) -> None:
+    batch(root, html=report, limit=1, refine={"propagate": None})
+    facts = dict(page_data(report)["facts"])
+    assert facts["Refinement"] == "networks refined, fused and propagated (the default method)"
+    assert facts["Before"] == "the network's depth, aligned with the points"
+
+
 def test_without_ground_truth_gains_are_those_at_held_out_points_and_settings_are_stated(
     root: Path, report: Path
 ) -> None:

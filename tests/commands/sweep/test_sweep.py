@@ -160,6 +160,17 @@ def test_a_grid_has_a_cell_for_each_combination_and_loads_the_network_once(
     assert text[text.index(r"\midrule") + 1].split(" & ")[6] == f"{mae:.4f}"
 
 
+def test_the_tables_say_which_scale_of_the_files_is_assumed(root: Path) -> None:
+    for path in (root / "gt").iterdir():
+        millimetres = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        codes = (millimetres * 0.256).round().astype(np.uint16)
+        cv2.imwrite(str(path), codes)  # without the scale in its text
+    record = sweep(root, "iterations=1")
+    assert record["assumed"] == ["gt: 16-bit PNG ÷ 256, assumed"]
+    first, *_ = (root / "out" / "sweep.tex").read_text().splitlines()
+    assert first.endswith("gains over plain in %; gt: 16-bit PNG ÷ 256, assumed")
+
+
 def test_one_by_one_shares_what_the_tables_have_in_common(root: Path) -> None:
     record = sweep(root, "iterations=1,5", "lr=0.01,0.1", "loss=l1,l2", one_by_one=True)
     assert [study["name"] for study in record["studies"]] == ["iterations", "lr", "loss"]
