@@ -20,7 +20,7 @@ from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
-from pnpdepth_cli.models.onnx.limits import inlined
+from pnpdepth_cli.models.onnx.limits import inlined, load_external
 from pnpdepth_cli.models.onnx.quantised import Quantised, outputs_of, quantises, session_of
 
 MISMATCH = 1e-3
@@ -68,7 +68,7 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         return definition
     return replace(
         definition,
-        build=lambda: Quantised(source, file, input_name),
+        build=lambda: Quantised(source, file, model, input_name),
         verify=None,
         layers=("output",),
         defaults=replace(definition.defaults, iterations=0),
@@ -142,7 +142,8 @@ def _read(file: Path) -> Any:
             " pip install 'pnpdepth[onnx]'"
         ) from None
     try:
-        model = onnx.load(str(file))
+        model = onnx.load(str(file), load_external_data=False)
+        load_external(model, file.parent)
     except Exception as error:  # protobuf's own errors, missing external data, …
         raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
     if not model.graph.node:
