@@ -33,11 +33,13 @@ _WEB = ("http", "https")
 """Addresses that may have a query, in stores that list no folders."""
 _VERSIONS = ("ETag", "etag", "generation", "md5Hash", "blob_id", "LastModified", "mtime")
 """What stores call the version of an object's content, the surest first."""
+_CONNECT_S, _READ_S, _TOTAL_S = 5, 30, 300
+"""Seconds until a store must accept, until it must go on, and, on the web, for one file."""
 _OPTIONS: dict[str, dict[str, Any]] = {
     "s3": {
         "config_kwargs": {
-            "connect_timeout": 5,
-            "read_timeout": 30,
+            "connect_timeout": _CONNECT_S,
+            "read_timeout": _READ_S,
             "retries": {"total_max_attempts": 3, "mode": "standard"},
         }
     }
@@ -300,8 +302,14 @@ def _file_system(scheme: str) -> Any:
     try:
         import fsspec
 
+        options = _OPTIONS.get(scheme, {})
+        if scheme in _WEB:
+            from aiohttp import ClientTimeout
+
+            timeout = ClientTimeout(total=_TOTAL_S, sock_connect=_CONNECT_S, sock_read=_READ_S)
+            options = {"client_kwargs": {"timeout": timeout}}
         return fsspec.filesystem(
-            scheme, use_listings_cache=False, skip_instance_cache=True, **_OPTIONS.get(scheme, {})
+            scheme, use_listings_cache=False, skip_instance_cache=True, **options
         )
     except (ImportError, ValueError):
         install = "pip install 'pnpdepth[remote]'" + ("" if scheme == "s3" else f" {package}")

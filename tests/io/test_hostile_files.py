@@ -168,7 +168,7 @@ def test_an_exr_of_one_long_row_is_converted_in_64_bytes_a_pixel(tmp_path: Path)
         assert read_rgb(path).values.shape == (1, width, 3)
 
 
-SHAPES = ["(\n", "(6, 8", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
+SHAPES = ["(\n", "(6, 8", "(True, 5)", "(2, 10**9)", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
 DTYPES = ["f999", "<q8", ",", "i4, i4", "M8[x]", "\x00f4"]
 
 
