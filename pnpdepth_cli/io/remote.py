@@ -12,7 +12,7 @@ import posixpath
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -318,9 +318,17 @@ def _file_system(scheme: str) -> Any:
 
 def _call(path: RemotePath, method: str, *more: Any, **options: Any) -> Any:
     """What the method returns; None if there is no such object."""
-    with _errors_of(path), suppress(FileNotFoundError):
-        file_system = _file_system(_scheme(path))
-        return getattr(file_system, method)(str(path) + path.query, *more, **options)
+    with _errors_of(path):
+        try:
+            file_system = _file_system(_scheme(path))
+            return getattr(file_system, method)(str(path) + path.query, *more, **options)
+        except FileNotFoundError as error:
+            # On the web, fsspec says so of whatever happens.
+            cause = error.__cause__ if _scheme(path) in _WEB else None
+            missing = isinstance(cause, FileNotFoundError) or getattr(cause, "status", 0) == 404
+            if cause is not None and not missing:
+                raise cause from None
+    return None
 
 
 def _scheme(path: RemotePath) -> str:
