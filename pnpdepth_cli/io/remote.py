@@ -308,9 +308,11 @@ def _file_system(scheme: str) -> Any:
 
             timeout = ClientTimeout(total=_TOTAL_S, sock_connect=_CONNECT_S, sock_read=_READ_S)
             options = {"client_kwargs": {"timeout": timeout}}
-        return fsspec.filesystem(
+        file_system = fsspec.filesystem(
             scheme, use_listings_cache=False, skip_instance_cache=True, **options
         )
+        file_system.retries = 1  # s3fs would repeat what botocore has repeated
+        return file_system
     except (ImportError, ValueError):
         install = "pip install 'pnpdepth[remote]'" + ("" if scheme == "s3" else f" {package}")
         raise UsageError(f"{scheme}:// needs fsspec and {package}: {install}") from None
