@@ -159,7 +159,9 @@ def _of_convolution(
     x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: list[int], *_: Any
 ) -> int:
     sides = [n + 2 * p for n, p in zip(x.shape[2:], padding, strict=True)]
-    return len(x) * len(weight) * math.prod(sides)
+    # Only float32 is computed without a copy of the pixels below each position of the kernel.
+    copied = 1 if x.dtype == torch.float32 else weight[0].numel()
+    return len(x) * max(len(weight), copied) * math.prod(sides)
 
 
 def _of_transposed(x: Tensor, weight: Tensor, bias: Any, stride: list[int], *rest: Any) -> int:

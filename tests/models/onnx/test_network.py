@@ -302,6 +302,12 @@ ACTIVATION_BOMBS = {
         constant("s", np.float32([1, 1, 1000, 1000])),
         helper.make_node("Resize", ["depth", "", "s"], ["big"], mode="linear"),
     ],
+    "Conv of doubles": [
+        helper.make_node("Cast", ["depth"], ["d64"], to=11),
+        size_of(1, 1, 1500, 1500), helper.make_node("ConstantOfShape", ["n"], ["k32"]),
+        helper.make_node("Cast", ["k32"], ["k64"], to=11),
+        helper.make_node("Conv", ["d64", "k64"], ["big"], pads=[800] * 4),
+    ],
     "MatMul": [
         constant("n", [-1, 1]), constant("m", [1, -1]), constant("k", [1, 1, 1, 20]),
         helper.make_node("Tile", ["depth", "k"], ["long"]),
