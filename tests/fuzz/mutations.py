@@ -32,9 +32,9 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
         data: A valid file.
         rng: Decides everything; the same state gives the same bytes.
     """
-    if rng.random() < 0.6:
+    if rng.random() < 0.65:
         if data[8:9] == b"{" and data[2:8] == bytes(6):
-            return _safetensors_with_another_header(data, rng)
+            return _safetensors_with_a_right_length(data, rng)
         for begin, inside in _CONTAINERS:
             if data.startswith(begin):
                 return inside(data, rng)
@@ -154,16 +154,16 @@ def _json_with_another_value(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _png_with_right_checksums(data: bytes, rng: np.random.Generator) -> bytes:
-    """The PNG with one damaged chunk; half of the damaged pixels are compressed again."""
+    """The PNG with one damaged chunk; most of the damaged pixels are compressed again."""
     at, chunks = 8, []
     while at + 8 <= len(data):
         (size,) = struct.unpack_from(">I", data, at)
         chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
         at += 12 + size
-    chosen = int(rng.integers(len(chunks) - 1))
+    chosen = len(chunks) - 2 if rng.random() < 0.5 else int(rng.integers(len(chunks) - 1))
     kind, content = chunks[chosen]
-    if kind == b"IDAT" and len(chunks) == 3 and rng.random() < 0.5:
-        content = zlib.compress(mutated(zlib.decompress(content), rng))
+    if kind == b"IDAT" and [k for k, _ in chunks].count(kind) == 1 and rng.random() < 0.8:
+        content = zlib.compress(bytes(_flip_bits(bytearray(zlib.decompress(content)), rng)))
     else:
         content = bytes(_overwrite_an_integer(bytearray(content), rng))
     chunks[chosen] = kind, content
@@ -174,9 +174,11 @@ def _png_with_right_checksums(data: bytes, rng: np.random.Generator) -> bytes:
     return packed
 
 
-def _safetensors_with_another_header(data: bytes, rng: np.random.Generator) -> bytes:
-    """Still a length, JSON and the tensors."""
+def _safetensors_with_a_right_length(data: bytes, rng: np.random.Generator) -> bytes:
+    """Still a length, JSON and the tensors; most headers stay, as their reader takes no other."""
     (size,) = struct.unpack_from("<Q", data)
+    if rng.random() < 0.85:
+        return data[: 8 + size] + bytes(_flip_bits(bytearray(data[8 + size :]), rng))
     header = _json_with_another_value(data[8 : 8 + size], rng)
     return struct.pack("<Q", len(header)) + header + data[8 + size :]
 
