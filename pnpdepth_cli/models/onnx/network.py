@@ -148,6 +148,10 @@ def _read(file: Path) -> Any:
         raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
     if not model.graph.node:
         raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
+    for node in (*model.graph.node, *(node for f in model.functions for node in f.node)):
+        words = (node.name, node.op_type, node.domain, *node.input, *node.output)
+        if not all(isinstance(word, str) for word in words):
+            raise ModelError(f"ONNX file {file} cannot be read: its names are not text in UTF-8")
     if _opset(model) not in _OPSETS:
         raise ModelError(
             f"ONNX file {file} is of opset {_opset(model)}; export it with one from"

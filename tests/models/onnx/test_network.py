@@ -86,7 +86,13 @@ def test_an_incorrect_conversion_is_refused(
 def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "net.onnx"
     assert "does not exist" in refused(path)
-    for content, message in ((b"not a network", "cannot be read"), (b"", "holds no graph")):
+    named = write_network(path).read_bytes()
+    contents = {b"not a network": "cannot be read", b"": "holds no graph"}
+    contents |= {
+        named.replace(word, b"\xff" + word[1:]): "not text in UTF-8"
+        for word in (b"Sigmoid", b"dec/up", b"w1")
+    }
+    for content, message in contents.items():
         path.write_bytes(content)
         assert message in refused(path)
     node = helper.make_node("NonZero", ["depth"], ["where"])
