@@ -17,11 +17,22 @@ def main() -> None:
         from pnpdepth_cli.cli.main import run
 
         code = run(sys.argv[1:])
-    except KeyboardInterrupt:
+    except BaseException as error:
+        if not _is_interrupt(error):
+            raise
         with contextlib.suppress(OSError):
             os.write(2, b"pnpdepth: interrupted\n")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the results are written; end with their code
     sys.exit(code)
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether it is a Ctrl-C, or came of one: before Python 3.12, a class body turns it into a
+    RuntimeError.
+    """
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error is not None
 
 
 def _keep_freed_memory() -> None:

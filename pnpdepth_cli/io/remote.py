@@ -12,7 +12,7 @@ import posixpath
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -33,11 +33,13 @@ _WEB = ("http", "https")
 """Addresses that may have a query, in stores that list no folders."""
 _VERSIONS = ("ETag", "etag", "generation", "md5Hash", "blob_id", "LastModified", "mtime")
 """What stores call the version of an object's content, the surest first."""
+_CONNECT_S, _READ_S, _TOTAL_S = 5, 30, 300
+"""Seconds until a store must accept, until it must go on, and, on the web, for one file."""
 _OPTIONS: dict[str, dict[str, Any]] = {
     "s3": {
         "config_kwargs": {
-            "connect_timeout": 5,
-            "read_timeout": 30,
+            "connect_timeout": _CONNECT_S,
+            "read_timeout": _READ_S,
             "retries": {"total_max_attempts": 3, "mode": "standard"},
         }
     }
@@ -300,9 +302,17 @@ def _file_system(scheme: str) -> Any:
     try:
         import fsspec
 
-        return fsspec.filesystem(
-            scheme, use_listings_cache=False, skip_instance_cache=True, **_OPTIONS.get(scheme, {})
+        options = _OPTIONS.get(scheme, {})
+        if scheme in _WEB:
+            from aiohttp import ClientTimeout
+
+            timeout = ClientTimeout(total=_TOTAL_S, sock_connect=_CONNECT_S, sock_read=_READ_S)
+            options = {"client_kwargs": {"timeout": timeout}}
+        file_system = fsspec.filesystem(
+            scheme, use_listings_cache=False, skip_instance_cache=True, **options
         )
+        file_system.retries = 1  # s3fs would repeat what botocore has repeated
+        return file_system
     except (ImportError, ValueError):
         install = "pip install 'pnpdepth[remote]'" + ("" if scheme == "s3" else f" {package}")
         raise UsageError(f"{scheme}:// needs fsspec and {package}: {install}") from None
@@ -310,9 +320,17 @@ def _file_system(scheme: str) -> Any:
 
 def _call(path: RemotePath, method: str, *more: Any, **options: Any) -> Any:
     """What the method returns; None if there is no such object."""
-    with _errors_of(path), suppress(FileNotFoundError):
-        file_system = _file_system(_scheme(path))
-        return getattr(file_system, method)(str(path) + path.query, *more, **options)
+    with _errors_of(path):
+        try:
+            file_system = _file_system(_scheme(path))
+            return getattr(file_system, method)(str(path) + path.query, *more, **options)
+        except FileNotFoundError as error:
+            # On the web, fsspec says so of whatever happens.
+            cause = error.__cause__ if _scheme(path) in _WEB else None
+            missing = isinstance(cause, FileNotFoundError) or getattr(cause, "status", 0) == 404
+            if cause is not None and not missing:
+                raise cause from None
+    return None
 
 
 def _scheme(path: RemotePath) -> str:

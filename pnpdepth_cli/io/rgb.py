@@ -31,6 +31,7 @@ _RESOLUTION, _RESOLUTION_UNIT = 0xA20E, 0xA210
 _WIDTH, _HEIGHT = 0xA002, 0xA003
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
+_BLOCK = 1 << 20  # values that are converted at a time
 _PLAUSIBLE = (0.2, 50.0)
 """Focal length as a multiple of the image's longer side: fields of view of 136° to 1°."""
 
@@ -149,19 +150,23 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
 
 def _from_linear_light(path: Path, data: bytes) -> RgbImage:
     linear = _colour_of(path, read_exr_channels(path, data)).astype(np.float32)
-    linear = np.nan_to_num(linear, nan=0.0, posinf=1e9, neginf=0.0)
+    np.nan_to_num(linear, copy=False, nan=0.0, posinf=1e9, neginf=0.0)
     outside = float(((linear > 1) | (linear < 0)).any(axis=2).mean())
     note = "EXR linear light, converted with the sRGB curve"
     if outside > 0:
         note += f"; {100 * outside:.2g} % of pixels lay outside 0..1 and were clipped"
-    return RgbImage(values=srgb_from_linear(np.clip(linear, 0, 1)), note=note)
+    return RgbImage(values=srgb_from_linear(linear.clip(0, 1, out=linear)), note=note)
 
 
 def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     """Returns linear light in 0..1 of any shape, sRGB-encoded (IEC 61966-2-1)."""
-    light = linear.astype(np.float64)  # in float32 white would come out just below 1
-    curve = 1.055 * np.power(light, 1 / 2.4) - 0.055
-    return np.where(light <= 0.0031308, 12.92 * light, curve).astype(np.float32)
+    encoded = np.empty(linear.size, np.float32)
+    for start in range(0, linear.size, _BLOCK):
+        # In float32 white would come out just below 1.
+        light = linear.reshape(-1)[start : start + _BLOCK].astype(np.float64)
+        curve = 1.055 * np.power(light, 1 / 2.4) - 0.055
+        encoded[start : start + _BLOCK] = np.where(light <= 0.0031308, 12.92 * light, curve)
+    return encoded.reshape(linear.shape)
 
 
 def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:

@@ -188,9 +188,16 @@ def _json(file: Path, why: str) -> Mapping[str, Any]:
 
 
 def _weights(folder: Path) -> Path:
-    for name in _WEIGHTS:
-        if (folder / name).is_file():
-            return folder / name
+    single, index = (folder / name for name in _WEIGHTS)
+    if single.is_file():
+        return single
+    if index.is_file():
+        parts = _json(index, "it names the files of weights").get("weight_map")
+        for name in parts.values() if isinstance(parts, Mapping) else [parts]:
+            file = folder / str(name)
+            if file.parent != folder or file.suffix != single.suffix or not file.is_file():
+                raise CheckpointError(f"{index}: {file} is no safetensors file beside it")
+        return index
     if any((folder / name).is_file() for name in _PICKLED):
         raise CheckpointError(
             f"{folder} has its weights as a pickle only; convert it: pnpdepth models convert"

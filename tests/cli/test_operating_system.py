@@ -166,8 +166,11 @@ def python(code: str, environment: Mapping[str, str] = {}) -> subprocess.Complet
     )  # fmt: skip
 
 
-def test_ctrl_c_during_the_first_imports_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "click.py").write_text("raise KeyboardInterrupt")
+@pytest.mark.parametrize(
+    "line", ["raise KeyboardInterrupt", "raise RuntimeError from KeyboardInterrupt()"]
+)
+def test_ctrl_c_during_the_first_imports_is_one_line(tmp_path: Path, line: str) -> None:
+    (tmp_path / "click.py").write_text(line)
     path = os.pathsep.join([str(tmp_path), str(SAMPLES.parent)])
     done = python("from pnpdepth_cli.cli.start import main; main()", {"PYTHONPATH": path})
     assert (done.returncode, done.stderr) == (130, "pnpdepth: interrupted\n")

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import io
+import json
 import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -28,8 +32,14 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
         data: A valid file.
         rng: Decides everything; the same state gives the same bytes.
     """
-    if data[:2] == b"PK" and rng.random() < 0.5:
-        return _zip_with_a_mutated_member(data, rng)
+    if rng.random() < 0.65:
+        if data[8:9] == b"{" and data[2:8] == bytes(6):
+            return _safetensors_with_a_right_length(data, rng)
+        for begin, inside in _CONTAINERS:
+            if data.startswith(begin):
+                return inside(data, rng)
+        gentle = _GENTLE_TEXT_MUTATIONS if _is_text(data) else _GENTLE_BINARY_MUTATIONS
+        return bytes(gentle[int(rng.integers(len(gentle)))](bytearray(data), rng))
     result = bytearray(data)
     kinds = _TEXT_MUTATIONS if _is_text(data) else _BINARY_MUTATIONS
     for _ in range(int(rng.integers(1, 5))):
@@ -104,6 +114,75 @@ def _repeat_a_line(data: bytearray, rng: np.random.Generator) -> bytearray:
     return bytearray(b"\n".join([*lines[:at], *[lines[at]] * count, *lines[at + 1 :]]))
 
 
+def _flip_a_late_bit(data: bytearray, rng: np.random.Generator) -> bytearray:
+    """Where the content of most formats is."""
+    data[int(rng.integers(len(data) // 2, len(data)))] ^= 1 << int(rng.integers(8))
+    return data
+
+
+def _overwrite_a_late_integer(data: bytearray, rng: np.random.Generator) -> bytearray:
+    half = len(data) // 2
+    return data[:half] + _overwrite_an_integer(data[half:], rng)[: len(data) - half]
+
+
+def _change_a_number(data: bytearray, rng: np.random.Generator) -> bytearray:
+    """The text with another number in place of one, which leaves its syntax as it is."""
+    numbers = list(re.finditer(rb"(?<![\w.])-?\d+(\.\d+)?(?![\w.])", bytes(data[:20_000])))
+    if not numbers:
+        return _replace_a_word(data, rng)
+    chosen = numbers[int(rng.integers(len(numbers)))]
+    text = _NUMBERS[int(rng.integers(len(_NUMBERS)))]
+    return data[: chosen.start()] + text.encode() + data[chosen.end() :]
+
+
+def _json_with_another_value(data: bytes, rng: np.random.Generator) -> bytes:
+    """The JSON with one value, at any depth, replaced; still JSON."""
+    try:
+        root = [json.loads(data)]
+    except ValueError:  # a line for each frame
+        return bytes(_change_a_number(bytearray(data), rng))
+    places: list[tuple[Any, Any]] = []
+    pending: list[Any] = [root]
+    while pending:
+        holder = pending.pop()
+        keys = list(holder) if isinstance(holder, dict) else range(len(holder))
+        places += [(holder, key) for key in keys]
+        pending += [holder[key] for key in keys if isinstance(holder[key], dict | list)]
+    holder, key = places[int(rng.integers(1, len(places)) if len(places) > 1 else 0)]
+    holder[key] = _VALUES[int(rng.integers(len(_VALUES)))]
+    return json.dumps(root[0]).encode()
+
+
+def _png_with_right_checksums(data: bytes, rng: np.random.Generator) -> bytes:
+    """The PNG with one damaged chunk; most of the damaged pixels are compressed again."""
+    at, chunks = 8, []
+    while at + 8 <= len(data):
+        (size,) = struct.unpack_from(">I", data, at)
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
+        at += 12 + size
+    chosen = len(chunks) - 2 if rng.random() < 0.5 else int(rng.integers(len(chunks) - 1))
+    kind, content = chunks[chosen]
+    if kind == b"IDAT" and [k for k, _ in chunks].count(kind) == 1 and rng.random() < 0.8:
+        content = zlib.compress(bytes(_flip_bits(bytearray(zlib.decompress(content)), rng)))
+    else:
+        content = bytes(_overwrite_an_integer(bytearray(content), rng))
+    chunks[chosen] = kind, content
+    packed = data[:8]
+    for kind, content in chunks:
+        packed += struct.pack(">I", len(content)) + kind + content
+        packed += struct.pack(">I", zlib.crc32(kind + content))
+    return packed
+
+
+def _safetensors_with_a_right_length(data: bytes, rng: np.random.Generator) -> bytes:
+    """Still a length, JSON and the tensors; most headers stay, as their reader takes no other."""
+    (size,) = struct.unpack_from("<Q", data)
+    if rng.random() < 0.85:
+        return data[: 8 + size] + bytes(_flip_bits(bytearray(data[8 + size :]), rng))
+    header = _json_with_another_value(data[8 : 8 + size], rng)
+    return struct.pack("<Q", len(header)) + header + data[8 + size :]
+
+
 def _zip_with_a_mutated_member(data: bytes, rng: np.random.Generator) -> bytes:
     """The archive with one damaged member, whose checksum is right."""
     packed = io.BytesIO()
@@ -116,6 +195,18 @@ def _zip_with_a_mutated_member(data: bytes, rng: np.random.Generator) -> bytes:
     return packed.getvalue()
 
 
+_NUMBERS = ("0", "-1", "0.5", "1e30", "-3.25", "7", "65536", "4294967296", "1e-9", "100")
+_VALUES = (None, True, "", "x", "../x", 0, -1, 0.5, 1e300, 2**63, [], {}, [1, 2, 3], [[0] * 3] * 3)
+_CONTAINERS: tuple[tuple[bytes, Callable[[bytes, np.random.Generator], bytes]], ...] = (
+    (b"PK", _zip_with_a_mutated_member),
+    (b"\x89PNG", _png_with_right_checksums),
+    (b"{", _json_with_another_value),
+    (b"[", _json_with_another_value),
+)
+"""By their first bytes, formats whose content is reached only if what is around it is right."""
+
+_GENTLE_BINARY_MUTATIONS: tuple[Mutation, ...] = (_flip_a_late_bit, _overwrite_a_late_integer)
+_GENTLE_TEXT_MUTATIONS: tuple[Mutation, ...] = (_change_a_number,)
 _BINARY_MUTATIONS: tuple[Mutation, ...] = (
     *(_flip_bits, _cut_short, _remove_a_part, _insert_noise, _repeat_a_part),
     *(_overwrite_an_integer, _overwrite_an_integer, _replace_a_word),

@@ -17,6 +17,16 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import check_pixel_count
 from pnpdepth_cli.io.rgb import read_rgb
+from tests.exr_files import (
+    DEEP,
+    PARTS,
+    TILED,
+    exr_attribute,
+    exr_file,
+    exr_header,
+    exr_line,
+)
+from tests.models.weights.files import little
 
 
 def png(path: Path, size: tuple[int, int], bits: int, colour: int, body: bytes) -> Path:
@@ -83,7 +93,82 @@ def test_tags_that_share_their_bytes_are_refused(where: str, tmp_path: Path) -> 
             read(path)
 
 
-SHAPES = ["(\n", "(6, 8", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
+SMALL, LOW, HIGH = (0, 0, 3, 1), -(2**31), 2**31 - 1
+LINES = [exr_line(y, 4) for y in (0, 1)]
+
+
+def _tiles(width: int, height: int, mode: int) -> bytes:
+    return exr_attribute("tiles", "tiledesc", struct.pack("<IIB", width, height, mode))
+
+
+def _part(number: int, window: tuple[int, ...], kind: str = "scanlineimage") -> bytes:
+    rows = struct.pack("<i", window[3] - window[1] + 1)
+    more = exr_attribute("name", "string", f"p{number}".encode())
+    more += exr_attribute("type", "string", kind.encode())
+    return exr_header(window, more=more + exr_attribute("chunkCount", "int", rows))
+
+
+EXRS = {
+    "every pixel there is": exr_file(exr_header((LOW, LOW, HIGH, HIGH))),
+    "a window of 900 megapixels": exr_file(exr_header((0, 0, 29_999, 29_999))),
+    "a window upside down": exr_file(exr_header((5, 5, 4, 4))),
+    "a display of every pixel": exr_file(exr_header(SMALL, display=(0, 0, HIGH, HIGH)), LINES),
+    "no rows": exr_file(exr_header(SMALL)),
+    "no channel": exr_file(exr_header(SMALL, names=())),
+    "5,000 channels": exr_file(exr_header((0, 0, 99, 99), names=[f"c{n}" for n in range(5000)])),
+    "100,000 channels": exr_file(exr_header(SMALL, names=[f"c{n}" for n in range(100_000)])),
+    "a channel twice": exr_file(exr_header(SMALL, names=("Z", "Z")), LINES),
+    "a sampling of 0": exr_file(exr_header(SMALL, sampling=0), LINES),
+    "a negative sampling": exr_file(exr_header(SMALL, sampling=-1), LINES),
+    "an attribute of 2 GB": exr_file(exr_header(SMALL, more=b"a\0string\0\xff\xff\xff\x7f")),
+    "a negative attribute": exr_file(exr_header(SMALL, more=b"a\0string\0\xff\xff\xff\xff")),
+    "tiles of one pixel": exr_file(exr_header((0, 0, 5000, 5000), more=_tiles(1, 1, 2)), (), TILED),
+    "tiles of no pixel": exr_file(exr_header(SMALL, more=_tiles(0, 0, 0)), LINES, TILED),
+    "endless tiles": exr_file(exr_header(SMALL, more=_tiles(2**32 - 1, 1, 1)), LINES, TILED),
+    "deep": exr_file(_part(0, SMALL, "deepscanline"), LINES, DEEP),
+    "parts of 4 GB": exr_file(
+        b"".join(_part(n, (0, 0, 5791, 5791)) for n in range(32)) + b"\0", (), PARTS
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", EXRS)
+def test_what_an_exr_claims_is_checked(
+    tmp_path: Path, kind: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.exr"
+    path.write_bytes(EXRS[kind])
+    for read in (read_depth, read_rgb):
+        with little(), pytest.raises(FileFormatError) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+    assert ("parts in" in str(caught.value)) == (kind == "parts of 4 GB")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_exr_with_negative_windows_attributes_or_mipmaps_is_read(tmp_path: Path) -> None:
+    path, levels = tmp_path / "a.exr", [(4, 2), (2, 1), (1, 1)]
+    pixels = [w * h for w, h in levels]
+    mipmaps = [struct.pack("<3i", 0, 0, n) + exr_line(n, p) for n, p in enumerate(pixels)]
+    many = b"".join(exr_attribute(f"a{n}", "string", b"x") for n in range(10_000))
+    for content in (
+        exr_file(exr_header((-3, -1, 0, 0)), [exr_line(y, 4) for y in (-1, 0)]),
+        exr_file(exr_header(SMALL, more=many), LINES),
+        exr_file(exr_header(SMALL, more=_tiles(64, 64, 1)), mipmaps, TILED),
+    ):
+        path.write_bytes(content)
+        assert read_depth(path).values.tolist() == [[2.0] * 4] * 2
+        assert read_rgb(path).values.shape == (2, 4, 3)
+
+
+def test_an_exr_of_one_long_row_is_converted_in_64_bytes_a_pixel(tmp_path: Path) -> None:
+    path, width = tmp_path / "a.exr", 4_000_000
+    path.write_bytes(exr_file(exr_header(SMALL, display=(0, 0, width - 1, 0)), LINES))
+    with little(megabytes=64 * width // 10**6):
+        assert read_rgb(path).values.shape == (1, width, 3)
+
+
+SHAPES = ["(\n", "(6, 8", "(True, 5)", "(2, 10**9)", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
 DTYPES = ["f999", "<q8", ",", "i4, i4", "M8[x]", "\x00f4"]
 
 

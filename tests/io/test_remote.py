@@ -2,6 +2,10 @@ from __future__ import annotations
 
 import errno
 import pickle
+import socketserver
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -196,3 +200,57 @@ def test_an_object_that_cannot_be_copied_is_an_error(
     finally:
         set_max_pixels(None)
     assert ("get_file" in fake.calls) == (error is not None)
+
+
+@contextmanager
+def web_server(answer: bytes, then_s: float) -> Iterator[str]:
+    """The address of a server that gives this answer to any request, and hangs up after a while."""
+
+    class Handler(socketserver.BaseRequestHandler):
+        def handle(self) -> None:
+            self.request.recv(65536)
+            self.request.sendall(answer)
+            ended.wait(then_s)
+
+    ended = threading.Event()
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}/x.csv"
+        finally:
+            ended.set()
+            server.shutdown()
+
+
+def web_head(status: str, length: object) -> bytes:
+    return f"HTTP/1.1 {status}\r\nContent-Length: {length}\r\n\r\n".encode()
+
+
+@pytest.mark.parametrize(
+    ("answer", "then_s", "message"),
+    [
+        (b"", 60, "no answer in time"),
+        (web_head("200 OK", 1000) + b"image", 60, "no answer in time"),
+        (web_head("200 OK", 1000) + b"image", 0, "payload is not completed"),
+        (b"", 0, "cannot be reached"),
+        (b"\x00\xff" * 100, 0, "cannot be reached"),
+        (web_head("500 Oops", 0), 0, "500"),
+        (web_head("403 No", 0), 0, "may not be read with these credentials"),
+        (web_head("404 No", 0), 0, "no such object"),
+        (web_head("200 OK", -5), 0, "cannot be reached"),
+        (web_head("200 OK", 10**15), 0, "1,000,000,000,000,000 bytes, more than"),
+    ],
+)
+def test_a_slow_a_cut_and_a_false_answer_are_one_line(
+    answer: bytes, then_s: float, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra [remote]")
+    monkeypatch.setattr(stores, "_READ_S", 0.3)
+    stores._file_system.cache_clear()
+    with web_server(answer, then_s) as address:
+        path = path_of(address)
+        with pytest.raises(PnpDepthError, match=message) as caught, local_files([path]):
+            pass
+    stores._file_system.cache_clear()
+    assert len(str(caught.value).splitlines()) == 1

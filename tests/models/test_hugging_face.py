@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import socket
 from pathlib import Path
@@ -266,6 +267,30 @@ def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
             hf_definition(folder)
     (folder / "config.json").unlink()
     with pytest.raises(ModelError, match=r"config\.json is missing"):
+        hf_definition(folder)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../original.safetensors",
+        "/dev/zero",
+        "/etc/passwd",
+        5,
+        "pytorch_model.bin",
+        "pipe.safetensors",
+    ],
+)
+def test_an_index_names_files_of_its_folder_only(name: object, folder: Path) -> None:
+    shutil.copy(folder / "model.safetensors", folder.parent / "original.safetensors")
+    (folder / "model.safetensors").rename(folder / "part.safetensors")
+    (folder / "pytorch_model.bin").write_bytes(b"x")
+    os.mkfifo(folder / "pipe.safetensors")
+    index = folder / "model.safetensors.index.json"
+    index.write_text(json.dumps({"weight_map": {"a": "part.safetensors"}}))
+    assert hf_definition(folder).checkpoint == index
+    index.write_text(json.dumps({"weight_map": {"a": "part.safetensors", "b": name}}))
+    with pytest.raises(CheckpointError, match="is no safetensors file beside it"):
         hf_definition(folder)
 
 

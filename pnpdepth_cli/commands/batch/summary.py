@@ -88,7 +88,8 @@ class Tally:
         self._sums: defaultdict[tuple[str, str], dict[str, tuple[float, int]]] = defaultdict(dict)
 
     def add(self, row: Row) -> None:
-        """Adds one row."""
+        """Adds one row. A damaged one raises one of `records.DAMAGED`, at the latest here."""
+        _columns(row, ())
         self.counts[row["status"]] += 1
         self.warned += bool(row.get("warnings"))
         self.unsure |= dict.fromkeys(row.get("unsure", ()))

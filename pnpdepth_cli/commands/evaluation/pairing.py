@@ -5,17 +5,17 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import pickle
 import re
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.budget import budget, size_problem
 from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
@@ -30,19 +30,18 @@ from pnpdepth_cli.io.dataset import (
 )
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray
+from pnpdepth_cli.io.formats.arrays import parse_npy
 from pnpdepth_cli.io.layouts import find_layout, list_frames
 from pnpdepth_cli.io.remote import RemotePath
+from pnpdepth_cli.models.weights.numpy_file import read_pickled_arrays
 
 _DEPTH_MARKS = ("_depth", ".depth")
 _COMPANIONS = ("_sigma_preview", "_preview", "_improvement", "_sigma", "_valid")
 # KITTI's selection names the kind of file in the middle.
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5
-_ARRAY_PARTS = {
-    *((f"numpy.{core}.multiarray", part) for core in ("core", "_core")
-      for part in ("_reconstruct", "scalar")),
-    *(("numpy", part) for part in ("ndarray", "dtype")),
-}  # fmt: skip
+_MOST_COMPRESSED = 100
+"""How many bytes of depth one compressed byte may stand for; for sparse depth of LiDAR it is 20."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -294,7 +293,7 @@ def _stacked_pairs(
     """A frame for each map of two files of several frames."""
     others = stack_size(ground_truth)
     if others != count:
-        stored = "a single map" if others is None else f"{others:,} frames"
+        stored = "no stack of frames" if others is None else f"{others:,} frames"
         raise InputError(f"{prediction} holds {count:,} frames but {ground_truth} {stored}")
     frames = (Frame(name=f"{index:04}", gt=ground_truth) for index in range(count))
     return [
@@ -326,37 +325,29 @@ def load_stacked(path: Path, index: int) -> StoredArray:
 
 
 @functools.lru_cache(maxsize=4)
-def _stack(path: Path) -> Sequence[NDArray[Any]] | NDArray[Any] | None:
-    """The stack in a file; None for anything else, which the reader of single maps reports."""
+def _stack(path: Path) -> list[NDArray[Any]] | None:
+    """The stack in a file; None for anything else, which the reader of single maps reports.
+
+    monodepth2 stores images of different sizes as objects, a pickle.
+    """
     try:
         if path.suffix.lower() == ".npy":
-            with path.open("rb") as file:
-                array = _array_in(file)
+            data = b"" if size_problem(path) else path.read_bytes()
         else:
             with zipfile.ZipFile(path) as archive:
-                (name,) = archive.namelist()
-                array = _array_in(io.BytesIO(archive.read(name)))
+                (member,) = archive.infolist()
+                data = archive.read(member) if _can_be_true(path, member) else b""
+        arrays = read_pickled_arrays(io.BytesIO(data))
+        if arrays is None:
+            array = parse_npy(path, data)
+            return [*array] if array.ndim == 3 and 1 not in (len(array), array.shape[2]) else None
     except Exception:  # NumPy evaluates the header, which raises many kinds where it is damaged
         return None
-    if array.dtype == object:
-        return [np.asarray(each) for each in array.ravel()]
-    return array if array.ndim == 3 and 1 not in (array.shape[0], array.shape[2]) else None
+    return arrays
 
 
-def _array_in(file: IO[bytes]) -> NDArray[Any]:
-    """The array of an NPY; monodepth2 stores images of different sizes as objects, a pickle."""
-    header = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
-    _, _, dtype = header[np.lib.format.read_magic(file)[0]](file)
-    if dtype.hasobject:
-        return np.asarray(_ArrayUnpickler(file).load())
-    file.seek(0)
-    return np.asarray(np.load(file, allow_pickle=False))
-
-
-class _ArrayUnpickler(pickle.Unpickler):
-    """Creates NumPy arrays of numbers; refuses every other class and function."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _ARRAY_PARTS:
-            raise pickle.UnpicklingError(f"{module}.{name} is not part of an array")
-        return super().find_class(module, name)
+def _can_be_true(path: Path, member: zipfile.ZipInfo) -> bool:
+    """Whether an array in an archive may have the size that it claims."""
+    most = max(budget().max_image_bytes, _MOST_COMPRESSED * path.stat().st_size)
+    size_ok = member.file_size <= min(most, budget().max_decoded_bytes)
+    return size_ok and member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)

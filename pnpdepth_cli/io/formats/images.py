@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from pnpdepth_cli.io.decoding import (
     raw_mode,
     silence,
 )
-from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
+from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged
 from pnpdepth_cli.io.formats.depth_format import (
     SCALE_KEY,
     DepthFormat,
@@ -158,6 +159,8 @@ TIFF = DepthFormat(
 
 
 _DEPTH_NAMES = frozenset({"z", "depth"})
+_CHANNEL_LIST = re.compile(rb"channels\0chlist\0(.{4})", re.DOTALL)
+_MOST_CHANNEL_BYTES = 1 << 19  # 20,000 channels; OpenEXR's time grows with the square
 
 
 def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
@@ -171,12 +174,17 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
     """
     import OpenEXR
 
+    lists = [int.from_bytes(size, "little") for size in _CHANNEL_LIST.findall(data)]
+    if sum(lists) > _MOST_CHANNEL_BYTES:
+        raise FileFormatError(f"{path} lists tens of thousands of channels; export the depth alone")
     try:
         with silence():
             with OpenEXR.File(str(path), header_only=True) as file:
                 count = len(file.parts)
-                for index in range(count):
-                    _check_header(path, file.header(index), len(data))
+                claimed = sum(
+                    _claimed_bytes(path, file.header(index), len(data)) for index in range(count)
+                )
+            check_value_count(path, 1, value_bytes=claimed, what=f"{count} parts")
             with OpenEXR.File(str(path), separate_channels=True) as file:
                 parts = [_part_channels(part) for part in file.parts]
                 names = [str(part.name()) for part in file.parts]
@@ -212,7 +220,9 @@ def _write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str])
         raise OSError(str(error)) from error
 
 
-def _check_header(path: Path, header: dict[str, Any], file_bytes: int) -> None:
+def _claimed_bytes(path: Path, header: dict[str, Any], file_bytes: int) -> int:
+    """How many bytes a part is decoded to. FileFormatError if it is not one that can be read."""
+    claimed = 0
     if "deep" in str(header.get("type", "")):
         raise FileFormatError(f"{path} is a deep EXR; export it flattened")
     for window in ("dataWindow", "displayWindow"):
@@ -222,11 +232,13 @@ def _check_header(path: Path, header: dict[str, Any], file_bytes: int) -> None:
         check_pixel_count(
             path, width, height, channels=channels, value_bytes=4, file_bytes=file_bytes
         )
+        claimed = max(claimed, 4 * channels * width * height)
     for channel in header["channels"]:
         if (channel.xSampling, channel.ySampling) != (1, 1):
             raise FileFormatError(
                 f"{path}: channel {channel.name} is subsampled; export it at full resolution"
             )
+    return claimed
 
 
 def _part_channels(part: Any) -> dict[str, NDArray[Any]]:

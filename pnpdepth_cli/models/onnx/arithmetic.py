@@ -85,9 +85,15 @@ register(
         ).clamp(0, 1),
         "Gelu": lambda node, i: F.gelu(i[0], approximate=node.get("approximate", "none")),
         "MatMul": lambda _, i: torch.matmul(i[0], i[1]),
-        "Einsum": lambda node, i: torch.einsum(node.get("equation"), *i),
     }
 )
+
+
+@operator("Einsum")
+def einsum(node: Node, inputs: Inputs) -> Tensor:
+    if len(inputs) > 2:  # the products of two of them may be far larger than the result
+        raise Unsupported("more than two inputs")
+    return torch.einsum(node.get("equation"), *inputs)
 
 
 @operator("IsInf")

@@ -24,7 +24,7 @@ from pnpdepth_cli.models.onnx import (  # noqa: F401  (each registers its operat
     resizing,
     tensors,
 )
-from pnpdepth_cli.models.onnx.limits import SizeLimit
+from pnpdepth_cli.models.onnx.limits import SizeLimit, largest_activation
 from pnpdepth_cli.models.onnx.table import HOST_INPUTS, OPERATORS, Node, Unsupported
 from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
 
@@ -39,8 +39,8 @@ _CONSTANT_ELEMENTS, _CONSTANT_GROWTH, _CONSTANTS = 1 << 24, 4, 4
 """One computed constant may have so many elements, or so many times those stored in the file; all
 of them together so many times as many as one."""
 
-_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH = 1 << 28, 64
-"""One activation may have so many elements (1 GB), or so many times those of input and weights."""
+_WORK = 1 << 34
+"""Elements that may be read, and products summed, for all computed constants: seconds."""
 
 
 class OnnxNode(nn.Module):
@@ -94,7 +94,7 @@ class OnnxGraph(nn.Module):
 
     One output is a tensor, several are a dict by name. Everything is computed in float32; weights
     in half precision are widened. The first pass with inputs of a size allocates no activation
-    beyond _ACTIVATION_ELEMENTS.
+    beyond `largest_activation`.
 
     Args:
         model: The onnx.ModelProto, without functions of its own, its nodes in order.
@@ -125,7 +125,7 @@ class OnnxGraph(nn.Module):
         shapes: set[str] = set()
         steps = []
         largest = max(_CONSTANT_ELEMENTS, _CONSTANT_GROWTH * self._stored)
-        limit = SizeLimit(largest, in_all=_CONSTANTS * largest)
+        limit = SizeLimit(largest, in_all=_CONSTANTS * largest, work=_WORK)
         for name, proto in nodes:
             attributes = {a.name: _attribute(a, path) for a in proto.attribute}
             used = sum(bool(output) for output in proto.output)
@@ -163,7 +163,7 @@ class OnnxGraph(nn.Module):
             deque(run_steps(self._steps, values), maxlen=0)
         else:
             elements = self._stored + sum(one.numel() for one in inputs)
-            largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * elements)
+            largest = largest_activation(elements)
             with SizeLimit(largest):
                 for step in run_steps(self._steps, values):
                     if sum(value.numel() for value in values.values()) > 2 * largest:

@@ -2,7 +2,8 @@
 
 The functions that a model defines itself may call each other and, written out, become endless.
 ConstantOfShape, Tile, Pad, Expand and many other operators can turn a few bytes into gigabytes;
-`SizeLimit` knows the size of every result before it is allocated.
+`SizeLimit` knows the size of every result before it is allocated. Tensors can share the bytes of
+the files beside the model.
 """
 
 from __future__ import annotations
@@ -19,11 +20,44 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten
 
+from pnpdepth_cli.budget import budget
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.onnx.table import Unsupported
 
 _MAX_WRITTEN_OUT = 1 << 28  # bytes
 _NODE_BYTES = 1 << 12  # that a node takes in memory at least; depth networks have up to 10,000
+_SHARED = 2  # tensors that may have the same bytes of a file beside the model
+_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH = 1 << 28, 64
+
+
+def largest_activation(given: int) -> int:
+    """Returns how many elements one activation may have: 2²⁸ (1 GB), or 64 times those given.
+
+    Args:
+        given: Elements of input and weights.
+    """
+    return max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * given)
+
+
+def load_external(model: Any, folder: Path) -> None:
+    """Reads the tensors that lie in files beside the model into it.
+
+    Raises:
+        ValueError: They claim more than these files have, or more than memory holds.
+    """
+    from onnx import external_data_helper as external
+
+    claims = [
+        external.ExternalDataInfo(tensor)
+        for tensor in external._get_all_tensors(model)
+        if external.uses_external_data(tensor)
+    ]
+    sizes = {claim.location: (folder / claim.location).stat().st_size for claim in claims}
+    claimed = sum(claim.length or sizes[claim.location] for claim in claims)
+    most = min(_SHARED * sum(sizes.values()), budget().max_decoded_bytes)
+    if claimed > most:
+        raise ValueError(f"its tensors claim {claimed:,} bytes of other files, more than {most:,}")
+    external.load_external_data_for_model(model, str(folder))
 
 
 def inlined(model: Any, path: Path) -> Any:
@@ -41,7 +75,7 @@ def inlined(model: Any, path: Path) -> Any:
         return int(functions[key].ByteSize()) + size(functions[key])
 
     def size(graph: Any) -> int:
-        calls = [(n.domain, n.op_type, getattr(n, "overload", "")) for n in _nodes(graph.node)]
+        calls = [(n.domain, n.op_type, getattr(n, "overload", "")) for n in nodes_in(graph.node)]
         return sum(written_out(call) if call in functions else _NODE_BYTES for call in calls)
 
     try:
@@ -58,13 +92,13 @@ def inlined(model: Any, path: Path) -> Any:
     return inliner.inline_local_functions(model)
 
 
-def _nodes(nodes: Iterable[Any]) -> Iterable[Any]:
-    """The nodes, and those in the graphs that are their attributes."""
+def nodes_in(nodes: Iterable[Any]) -> Iterable[Any]:
+    """Yields the nodes, and those in the graphs that are their attributes."""
     for node in nodes:
         yield node
         for attribute in node.attribute:
             for graph in (*attribute.graphs, attribute.g):
-                yield from _nodes(graph.node)
+                yield from nodes_in(graph.node)
 
 
 class SizeLimit(TorchFunctionMode):
@@ -73,18 +107,26 @@ class SizeLimit(TorchFunctionMode):
     Args:
         largest: Elements of one result.
         in_all: Elements of all results together, or no limit.
+        work: Elements read and products summed by all operations together, or no limit.
     """
 
-    def __init__(self, largest: int, in_all: float = math.inf) -> None:
+    def __init__(self, largest: int, in_all: float = math.inf, work: float = math.inf) -> None:
         super().__init__()
-        self._largest, self._left = largest, in_all
+        self._largest, self._left, self._work = largest, in_all, work
 
     def __torch_function__(
         self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         """Runs the operation if its result fits; see TorchFunctionMode."""
         kwargs = kwargs or {}
-        self._refuse(_elements_at_most(func, args, kwargs))
+        most = _elements_at_most(func, args, kwargs)
+        self._refuse(most)
+        if self._work < math.inf:
+            products = _PRODUCTS.get(getattr(func, "__name__", ""))
+            self._work -= most * products(*args) if products else 0
+            self._work -= sum(map(torch.numel, _tensors_in((args, kwargs))))
+            if self._work < 0:
+                raise Unsupported("far more arithmetic on constants than networks have")
         result = func(*args, **kwargs)
         elements = sum(part.numel() for part in _tensors_in(result) if part._base is None)
         self._left -= elements
@@ -117,7 +159,9 @@ def _of_convolution(
     x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: list[int], *_: Any
 ) -> int:
     sides = [n + 2 * p for n, p in zip(x.shape[2:], padding, strict=True)]
-    return len(x) * len(weight) * math.prod(sides)
+    # Only float32 is computed without a copy of the pixels below each position of the kernel.
+    copied = 1 if x.dtype == torch.float32 else weight[0].numel()
+    return len(x) * max(len(weight), copied) * math.prod(sides)
 
 
 def _of_transposed(x: Tensor, weight: Tensor, bias: Any, stride: list[int], *rest: Any) -> int:
@@ -164,6 +208,15 @@ _GROWING: dict[str, Callable[..., float]] = {
     ),
 }
 """Functions whose result may be far larger than their tensors."""
+
+
+_PRODUCTS: dict[str, Callable[..., int]] = {
+    **{f"conv{axes}d": lambda _, weight, *__: weight[0].numel() for axes in (1, 2, 3)},
+    **{f"conv_transpose{axes}d": lambda _, weight, *__: weight[0].numel() for axes in (1, 2, 3)},
+    **dict.fromkeys(("matmul", "__matmul__"), lambda a, _: a.shape[-1]),
+    "einsum": lambda _, *tensors: max(map(torch.numel, tensors)),
+}
+"""At most how many products of elements are summed for an element of the result."""
 
 
 def _tensors_in(value: Any) -> list[Tensor]:

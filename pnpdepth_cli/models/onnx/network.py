@@ -20,7 +20,7 @@ from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
-from pnpdepth_cli.models.onnx.limits import inlined
+from pnpdepth_cli.models.onnx.limits import inlined, load_external
 from pnpdepth_cli.models.onnx.quantised import Quantised, outputs_of, quantises, session_of
 
 MISMATCH = 1e-3
@@ -68,7 +68,7 @@ def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
         return definition
     return replace(
         definition,
-        build=lambda: Quantised(source, file, input_name),
+        build=lambda: Quantised(source, file, model, input_name),
         verify=None,
         layers=("output",),
         defaults=replace(definition.defaults, iterations=0),
@@ -142,11 +142,16 @@ def _read(file: Path) -> Any:
             " pip install 'pnpdepth[onnx]'"
         ) from None
     try:
-        model = onnx.load(str(file))
+        model = onnx.load(str(file), load_external_data=False)
+        load_external(model, file.parent)
     except Exception as error:  # protobuf's own errors, missing external data, …
         raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
     if not model.graph.node:
         raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
+    for node in (*model.graph.node, *(node for f in model.functions for node in f.node)):
+        words = (node.name, node.op_type, node.domain, *node.input, *node.output)
+        if not all(isinstance(word, str) for word in words):
+            raise ModelError(f"ONNX file {file} cannot be read: its names are not text in UTF-8")
     if _opset(model) not in _OPSETS:
         raise ModelError(
             f"ONNX file {file} is of opset {_opset(model)}; export it with one from"

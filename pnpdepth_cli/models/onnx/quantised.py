@@ -12,8 +12,12 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.onnx.limits import largest_activation, nodes_in
 
 _QUANTISES = re.compile("Quantize|QLinear|QGemm|Integer")  # not DequantizeLinear of weights
+
+_ENDLESS = ("Loop", "Scan")
+_ACTIVATION_BYTES = 8  # input and output of a node, in float32
 
 
 def quantises(model: Any) -> bool:
@@ -27,19 +31,30 @@ class Quantised(nn.Module):
     Args:
         source: What onnxruntime reads: a file, or the content of one.
         file: The network's file, for messages.
+        model: The onnx.ModelProto.
         input_name: Name of the image in the graph.
 
     Raises:
-        ModelError: onnxruntime cannot open it.
+        ModelError: onnxruntime cannot open it, or it has loops.
     """
 
-    def __init__(self, source: str | bytes, file: Path, input_name: str) -> None:
+    def __init__(self, source: str | bytes, file: Path, model: Any, input_name: str) -> None:
         super().__init__()
-        self._session, self._file, self._input_name = session_of(source, file), file, input_name
+        if any(node.op_type in _ENDLESS for node in nodes_in(model.graph.node)):
+            raise ModelError(f"ONNX file {file} is quantised and has loops, which are not covered")
+        self._source, self._file, self._input_name = source, file, input_name
+        self._given = sum(tensor.ByteSize() for tensor in model.graph.initializer)
+        self._session = session_of(
+            source, file, _ACTIVATION_BYTES * largest_activation(self._given)
+        )
         self.output = nn.Identity()
 
     def forward(self, image: Tensor) -> Tensor:
         """Returns the graph's output, each image of a batch on its own."""
+        if image[0].numel() > self._given:  # larger images need more memory
+            self._given = image[0].numel()
+            most = _ACTIVATION_BYTES * largest_activation(2 * self._given)
+            self._session = session_of(self._source, self._file, most)
         outputs = [
             outputs_of(self._session, {self._input_name: one[None].detach().cpu()}, self._file)
             for one in image
@@ -48,15 +63,32 @@ class Quantised(nn.Module):
         return result.detach()
 
 
-def session_of(source: str | bytes, file: Path) -> Any:
-    """Returns an onnxruntime session on the CPU. ModelError, with the file, if it does not open."""
-    import onnxruntime
+def session_of(source: str | bytes, file: Path, most_bytes: int | None = None) -> Any:
+    """Returns an onnxruntime session on the CPU. ModelError, with the file, if it does not open.
 
-    options = onnxruntime.SessionOptions()
+    Args:
+        source: A file, or the content of one.
+        file: For messages.
+        most_bytes: What the session may allocate; None is no limit.
+    """
+    import onnxruntime as ort
+
+    options, disabled = ort.SessionOptions(), []
     options.log_severity_level = 4
     options.intra_op_num_threads = torch.get_num_threads()
+    if most_bytes is not None:
+        arena = ort.OrtMemoryInfo(
+            "Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT
+        )
+        # With another strategy, the arena doubles.
+        limits = ort.OrtArenaCfg({"max_mem": most_bytes, "arena_extend_strategy": 1})
+        ort.create_and_register_allocator(arena, limits)  # in place of the one before
+        options.add_session_config_entry("session.use_env_allocators", "1")
+        disabled = ["ConstantFolding"]  # which allocates elsewhere
     try:
-        return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        return ort.InferenceSession(
+            source, options, providers=["CPUExecutionProvider"], disabled_optimizers=disabled
+        )
     except Exception as error:  # onnxruntime has a type for each of its status codes
         raise _does_not_run(file, error) from None
 

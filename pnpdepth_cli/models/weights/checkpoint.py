@@ -128,6 +128,7 @@ def _fitted(
             raise ModelError(f"read_checkpoint of {definition.name!r} gives no named tensors")
     problems = {
         "missing": [n for n in own if n not in state and not n.endswith(_COUNTER)],
+        "complex": [n for n in own if n in state and state[n].is_complex() > own[n].is_complex()],
         "unexpected": [name for name in state if name not in own],
         "of another shape": [
             f"{n} {tuple(state[n].shape)} for {tuple(own[n].shape)}"

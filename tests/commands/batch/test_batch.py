@@ -337,10 +337,11 @@ def test_a_record_that_lacks_what_the_summary_needs_is_an_error_that_names_it(ro
     batch(root)
     path = root / "out/c.json"
     record = json.loads(path.read_text())
-    del record["scores"]
-    path.write_text(json.dumps(record))
-    with pytest.raises(InputError, match=r"c\.json is damaged; remove it, and run again"):
-        batch(root)
+    lacking = {key: value for key, value in record.items() if key != "scores"}
+    for damaged in (lacking, *(record | {key: 0.5} for key in ("seconds", "points"))):
+        path.write_text(json.dumps(damaged))
+        with pytest.raises(InputError, match=r"c\.json is damaged; remove it, and run again"):
+            batch(root)
 
 
 def test_a_batch_can_be_stopped_between_frames_and_goes_on(root: Path) -> None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pnpdepth_cli import budget
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.pairing import (
     FramePair,
@@ -21,6 +24,7 @@ from pnpdepth_cli.commands.evaluation.pairing import (
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
+from tests.models.weights.files import little, npy_of
 
 
 def depth_at(path: Path) -> Path:
@@ -217,6 +221,35 @@ def test_images_of_different_sizes_are_objects_and_anything_else_is_not_executed
     np.save(tmp_path / "attack.npy", maps, allow_pickle=True)
     assert stack_size(tmp_path / "attack.npy") is None
     assert calls == []
+
+
+_PUT = b"\x80\x04Nr\xff\xff\xff\x1f."  # at place 536,870,911 of the memo
+_DEEP = b"\x80\x04\x8c\x01a" + b"\x85" * 300_000 + b"."
+_LONG = b"\x80\x04\x8e\xff\xff\xff\xff\x03\x00\x00\x00."
+
+
+@pytest.mark.parametrize("content", [_PUT, _DEEP, _LONG], ids=["memo", "deep", "long"])
+def test_a_pickle_that_asks_for_gigabytes_is_no_stack(tmp_path: Path, content: bytes) -> None:
+    with little():
+        assert stack_size(npy_of(tmp_path / "a.npy", content)) is None
+
+
+@pytest.mark.parametrize("shape", [(2, 6, 8), (5, 1000, 1000)])
+def test_an_archive_that_is_far_larger_than_its_file_is_no_stack(
+    tmp_path: Path, shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(budget, "_chosen", 1_000_000)
+    header = io.BytesIO()
+    settings = {"descr": "<f4", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(header, settings)
+    with (
+        zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("gt.npy", "w") as member,
+    ):
+        member.write(header.getvalue())
+        member.write(bytes(20_000_000))
+    with little():
+        assert stack_size(tmp_path / "a.npz") is None
 
 
 def test_single_maps_are_no_stack_and_numbers_of_frames_must_agree(tmp_path: Path) -> None:

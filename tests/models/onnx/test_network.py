@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import LayerError, ModelError, UsageError
 from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.models.onnx import graph
+from pnpdepth_cli.models.onnx import graph, limits
 from pnpdepth_cli.models.onnx.table import OPERATORS
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -85,7 +86,13 @@ def test_an_incorrect_conversion_is_refused(
 def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "net.onnx"
     assert "does not exist" in refused(path)
-    for content, message in ((b"not a network", "cannot be read"), (b"", "holds no graph")):
+    named = write_network(path).read_bytes()
+    contents = {b"not a network": "cannot be read", b"": "holds no graph"}
+    contents |= {
+        named.replace(word, b"\xff" + word[1:]): "not text in UTF-8"
+        for word in (b"Sigmoid", b"dec/up", b"w1")
+    }
+    for content, message in contents.items():
         path.write_bytes(content)
         assert message in refused(path)
     node = helper.make_node("NonZero", ["depth"], ["where"])
@@ -301,6 +308,12 @@ ACTIVATION_BOMBS = {
         constant("s", np.float32([1, 1, 1000, 1000])),
         helper.make_node("Resize", ["depth", "", "s"], ["big"], mode="linear"),
     ],
+    "Conv of doubles": [
+        helper.make_node("Cast", ["depth"], ["d64"], to=11),
+        size_of(1, 1, 1500, 1500), helper.make_node("ConstantOfShape", ["n"], ["k32"]),
+        helper.make_node("Cast", ["k32"], ["k64"], to=11),
+        helper.make_node("Conv", ["d64", "k64"], ["big"], pads=[800] * 4),
+    ],
     "MatMul": [
         constant("n", [-1, 1]), constant("m", [1, -1]), constant("k", [1, 1, 1, 20]),
         helper.make_node("Tile", ["depth", "k"], ["long"]),
@@ -335,11 +348,147 @@ def test_what_is_far_larger_than_the_file_is_refused_before_allocation(
         assert "a result of" in refused(path)
 
 
+QUANTISED = [
+    constant("qs", np.float32(0.02)), constant("qz", np.uint8(0)),
+    helper.make_node("QuantizeLinear", ["depth", "qs", "qz"], ["q"]),
+    helper.make_node("DequantizeLinear", ["q", "qs", "qz"], ["dq"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["Range", "Concat", "Pad", "Expand", "Resize", "MatMul"])
+def test_what_onnxruntime_allocates_for_a_quantised_network_is_bounded(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "_ACTIVATION_ELEMENTS", 1 << 22)
+    bomb = (CONSTANT_BOMBS | ACTIVATION_BOMBS)[kind]
+    tail = [
+        helper.make_node("ReduceSum", ["big"], ["small"], keepdims=0),
+        helper.make_node("Cast", ["small"], ["number"], to=1),
+        helper.make_node("Mul", ["dq", "number"], ["out"]),
+    ]
+    path = write_network(tmp_path / "x.onnx", nodes=(*QUANTISED, *bomb, *tail), outputs=("out",))
+    module = load_network(str(path), None).module
+    with (
+        little(megabytes=200),
+        pytest.raises(ModelError, match=r"x\.onnx does not run in onnxruntime"),
+    ):
+        module(image(1, 3, 32, 48))
+
+
+def test_a_quantised_network_takes_larger_images_than_the_first_and_no_loops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "_ACTIVATION_ELEMENTS", 1)
+    nodes = (*QUANTISED, helper.make_node("Identity", ["dq"], ["out"]))
+    free = write_network(tmp_path / "a.onnx", shape=(1, 3, "h", "w"), nodes=nodes, outputs=("out",))
+    network = load_network(str(free), None)
+    assert network.module(image(1, 3, 512, 512)).shape == (1, 1, 512, 512)
+    value = helper.make_tensor_value_info("v", onnx.TensorProto.FLOAT, None)
+    body = helper.make_graph([helper.make_node("Loop", ["v"], ["v"])], "body", [], [value])
+    branches = {"then_branch": body, "else_branch": body}
+    loop = helper.make_node("If", ["qz"], ["out"], **branches)
+    add = helper.make_node("Sum", ["dq", "out"], ["both"])
+    looping = write_network(tmp_path / "b.onnx", nodes=(*QUANTISED, loop, add), outputs=("both",))
+    assert "has loops" in refused(looping)
+
+
+CONSTANT_WORK = {
+    "Conv": [
+        constant("n", [1, 1, 2048, 2048]), helper.make_node("ConstantOfShape", ["n"], ["a1"]),
+        constant("m", [1, 1, 1024, 1024]), helper.make_node("ConstantOfShape", ["m"], ["a2"]),
+        helper.make_node("Conv", ["a1", "a2"], ["big"]),
+    ],
+    "ReduceSum": [
+        constant("n", [4096, 4096]), helper.make_node("ConstantOfShape", ["n"], ["a1"]),
+        *(
+            helper.make_node("ReduceSum", ["a1"], [f"r{n}"], keepdims=0)
+            for n in range(2000)
+        ),
+        helper.make_node("Sum", [f"r{n}" for n in range(2000)], ["big"]),
+    ],
+    "Einsum": [
+        constant("a1", np.ones((60_000, 1))), constant("a2", np.ones((1, 60_000))),
+        helper.make_node("Einsum", ["a1", "a2", "a1"], ["big"], equation="ij,jk,kl->il"),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", CONSTANT_WORK)
+def test_arithmetic_on_constants_is_bounded(kind: str, tmp_path: Path) -> None:
+    last = helper.make_node("Add", ["depth", "big"], ["out"])
+    path = write_network(tmp_path / "x.onnx", nodes=(*CONSTANT_WORK[kind], last), outputs=("out",))
+    with little(megabytes=500, seconds=4):
+        message = refused(path)
+    assert ("two inputs" if kind == "Einsum" else "more arithmetic on constants") in message
+
+
+def beside(path: Path, *, copies: int = 0, dims: Any = (8, 3, 3, 3), **entry: object) -> Path:
+    """A network whose first weights, and so many more, lie in a file beside it."""
+    (path.parent / "weights.bin").write_bytes(bytes(range(216)) * 4)
+
+    def change(model: Any) -> None:
+        tensors = [model.graph.initializer[0]]
+        tensors += [model.graph.initializer.add(name=f"t{n}", data_type=1) for n in range(copies)]
+        for tensor in tensors:
+            del tensor.dims[:]
+            tensor.dims.extend(dims)
+            tensor.ClearField("raw_data")
+            tensor.data_location = onnx.TensorProto.EXTERNAL
+            for key, value in ({"location": "weights.bin"} | entry).items():
+                tensor.external_data.add(key=key, value=str(value))
+
+    return edited(path, change)
+
+
+OUTSIDE = ["../secret.bin", "../../../../../../etc/passwd", "/etc/passwd", "link.bin", "", "fifo"]
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        *({"location": location} for location in OUTSIDE),
+        *({"offset": n} for n in (-4, 4, 2**62, 10**40, "x", "9" * 5000)),
+        *({"length": n} for n in (-1, 4, 2**62)),
+        *({"dims": dims} for dims in ((2**31, 2**31), (8, 3, 3))),
+        {"copies": 1000},
+    ],
+    ids=lambda entry: f"{next(iter(entry.items()))}"[:40],
+)
+def test_weights_beside_the_model_stay_there_and_are_read_once(
+    entry: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "secret.bin").write_bytes(bytes(864))
+    folder = tmp_path / "models"
+    folder.mkdir()
+    (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
+    os.mkfifo(folder / "fifo")
+    with little():
+        assert "cannot be read" in refused(beside(folder / "x.onnx", **entry))
+
+
+def test_weights_beside_the_model_are_those_of_one_file(tmp_path: Path) -> None:
+    path = beside(tmp_path / "x.onnx", copies=1)
+    graph = onnx.load(str(path)).graph
+    (tmp_path / "one.onnx").write_bytes(onnx.load(str(path)).SerializeToString())
+    assert len(graph.initializer) > 2
+    x = image(1, 3, 32, 48)
+    one, two = (
+        load_network(str(tmp_path / name), None).module(x) for name in ("one.onnx", "x.onnx")
+    )
+    assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize("sides", [(10**6, 10**6), (2**62, 2**62), (20_000, 20_000)])
+def test_an_image_size_beyond_the_budget_is_refused(sides: Any, tmp_path: Path) -> None:
+    with little():
+        assert "pixels" in refused(write_network(tmp_path / "x.onnx", shape=(1, 3, *sides)))
+
+
 def test_activations_that_are_needed_at_a_time_are_bounded_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(graph, "_ACTIVATION_ELEMENTS", 10**5)
-    monkeypatch.setattr(graph, "_ACTIVATION_GROWTH", 0)
+    monkeypatch.setattr(limits, "_ACTIVATION_ELEMENTS", 10**5)
+    monkeypatch.setattr(limits, "_ACTIVATION_GROWTH", 0)
     tiles = [
         node
         for n in range(6)

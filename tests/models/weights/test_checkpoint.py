@@ -25,7 +25,7 @@ from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.torch_export import exported_definition
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
-from tests.models.weights.files import refused, write_npy
+from tests.models.weights.files import little, refused, write_npy
 from tests.models.weights.test_tensor_bundle import bundle, entry
 
 LARGE = 100 << 30  # bytes
@@ -313,6 +313,56 @@ def test_a_file_cut_anywhere_is_refused(
     for length in range(0, len(whole) - 1, max(1, len(whole) // 60)):
         path.write_bytes(whole[:length])
         assert f"w{suffix} cannot be read" in refused(path)
+
+
+def tensor(kind: str | None = "F32", shape: Any = (2,), at: Any = (0, 8)) -> dict[str, Any]:
+    """An entry of a safetensors header."""
+    return {"dtype": kind, "shape": shape, "data_offsets": at}
+
+
+HEADERS: dict[str, Any] = {
+    "a negative offset": {"a": tensor(at=(-8, 0))},
+    "an end before its beginning": {"a": tensor(at=(8, 0))},
+    "an offset of 2⁶²": {"a": tensor(at=(0, 2**62))},
+    "an offset of 2⁶⁴": {"a": tensor(at=(0, 2**64))},
+    "tensors that overlap": {"a": tensor(), "b": tensor(at=(4, 12))},
+    "tensors that share": {"a": tensor(), "b": tensor()},
+    "a hole": {"a": tensor(), "b": tensor(at=(16, 24))},
+    "an unknown type": {"a": tensor("F33")},
+    "no type": {"a": tensor(None)},
+    "a type that torch lacks": {"a": tensor("F6_E2M3", (8,), (0, 6))},
+    "a shape whose product overflows": {"a": tensor(shape=(2**32, 2**32))},
+    "an empty one that overflows": {"a": tensor(shape=(2**62, 2**62, 0), at=(0, 0))},
+    "a side of 2⁶⁴ − 1": {"a": tensor(shape=(0, 2**64 - 1), at=(0, 0))},
+    "a negative side": {"a": tensor(shape=(-2,))},
+    "half a side": {"a": tensor(shape=(2.0,))},
+    "metadata of text": {"__metadata__": "x", "a": tensor()},
+    "metadata of numbers": {"__metadata__": {"x": 1}, "a": tensor()},
+    "metadata of metadata": {"__metadata__": {"x": {"y": "z"}}, "a": tensor()},
+    "metadata for a tensor": {"__metadata__": tensor()},
+    "a list": [],
+}
+
+
+@pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS)
+@pytest.mark.parametrize("length", [None, 0, 100_000_001, 2**63, 2**64 - 1])
+def test_a_safetensors_header_that_lies_is_refused(
+    header: Any, length: int | None, tmp_path: Path
+) -> None:
+    text = json.dumps(header).encode()
+    start = struct.pack("<Q", len(text) if length is None else length)
+    size = 6 if "F6" in str(header) else 0 if "[0, 0]" in str(text) else 8
+    (tmp_path / "w.safetensors").write_bytes(start + text + bytes(size))
+    with little():
+        refused(tmp_path / "w.safetensors")
+
+
+def test_complex_weights_are_not_cut_to_their_real_part(tmp_path: Path) -> None:
+    network = Net()
+    state = network.state_dict()
+    torch.save(state | {"conv.bias": state["conv.bias"] * 1j}, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"net': 1 complex \(conv\.bias\)"):
+        load_checkpoint(network, definition(), tmp_path / "w.pth")
 
 
 def test_garbage_is_refused(tmp_path: Path) -> None:
