@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,12 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.frames import load_frame
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.commands.evaluation.scoring import filled
 from pnpdepth_cli.commands.evaluation.tables import worst
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
+from pnpdepth_cli.io.dataset import Protocol
 from pnpdepth_cli.io.depth import write_depth
 
 
@@ -187,6 +191,15 @@ def test_missing_pixels_are_skipped_clamped_or_refused(two: Path) -> None:
     assert "--missing fail refuses" in (refused.frames[1].error or "")
 
 
+def test_an_interval_ends_at_what_the_measure_can_be(tmp_path: Path) -> None:
+    for name, depth in zip("abcdefgh", [2.0] * 6 + [2.1, 9.0], strict=True):
+        depth_file(tmp_path / "out" / f"{name}.npy", [[depth]])
+        depth_file(tmp_path / "gt" / f"{name}.npy", [[2]])
+    found = scored(tmp_path, resamples=200).interval or {}
+    assert (found["rmse"][0], found["delta1"][1]) == (0.0, 1.0)
+    assert found["rmse"][1] > 7 / 8 > found["delta1"][0]
+
+
 def test_few_groups_of_frames_have_no_interval_but_a_note(tmp_path: Path) -> None:
     for drive in ("a", "b"):
         for number in range(4):
@@ -345,6 +358,8 @@ def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) 
     for folder, codes in (("out", [[65535, 512]]), ("gt", [[256, 512]])):
         (tmp_path / folder).mkdir()
         cv2.imwrite(str(tmp_path / folder / "a.png"), np.array(codes, np.uint16))
+    assert filled(np.array([[0, 0.5, 0]], np.float32)).tolist() == [[0.5, 0.5, 0.5]]
+    assert filled(np.zeros((1, 2), np.float32)).tolist() == [[0, 0]]
     devkit = scored(tmp_path, protocol="kitti-devkit")
     assert devkit.mean["mae"] == pytest.approx((65535 / 256 - 1) / 2)
     assert scored(tmp_path).frames[0].pixels == 1
@@ -464,5 +479,10 @@ def test_measures_of_the_scene_need_intrinsics(sequences: Path) -> None:
     result = scored(sequences, groups=("cloud", "normals"), calib=sequences / "K.txt")
     assert 0 < result.mean["f_score"] < 1
     assert 0 < result.mean["normal_angle"] < 90
+    pair = result.frames[0].pair
+    cut = replace(pair.frame, protocol=Protocol(name="cut", crop=(4, 6)))
+    cut_out = load_frame(replace(pair, prediction=None, frame=cut), result.protocol, result.request)
+    assert cut_out.intrinsics is not None
+    assert cut_out.intrinsics.tolist() == [[50, 0, 15 - 12], [0, 50, 10 - 8], [0, 0, 1]]
     with pytest.raises(InputError, match="--measures distance needs the sparse depth of frame"):
         scored(sequences, groups=("distance",))

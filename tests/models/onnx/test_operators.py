@@ -123,7 +123,7 @@ def test_activations_of_old_and_new_opsets() -> None:
         check("Gelu", [X], opset=20, approximate=approximate)
     check("Clip", [X], opset=6, min=0.0, max=6.0)
     check("Clip", [X], opset=6, max=0.5)
-    check("Clip", [X, np.array(0, F32), np.array(6, F32)])
+    check("Clip", [X, np.array(0, F32), np.array(6, F32)], opset=11)
     check("Clip", [X, None, np.array(0.5, F32)])
     check("Clip", [X, np.array(2, F32), np.array(1, F32)])
     check("PRelu", [X, normal(4, 1, 1)])
@@ -131,6 +131,7 @@ def test_activations_of_old_and_new_opsets() -> None:
         check("IsInf", [np.array([np.inf, -np.inf, 1], F32)], **detect)
     check("Softmax", [X], opset=9)
     check("Softmax", [X], opset=11, axis=2)
+    check("Softmax", [X], opset=13)
 
 
 def test_matrices() -> None:
@@ -154,8 +155,8 @@ def test_reductions_of_old_and_new_opsets(op: str) -> None:
 
 
 PADS = [
-    {"pads": [1, 1, 1, 1]}, {"pads": [0, 1, 2, 1]}, {"auto_pad": "SAME_UPPER"},
-    {"auto_pad": "SAME_LOWER"}, {"auto_pad": "VALID"}, {},
+    {"pads": [1, 1, 1, 1]}, {"pads": [0, 1, 2, 1]}, {"pads": [0, 0, 1, 2]}, {},
+    {"auto_pad": "SAME_UPPER"}, {"auto_pad": "SAME_LOWER"}, {"auto_pad": "VALID"},
 ]  # fmt: skip
 
 
