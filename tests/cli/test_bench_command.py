@@ -34,11 +34,7 @@ def test_the_table_goes_to_stdout_and_what_it_was_measured_with_to_stderr(
     ],
 )
 def test_the_exit_code_is_that_of_the_kind_of_error(
-    frame: FrameOnDisk,
-    capsys: pytest.CaptureFixture[str],
-    more: list[str],
-    code: int,
-    message: str,
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str], more: list[str], code: int, message: str
 ) -> None:
     assert code_of(bench(frame, *more)) == code
     out, err = capsys.readouterr()

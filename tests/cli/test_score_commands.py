@@ -189,11 +189,7 @@ EXITS = [
 
 @pytest.mark.parametrize(("arguments", "code", "message"), EXITS)
 def test_the_exit_code_is_that_of_the_kind_of_error(
-    frames: Path,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    code: int,
-    message: str,
+    frames: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, message: str
 ) -> None:
     assert code_of(*arguments) == code
     out, err = capsys.readouterr()

@@ -62,9 +62,7 @@ def test_the_mean_is_that_of_the_textbook(count: int, colour: bool) -> None:
     assert np.allclose(predict(residuals).numpy(), dense_reference(residuals), atol=2e-4)
 
 
-def test_prediction_by_blocks_is_near_the_exact_prediction(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_prediction_by_blocks_is_near_the_exact_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
     residuals = field(120, size=(60, 80))
     exact = predict(residuals)
     monkeypatch.setattr(kriging, "_MAX_EXACT", 10)

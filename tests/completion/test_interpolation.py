@@ -134,8 +134,7 @@ def test_linear_is_what_scipy_gives_inside_the_hull_and_nearest_outside() -> Non
 
 @pytest.mark.parametrize("space", SPACES)
 @given(
-    slopes=st.tuples(st.floats(-0.004, 0.004), st.floats(-0.004, 0.004)),
-    seed=st.integers(0, 2**16),
+    slopes=st.tuples(st.floats(-0.004, 0.004), st.floats(-0.004, 0.004)), seed=st.integers(0, 2**16)
 )
 @settings(max_examples=10)
 def test_what_is_linear_in_a_space_is_restored_in_it_between_the_corners(

@@ -12,13 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, OutputError, SizeError
-from pnpdepth_cli.io.colours import (
-    UNKNOWN,
-    DepthScale,
-    depth_scale,
-    paint_signed,
-    round_steps,
-)
+from pnpdepth_cli.io.colours import UNKNOWN, DepthScale, depth_scale, paint_signed, round_steps
 from pnpdepth_cli.io.figure import draw_discs, figure_content, magnification
 from pnpdepth_cli.io.visualisation import (
     error_map,

@@ -40,8 +40,7 @@ LAYERS = [
 
 
 @pytest.mark.parametrize(
-    ("wanted", "ranks"),
-    [(30, [2, 1, 3, None]), (100, [1, 2, 3, None]), (5, [3, 2, 1, None])],
+    ("wanted", "ranks"), [(30, [2, 1, 3, None]), (100, [1, 2, 3, None]), (5, [3, 2, 1, None])]
 )
 def test_the_cheapest_layer_whose_field_is_wide_enough_comes_first(
     wanted: float, ranks: list[int | None]

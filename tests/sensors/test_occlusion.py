@@ -9,11 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pnpdepth_cli.sensors import (
-    FORWARD_LEFT_UP,
-    Camera,
-    project_velodyne,
-)
+from pnpdepth_cli.sensors import FORWARD_LEFT_UP, Camera, project_velodyne
 from pnpdepth_cli.sensors.projection import hidden_points
 
 K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])

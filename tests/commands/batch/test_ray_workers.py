@@ -18,12 +18,7 @@ from pnpdepth_cli.commands.batch.ray_workers import (
     rows_of_actors,
     software,
 )
-from pnpdepth_cli.commands.batch.request import (
-    LOCAL,
-    ClusterOptions,
-    parse_address,
-    ray_workers_of,
-)
+from pnpdepth_cli.commands.batch.request import LOCAL, ClusterOptions, parse_address, ray_workers_of
 from pnpdepth_cli.errors import ClusterError, ModelError, StorageError, UsageError
 
 Refine = Callable[[Sequence[int], bool], list[dict[str, Any]]]

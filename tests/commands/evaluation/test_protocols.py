@@ -8,11 +8,7 @@ from typing import Any
 
 import pytest
 
-from pnpdepth_cli.commands.evaluation.protocols import (
-    PROTOCOLS,
-    choose_protocol,
-    crop_window,
-)
+from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS, choose_protocol, crop_window
 from pnpdepth_cli.errors import SizeError, UsageError
 
 # (protocol, frame, (top, bottom, left, right)) as the published evaluations cut them

@@ -96,7 +96,7 @@ def test_the_frames_that_decide_are_spread_from_the_first_readable_one_to_the_la
     assert reference_frames(numbers, 3) == [22, 39]
     assert [reference_frames(numbers[:n], 3) for n in (4, 5, 6)] == [[], [4], [4 + 1]]
     assert registering(numbers, 3) == [
-        *(3, 5, 7, 10, 12, 15, 17, 19, 22, 24, 27, 29, 31, 34, 36, 39),
+        *(3, 5, 7, 10, 12, 15, 17, 19, 22, 24, 27, 29, 31, 34, 36, 39)
     ]
     assert registering(numbers[:6], 3) == [3, 4, 5]
 

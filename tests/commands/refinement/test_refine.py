@@ -127,9 +127,7 @@ def test_a_depth_file_as_output_is_written_alone(frame: FrameOnDisk) -> None:
     assert files(frame.folder) - before == names
 
 
-def test_existing_results_are_replaced_only_on_request_and_inputs_never(
-    frame: FrameOnDisk,
-) -> None:
+def test_existing_results_are_replaced_only_on_request_and_inputs_never(frame: FrameOnDisk) -> None:
     run(frame)
     depth = frame.folder / "out" / "img_depth.png"
     old = depth.read_bytes()

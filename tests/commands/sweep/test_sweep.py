@@ -25,12 +25,7 @@ from pnpdepth_cli.commands.sweep.points import Sampling, frame_points, read_samp
 from pnpdepth_cli.commands.sweep.sweep import SweepRequest, run_sweep
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.errors import (
-    InputError,
-    OutputError,
-    PnpDepthError,
-    UsageError,
-)
+from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.frames import refiner as frame_refiner
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.sensors import (

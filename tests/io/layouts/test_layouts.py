@@ -16,10 +16,7 @@ from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest, sample_pattern
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, find_protocol
-from pnpdepth_cli.io.dataset.reading import (
-    masked,
-    moved_to,
-)
+from pnpdepth_cli.io.dataset.reading import masked, moved_to
 from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames
 from tests.data_sets import (
     BENCHMARKS,
@@ -221,8 +218,7 @@ def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "line",
-    ["0 depth/0.png 1.5 rgb/0.png", "1.5 rgb/0.png 1.51 depth/0.png  # TUM's own order"],
+    "line", ["0 depth/0.png 1.5 rgb/0.png", "1.5 rgb/0.png 1.51 depth/0.png  # TUM's own order"]
 )
 def test_associations_pair_images_and_depth(line: str, tmp_path: Path) -> None:
     (tmp_path / "associations.txt").write_text(f"# comment\n{line}\n")

@@ -15,15 +15,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
-from tests.models.weights.files import (
-    Hostile,
-    hostile,
-    little,
-    npy_of,
-    pickled,
-    refused,
-    write_npy,
-)
+from tests.models.weights.files import Hostile, hostile, little, npy_of, pickled, refused, write_npy
 
 RING: dict[str, Any] = {}
 RING["again"] = RING
