@@ -172,32 +172,6 @@ def test_files_are_not_overwritten_unasked_and_inputs_never(
     assert code_of("eval", "out", "gt", "--csv", "nowhere/s.csv") == 2
 
 
-EXITS = [
-    (["eval", "out", "gt", "--protocol", "kiti"], 2, "kitti"),
-    (["eval", "out", "gt", "--delta", "1,2"], 2, "--delta"),
-    (["eval", "out", "gt", "--delta", "fast"], 2, "--delta"),
-    (["eval", "out", "gt", "--missing", "max"], 2, "scores empty predictions as --max-depth"),
-    (["eval", "out", "gt", "--json", "--csv", "-"], 2, "can go to stdout"),
-    (["eval", "out", "gt/a.npy"], 2, "two files or two folders"),
-    (["eval", "out", "nowhere"], 3, "nowhere"),
-    (["eval", "out", "gt", "--protocol", "nyu-eigen"], 3, "640×480"),
-    (["eval", "out", "gt", "--sparse", "nowhere"], 3, "nowhere"),
-    (["compare", "a.json"], 2, "two runs"),
-    (["compare", "a.json", "b.json"], 3, "a.json"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "code", "message"), EXITS)
-def test_the_exit_code_is_that_of_the_kind_of_error(
-    frames: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, message: str
-) -> None:
-    assert code_of(*arguments) == code
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert message in err
-    assert "Traceback" not in err
-
-
 def test_runs_are_compared_as_a_table_as_json_and_as_files(
     frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

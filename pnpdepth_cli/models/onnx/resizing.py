@@ -55,7 +55,7 @@ def _resized(x: Tensor, node: Node, factors: list[float], sizes: list[int] | Non
     if fast is not None:
         return fast
     for axis, (size, factor) in enumerate(zip(sizes, factors, strict=True)):
-        if size != x.shape[axis] or factor != 1:
+        if factor != 1:
             x = _along(x, axis, *_taps(node, x.shape[axis], size, factor))
     return x
 
