@@ -31,8 +31,9 @@ def test_times_are_in_milliseconds_and_forward_passes(capsys: pytest.CaptureFixt
     bench_command._print(
         {
             "device": "cpu", "threads": 1, "versions": {"torch": "2"}, "notes": [],
-            "size": (24, 32), "points": 50, "model": "net", "layer": "z", "iterations": 5, "precision": "fp32",
+            "size": (24, 32), "points": 50, "model": "net", "layer": "z", "iterations": 5,
             "parts": {"refinement": part, "other": part | {"peak_mb": None}}, "limit": 1.5,
+            "precision": "fp32",
         }
     )  # fmt: skip
     out, err = capsys.readouterr()

@@ -76,8 +76,9 @@ def test_what_openexr_prints_to_stdout_does_not_get_between_the_data(tmp_path: P
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_a_full_stderr_does_not_stop_the_work_and_a_full_stdout_is_one_line(tmp_path: Path) -> None:
-    assert shell(f"{sample_command('a.npy')} 2>/dev/full", tmp_path).returncode == 0
-    assert (tmp_path / "a.npy").exists()
+    for output, stderr in (("a.npy", "/dev/full"), ("b.npy", "/dev/null")):
+        assert shell(f"{sample_command(output)} 2>{stderr}", tmp_path).returncode == 0
+    assert (tmp_path / "a.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
     done = shell("pnpdepth --help >/dev/full", tmp_path)
     assert done.returncode == 2
     assert done.stderr == "pnpdepth: stdout cannot be written to: No space left on device\n"

@@ -199,7 +199,10 @@ def test_any_name_that_a_file_can_have_will_do(tmp_path: Path) -> None:
     listener = RecordingListener()
     batch(root, listener)
     assert {row["status"] for row in listener.rows} == {"done"}
-    assert (root / "out/two/a_depth.png").is_file()
+    written = {
+        os.fspath(path.relative_to(root / "out")) for path in root.glob("out/**/*_depth.png")
+    }
+    assert written == {f"{name}_depth.png" for name in names}
     assert sorted(row["name"] for row in summary(root)["frames"]) == names
     with (root / "out/summary.csv").open(encoding="utf-8", newline="") as file:
         in_table = [row["name"] for row in csv.DictReader(file)]
