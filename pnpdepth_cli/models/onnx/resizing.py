@@ -102,8 +102,6 @@ def _taps(node: Node, size: int, out: int, factor: float) -> tuple[Tensor, Tenso
     if mode not in ("linear", "cubic"):
         raise Unsupported(f"mode {mode}")
     linear = mode == "linear"
-    if linear and not antialias:
-        position = position.clamp(0, size - 1)
     shrink = min(1.0, factor) if antialias else 1.0
     reach = math.ceil((1 if linear else 2) / shrink)
     index = position.floor().long()[:, None] + torch.arange(1 - reach, reach + 1)

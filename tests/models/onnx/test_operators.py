@@ -308,9 +308,11 @@ def test_shapes() -> None:
     check("Unsqueeze", [normal(3, 2), np.array([0, -1], I64)])
     check("Unsqueeze", [normal(3, 2)], opset=11, axes=[1, 3])
     check("Expand", [normal(3, 1), np.array([2, 1, 4], I64)])
+    check("Expand", [normal(2, 3, 1), np.array([3, 4], I64)])
     check("Tile", [normal(3, 2), np.array([2, 3], I64)])
     check("Concat", [normal(3, 2), normal(4, 2)], axis=0)
-    check("SpaceToDepth", [normal(1, 2, 4, 6)], blocksize=2)
+    check("SpaceToDepth", [normal(1, 2, 6, 9)], blocksize=3)
+    check("DepthToSpace", [normal(1, 18, 2, 3)], blocksize=3)
     check("CastLike", [X, np.array([1], I64)])
     check(
         "ConstantOfShape",
@@ -343,7 +345,7 @@ def test_pads(mode: str) -> None:
 SLICES = [
     ([1], [5], [2], [2]), ([-1], [-100], [3], [-1]), ([4], [0], [2], [-2]),
     ([0], [2**62], [1], [1]), ([1, -3], [3, -1], [1, -1], [1, 1]), ([5], [2], [2], [1]),
-    ([-100], [3], [3], [1]),
+    ([-100], [3], [3], [1]), ([-1], [-7], [2], [-1]), ([-1], [-8], [2], [-1]),
 ]  # fmt: skip
 
 
