@@ -132,11 +132,10 @@ def _coordinates(mode: str, size: int, out: int, factor: float) -> Tensor:
         return (o + 0.5) / scale
     if mode == "pytorch_half_pixel" and out == 1:
         return torch.zeros(out)
-    half = (o + 0.5) / scale - 0.5
     if mode == "half_pixel_symmetric":
-        return half + size / 2 * (1 - out / (scale * size))
+        return size / 2 * (1 - out / (scale * size)) + (o + 0.5) / scale - 0.5
     if mode in ("half_pixel", "pytorch_half_pixel"):
-        return half
+        return (o + 0.5) / scale - 0.5
     raise Unsupported(f"coordinate_transformation_mode {mode}")
 
 
