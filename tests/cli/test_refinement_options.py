@@ -49,15 +49,8 @@ def test_the_users_options_override_the_definition_and_another_update_its_step()
 
 @pytest.mark.parametrize("command", [refine, batch])
 def test_names_and_values_reach_the_settings(command: click.Command) -> None:
-    arguments = [
-        "a",
-        "-o",
-        "b",
-        "--set",
-        "blur=2,keep-best",
-        "--set",
-        "mask-scale=0.5,precision=bf16",
-    ]
+    arguments = ["a", "-o", "b", "--set", "blur=2,keep-best,mask-scale=0.5"]
+    arguments += ["--set", "precision=bf16"]
     arguments += ["--sparse", "s", "--scan", "extrinsics=pose.txt"] if command is refine else []
     params = dict(command.make_context("command", arguments).params)
     values = taken(Settings, params)

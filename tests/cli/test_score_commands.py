@@ -53,7 +53,7 @@ def test_the_table_is_data_and_what_was_assumed_is_talk(
         "coverage",
         "100.00%",
         "b ü_1",
-        "c\\nd",
+        r"c\nd",
     ):
         assert word in out, word
     assert err.startswith("protocol paper: all known ground truth, no crop")
@@ -63,20 +63,10 @@ def test_the_table_is_data_and_what_was_assumed_is_talk(
 def test_json_is_the_whole_result_with_every_option_and_the_same_with_more_workers(
     frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = (
-        "--protocol",
-        "garg",
-        "--max-depth",
-        "10",
-        "--scale-by",
-        "median",
-        "--missing",
-        "max",
-    )
+    options = "--protocol garg --max-depth 10 --scale-by median --missing max --delta 1.06 --json"
     texts = []
     for workers in ("1", "3"):
-        more = ("--delta", "1.06", "--workers", workers, "--json")
-        assert code_of("eval", "out", "gt", *options, *more) == 0
+        assert code_of("eval", "out", "gt", *options.split(), "--workers", workers) == 0
         texts.append(capsys.readouterr().out)
     assert texts[0] == texts[1]
     record = json.loads(texts[0])

@@ -89,6 +89,7 @@ GREY = {"R": METRES, "G": METRES, "B": METRES, "A": np.ones_like(METRES)}
 UNSIGNED, HALVES = {"Z": np.array([[512, 0]], np.uint32)}, np.array([[0, 128]], np.uint8)
 BOTTOM_UP = METRES[::-1]
 PFM = b"Pf\n3 2\n-1.0\n" + BOTTOM_UP.astype("<f4").tobytes()
+UNKNOWN = "16-bit PNG ÷ 256, 2 pixels of value 65535 taken as unknown"
 FACTOR = "PFM, scale factor 0.25 of its header not applied"
 
 
@@ -122,12 +123,7 @@ FACTOR = "PFM, scale factor 0.25 of its header not applied"
         ("d.pfm", PFM, KNOWN, "PFM"),
         ("d.pfm", b"Pf 3 2 1\n" + BOTTOM_UP.astype(">f4").tobytes(), KNOWN, "PFM"),
         ("d.pfm", b"Pf\n1 1\n-0.25\n" + np.float32(2).tobytes(), [[2]], FACTOR),
-        (
-            "d.png",
-            np.array([[65535, 256, 65535]], np.uint16),
-            [[0, 1, 0]],
-            "16-bit PNG ÷ 256, 2 pixels of value 65535 taken as unknown",
-        ),
+        ("d.png", np.array([[65535, 256, 65535]], np.uint16), [[0, 1, 0]], UNKNOWN),
     ],
 )
 def test_every_format_gives_metres_where_they_are_finite_and_above_zero(

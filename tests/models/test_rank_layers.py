@@ -101,17 +101,7 @@ def test_few_points_want_a_deep_layer_and_many_a_late_one(
 def test_the_best_of_eight_layers_is_found_by_measuring_few(
     network: Network, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    fields = {
-        "a": 60,
-        "b": 60,
-        "broken": None,
-        "c": 44,
-        "d": 30,
-        "e": 16,
-        "f": 5,
-        "g": 2,
-        "last": None,
-    }
+    fields = dict(zip("abxcdefgy", (60, 60, None, 44, 30, 16, 5, 2, None), strict=True))
     measured: list[str] = []
 
     def measure(network: Network, name: str, *_: object, **__: object) -> MeasuredLayer:

@@ -60,14 +60,8 @@ def test_a_stem_names_its_frame(stem: str, name: str) -> None:
 
 MATCHED = [
     (  # the files of a refinement, and ground truth without images
-        [
-            "b_depth.png",
-            "b_preview.png",
-            "b_sigma_preview.png",
-            "b_improvement.png",
-            "ä ö_depth.exr",
-            "b.png",
-        ],
+        [f"b_{part}.png" for part in ("depth", "preview", "sigma_preview", "improvement")]
+        + ["ä ö_depth.exr", "b.png"],
         ["b.png", "ä ö.npy"],
         {"b": "b_depth.png", "ä ö": "ä ö_depth.exr"},
         ["out: ignored, as there is a _depth of each: b.png"],

@@ -33,19 +33,12 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
     assert from_json == from_csv
     assert from_csv == [
         Frame(
-            name="first",
-            image=tmp_path / "i.png",
-            sparse=tmp_path / "s.bin",
-            gt=tmp_path / "deep/g.png",
-            calib=tmp_path / "c.txt",
-            camera=3,
-            gt_scale=1000,
-            protocol=PROTOCOLS["kitti-odometry"],
-            masks=(tmp_path / "m.png",),
-            gt_other_size=True,
+            name="first", image=tmp_path / "i.png", sparse=tmp_path / "s.bin",
+            gt=tmp_path / "deep/g.png", calib=tmp_path / "c.txt", camera=3, gt_scale=1000,
+            protocol=PROTOCOLS["kitti-odometry"], masks=(tmp_path / "m.png",), gt_other_size=True,
             group="room",
         )
-    ]
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
