@@ -69,6 +69,8 @@ def test_prediction_by_blocks_is_near_the_exact_prediction(monkeypatch: pytest.M
     monkeypatch.setattr(kriging, "_MAX_EXACT_SMALL", 10)
     blocks = predict(residuals)
     assert not torch.equal(blocks, exact)
+    assert kriging._block_side(residuals.points) == 15  # of 80, 57, 41, 29, 21
+    assert kriging._block_side(field(16, size=(60, 80)).points) == 80
     assert float((blocks - exact).abs().max()) < 0.05
     assert float((blocks - exact).abs().mean()) < 0.005
 
