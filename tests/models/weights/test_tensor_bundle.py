@@ -105,7 +105,7 @@ def test_types_have_the_numbers_of_tensorflows_types_proto(tmp_path: Path) -> No
         6: torch.int8, 9: torch.int64, 10: torch.bool, 14: torch.bfloat16, 19: torch.float16,
     }  # fmt: skip
     entries = {str(number): entry(number, (), 0, kind.itemsize) for number, kind in types.items()}
-    tensors = read_tensor_bundle(bundle(tmp_path, entries, bytes(8)))
+    tensors = read_tensor_bundle(bundle(tmp_path, entries, bytes(64)))
     assert {int(name): tensor.dtype for name, tensor in tensors.items()} == types
 
 
