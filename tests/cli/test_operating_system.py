@@ -110,16 +110,12 @@ def test_names_of_5000_characters_are_one_line(
 @pytest.mark.parametrize(
     ("path", "number", "code"),
     [
-        ("in.png", errno.EACCES, 3),
-        ("out/x_depth.png", errno.EACCES, 2),
-        ("net.onnx", errno.EACCES, 4),
-        ("weights/a/b", errno.EACCES, 4),
-        ("table.csv", errno.ENAMETOOLONG, 2),
-        ("in_refined", errno.EACCES, 2),
-        (None, errno.ENOSPC, 2),
-        (None, errno.EIO, 3),
+        ("in.png", errno.EACCES, 3), ("out/x_depth.png", errno.EACCES, 2),
+        ("net.onnx", errno.EACCES, 4), ("weights/a/b", errno.EACCES, 4),
+        ("table.csv", errno.ENAMETOOLONG, 2), ("in_refined", errno.EACCES, 2),
+        (None, errno.ENOSPC, 2), (None, errno.EIO, 3),
     ],
-)
+)  # fmt: skip
 def test_the_code_of_an_error_follows_from_the_option_of_its_file(
     path: str | None, number: int, code: int
 ) -> None:

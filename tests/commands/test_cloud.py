@@ -107,14 +107,11 @@ def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path
 @pytest.mark.parametrize(
     "changes",
     [
-        {"intrinsics": [1, 2]},
-        {"intrinsics": [[0, 0, 0]] * 3},
-        {"intrinsics": [[1e999, 0, 0], [0, 1, 0], [0, 0, 1]]},
-        {"distortion": ["x"]},
-        {"lens": "pinhole"},
-        {"pose": [1, 2]},
+        {"intrinsics": [1, 2]}, {"intrinsics": [[0, 0, 0]] * 3},
+        {"intrinsics": [[1e999, 0, 0], [0, 1, 0], [0, 0, 1]]}, {"distortion": ["x"]},
+        {"lens": "pinhole"}, {"pose": [1, 2]},
     ],
-)
+)  # fmt: skip
 def test_a_damaged_camera_in_a_record_is_one_line(tmp_path: Path, changes: dict[str, Any]) -> None:
     path = with_camera(frame(tmp_path, "a"), None)
     record = json.loads((tmp_path / "a.json").read_text())

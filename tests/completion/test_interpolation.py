@@ -27,12 +27,9 @@ from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
 FILLS: dict[str, Callable[[SparsePoints], Tensor]] = {
-    "nearest": nearest,
-    "linear": linear,
-    "linear log": partial(linear, space="log"),
-    "idw": inverse_distance,
-    "morphological": morphological,
-}
+    "nearest": nearest, "linear": linear, "linear log": partial(linear, space="log"),
+    "idw": inverse_distance, "morphological": morphological,
+}  # fmt: skip
 
 
 def points_at(

@@ -57,14 +57,11 @@ def npy_bytes(points: NDArray[np.float32], dtype: type = np.float64) -> bytes:
 
 
 FILES = {
-    "kitti.bin": bin_bytes,
-    "scan.npy": npy_bytes,
-    "binary.pcd": pcd_bytes,
-    "ascii.pcd": lambda points: pcd_bytes(points, "ascii"),
-    "little.ply": ply_bytes,
+    "kitti.bin": bin_bytes, "scan.npy": npy_bytes, "binary.pcd": pcd_bytes,
+    "ascii.pcd": lambda points: pcd_bytes(points, "ascii"), "little.ply": ply_bytes,
     "big.ply": lambda points: ply_bytes(points, "binary_big_endian"),
     "ascii.ply": lambda points: ply_bytes(points, "ascii"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FILES)

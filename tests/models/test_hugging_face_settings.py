@@ -171,20 +171,15 @@ def test_plain_attention_is_taken(folder: Path) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"size_divisor": "x"},
-        {"size_divisor": [32]},
-        {"size_divisor": 10**12},
-        {"rescale_factor": None},
-        {"rescale_factor": 0},
-        {"rescale_factor": 10**400},
+        {"size_divisor": "x"}, {"size_divisor": [32]}, {"size_divisor": 10**12},
+        {"rescale_factor": None}, {"rescale_factor": 0}, {"rescale_factor": 10**400},
         {"do_normalize": True, "image_mean": {"r": 1}},
-        {"do_normalize": True, "image_std": [10**400] * 3},
-        {"size": [1, 2]},
+        {"do_normalize": True, "image_std": [10**400] * 3}, {"size": [1, 2]},
         {"size": {"height": "x", "width": 3}},
         *({"size": size} for size in (0, (1 << 16) + 1, 56.0)),
         *({"size_divisor": side} for side in (-1, (1 << 16) + 1, 1 / ((1 << 16) + 1), 1.0)),
     ],
-)
+)  # fmt: skip
 def test_settings_that_are_no_numbers_are_refused_in_one_line(
     change: dict[str, Any], folder: Path
 ) -> None:

@@ -76,14 +76,11 @@ def test_a_branch_runs_again_where_it_depends_on_z_by_any_operation(operation: s
 @pytest.mark.parametrize(
     "escape",
     [
-        lambda y: bool(y.mean() > 0),
-        lambda y: y.mean().item() > 0,
-        lambda y: y.mean((0, 2, 3)).tolist()[0] > 0,
-        lambda y: y.numpy().mean() > 0,
-        lambda y: len(y[y > 0]) > 400,
-        lambda y: int((y > 0).sum()) > 400,
+        lambda y: bool(y.mean() > 0), lambda y: y.mean().item() > 0,
+        lambda y: y.mean((0, 2, 3)).tolist()[0] > 0, lambda y: y.numpy().mean() > 0,
+        lambda y: len(y[y > 0]) > 400, lambda y: int((y > 0).sum()) > 400,
     ],
-)
+)  # fmt: skip
 def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], bool]) -> None:
     torch.manual_seed(0)
     network, x = Branching(escape), image()
@@ -104,18 +101,12 @@ def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], 
 @pytest.mark.parametrize(
     "write",
     [
-        lambda t: t.add_(1),
-        lambda t: t[1:].zero_(),
-        lambda t: torch.add(t, 1, out=t),
-        lambda t: torch._foreach_mul_([t], 2.0),
-        lambda t: F.relu_(t.view(3, 1)),
-        lambda t: t.detach().exp_(),
-        lambda t: t.__setitem__(0, 9.0),
-        lambda t: nn.ReLU(inplace=True)(t),
-        lambda t: t.clamp_(max=0),
-        lambda t: t.data.fill_(4),
+        lambda t: t.add_(1), lambda t: t[1:].zero_(), lambda t: torch.add(t, 1, out=t),
+        lambda t: torch._foreach_mul_([t], 2.0), lambda t: F.relu_(t.view(3, 1)),
+        lambda t: t.detach().exp_(), lambda t: t.__setitem__(0, 9.0),
+        lambda t: nn.ReLU(inplace=True)(t), lambda t: t.clamp_(max=0), lambda t: t.data.fill_(4),
     ],
-)
+)  # fmt: skip
 def test_every_form_of_writing_is_seen(write: Callable[[Tensor], object]) -> None:
     tensor = torch.tensor([-1.0, 2.0, 3.0])
     saved = SavedTensors(tensor)
@@ -138,20 +129,14 @@ def test_reading_makes_no_copy() -> None:
 
 CONSTANT = torch.ones(2, 3)
 REPLACEABLE: list[tuple[Callable[[Tensor], object], bool]] = [
-    (lambda t: t + 1, True),
-    (lambda t: {"a": [t + 1, 5, "text", None]}, True),
-    (lambda t: (t + 1).relu_().view(3, 2), True),
-    (lambda t: t, False),
-    (lambda t: t.view(3, 2), False),
-    (lambda t: t.add_(1), False),
-    (lambda t: (t.add_(1), t + 1)[1], False),
-    (lambda t: (CONSTANT.add_(1), t + 1)[1], False),
-    (lambda t: CONSTANT, False),
-    (lambda t: iter([t + 1]), False),
-    (lambda t: {"a": t + 1, "b": object()}, False),
-    (lambda t: [(t + 1)] * 2, False),
+    (lambda t: t + 1, True), (lambda t: {"a": [t + 1, 5, "text", None]}, True),
+    (lambda t: (t + 1).relu_().view(3, 2), True), (lambda t: t, False),
+    (lambda t: t.view(3, 2), False), (lambda t: t.add_(1), False),
+    (lambda t: (t.add_(1), t + 1)[1], False), (lambda t: (CONSTANT.add_(1), t + 1)[1], False),
+    (lambda t: CONSTANT, False), (lambda t: iter([t + 1]), False),
+    (lambda t: {"a": t + 1, "b": object()}, False), (lambda t: [(t + 1)] * 2, False),
     (lambda t: (t + 1).unbind(0), False),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("call", "replaceable"), REPLACEABLE)

@@ -181,6 +181,7 @@ TRANSPOSED = [
     {"strides": [2, 2], "pads": [0, 0, 1, 1]}, {"strides": [2, 2], "output_shape": [14, 12]},
     {"strides": [2, 2], "auto_pad": "SAME_UPPER"}, {"strides": [2, 2], "auto_pad": "SAME_LOWER"},
     {"strides": [2, 2], "output_shape": [13, 12], "auto_pad": "SAME_UPPER"},
+    {"strides": [2, 2], "output_shape": [14, 12], "output_padding": [1, 0]},
     {"strides": [2, 1], "dilations": [2, 1]}, {"strides": [3, 3], "pads": [1, 0, 0, 1]},
 ]  # fmt: skip
 

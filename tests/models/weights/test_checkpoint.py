@@ -297,13 +297,10 @@ def test_a_pointer_to_a_file_that_was_not_fetched_is_named(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("save", "suffix"),
     [
-        (torch.save, ".pth"),
-        (save_older, ".pth"),
-        (save_file, ".safetensors"),
-        (save_layers, ".npy"),
-        (save_numbered, ".npz"),
+        (torch.save, ".pth"), (save_older, ".pth"), (save_file, ".safetensors"),
+        (save_layers, ".npy"), (save_numbered, ".npz"),
     ],
-)
+)  # fmt: skip
 def test_a_file_cut_anywhere_is_refused(
     save: Callable[[Any, Path], None], suffix: str, tmp_path: Path
 ) -> None:
