@@ -36,16 +36,9 @@ Make = Callable[..., Any]
 
 
 def write_bag(
-    path: Path,
-    *,
-    frames: int = 3,
-    compressed: bool = False,
-    static: bool = True,
-    info: bool = True,
-    poses: str = "",
-    compression: Any = None,
-    view: View | None = None,
-) -> Path:
+    path: Path, *, frames: int = 3, compressed: bool = False, static: bool = True,
+    info: bool = True, poses: str = "", compression: Any = None, view: View | None = None,
+) -> Path:  # fmt: skip
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.

@@ -34,12 +34,9 @@ CAMERAS = {
 
 
 def write_text_model(
-    folder: Path,
-    *,
-    camera: str = "PINHOLE",
-    names: tuple[str, ...] = ("a.png", "b.png", "c.png"),
+    folder: Path, *, camera: str = "PINHOLE", names: tuple[str, ...] = ("a.png", "b.png", "c.png"),
     points: int = 40,
-) -> None:
+) -> None:  # fmt: skip
     """A wall 4 units away that cameras side by side see; each observes all points."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cameras.txt").write_text(

@@ -195,11 +195,9 @@ NO_CAMERA: dict[str, Any] = {
     "source": "x",
 }  # fmt: skip
 BAD_CAMERAS: list[dict[str, Any]] = [
-    {"intrinsics": [[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]},
-    {"pose": [[10**400, 0, 0, 0]] * 3},
-    {"distortion": [10**400]},
-    {"lens": 5},
-]
+    {"intrinsics": [[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]}, {"pose": [[10**400, 0, 0, 0]] * 3},
+    {"distortion": [10**400]}, {"lens": 5},
+]  # fmt: skip
 BAD_NAMES = ["../../../ESC", "/etc/x.png", "a\nb.png", 7, "..", "n" * 201, "a\\b.png", "x/../../y"]
 
 

@@ -165,12 +165,9 @@ def nuscenes_bytes(points: NDArray[np.float32]) -> bytes:
     ],
 )
 def test_a_bin_of_kitti_or_nuscenes_is_recognised_by_name_and_content(
-    name: str,
-    count: int,
-    encoded: Callable[[NDArray[np.float32]], bytes],
-    source: str,
+    name: str, count: int, encoded: Callable[[NDArray[np.float32]], bytes], source: str,
     tmp_path: Path,
-) -> None:
+) -> None:  # fmt: skip
     points = np.resize(POINTS, (count, 3))
     (tmp_path / name).write_bytes(encoded(points))
     scan = read_scan(tmp_path / name)

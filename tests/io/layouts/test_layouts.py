@@ -187,13 +187,11 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("\n", "has no poses"),
-        (_ROW, "000001.png has no pose: its sequence's file holds 1 poses"),
-        (_ROW[2:], "00.txt: line 1"),
-        (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt: line 3"),
+        ("\n", "has no poses"), (_ROW, "000001.png has no pose: its sequence's file holds 1 poses"),
+        (_ROW[2:], "00.txt: line 1"), (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt: line 3"),
         (_ROW.replace("1", "one"), "00.txt: line 1"),
     ],
-)
+)  # fmt: skip
 def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
     tmp_path: Path, text: str, message: str
 ) -> None:
