@@ -129,6 +129,7 @@ def test_the_help_names_all_that_can_be_varied() -> None:
     assert set(PARAMETERS) <= set(re.findall(r"[a-z]+(?:-[a-z]+)?", paragraph))
 
 
+@pytest.mark.slow
 def test_the_sample_frames_give_a_table_and_a_plot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

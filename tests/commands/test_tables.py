@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pnpdepth_cli.commands.error_tables import change, error_table, format_error
+from pnpdepth_cli.commands.error_tables import change, error_table, format_error, refinement_table
 from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
 from pnpdepth_cli.commands.tables import Table
 from pnpdepth_cli.core.metrics import MEASURES
@@ -46,6 +46,23 @@ def test_linear_interpolation_stands_beside_the_errors_and_points_used_show_no_g
         ["error at 1,234 held-out points, MAE", "2.0000 m", "1.0000 m", "-50.0%", "–", "–"],
         ["error at 1,234 points used, MAE", "2.0000 m", "1.0000 m", "", "–", ""],
     ]
+
+
+def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> None:
+    check = {"points": 12, "aligned": 4.0, "fused": 3.0, "propagated": 1.0, "linear": 2.0}
+    record: dict[str, Any] = {
+        "method": {"kind": "default", "networks": ["net"]}, "model": {"name": "net"}, "unit": "m",
+        "stages": None, "scores": None, "linear": {"check": check | {"result": 1.0}},
+    }  # fmt: skip
+    assert styled(refinement_table(record)) == [
+        [("net aligned", ""), ("4.0000 m", ""), ("+100.0%", "bad")],
+        [("residual propagated", "bold"), ("1.0000 m", "bold"), ("-50.0%", "good")],
+        [("linear interpolation", ""), ("2.0000 m", ""), ("", "")],
+    ]
+    record["method"]["networks"].append("other")
+    record["linear"]["check"]["result"] = 0.5
+    _, fused, _, result, _ = (row[0] for row in refinement_table(record).rows)
+    assert (fused, result) == ("with points, fused", "result")
 
 
 def styled(table: Table) -> list[list[tuple[str, str]]]:
