@@ -346,12 +346,21 @@ def test_a_record_that_lacks_what_the_summary_needs_is_an_error_that_names_it(ro
         batch(root)
 
 
-def test_a_batch_can_be_stopped_between_frames_and_goes_on(root: Path) -> None:
+def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left(
+    root: Path,
+) -> None:
     stops = iter([False, False, True])
     outcome = batch(root, stopped=lambda: next(stops))
     assert outcome.stopped
+    (root / "out" / "deep").mkdir()
+    for folder in ("out", "out/deep"):
+        (root / folder / ".0123456789ab").write_bytes(b"half")
     assert outcome.summary["counts"]["pending"] == 2
-    assert done(root) == ["c", "d"]
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.names == ["c", "d"]
+    assert "removed 2 half-written files of a run that was killed" in listener.messages
+    assert not list(root.rglob(".0123456789ab"))
 
 
 def test_frames_without_sparse_depth_need_to_be_sampled(root: Path, tmp_path: Path) -> None:
