@@ -197,10 +197,13 @@ SCORES = {
 }
 
 
+WITH_MRE = {stage: scores | {"mre": 0.5} for stage, scores in SCORES.items()}
+
+
 def test_a_batch_is_compared_with_what_it_started_from(tmp_path: Path) -> None:
     frames = [
         {"name": "drive/1", "status": "done", "scores": SCORES},
-        {"name": "drive/2", "status": "done", "scores": SCORES},
+        {"name": "drive/2", "status": "done", "scores": WITH_MRE},
         {"name": "drive/3", "status": "failed", "scores": None},
     ]
     (tmp_path / "summary.json").write_text(json.dumps({"counts": {}, "frames": frames}))
