@@ -46,6 +46,7 @@ def test_a_stdout_closed_before_the_start_disturbs_only_data_for_it(tmp_path: Pa
     done = shell(f"{sample_command('b.npy')} --json >&-", tmp_path)
     assert done.returncode == 2
     assert done.stderr == "pnpdepth: stdout cannot be written to: it is closed\n"
+    assert shell("pnpdepth --version <&-", tmp_path).stdout.startswith("pnpdepth, version")
 
 
 @POSIX

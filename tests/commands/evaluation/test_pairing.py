@@ -71,8 +71,7 @@ MATCHED = [
         {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None}, [],
     ),
     (
-        ["a.png", "x.png", "y.png", ".b.png", ".hidden/c.png"],
-        ["a.png", "b.png"],
+        ["a.png", "x.png", "y.png", ".b.png", ".hidden/c.png"], ["a.png", "b.png"],
         {"a": "a.png", "b": None},
         ["warning: 2 of 3 predictions have no ground truth and are not scored: x, y"],
     ),

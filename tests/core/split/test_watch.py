@@ -52,10 +52,9 @@ DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 
 INDEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "the features before z": lambda z, y: y,
-    "the shape of z": lambda z, y: y * z.shape[1],
+    "the features before z": lambda z, y: y, "the shape of z": lambda z, y: y * z.shape[1],
     "new zeros": lambda z, y: y + torch.zeros(z.shape),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("operation", [*DEPENDENT, *INDEPENDENT])

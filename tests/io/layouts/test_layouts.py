@@ -285,11 +285,10 @@ def test_synthias_random_set_has_centimetres_in_either_folder(
 @pytest.mark.parametrize(
     ("stem", "size", "is_synthia"),
     [
-        ("kitchen", (760, 1280), False),
-        ("0000001", (480, 640), False),
+        ("kitchen", (760, 1280), False), ("0000001", (480, 640), False),
         ("0000001", (760, 1280), True),
     ],
-)
+)  # fmt: skip
 def test_rgb_and_depth_are_synthia_with_its_names_and_size_only(
     tmp_path: Path, stem: str, size: tuple[int, int], is_synthia: bool
 ) -> None:
