@@ -92,10 +92,9 @@ def test_a_full_stderr_does_not_stop_the_work_and_a_full_stdout_is_one_line(tmp_
         (["sample", str(GT), "--count", "5", "-o", "{long}.png"], 2),
         (["refine", str(GT), "--sparse", "{long}"], 3),
         (["refine", str(GT), "--sparse", str(GT), "--model", "{long}.onnx", "-o", "a"], 4),
-        (["batch", "{long}", "-o", "out"], 3),
-        (["eval", "{long}", "{long}"], 3),
+        (["batch", "{long}", "-o", "out"], 3), (["eval", "{long}", "{long}"], 3),
     ],
-)
+)  # fmt: skip
 def test_names_of_5000_characters_are_one_line(
     arguments: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

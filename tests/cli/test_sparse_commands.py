@@ -72,11 +72,6 @@ def test_refine_takes_a_scan_with_its_calibration(
     assert record["points"]["used"] == 150
     assert record["inputs"]["sparse"]["dropped"]["hidden by foreground"] == 0
     assert record["sparse_error"]["after"]["mae"] < record["sparse_error"]["before"]["mae"]
-    arguments.append("--overwrite")
-    assert code_of(arguments) == 2
-    assert "needs --calib" in capsys.readouterr().err
-    assert code_of([*arguments[:3], str(scan.gt), *arguments[4:], "--scan", "max-range=9"]) == 2
-    assert "is no scan" in capsys.readouterr().err
 
 
 def test_max_pixels_refuses_and_allows_an_image_by_its_size(

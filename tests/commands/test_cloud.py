@@ -165,14 +165,13 @@ def test_frames_are_one_cloud_in_the_world_frame_in_which_voxels_merge_them(tmp_
     [
         ({"fov_deg": None}, UsageError, "give --calib or --fov"),
         ({"calib": Path("k.txt")}, UsageError, "--calib and --fov both"),
-        ({"fov_deg": 0.0}, UsageError, "--fov is 0"),
-        ({"voxel": 0.0}, UsageError, "--voxel"),
+        ({"fov_deg": 0.0}, UsageError, "--fov is 0"), ({"voxel": 0.0}, UsageError, "--voxel"),
         ({"edge": math.inf}, UsageError, "--edge"),
         ({"max_depth": 0.5}, InputError, "no pixel is left"),
         ({"min_views": 2}, UsageError, "--min-views 2 needs"),
         ({"max_sigma": 0.1}, InputError, "--uncertainty"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_done_is_one_line_and_writes_nothing(
     tmp_path: Path, values: dict[str, Any], error: type[Exception], message: str
 ) -> None:

@@ -397,10 +397,9 @@ def test_a_layer_without_a_gradient_back_to_it_is_refused_on_one_line(
 
 
 OTHERS = (
-    POINTS,
-    SparsePoints(xy=torch.tensor([[2.5, 7.0]]), depth=torch.tensor([9.0]), size=(16, 16)),
+    POINTS, SparsePoints(xy=torch.tensor([[2.5, 7.0]]), depth=torch.tensor([9.0]), size=(16, 16)),
     SparsePoints(xy=POINTS.xy.flip(1), depth=POINTS.depth * 3, size=(16, 16)),
-)
+)  # fmt: skip
 IMAGES = torch.cat([image(), image().flip(-1) * 2, image() - 1])
 
 

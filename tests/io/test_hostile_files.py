@@ -9,6 +9,7 @@ import sys
 import zlib
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from PIL import Image
@@ -18,6 +19,7 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.decoding import check_tags
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import check_pixel_count
+from pnpdepth_cli.io.formats.images import _check_header
 from pnpdepth_cli.io.rgb import read_rgb
 
 
@@ -120,6 +122,14 @@ def test_a_pixel_is_one_channel_of_one_byte_unless_told(sixteen: str) -> None:
     check_pixel_count(Path("a.tif"), 4000, 8000, **{sixteen: 16})  # the budget to the byte
     with pytest.raises(FileFormatError, match="in 512,064,000 bytes, more than 512,000,000"):
         check_pixel_count(Path("a.tif"), 4000, 8001, **{sixteen: 16})
+
+
+def test_an_exr_has_four_bytes_a_pixel_of_every_channel() -> None:
+    channel = SimpleNamespace(name="Z", xSampling=1, ySampling=1)
+    header = dict.fromkeys(("dataWindow", "displayWindow"), ((0, 0), (3999, 3999)))
+    _check_header(Path("a.exr"), header | {"channels": [channel] * 8}, 1 << 30)
+    with pytest.raises(FileFormatError, match="in 576,000,000 bytes, more than 512,000,000"):
+        _check_header(Path("a.exr"), header | {"channels": [channel] * 9}, 1 << 30)
 
 
 def test_the_tags_of_a_tiff_claim_as_many_bytes_as_their_types_have() -> None:

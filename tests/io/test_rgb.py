@@ -103,13 +103,12 @@ def test_only_the_first_page_is_read_with_a_note(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "fact"),
     [
-        (b"", "is empty"),
-        (b"hello, world", "is not an image"),
+        (b"", "is empty"), (b"hello, world", "is not an image"),
         (b"\x93NUMPY\x01\x00", "not an im"),
         (b"\0\0\0\x18ftypavif\0\0\0\0", "AVIF photo; .* save it as JPEG"),
         (b"\0\0\0\x18ftypheic\0\0\0\0", "cannot be decoded|reads HEIC, or save it as JPEG"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes, fact: str) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)

@@ -80,15 +80,14 @@ def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_
 @pytest.mark.parametrize(
     ("processing", "size"),
     [
-        ({"size": 56}, Fixed(56, 56)),
-        ({"size": {"shortest_edge": 30}}, Fixed(30, 30)),
+        ({"size": 56}, Fixed(56, 56)), ({"size": {"shortest_edge": 30}}, Fixed(30, 30)),
         ({"size": {"height": 1, "width": 1 << 16}}, Fixed(1, 1 << 16)),
         ({"size": 56, "keep_aspect_ratio": True}, Near(of=32, height=56, width=56)),
         ({**ASPECT, "size": 9, "ensure_multiple_of": 1 / 64}, Near(of=64, height=9, width=9)),
         ({"do_resize": False, "size": 56}, Near(of=32)),
         ({"size_divisor": 1 << 16}, Near(of=1 << 16)),
     ],
-)
+)  # fmt: skip
 def test_the_size_is_fixed_or_near_one_or_a_multiple(
     processing: dict[str, Any], size: Fixed | Near, folder: Path
 ) -> None:
@@ -99,14 +98,13 @@ def test_the_size_is_fixed_or_near_one_or_a_multiple(
 @pytest.mark.parametrize(
     ("processing", "mean", "std"),
     [
-        ({}, 0.0, 1.0),
-        ({"do_normalize": True}, 0.5, 0.5),
+        ({}, 0.0, 1.0), ({"do_normalize": True}, 0.5, 0.5),
         ({"do_normalize": True, "rescale_factor": 1 / 127.5}, 0.25, 0.25),
         ({"image_mean": [0.25] * 3, "image_std": [0.2] * 3}, 0.25, 0.2),
         ({"image_mean": [0.25] * 3, "do_normalize": False, "rescale_factor": 2 / 255}, 0.0, 0.5),
         ({"image_mean": [51] * 3, "image_std": [102] * 3, "do_rescale": False}, 0.2, 0.4),
     ],
-)
+)  # fmt: skip
 def test_normalisation_is_that_of_an_image_from_0_to_1(
     processing: dict[str, Any], mean: float, std: float, folder: Path
 ) -> None:

@@ -32,9 +32,7 @@ class Behind(nn.Module):
 
 
 DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "z itself": lambda z, y: z,
-    "detach": lambda z, y: z.detach() * 2,
-    "data": lambda z, y: z.data,
+    "z itself": lambda z, y: z, "detach": lambda z, y: z.detach() * 2, "data": lambda z, y: z.data,
     "argmax": lambda z, y: y + z.argmax(1, keepdim=True),
     "a comparison": lambda z, y: torch.where(z > 0, y, -y),
     "a view": lambda z, y: z.detach()[:, [0]].expand(-1, 4, -1, -1),
@@ -49,7 +47,7 @@ DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "argmax as a list": lambda z, y: y + z.argmax(1).flatten().tolist()[5],
     "a mask": lambda z, y: y + y[z > 0].sum(),
     "foreach": lambda z, y: torch._foreach_add([y], [z.detach()])[0],
-}
+}  # fmt: skip
 
 INDEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "the features before z": lambda z, y: y, "the shape of z": lambda z, y: y * z.shape[1],
