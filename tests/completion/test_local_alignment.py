@@ -45,8 +45,7 @@ def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve
     for row, column in ((5, 5), (47, 0), (30, 15), (20, 60)):
         distance = np.hypot(*(points.xy.numpy() - (column, row)).T)
         near = np.argsort(distance)[:12]
-        weight = np.maximum(distance[near], 0.5) ** -3.0
-        weight = weight / weight.sum() * (inlier[near] + 1e-6)
+        weight = np.maximum(distance[near], 0.5) ** -3.0 * (inlier[near] + 1e-6)
         root = np.sqrt(weight / weight.sum())
         z = (at_points[near] - mean) / std
         lines = np.vstack([np.column_stack([root, root * z]), [0, RIDGE**0.5]])
