@@ -65,7 +65,7 @@ def lidar(**values: object) -> Lidar:
     ("name", "wrong", "right", "message"),
     [
         ("elevations_deg", [(), (90.1,), (np.nan,)], [(-90.0, 90.0)], "between −90° and 90°"),
-        ("azimuth_step_deg", [0.0009, 360.1, np.nan], [0.001, 360.0], "must be 0.001 to 360"),
+        ("azimuth_step_deg", [0.0, 0.0009, 360.1, np.nan], [0.001, 360.0], "must be 0.001 to 360"),
         ("max_range", [0.0, -1.0, np.nan], [0.1], "max_range must be > 0"),
         ("range_noise", [-0.1, np.inf, np.nan], [0.0], "noise must be >= 0"),
         ("angle_noise_deg", [-0.1, np.inf], [0.0, 400.0], "noise must be >= 0"),
