@@ -44,7 +44,7 @@ def test_every_lens_of_the_list_is_implemented() -> None:
     ),
 )
 def test_radial_tangential_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
-    points = np.column_stack([directions(seed, 0.6), np.ones(60)])
+    points = 3 * np.column_stack([directions(seed, 0.6), np.ones(60)])
     camera = Camera(intrinsics=K, distortion=coefficients)
     theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(coefficients))
     np.testing.assert_allclose(camera.pixels_of(points), theirs[:, 0], atol=1e-6)
@@ -53,7 +53,7 @@ def test_radial_tangential_is_opencvs(seed: int, coefficients: tuple[float, ...]
 @settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), coefficients=st.tuples(*[small] * 4))
 def test_fisheye_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
-    points = np.column_stack([directions(seed), np.ones(60)])
+    points = 3 * np.column_stack([directions(seed), np.ones(60)])
     camera = Camera(intrinsics=K, distortion=coefficients, lens="fisheye")
     theirs, _ = cv2.fisheye.projectPoints(
         points[:, None], np.zeros(3), np.zeros(3), K, np.array(coefficients)
