@@ -75,6 +75,8 @@ SHOWN = {
 def test_the_other_lenses_show_points_where_pycolmap_does(lens: str) -> None:
     shown = distort(np.array([[0.5, 0.3], [-1.2, 0.8]]), lens, EXAMPLES[lens])
     np.testing.assert_allclose(shown.ravel(), SHOWN[lens], rtol=0, atol=1e-11)
+    near, nearer = (distort(np.array([[x, 0.0]]), lens, EXAMPLES[lens])[0, 0] for x in (1e-6, 1e-9))
+    assert nearer == pytest.approx(near / 1000)
 
 
 @pytest.mark.parametrize("lens", LENSES)
