@@ -59,16 +59,8 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     assert record["baselines"]["farthest"]["held_out_mae"] > 0
     assert record["loss"][-1] < record["loss"][0]
     files_of = [f"my_package/{name}.py" for name in ("charbonnier", "rmsprop")]
-    by_file = [
-        "--loss",
-        files_of[0],
-        "--update",
-        files_of[1],
-        "--lr",
-        "1%",
-        "--propagate",
-        "median",
-    ]
+    by_file = ["--loss", files_of[0], "--update", files_of[1], "--lr", "1%"]
+    by_file += ["--propagate", "median"]
     output[-2] = "by_file"
     again = json.loads(run(["refine", *files, *network, *by_file, *output], package))
     assert again["loss"] == record["loss"]

@@ -182,8 +182,7 @@ def layers(
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     if row["problem"]:
-        reason = row["problem"].partition(": ")[2] or row["problem"]
-        return (row["name"], "–", *[""] * 5, reason)
+        return (row["name"], "–", *[""] * 5, row["problem"])
     return (
         row["name"],
         "×".join(str(n) for n in row["shape"]),

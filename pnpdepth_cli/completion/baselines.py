@@ -147,8 +147,7 @@ def _lines_at(
 ) -> tuple[Tensor, Tensor]:
     """The same, (M,), around nodes (M, 2)."""
     distance, near = nearest_points(points, nodes, min(NEIGHBOURS, len(points)))
-    weight = distance.clamp_min(_AT_A_POINT).pow(-POWER)
-    weight = weight / weight.sum(dim=1, keepdim=True) * (inlier_weight[near] + _OUTLIER_WEIGHT)
+    weight = distance.clamp_min(_AT_A_POINT).pow(-POWER) * (inlier_weight[near] + _OUTLIER_WEIGHT)
     weight = weight / weight.sum(dim=1, keepdim=True)
     z, residual = z[near], residual[near]
     mean_z, mean = ((weight * v).sum(dim=1, keepdim=True) for v in (z, residual))

@@ -1,12 +1,22 @@
-"""The figures of the source tree, on a small tree and on this one."""
+"""The figures of the source tree, on a small tree and on this one; every benchmark is imported."""
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from pathlib import Path
 
 import pytest
 
+import benchmarks
 from benchmarks.structure import ROOT, figures, hops_of
+
+NAMES = [module.name for module in pkgutil.walk_packages(benchmarks.__path__, "benchmarks.")]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_benchmark_is_importable(name: str) -> None:
+    importlib.import_module(name)
 
 
 def test_the_figures_of_a_small_tree(tmp_path: Path) -> None:

@@ -72,27 +72,6 @@ def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
     assert "\x1b" not in err
 
 
-EXITS: list[tuple[list[str], int, str]] = [
-    (["--shard", "0/2"], 2, "1/4"),
-    (["--workers", "0"], 2, "'--workers': 0 is not in the range x>=1"),
-    (["--html-3d"], 2, "name its folder with --html"),
-    (["--sample", "many"], 2, "500"),
-    (["--layout", "tum"], 3, "does not look like 'tum'"),
-    (["--layer", "encod"], 4, "encode"),
-    (["--device", "cuda:9"], 6, "--device cpu"),
-]
-
-
-@pytest.mark.parametrize(("more", "code", "message"), EXITS)
-def test_the_exit_code_is_that_of_the_kind_of_error(
-    root: Path, capsys: pytest.CaptureFixture[str], more: list[str], code: int, message: str
-) -> None:
-    assert code_of(arguments(*more)) == code
-    err = capsys.readouterr().err
-    assert message in err.splitlines()[-1]
-    assert "Traceback" not in err
-
-
 def test_ray_without_an_address_is_this_machine(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from pnpdepth_cli.cli import bench as bench_command
 from tests.cli.test_commands import code_of
 from tests.commands.frames import FrameOnDisk
 
@@ -25,23 +26,19 @@ def test_the_table_goes_to_stdout_and_what_it_was_measured_with_to_stderr(
     assert "torch" in err
 
 
-@pytest.mark.parametrize(
-    ("more", "code", "message"),
-    [
-        (["--repeats", "0"], 2, "0 is not in the range x>=1"),
-        (["--layer", "encod"], 4, "did you mean encode"),
-        (["--size", "big"], 2, "HxW"),
-    ],
-)
-def test_the_exit_code_is_that_of_the_kind_of_error(
-    frame: FrameOnDisk,
-    capsys: pytest.CaptureFixture[str],
-    more: list[str],
-    code: int,
-    message: str,
-) -> None:
-    assert code_of(bench(frame, *more)) == code
+def test_times_are_in_milliseconds_and_forward_passes(capsys: pytest.CaptureFixture[str]) -> None:
+    part = {"median_s": 1.25, "lower_s": 1.0, "upper_s": 1.5, "forwards": 2.0, "peak_mb": 1234.5}
+    bench_command._print(
+        {
+            "device": "cpu", "threads": 1, "versions": {"torch": "2"}, "notes": [],
+            "size": (24, 32), "points": 50, "model": "net", "layer": "z", "iterations": 5,
+            "parts": {"refinement": part, "other": part | {"peak_mb": None}}, "limit": 1.5,
+            "precision": "fp32",
+        }
+    )  # fmt: skip
     out, err = capsys.readouterr()
-    assert out == ""
-    assert message in err
-    assert "Traceback" not in err
+    *_, first, second, _, last = (" ".join(line.split()) for line in out.splitlines())
+    assert err == "cpu, 1 thread, torch 2\n"
+    assert first == "refinement 1,250.0 ms 1,000.0–1,500.0 ms 2.00 1,234 MB"
+    assert second == "other 1,250.0 ms 1,000.0–1,500.0 ms 2.00"
+    assert last == "a refinement takes 2.00 forward passes; the limit is 1.50"

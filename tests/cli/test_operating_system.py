@@ -46,6 +46,7 @@ def test_a_stdout_closed_before_the_start_disturbs_only_data_for_it(tmp_path: Pa
     done = shell(f"{sample_command('b.npy')} --json >&-", tmp_path)
     assert done.returncode == 2
     assert done.stderr == "pnpdepth: stdout cannot be written to: it is closed\n"
+    assert shell("pnpdepth --version <&-", tmp_path).stdout.startswith("pnpdepth, version")
 
 
 @POSIX
@@ -75,11 +76,10 @@ def test_what_openexr_prints_to_stdout_does_not_get_between_the_data(tmp_path: P
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_a_full_stderr_does_not_stop_the_work_and_a_full_stdout_is_one_line(
-    tmp_path: Path,
-) -> None:
-    assert shell(f"{sample_command('a.npy')} 2>/dev/full", tmp_path).returncode == 0
-    assert (tmp_path / "a.npy").exists()
+def test_a_full_stderr_does_not_stop_the_work_and_a_full_stdout_is_one_line(tmp_path: Path) -> None:
+    for output, stderr in (("a.npy", "/dev/full"), ("b.npy", "/dev/null")):
+        assert shell(f"{sample_command(output)} 2>{stderr}", tmp_path).returncode == 0
+    assert (tmp_path / "a.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
     done = shell("pnpdepth --help >/dev/full", tmp_path)
     assert done.returncode == 2
     assert done.stderr == "pnpdepth: stdout cannot be written to: No space left on device\n"
@@ -92,10 +92,9 @@ def test_a_full_stderr_does_not_stop_the_work_and_a_full_stdout_is_one_line(
         (["sample", str(GT), "--count", "5", "-o", "{long}.png"], 2),
         (["refine", str(GT), "--sparse", "{long}"], 3),
         (["refine", str(GT), "--sparse", str(GT), "--model", "{long}.onnx", "-o", "a"], 4),
-        (["batch", "{long}", "-o", "out"], 3),
-        (["eval", "{long}", "{long}"], 3),
+        (["batch", "{long}", "-o", "out"], 3), (["eval", "{long}", "{long}"], 3),
     ],
-)
+)  # fmt: skip
 def test_names_of_5000_characters_are_one_line(
     arguments: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -111,16 +110,12 @@ def test_names_of_5000_characters_are_one_line(
 @pytest.mark.parametrize(
     ("path", "number", "code"),
     [
-        ("in.png", errno.EACCES, 3),
-        ("out/x_depth.png", errno.EACCES, 2),
-        ("net.onnx", errno.EACCES, 4),
-        ("weights/a/b", errno.EACCES, 4),
-        ("table.csv", errno.ENAMETOOLONG, 2),
-        ("in_refined", errno.EACCES, 2),
-        (None, errno.ENOSPC, 2),
-        (None, errno.EIO, 3),
+        ("in.png", errno.EACCES, 3), ("out/x_depth.png", errno.EACCES, 2),
+        ("net.onnx", errno.EACCES, 4), ("weights/a/b", errno.EACCES, 4),
+        ("table.csv", errno.ENAMETOOLONG, 2), ("in_refined", errno.EACCES, 2),
+        (None, errno.ENOSPC, 2), (None, errno.EIO, 3),
     ],
-)
+)  # fmt: skip
 def test_the_code_of_an_error_follows_from_the_option_of_its_file(
     path: str | None, number: int, code: int
 ) -> None:

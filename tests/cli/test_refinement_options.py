@@ -49,15 +49,8 @@ def test_the_users_options_override_the_definition_and_another_update_its_step()
 
 @pytest.mark.parametrize("command", [refine, batch])
 def test_names_and_values_reach_the_settings(command: click.Command) -> None:
-    arguments = [
-        "a",
-        "-o",
-        "b",
-        "--set",
-        "blur=2,keep-best",
-        "--set",
-        "mask-scale=0.5,precision=bf16",
-    ]
+    arguments = ["a", "-o", "b", "--set", "blur=2,keep-best,mask-scale=0.5"]
+    arguments += ["--set", "precision=bf16"]
     arguments += ["--sparse", "s", "--scan", "extrinsics=pose.txt"] if command is refine else []
     params = dict(command.make_context("command", arguments).params)
     values = taken(Settings, params)
@@ -71,12 +64,10 @@ def test_names_and_values_reach_the_settings(command: click.Command) -> None:
     ("text", "message"),
     [
         ("lr=1", "choose from sparse-size-ok, .*, schedule, blur"),
-        ("blur", "--set blur must be blur=S"),
-        ("keep-best=1", "must be keep-best"),
-        ("mask=all", "'all' is not one of"),
-        ("blur=x", "'x' is not a valid float"),
+        ("blur", "--set blur must be blur=S"), ("keep-best=1", "must be keep-best"),
+        ("mask=all", "'all' is not one of"), ("blur=x", "'x' is not a valid float"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_name_or_no_value_is_refused(text: str, message: str) -> None:
     with pytest.raises((UsageError, click.UsageError), match=message):
         refine.make_context("refine", ["a.png", "--sparse", "s.png", "--set", text])

@@ -44,17 +44,7 @@ def test_the_table_is_data_and_what_was_assumed_is_talk(
 ) -> None:
     assert code_of("eval", "out", "gt") == 0
     out, err = capsys.readouterr()
-    for word in (
-        "6 frames",
-        "RMSE",
-        "SILog",
-        "δ3",
-        "95 %",
-        "coverage",
-        "100.00%",
-        "b ü_1",
-        "c\\nd",
-    ):
+    for word in ("6 frames", "RMSE", "δ3", "95 %", "coverage", "100.00%", "b ü_1", r"c\nd"):
         assert word in out, word
     assert err.startswith("protocol paper: all known ground truth, no crop")
     assert "float32 NPY" in err
@@ -63,20 +53,10 @@ def test_the_table_is_data_and_what_was_assumed_is_talk(
 def test_json_is_the_whole_result_with_every_option_and_the_same_with_more_workers(
     frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = (
-        "--protocol",
-        "garg",
-        "--max-depth",
-        "10",
-        "--scale-by",
-        "median",
-        "--missing",
-        "max",
-    )
+    options = "--protocol garg --max-depth 10 --scale-by median --missing max --delta 1.06 --json"
     texts = []
     for workers in ("1", "3"):
-        more = ("--delta", "1.06", "--workers", workers, "--json")
-        assert code_of("eval", "out", "gt", *options, *more) == 0
+        assert code_of("eval", "out", "gt", *options.split(), "--workers", workers) == 0
         texts.append(capsys.readouterr().out)
     assert texts[0] == texts[1]
     record = json.loads(texts[0])
@@ -170,36 +150,6 @@ def test_files_are_not_overwritten_unasked_and_inputs_never(
     assert code_of("eval", "out/a.npy", "gt/a.npy", "--csv", "gt/a.npy", "--overwrite") == 2
     assert Path("gt/a.npy").read_bytes() == before
     assert code_of("eval", "out", "gt", "--csv", "nowhere/s.csv") == 2
-
-
-EXITS = [
-    (["eval", "out", "gt", "--protocol", "kiti"], 2, "kitti"),
-    (["eval", "out", "gt", "--delta", "1,2"], 2, "--delta"),
-    (["eval", "out", "gt", "--delta", "fast"], 2, "--delta"),
-    (["eval", "out", "gt", "--missing", "max"], 2, "scores empty predictions as --max-depth"),
-    (["eval", "out", "gt", "--json", "--csv", "-"], 2, "can go to stdout"),
-    (["eval", "out", "gt/a.npy"], 2, "two files or two folders"),
-    (["eval", "out", "nowhere"], 3, "nowhere"),
-    (["eval", "out", "gt", "--protocol", "nyu-eigen"], 3, "640×480"),
-    (["eval", "out", "gt", "--sparse", "nowhere"], 3, "nowhere"),
-    (["compare", "a.json"], 2, "two runs"),
-    (["compare", "a.json", "b.json"], 3, "a.json"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "code", "message"), EXITS)
-def test_the_exit_code_is_that_of_the_kind_of_error(
-    frames: Path,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    code: int,
-    message: str,
-) -> None:
-    assert code_of(*arguments) == code
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert message in err
-    assert "Traceback" not in err
 
 
 def test_runs_are_compared_as_a_table_as_json_and_as_files(

@@ -31,32 +31,6 @@ def test_project_reports_dropped_points_and_written_files(
     assert json.loads(capsys.readouterr().out)["points"]["count"] == 150
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "message"),
-    [
-        (["--size", "48"], 2, "HxW"),
-        (["--size", "48x64", "--camera", "1"], 2, "leave out --camera"),
-        (["--size", "48x64", "--scan", "min-range=9,max-range=2"], 2, "is empty"),
-        (["--image", "missing.png"], 3, "missing.png"),
-        (["--size", "48x64", "--scan", "min-range=90"], 3, "none of the scan's"),
-    ],
-)
-def test_the_exit_code_of_project_is_that_of_the_kind_of_error(
-    frame: ScanOnDisk,
-    capsys: pytest.CaptureFixture[str],
-    options: list[str],
-    code: int,
-    message: str,
-) -> None:
-    sparse = frame.folder / "sparse.png"
-    arguments = ["project", str(frame.scan), "--calib", str(frame.calib), "-o", str(sparse)]
-    assert code_of([*arguments, *options]) == code
-    err = capsys.readouterr().err
-    assert message in err
-    assert err.count("\n") == 1
-    assert not sparse.exists()
-
-
 def test_sample_takes_a_number_or_a_share(
     frame: ScanOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -98,11 +72,6 @@ def test_refine_takes_a_scan_with_its_calibration(
     assert record["points"]["used"] == 150
     assert record["inputs"]["sparse"]["dropped"]["hidden by foreground"] == 0
     assert record["sparse_error"]["after"]["mae"] < record["sparse_error"]["before"]["mae"]
-    arguments.append("--overwrite")
-    assert code_of(arguments) == 2
-    assert "needs --calib" in capsys.readouterr().err
-    assert code_of([*arguments[:3], str(scan.gt), *arguments[4:], "--scan", "max-range=9"]) == 2
-    assert "is no scan" in capsys.readouterr().err
 
 
 def test_max_pixels_refuses_and_allows_an_image_by_its_size(

@@ -75,13 +75,9 @@ def refinement(root: Path, **changes: Any) -> RefineRequest:
 
 
 def batch(
-    root: Path,
-    listener: RecordingListener | None = None,
-    *,
-    stopped: Any = lambda: False,
-    refine: dict[str, Any] | None = None,
-    **changes: Any,
-) -> BatchOutcome:
+    root: Path, listener: RecordingListener | None = None, *, stopped: Any = lambda: False,
+    refine: dict[str, Any] | None = None, **changes: Any,
+) -> BatchOutcome:  # fmt: skip
     """A batch of the folder into its out/."""
     fields: dict[str, Any] = {
         "source": root,

@@ -29,7 +29,7 @@ def test_every_part_is_timed_and_compared_with_one_forward_pass(frame: FrameOnDi
     record = json.loads(json.dumps(measured(frame, precision="bf16")))
     parts = record["parts"]
     assert list(parts) == [
-        *("forward", "front", "rear", "rear and gradient", "refinement", FIRST_FRAME),
+        *("forward", "front", "rear", "rear and gradient", "refinement", FIRST_FRAME)
     ]
     forward, front, rear = (parts[name]["median_s"] for name in ("forward", "front", "rear"))
     for part in parts.values():

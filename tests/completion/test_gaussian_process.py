@@ -62,15 +62,15 @@ def test_the_mean_is_that_of_the_textbook(count: int, colour: bool) -> None:
     assert np.allclose(predict(residuals).numpy(), dense_reference(residuals), atol=2e-4)
 
 
-def test_prediction_by_blocks_is_near_the_exact_prediction(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_prediction_by_blocks_is_near_the_exact_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
     residuals = field(120, size=(60, 80))
     exact = predict(residuals)
     monkeypatch.setattr(kriging, "_MAX_EXACT", 10)
     monkeypatch.setattr(kriging, "_MAX_EXACT_SMALL", 10)
     blocks = predict(residuals)
     assert not torch.equal(blocks, exact)
+    assert kriging._block_side(residuals.points) == 15  # of 80, 57, 41, 29, 21
+    assert kriging._block_side(field(16, size=(60, 80)).points) == 80
     assert float((blocks - exact).abs().max()) < 0.05
     assert float((blocks - exact).abs().mean()) < 0.005
 

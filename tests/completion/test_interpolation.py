@@ -27,12 +27,9 @@ from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
 FILLS: dict[str, Callable[[SparsePoints], Tensor]] = {
-    "nearest": nearest,
-    "linear": linear,
-    "linear log": partial(linear, space="log"),
-    "idw": inverse_distance,
-    "morphological": morphological,
-}
+    "nearest": nearest, "linear": linear, "linear log": partial(linear, space="log"),
+    "idw": inverse_distance, "morphological": morphological,
+}  # fmt: skip
 
 
 def points_at(
@@ -134,8 +131,7 @@ def test_linear_is_what_scipy_gives_inside_the_hull_and_nearest_outside() -> Non
 
 @pytest.mark.parametrize("space", SPACES)
 @given(
-    slopes=st.tuples(st.floats(-0.004, 0.004), st.floats(-0.004, 0.004)),
-    seed=st.integers(0, 2**16),
+    slopes=st.tuples(st.floats(-0.004, 0.004), st.floats(-0.004, 0.004)), seed=st.integers(0, 2**16)
 )
 @settings(max_examples=10)
 def test_what_is_linear_in_a_space_is_restored_in_it_between_the_corners(

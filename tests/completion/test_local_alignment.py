@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import BEYOND, aligned, from_space, to_space
-from pnpdepth_cli.completion.baselines import locally_aligned
+from pnpdepth_cli.completion.baselines import RIDGE, locally_aligned
+from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene_depth
 
@@ -28,6 +30,30 @@ def test_a_prediction_that_is_a_line_away_everywhere_is_restored(space: str, cou
         prediction = gt / 3
     dense = locally_aligned(prediction, random_points(gt, count), space=space)
     assert torch.allclose(dense, gt, rtol=1e-3)
+
+
+def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve_points() -> None:
+    gt = scene_depth()
+    points = spoiled(random_points(gt, 40), 0.1)
+    prediction = gt * torch.linspace(0.6, 1.5, SIZE[1])
+    x = aligned(prediction, points, kind="auto", space="depth").double()
+    at_points, y = points.sample(x).numpy(), points.depth.double().numpy()
+    mean, std = at_points.mean(), at_points.std()
+    inlier = inlier_weights(points, torch.from_numpy(np.log(y / at_points))).numpy()
+    assert inlier.min() == 0 < inlier.max()
+    dense = locally_aligned(prediction, points)
+    for row, column in ((5, 5), (47, 0), (30, 15), (20, 60)):
+        distance = np.hypot(*(points.xy.numpy() - (column, row)).T)
+        near = np.argsort(distance)[:12]
+        weight = np.maximum(distance[near], 0.5) ** -3.0 * (inlier[near] + 1e-6)
+        root = np.sqrt(weight / weight.sum())
+        z = (at_points[near] - mean) / std
+        lines = np.vstack([np.column_stack([root, root * z]), [0, RIDGE**0.5]])
+        values = np.append(root * (y - at_points)[near], 0)
+        shift, slope = np.linalg.lstsq(lines, values)[0]
+        here = float(x[row, column])
+        expected = here + shift + slope * (here - mean) / std
+        assert float(dense[row, column]) == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize("space", SPACES)

@@ -30,9 +30,7 @@ def test_outliers_are_left_out_and_inliers_kept(count: int) -> None:
 
 
 @pytest.mark.parametrize("count", [120, 250])
-def test_points_far_from_the_prediction_are_inliers_where_they_agree(
-    count: int,
-) -> None:
+def test_points_far_from_the_prediction_are_inliers_where_they_agree(count: int) -> None:
     residuals = field(count, size=(60, 80))
     x, y = residuals.points.xy.unbind(1)
     corridor = (x < 30) & (y < 30)

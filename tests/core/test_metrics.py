@@ -11,12 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pnpdepth_cli.core.metrics import (
-    MEASURES,
-    Scores,
-    error_sums,
-    score,
-)
+from pnpdepth_cli.core.metrics import MEASURES, Scores, error_sums, score
 
 
 def test_two_pixels_by_hand() -> None:

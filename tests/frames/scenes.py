@@ -81,10 +81,7 @@ def member(
         **({"size": Multiple(4), "takes_prior": build is TwicePrior} | of_definition),
     )
     network = Network(
-        definition=definition,
-        module=build().eval(),
-        device=torch.device("cpu"),
-        checkpoint=None,
+        definition=definition, module=build().eval(), device=torch.device("cpu"), checkpoint=None
     )
     settings = settings or Settings(iterations=0, align="none")
     return Member(network=network, layer="layer", settings=settings)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from pnpdepth_cli.frames import default
 from pnpdepth_cli.frames.default import FOLDS, MIN_POINTS, refine_default, split_hidden
 from pnpdepth_cli.frames.frame import Check, Frame, Refined
 from pnpdepth_cli.frames.fuse import Fusion, Member, weighted_mean
+from pnpdepth_cli.frames.uncertainty import relative_shape, with_uncertainty
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -48,6 +51,35 @@ def test_the_stages_follow_each_other_and_the_last_is_the_result() -> None:
     assert np.array_equal(result.before, result.stages["aligned"])
     errors = [float(np.abs(d - depth_of_scene().numpy()).mean()) for d in result.stages.values()]
     assert errors[-1] < errors[0]
+
+
+def test_without_a_check_the_uncertainty_is_the_relative_shape_alone() -> None:
+    result = refined(frame_in_memory(MIN_POINTS - 1), member(Brightness))
+    got = with_uncertainty(result)
+    depths = (torch.from_numpy(depth) for depth in (result.before, result.after))
+    expected = relative_shape(result.used, *depths).numpy() * result.after
+    assert np.array_equal(got.sigma, expected.astype(np.float32))
+    assert "too few points to calibrate it with" in got.notes[-1]
+
+
+def test_a_network_farther_off_than_the_result_or_without_depth_is_rejected() -> None:
+    points = frame_in_memory(60).points
+    hidden = replace(points, depth=torch.full((60,), 2.0))
+    alone = {
+        name: SimpleNamespace(before=np.full(SIZE, depth, np.float32))
+        for name, depth in (("near", 1.0), ("far", 2.3), ("exact", 2.1))
+    }
+    fused: Any = SimpleNamespace(after=torch.full(SIZE, 2.2), alone=alone)
+    names: list[Any] = [*alone, "failed"]
+    assert default._rejected(fused, names, points, hidden) == ("near", "far", "failed")
+
+
+@pytest.mark.parametrize("fold", [0, 1])
+def test_nothing_is_hidden_where_a_fold_is_everything_or_nothing(
+    fold: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(default, "spatial_folds", lambda p, *_, **__: torch.full((len(p),), fold))
+    assert split_hidden(frame_in_memory(60).points, 0) is None
 
 
 def test_hidden_points_are_a_fifth_and_the_others_are_kept() -> None:

@@ -201,10 +201,7 @@ def test_steps_that_fail_leave_the_networks_own_depth() -> None:
     network = load_network("compact", None)
     wild = replace(HIDDEN, lr=1e30, iterations=5)
     compact = fuse.Member(
-        network=network,
-        layer="decoder.s8",
-        settings=Settings(iterations=0),
-        hidden_points=wild,
+        network=network, layer="decoder.s8", settings=Settings(iterations=0), hidden_points=wild
     )
     frame = frame_in_memory(60)
     with Fusion([compact]) as fusion:

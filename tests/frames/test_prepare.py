@@ -31,11 +31,7 @@ class Same(nn.Module):
 
 def network(*, weighs_points: bool) -> Network:
     definition = ModelDefinition(
-        name="same",
-        build=Same,
-        size=Fixed(2, 2),
-        input_kind="sparse",
-        weighs_points=weighs_points,
+        name="same", build=Same, size=Fixed(2, 2), input_kind="sparse", weighs_points=weighs_points
     )
     return Network(
         definition=definition, module=Same(), device=torch.device("cpu"), checkpoint=None

@@ -66,11 +66,7 @@ def run_input(seed: Seed, data: bytes) -> dict[str, Any]:
     start, before = time.process_time(), peak_bytes()
     code: object = None
     try:
-        with (
-            libraries_to(err),
-            contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(err),
-        ):
+        with libraries_to(err), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             main(list(seed.command))
     except SystemExit as end:
         code = end.code

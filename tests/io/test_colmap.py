@@ -104,16 +104,45 @@ def test_a_photo_is_found_by_the_longest_name_that_ends_its_path(tmp_path: Path)
         name_in_model(model, Path("/photos/9.png"))
 
 
-def test_panoramas_are_refused_in_one_line(tmp_path: Path) -> None:
-    write_text_model(tmp_path)
-    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 64 32 64 32\n")
-    with pytest.raises(FileFormatError, match="has no z axis; render perspective views"):
-        read_model(tmp_path)
+def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:
+    write_text_model(tmp_path, points=3)
+    (tmp_path / "points3D.txt").write_text(
+        "# comment\n\n7 1 2 3 9 8 7 0.5 1 0 2 0\n8 4 5 6 9 8 7 1\n"
+    )
+    model = read_model(tmp_path)
+    assert (model.points.xyz.tolist(), model.points.error.tolist()) == (
+        [[1, 2, 3], [4, 5, 6]], [0.5, 1],
+    )  # fmt: skip
+    assert model.points.track.tolist() == [2, 0]
+    assert model.images["b.png"].points.tolist() == [1, 2, 3]
+    assert model.images["b.png"].translation.tolist() == [0.1, 0, 0]
 
 
-def test_an_image_whose_camera_is_missing_is_named(tmp_path: Path) -> None:
+IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"
+
+
+@pytest.mark.parametrize(
+    ("part", "text", "message"),
+    [
+        ("cameras", "1 EQUIRECTANGULAR 64 32 64 32\n", "has no z axis; render perspective views"),
+        ("cameras", "5 PINHOLE 64 48 50 52 32 24\n", r"has camera 1, which cameras\.txt lacks"),
+        ("cameras", "# x\n1 PINHOLE 64\n", "line 2: '1 PINHOLE 64' is not CAMERA_ID, MODEL"),
+        ("cameras", "1 PINHOLE 64 48\n", "line 1: a PINHOLE camera has 4 parameters, not 0"),
+        ("cameras", "\n\n1 PINHOLE 64 48 1 2 3 x\n", "line 3: .* is not numbers of a camera"),
+        (
+            "images", f"{IMAGE}5 5 -1\n\n{IMAGE}",
+            "line 4: the line of keypoints after it is missing",
+        ),
+        ("images", f"{IMAGE}5 5\n", "line 1: .* is not an image and its keypoints"),
+        ("images", "1 1 0 0 0 0 0 0 1\n\n", "line 1: .* is not an image and its keypoints"),
+        ("points3D", "# x\n7 1 2 3 9 8 7 0.5 1\n", "line 2: .* is not a point and its track"),
+        ("points3D", "7 1 2 3 9 8 7\n", "line 1: .* is not a point and its track"),
+    ],
+)  # fmt: skip
+def test_a_faulty_line_of_a_text_model_is_named(
+    part: str, text: str, message: str, tmp_path: Path
+) -> None:
     write_text_model(tmp_path)
-    cameras = tmp_path / "cameras.txt"
-    cameras.write_text(cameras.read_text().replace("1 PINHOLE", "5 PINHOLE"))
-    with pytest.raises(FileFormatError, match=r"has camera 1, which cameras\.txt lacks"):
+    (tmp_path / f"{part}.txt").write_text(text)
+    with pytest.raises(FileFormatError, match=message):
         read_model(tmp_path)

@@ -8,6 +8,7 @@ import pytest
 from pnpdepth_cli.io.depth import describe_range, implausible
 
 PNG = "16-bit PNG ÷ 256"
+OTHER = "if it holds millimetres, --depth-scale 1000 makes it 0.8–3.4 m"
 
 
 @pytest.mark.parametrize(
@@ -19,21 +20,10 @@ PNG = "16-bit PNG ÷ 256"
         ([0.034, 0.97], "x", False, "2 points, 0.034–1.0 m (x)"),
         ([12, 12345.6], "x", False, "2 points, 12.0–12,345.6 m (x)"),
         ([0.0001, 2], "x", False, "2 points, 1.0e-04–2.0 m (x)"),
-        (
-            [2.125, 63.4] * 500,
-            PNG,
-            True,
-            f"1,000 points, 2.1–63.4 m ({PNG}; --depth-scale to change)",
-        ),
+        ([2, 63.4] * 500, PNG, True, f"1,000 points, 2.0–63.4 m ({PNG}; --depth-scale to change)"),
         ([3, 13], "PNG ÷ 1000", True, "2 points, 3.0–13.0 m (PNG ÷ 1000; --depth-scale to change)"),
         ([3.125, 13.28], PNG, False, f"2 points, 3.1–13.3 m ({PNG})"),
-        (
-            [3.125, 13.28],
-            PNG,
-            True,
-            f"2 points, 3.1–13.3 m ({PNG} assumed; if it holds millimetres, --depth-scale 1000"
-            " makes it 0.8–3.4 m)",
-        ),
+        ([3.125, 13.28], PNG, True, f"2 points, 3.1–13.3 m ({PNG} assumed; {OTHER})"),
     ],
 )
 def test_the_range_has_count_ends_and_what_was_assumed(

@@ -56,12 +56,10 @@ def ones(*names: str) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("text", "scale", "used", "end"),
     [
-        (None, None, 256, "÷ 256"),
-        (None, 1000, 1000, "÷ 1000"),
-        ("1000", None, 1000, "÷ 1000 (from the file)"),
-        ("1000", 500, 500, "÷ 500"),
+        (None, None, 256, "÷ 256"), (None, 1000, 1000, "÷ 1000"),
+        ("1000", None, 1000, "÷ 1000 (from the file)"), ("1000", 500, 500, "÷ 500"),
     ],
-)
+)  # fmt: skip
 def test_a_given_scale_beats_that_in_the_file_which_beats_kittis(
     name: str, text: str | None, scale: float | None, used: float, end: str, tmp_path: Path
 ) -> None:
@@ -89,6 +87,7 @@ GREY = {"R": METRES, "G": METRES, "B": METRES, "A": np.ones_like(METRES)}
 UNSIGNED, HALVES = {"Z": np.array([[512, 0]], np.uint32)}, np.array([[0, 128]], np.uint8)
 BOTTOM_UP = METRES[::-1]
 PFM = b"Pf\n3 2\n-1.0\n" + BOTTOM_UP.astype("<f4").tobytes()
+UNKNOWN = "16-bit PNG ÷ 256, 2 pixels of value 65535 taken as unknown"
 FACTOR = "PFM, scale factor 0.25 of its header not applied"
 
 
@@ -122,12 +121,7 @@ FACTOR = "PFM, scale factor 0.25 of its header not applied"
         ("d.pfm", PFM, KNOWN, "PFM"),
         ("d.pfm", b"Pf 3 2 1\n" + BOTTOM_UP.astype(">f4").tobytes(), KNOWN, "PFM"),
         ("d.pfm", b"Pf\n1 1\n-0.25\n" + np.float32(2).tobytes(), [[2]], FACTOR),
-        (
-            "d.png",
-            np.array([[65535, 256, 65535]], np.uint16),
-            [[0, 1, 0]],
-            "16-bit PNG ÷ 256, 2 pixels of value 65535 taken as unknown",
-        ),
+        ("d.png", np.array([[65535, 256, 65535]], np.uint16), [[0, 1, 0]], UNKNOWN),
     ],
 )
 def test_every_format_gives_metres_where_they_are_finite_and_above_zero(
@@ -242,12 +236,10 @@ def test_a_subsampled_exr_channel_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("corner", "rows", "columns"),
     [
-        ((1, 1), (1, 3), (1, 4)),
-        ((-1, -1), (0, 1), (0, 2)),
-        ((3, 2), (2, 4), (3, 5)),
+        ((1, 1), (1, 3), (1, 4)), ((-1, -1), (0, 1), (0, 2)), ((3, 2), (2, 4), (3, 5)),
         ((9, 9), 0, 0),
     ],
-)
+)  # fmt: skip
 def test_a_cropped_exr_is_placed_in_its_display_window(
     tmp_path: Path, corner: tuple[int, int], rows: Any, columns: Any
 ) -> None:

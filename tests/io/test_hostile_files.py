@@ -7,15 +7,19 @@ import struct
 import subprocess
 import sys
 import zlib
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from PIL import Image
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.decoding import check_tags
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import check_pixel_count
+from pnpdepth_cli.io.formats.images import _check_header
 from pnpdepth_cli.io.rgb import read_rgb
 from tests.exr_files import (
     DEEP,
@@ -203,3 +207,22 @@ def test_a_pixel_is_one_channel_of_one_byte_unless_told(sixteen: str) -> None:
     check_pixel_count(Path("a.tif"), 4000, 8000, **{sixteen: 16})  # the budget to the byte
     with pytest.raises(FileFormatError, match="in 512,064,000 bytes, more than 512,000,000"):
         check_pixel_count(Path("a.tif"), 4000, 8001, **{sixteen: 16})
+
+
+def test_an_exr_has_four_bytes_a_pixel_of_every_channel() -> None:
+    channel = SimpleNamespace(name="Z", xSampling=1, ySampling=1)
+    header = dict.fromkeys(("dataWindow", "displayWindow"), ((0, 0), (3999, 3999)))
+    _check_header(Path("a.exr"), header | {"channels": [channel] * 8}, 1 << 30)
+    with pytest.raises(FileFormatError, match="in 576,000,000 bytes, more than 512,000,000"):
+        _check_header(Path("a.exr"), header | {"channels": [channel] * 9}, 1 << 30)
+
+
+def test_the_tags_of_a_tiff_claim_as_many_bytes_as_their_types_have() -> None:
+    sizes = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
+    for kind, size in sizes.items():
+        for order in "<>":
+            for number in (240 // size, 240 // size + 1):
+                page = struct.pack(f"{order}IHHHIII", 8, 1, 256, kind, number, 0, 0)
+                data = ((b"II*\0" if order == "<" else b"MM\0*") + page).ljust(240, b"\0")
+                with nullcontext() if number * size <= 240 else pytest.raises(ValueError):
+                    check_tags(data)

@@ -34,9 +34,7 @@ def test_numpy_values_paths_and_dataclasses_become_plain_and_nan_null(tmp_path: 
     }  # fmt: skip
 
 
-def test_the_text_is_readable_and_what_json_cannot_hold_leaves_the_old_file(
-    tmp_path: Path,
-) -> None:
+def test_the_text_is_readable_and_what_json_cannot_hold_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "r.json"
     write_json(path, {"name": "Tübingen", "δ1": 0.5})
     with pytest.raises(TypeError):

@@ -12,14 +12,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, OutputError, SizeError
-from pnpdepth_cli.io.colours import (
-    UNKNOWN,
-    DepthScale,
-    depth_scale,
-    paint_signed,
-    round_steps,
-)
-from pnpdepth_cli.io.figure import draw_discs, figure_content, magnification
+from pnpdepth_cli.io.colours import UNKNOWN, DepthScale, depth_scale, paint_signed, round_steps
+from pnpdepth_cli.io.figure import _labels, draw_discs, figure_content, magnification, resized
 from pnpdepth_cli.io.visualisation import (
     error_map,
     improvement,
@@ -283,3 +277,22 @@ def test_what_is_no_figure_is_an_input_error(tmp_path: Path) -> None:
     Image.new("RGB", (4, 4)).save(path)
     with pytest.raises(FileFormatError, match="no figure of this program"):
         figure_content(path)
+
+
+def test_a_reduced_image_has_means_and_an_enlarged_one_squares() -> None:
+    pixels = np.array([[0, 2], [4, 6]], np.float32)
+    assert resized(pixels, 0.5).tolist() == [[3]]
+    assert resized(pixels, 2).tolist() == pixels.repeat(2, 0).repeat(2, 1).tolist()
+
+
+@pytest.mark.parametrize(
+    ("ticks", "labels"),
+    [
+        ([1.0, 1.05, 1.1], ["1.00", "1.05", "1.10"]), ([0.25, 8], ["0.2", "8.0"]),
+        ([10, 2000], ["10", "2,000"]), ([0, 0.5], ["0", "0"]), ([], []),
+    ],
+)  # fmt: skip
+def test_ticks_have_as_many_decimals_as_tell_them_apart(
+    ticks: list[float], labels: list[str]
+) -> None:
+    assert _labels(ticks) == list(zip(ticks, labels, strict=True))

@@ -14,10 +14,7 @@ from model_zoo_defs.adnn import Adnn, analysed, definitions, synthesised
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
-from tests.model_zoo_defs.cuts import (
-    built,
-    frame_for,
-)
+from tests.model_zoo_defs.cuts import built, frame_for
 
 Array = NDArray[np.float64]
 SHAPES = {"kernel0": (11, 11, 1, 8), "kernel1": (5, 5, 8, 16), "kernel2": (3, 3, 16, 32)}

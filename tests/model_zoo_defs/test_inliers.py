@@ -73,7 +73,7 @@ def test_on_a_grid_they_are_the_nearest_twelve() -> None:
 def test_points_without_neighbours_have_a_weight(shaken: InlierWeights, count: int) -> None:
     points = Points(sparse_map(count))
     weights = shaken(points, Cloud.of(points, images(1)))
-    assert bool(torch.isfinite(weights).all())
+    assert bool(((weights >= 0) & (weights <= 1)).all())
     assert torch.equal(weights != 1, points.mask > 0)
 
 

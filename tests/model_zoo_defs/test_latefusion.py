@@ -13,10 +13,7 @@ from model_zoo_defs.latefusion import Encoder, Halved, LateFusion, averaged, def
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
-from tests.model_zoo_defs.cuts import (
-    built,
-    frame_for,
-)
+from tests.model_zoo_defs.cuts import built, frame_for
 
 TINY = definitions["latefusion-tiny"]
 

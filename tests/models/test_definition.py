@@ -13,13 +13,7 @@ import torch
 from torch import nn
 
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import (
-    Fixed,
-    ModelDefinition,
-    Multiple,
-    Near,
-    Normalisation,
-)
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near, Normalisation
 from pnpdepth_cli.settings import Settings
 
 

@@ -16,12 +16,11 @@ from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.aligned import AlignedDepth
-from pnpdepth_cli.models.definition import Fixed, Near
 from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
+from tests.models.test_hugging_face_settings import PROCESSING, changed
 from tests.models.weights.files import little
 
 transformers = pytest.importorskip("transformers", reason="needs the extra [hf]")
@@ -107,36 +106,16 @@ def depth_pro() -> Any:
     return transformers.DepthProForDepthEstimation(config)
 
 
-IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
-HALF = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
-ASPECT = {"keep_aspect_ratio": True, "do_resize": True}
-NETWORKS: dict[str, tuple[Any, dict[str, Any], tuple[str, str]]] = {
-    "depth_anything": (
-        depth_anything,
-        {**IMAGENET, **ASPECT, "size": {"height": 56, "width": 56}, "ensure_multiple_of": 14},
-        ("inverse", "affine"),
-    ),
-    "prompt_depth_anything": (
-        prompt_depth_anything,
-        {**IMAGENET, **ASPECT, "size": {"height": 56, "width": 56}, "ensure_multiple_of": 14},
-        ("depth", "metric"),
-    ),
-    "dpt": (dpt, {**HALF, "size": {"height": 64, "width": 64}}, ("unknown", "affine")),
-    "zoedepth": (
-        zoedepth,
-        {**HALF, **ASPECT, "size": {"height": 64, "width": 96}, "ensure_multiple_of": 32},
-        ("depth", "metric"),
-    ),
-    "glpn": (glpn, {"size_divisor": 32, "do_rescale": True}, ("depth", "metric")),
-    "depth_pro": (depth_pro, {**HALF, "size": {"height": 64, "width": 64}}, ("inverse", "scale")),
-}
+MAKERS = {
+    "depth_anything": depth_anything, "prompt_depth_anything": prompt_depth_anything, "dpt": dpt,
+    "zoedepth": zoedepth, "glpn": glpn, "depth_pro": depth_pro,
+}  # fmt: skip
 
 
 def saved(folder: Path, name: str) -> Path:
-    make, processing, _ = NETWORKS[name]
     torch.manual_seed(0)
-    make().save_pretrained(folder)
-    (folder / "preprocessor_config.json").write_text(json.dumps(processing))
+    MAKERS[name]().save_pretrained(folder)
+    (folder / "preprocessor_config.json").write_text(json.dumps(PROCESSING[name]))
     return folder
 
 
@@ -150,13 +129,12 @@ def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_network")
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", MAKERS)
 def test_a_folder_loads_lists_layers_and_refines_without_network_access(
     tmp_path: Path, name: str
 ) -> None:
     network = load_network(str(saved(tmp_path / name, name)), None)
     definition = network.definition
-    assert (definition.output_kind, definition.output_scale) == NETWORKS[name][2]
     assert definition.layers
     frame = FrameMap.fit(definition.size, 60, 90)
     chosen = torch.randperm(60 * 90, generator=torch.Generator().manual_seed(0))[:100]
@@ -181,64 +159,6 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
     assert bool((result.after > 0).all())
 
 
-def test_prompt_depth_anything_receives_the_points_as_coarse_dense_depth(tmp_path: Path) -> None:
-    definition = hf_definition(saved(tmp_path / "p", "prompt_depth_anything"))
-    assert definition.input_kind == "rgb+sparse"
-    sparse = torch.zeros(1, 1, 384, 512)  # twice the prompt's size: a plane that rises to the right
-    for row, column in ((0, 0), (0, 511), (383, 0), (383, 511), (100, 300)):
-        sparse[0, 0, row, column] = 1 + column / 511
-    _, prompt = definition.call_arguments(torch.rand(1, 3, 384, 512), sparse)
-    assert prompt.shape == (1, 1, 192, 256)
-    rising = 1 + (2 * torch.arange(256) + 0.5) / 511
-    assert torch.allclose(prompt[0, 0, 1:-1, 1:-1], rising[1:-1].expand(190, -1), atol=1e-3)
-
-
-def changed(folder: Path, name: str, change: dict[str, Any]) -> Path:
-    settings = json.loads((folder / name).read_text())
-    (folder / name).write_text(json.dumps(settings | change))
-    return folder
-
-
-def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_path: Path) -> None:
-    folder = saved(tmp_path / "a", "depth_anything")
-    assert hf_definition(folder).size == Near(of=14, height=56, width=56)
-    definition = hf_definition(changed(folder, "config.json", {"depth_estimation_type": "metric"}))
-    assert (definition.output_kind, definition.default_alignment) == ("depth", "none")
-    assert hf_definition(saved(tmp_path / "d", "dpt")).size == Fixed(64, 64)
-    folder = saved(tmp_path / "z", "zoedepth")
-    changed(folder, "preprocessor_config.json", {"ensure_multiple_of": 1 / 32})  # of the image
-    assert hf_definition(folder).size == Near(of=32, height=64, width=96)
-    assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
-    assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
-    assert FrameMap.fit(Near(of=14, height=518, width=518), 5, 9).network == (294, 518)
-
-
-@pytest.mark.parametrize(
-    ("name", "size", "mean"),
-    [
-        ("depth_anything", Near(of=14, height=518, width=518), 0.485),
-        ("prompt_depth_anything", Near(of=14, height=756, width=756), 0.485),
-        ("dpt", Fixed(384, 384), 0.5),
-        ("zoedepth", Near(of=32, height=384, width=512), 0.5),
-        ("glpn", Near(of=32), 0.0),
-        ("depth_pro", Fixed(1536, 1536), 0.5),
-    ],
-)
-def test_a_folder_as_transformers_saves_it_is_prepared_as_usual_for_its_type(
-    name: str, size: Fixed | Near, mean: float, tmp_path: Path
-) -> None:
-    folder = saved(tmp_path / "net", name)
-    (folder / "preprocessor_config.json").unlink()
-    definition = hf_definition(folder)
-    assert definition.size == size
-    assert definition.normalisation is not None
-    assert definition.normalisation.mean[0] == mean
-    assert f"no preprocessor_config.json; assumed, as usual for {name}" in definition.assumed
-
-
-# ------------------------------------------------------------------ what is refused
-
-
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return saved(tmp_path_factory.mktemp("original") / "net", "glpn")
@@ -248,26 +168,6 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(original: Path, tmp_path: Path) -> Path:
     """A folder of a GLPN."""
     return Path(shutil.copytree(original, tmp_path / "net"))
-
-
-def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
-    (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
-    with pytest.raises(CheckpointError, match=r"pnpdepth models convert .*pytorch_model\.bin"):
-        hf_definition(folder)
-    (folder / "pytorch_model.bin").unlink()
-    with pytest.raises(CheckpointError, match="no model"):
-        hf_definition(folder)
-    for text, message in (
-        ('{"model_type": "bert"}', "'bert' are not known"),
-        ("{", "is not JSON"),
-        ('{"a":' + "[" * 100_000 + "]" * 100_000 + "}", "is not JSON"),
-    ):
-        (folder / "config.json").write_text(text)
-        with pytest.raises(ModelError, match=message):
-            hf_definition(folder)
-    (folder / "config.json").unlink()
-    with pytest.raises(ModelError, match=r"config\.json is missing"):
-        hf_definition(folder)
 
 
 @pytest.mark.parametrize(
@@ -315,38 +215,6 @@ def test_a_network_larger_than_its_weights_or_of_fetched_code_is_not_built(
         pytest.raises((CheckpointError, ModelError), match=message),
     ):
         load_network(str(folder), None)
-
-
-def test_plain_attention_is_taken(folder: Path) -> None:
-    assert hf_definition(changed(folder, "config.json", {"attn_implementation": "sdpa"}))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"size_divisor": "x"},
-        {"size_divisor": [32]},
-        {"size_divisor": 10**12},
-        {"rescale_factor": None},
-        {"rescale_factor": 0},
-        {"rescale_factor": 10**400},
-        {"do_normalize": True, "image_mean": {"r": 1}},
-        {"do_normalize": True, "image_std": [10**400] * 3},
-        {"size": [1, 2]},
-        {"size": {"height": "x", "width": 3}},
-        {"size": 10**9},
-    ],
-)
-def test_settings_that_are_no_numbers_are_refused_in_one_line(
-    change: dict[str, Any], folder: Path
-) -> None:
-    (folder / "preprocessor_config.json").write_text(json.dumps({"size_divisor": 32} | change))
-    if "size" in change:
-        (folder / "preprocessor_config.json").write_text(json.dumps(change))
-    with pytest.raises(ModelError, match=r"preprocessor_config\.json: ") as error:
-        hf_definition(folder)
-    assert "\n" not in str(error.value)
-    assert len(str(error.value)) < 600
 
 
 def test_code_in_a_folder_is_never_run(folder: Path, tmp_path: Path) -> None:

@@ -16,12 +16,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
 from pnpdepth_cli.models.frame import FrameMap
-from pnpdepth_cli.models.network import (
-    FARTHEST_DEPTH,
-    Network,
-    find_device,
-    load_network,
-)
+from pnpdepth_cli.models.network import FARTHEST_DEPTH, Network, find_device, load_network
 from pnpdepth_cli.points import SparsePoints
 
 POINTS = SparsePoints(
@@ -217,9 +212,7 @@ class Nothing(Plain):
 """
 
 
-def test_a_forward_without_gradient_or_output_is_refused(
-    tmp_path: Path,
-) -> None:
+def test_a_forward_without_gradient_or_output_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "nets.py"
     file.write_text(FORWARDS)
     assert load_network(f"{file}:Plain", None).definition.layers == ("down",)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.sensors.camera import LENS_MODELS, Camera, distort, largest_radius, undistort
+from pnpdepth_cli.sensors.mesh import _without_lens
 
 K = np.array([[420.0, 0, 320], [0, 410, 240], [0, 0, 1]])
 small = st.floats(-0.05, 0.05)
@@ -20,7 +21,7 @@ EXAMPLES: dict[str, tuple[float, ...]] = {
     "fov": (0.9,),
     "thin-prism-fisheye": (-0.02, 0.01, 0.001, -0.002, -0.003, 0.001, 0.002, -0.001),
     "rad-tan-thin-prism-fisheye": (
-        *(-0.02, 0.01, -0.003, 0.001, 0.0, 0.0, 0.001, -0.002, 0.002, 0.0, -0.001, 0.001),
+        *(-0.02, 0.01, -0.003, 0.001, 2e-4, -1e-4, 0.001, -0.002, 0.002, 0.003, -0.001, 0.004),
     ),
     "division": (-0.15,),
     "eucm": (0.6, 1.1),
@@ -43,7 +44,7 @@ def test_every_lens_of_the_list_is_implemented() -> None:
     ),
 )
 def test_radial_tangential_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
-    points = np.column_stack([directions(seed, 0.6), np.ones(60)])
+    points = 3 * np.column_stack([directions(seed, 0.6), np.ones(60)])
     camera = Camera(intrinsics=K, distortion=coefficients)
     theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(coefficients))
     np.testing.assert_allclose(camera.pixels_of(points), theirs[:, 0], atol=1e-6)
@@ -52,7 +53,7 @@ def test_radial_tangential_is_opencvs(seed: int, coefficients: tuple[float, ...]
 @settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), coefficients=st.tuples(*[small] * 4))
 def test_fisheye_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
-    points = np.column_stack([directions(seed), np.ones(60)])
+    points = 3 * np.column_stack([directions(seed), np.ones(60)])
     camera = Camera(intrinsics=K, distortion=coefficients, lens="fisheye")
     theirs, _ = cv2.fisheye.projectPoints(
         points[:, None], np.zeros(3), np.zeros(3), K, np.array(coefficients)
@@ -60,20 +61,61 @@ def test_fisheye_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
     np.testing.assert_allclose(camera.pixels_of(points), theirs[:, 0], atol=1e-6)
 
 
+SHOWN = {
+    "fov": (0.488792792406, 0.293275675444, -0.876695378841, 0.584463585894),
+    "thin-prism-fisheye": (0.449895921553, 0.269937552932, -0.796648971454, 0.531099314303),
+    "rad-tan-thin-prism-fisheye": (0.45144503903, 0.269709899078, -0.785131572445, 0.527469384902),
+    "division": (0.476810480135, 0.286086288081, -0.960256125229, 0.640170750153),
+    "eucm": (0.453183236583, 0.27190994195, -0.806467553733, 0.537645035822),
+}
+"""x, y, x, y of two points as pycolmap 4.2.1 printed them."""
+
+
+@pytest.mark.parametrize("lens", SHOWN)
+def test_the_other_lenses_show_points_where_pycolmap_does(lens: str) -> None:
+    shown = distort(np.array([[0.5, 0.3], [-1.2, 0.8]]), lens, EXAMPLES[lens])
+    np.testing.assert_allclose(shown.ravel(), SHOWN[lens], rtol=0, atol=1e-11)
+    near, nearer = (distort(np.array([[x, 0.0]]), lens, EXAMPLES[lens])[0, 0] for x in (1e-6, 1e-9))
+    assert nearer == pytest.approx(near / 1000)
+
+
 @pytest.mark.parametrize("lens", LENSES)
 def test_undoing_a_lens_gives_the_directions_back(lens: str) -> None:
-    plane = directions(0, 0.7)
+    turn, out = np.linspace(0, 40, 99), np.linspace(0, 5, 99)  # from the axis to 79 degrees
+    plane = np.column_stack([out * np.cos(turn), out * np.sin(turn)])
     shown = distort(plane, lens, EXAMPLES[lens])
-    assert np.abs(shown - plane).max() > 1e-3
-    np.testing.assert_allclose(undistort(shown, lens, EXAMPLES[lens]), plane, rtol=0, atol=1e-9)
+    assert np.abs(shown - plane).max() > 0.1
+    np.testing.assert_allclose(undistort(shown, lens, EXAMPLES[lens]), plane, rtol=0, atol=1e-12)
 
 
 def test_a_fisheye_that_turns_back_shows_nothing_beyond() -> None:
     turns_back = (-0.2, 0.0, 0.0, 0.0)  # angle − 0.2 angle³ has its maximum at 1.29 radians
     assert largest_radius("fisheye", turns_back) == pytest.approx(np.tan(1.29), rel=0.01)
-    beyond, shown = distort(np.array([[4.0, 0.0], [1.0, 0.0]]), "fisheye", turns_back)
+    beyond, *shown = distort(np.array([[4.0, 0], [3.0, 0], [1.0, 0]]), "fisheye", turns_back)
     assert np.isnan(beyond).all()
-    assert shown.tolist() == pytest.approx([np.pi / 4 - 0.2 * (np.pi / 4) ** 3, 0])
+    angle = np.arctan([3.0, 1.0])
+    np.testing.assert_allclose(shown, np.column_stack([angle - 0.2 * angle**3, [0, 0]]))
+
+
+@pytest.mark.parametrize(
+    ("lens", "radial"),
+    [
+        ("radial-tangential", "11001"), ("thin-prism-fisheye", "11001100"),
+        ("rad-tan-thin-prism-fisheye", "111111000000"),
+    ],
+)  # fmt: skip
+def test_a_lens_turns_back_by_its_radial_coefficients_alone(lens: str, radial: str) -> None:
+    for number, turns in enumerate(radial):
+        alone = tuple(-9.0 if i == number else 0.0 for i in range(len(radial)))
+        assert (largest_radius(lens, alone) < np.inf) == (turns == "1")
+
+
+def test_an_image_without_its_lens_is_unknown_where_the_lens_shows_nothing() -> None:
+    barrel = (-0.4, 0.0, 0.0, 0.0)
+    camera = Camera(intrinsics=np.array([[9.0, 0, 10], [0, 9, 10], [0, 0, 1]]), distortion=barrel)
+    seen = _without_lens(np.ones((21, 21), np.float32), camera)
+    radius = np.hypot(*(np.mgrid[:21, :21] - 10)) / 9
+    assert np.array_equal(seen == 1, radius <= largest_radius("radial-tangential", barrel))
 
 
 def test_a_point_that_the_lens_shows_nothing_at_has_no_direction() -> None:

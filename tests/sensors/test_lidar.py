@@ -10,12 +10,11 @@ from pnpdepth_cli.sensors import LIDARS, Lidar
 @pytest.mark.parametrize(
     ("name", "beams", "top", "bottom", "step", "most_m", "noise_m"),
     [
-        ("vlp-16", 16, 15.0, -15.0, 0.2, 100, 0.03),
-        ("vlp-32c", 32, 15.0, -25.0, 0.2, 200, 0.03),
+        ("vlp-16", 16, 15.0, -15.0, 0.2, 100, 0.03), ("vlp-32c", 32, 15.0, -25.0, 0.2, 200, 0.03),
         ("hdl-32e", 32, 10.67, -30.67, 0.166, 100, 0.02),
         ("hdl-64e", 64, 2.0, -24.33, 0.1728, 120, 0.02),
     ],
-)
+)  # fmt: skip
 def test_a_sensor_is_that_of_its_data_sheet(
     name: str, beams: int, top: float, bottom: float, step: float, most_m: float, noise_m: float
 ) -> None:
@@ -57,20 +56,35 @@ def test_directions_are_unit_vectors_at_the_sensors_angles() -> None:
     np.testing.assert_allclose(beams[1, 1, :2], [0, np.cos(np.radians(10))], atol=1e-12)
 
 
+def lidar(**values: object) -> Lidar:
+    right = {"name": "x", "elevations_deg": (0.0,), "azimuth_step_deg": 1.0, "max_range": 5.0}
+    return Lidar(**(right | values))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
-    "values",
+    ("name", "wrong", "right", "message"),
     [
-        {"elevations_deg": ()},
-        {"elevations_deg": (91.0,)},
-        {"elevations_deg": (float("nan"),)},
-        {"azimuth_step_deg": 0.0},
-        {"max_range": 0.0},
-        {"range_noise": -0.1},
-        {"dropout": 1.0},
-        {"rotation_noise_deg": float("nan")},
+        ("elevations_deg", [(), (90.1,), (np.nan,)], [(-90.0, 90.0)], "between −90° and 90°"),
+        ("azimuth_step_deg", [0.0, 0.0009, 360.1, np.nan], [0.001, 360.0], "must be 0.001 to 360"),
+        ("max_range", [0.0, -1.0, np.nan], [0.1], "max_range must be > 0"),
+        ("range_noise", [-0.1, np.inf, np.nan], [0.0], "noise must be >= 0"),
+        ("angle_noise_deg", [-0.1, np.inf], [0.0, 400.0], "noise must be >= 0"),
+        ("rotation_noise_deg", [-0.1, 360.1, np.nan], [0.0, 360.0], "must be 0 to 360"),
+        ("dropout", [-0.1, 1.0, np.nan], [0.0, 0.99], "must be >= 0 and < 1"),
     ],
 )
-def test_a_sensor_that_cannot_be_is_refused(values: dict[str, object]) -> None:
-    right = {"name": "x", "elevations_deg": (0.0,), "azimuth_step_deg": 1.0, "max_range": 5.0}
-    with pytest.raises(UsageError, match="sensor 'x'"):
-        Lidar(**(right | values))  # type: ignore[arg-type]
+def test_a_sensor_that_cannot_be_is_refused_and_one_at_the_bounds_taken(
+    name: str, wrong: list[object], right: list[object], message: str
+) -> None:
+    for value in wrong:
+        with pytest.raises(UsageError, match=f"sensor 'x': .*{message}"):
+            lidar(**{name: value})
+    for value in right:
+        assert getattr(lidar(**{name: value}), name) == value
+
+
+def test_at_most_two_to_the_23_rays_are_measured() -> None:
+    angles = tuple(np.linspace(-1, 1, 1 << 12).tolist())
+    lidar(elevations_deg=angles, azimuth_step_deg=360 / 2048)
+    with pytest.raises(UsageError, match="it measures 8,392,704 points per revolution"):
+        lidar(elevations_deg=angles, azimuth_step_deg=360 / 2049)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,8 @@ def test_the_motion_between_two_scans_is_found_without_images() -> None:
     estimate = motion_of_scans(own, ahead, ROOM_CAMERA)
     assert estimate.motion is not None
     np.testing.assert_allclose(estimate.motion, from_ahead(0.3), atol=0.02)
+    twice = replace(ahead, depth=2 * ahead.depth)  # most of it lies beyond all of the other
+    assert "agree" in motion_of_scans(own, twice, ROOM_CAMERA).basis
 
 
 def test_scans_need_small_gicp_which_the_message_names(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,15 +51,10 @@ def boards_before_a_wall(*, keep_occluded: bool = True) -> Points:
     on_board = (np.floor(5 * y / 0.25) % 2 == 0) & (np.abs(5 * z) < 0.4)
     x = np.where(on_board, 5.0, 20.0)
     camera = Camera(
-        intrinsics=INTRINSICS,
-        rotation=FORWARD_LEFT_UP,
-        translation=np.array([0.06, -0.08, -0.27]),
+        intrinsics=INTRINSICS, rotation=FORWARD_LEFT_UP, translation=np.array([0.06, -0.08, -0.27])
     )
     scan = project_velodyne(
-        np.column_stack([x, x * y, x * z]),
-        camera,
-        SIZE,
-        keep_occluded=keep_occluded,
+        np.column_stack([x, x * y, x * z]), camera, SIZE, keep_occluded=keep_occluded
     )
     return points_of(as_depth_image(scan))
 

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import NoPointsError, UsageError
-from pnpdepth_cli.sensors import (
-    FORWARD_LEFT_UP,
-    Camera,
-    as_depth_image,
-    project_velodyne,
-)
+from pnpdepth_cli.sensors import FORWARD_LEFT_UP, Camera, as_depth_image, project_velodyne
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 SIZE = (80, 101)

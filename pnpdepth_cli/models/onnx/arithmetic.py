@@ -31,8 +31,7 @@ _UNARY = (
 
 
 def _divided(a: Tensor, b: Tensor) -> Tensor:
-    whole = not a.is_floating_point() and not b.is_floating_point()
-    return torch.div(a, b, rounding_mode="trunc") if whole else a / b
+    return a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")
 
 
 _BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {

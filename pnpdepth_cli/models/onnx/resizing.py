@@ -55,7 +55,7 @@ def _resized(x: Tensor, node: Node, factors: list[float], sizes: list[int] | Non
     if fast is not None:
         return fast
     for axis, (size, factor) in enumerate(zip(sizes, factors, strict=True)):
-        if size != x.shape[axis] or factor != 1:
+        if factor != 1:
             x = _along(x, axis, *_taps(node, x.shape[axis], size, factor))
     return x
 
@@ -102,8 +102,6 @@ def _taps(node: Node, size: int, out: int, factor: float) -> tuple[Tensor, Tenso
     if mode not in ("linear", "cubic"):
         raise Unsupported(f"mode {mode}")
     linear = mode == "linear"
-    if linear and not antialias:
-        position = position.clamp(0, size - 1)
     shrink = min(1.0, factor) if antialias else 1.0
     reach = math.ceil((1 if linear else 2) / shrink)
     index = position.floor().long()[:, None] + torch.arange(1 - reach, reach + 1)
@@ -134,11 +132,10 @@ def _coordinates(mode: str, size: int, out: int, factor: float) -> Tensor:
         return (o + 0.5) / scale
     if mode == "pytorch_half_pixel" and out == 1:
         return torch.zeros(out)
-    half = (o + 0.5) / scale - 0.5
     if mode == "half_pixel_symmetric":
-        return half + size / 2 * (1 - out / (scale * size))
+        return size / 2 * (1 - out / (scale * size)) + (o + 0.5) / scale - 0.5
     if mode in ("half_pixel", "pytorch_half_pixel"):
-        return half
+        return (o + 0.5) / scale - 0.5
     raise Unsupported(f"coordinate_transformation_mode {mode}")
 
 

@@ -85,10 +85,9 @@ def test_a_second_run_does_nothing_also_where_files_were_touched_or_moved(root: 
         (None, "out/b_preview.png", "result missing: b_preview.png"),
         ("rgb/c.png", "rgb/b.png", "input changed: image"),
         ("gt/a.png", "gt/b.png", "other input files"),
-        ("rgb/c.png", "out/b.json", "record damaged"),
-        (None, "out/b.json", "interrupted"),
+        ("rgb/c.png", "out/b.json", "record damaged"), (None, "out/b.json", "interrupted"),
     ],
-)
+)  # fmt: skip
 def test_only_what_is_missing_or_changed_is_done_again(
     root: Path, source: str | None, changed: str, why: str
 ) -> None:
@@ -199,7 +198,10 @@ def test_any_name_that_a_file_can_have_will_do(tmp_path: Path) -> None:
     listener = RecordingListener()
     batch(root, listener)
     assert {row["status"] for row in listener.rows} == {"done"}
-    assert (root / "out/two/a_depth.png").is_file()
+    written = {
+        os.fspath(path.relative_to(root / "out")) for path in root.glob("out/**/*_depth.png")
+    }
+    assert written == {f"{name}_depth.png" for name in names}
     assert sorted(row["name"] for row in summary(root)["frames"]) == names
     with (root / "out/summary.csv").open(encoding="utf-8", newline="") as file:
         in_table = [row["name"] for row in csv.DictReader(file)]
@@ -241,8 +243,7 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Pa
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("../up", "leads out of the output folder"),
-        ("/up", "leads out of the output folder"),
+        ("../up", "leads out of the output folder"), ("/up", "leads out of the output folder"),
         ("summary", "needs a file of the batch's own"),
         ("summary.csv/x", "needs a file of the batch's own"),
         (".batch.lock/x", "needs a file of the batch's own"),
@@ -251,7 +252,7 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Pa
         ("ok.json/deep/x", "needs a file of frame 'ok'"),
         ("ok_sigma", "needs a file of frame 'ok'"),
     ],
-)
+)  # fmt: skip
 def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
     root: Path, name: str, why: str
 ) -> None:
@@ -344,12 +345,21 @@ def test_a_record_that_lacks_what_the_summary_needs_is_an_error_that_names_it(ro
             batch(root)
 
 
-def test_a_batch_can_be_stopped_between_frames_and_goes_on(root: Path) -> None:
+def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left(
+    root: Path,
+) -> None:
     stops = iter([False, False, True])
     outcome = batch(root, stopped=lambda: next(stops))
     assert outcome.stopped
+    (root / "out" / "deep").mkdir()
+    for folder in ("out", "out/deep"):
+        (root / folder / ".0123456789ab").write_bytes(b"half")
     assert outcome.summary["counts"]["pending"] == 2
-    assert done(root) == ["c", "d"]
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.names == ["c", "d"]
+    assert "removed 2 half-written files of a run that was killed" in listener.messages
+    assert not list(root.rglob(".0123456789ab"))
 
 
 def test_frames_without_sparse_depth_need_to_be_sampled(root: Path, tmp_path: Path) -> None:

@@ -17,13 +17,7 @@ from pnpdepth_cli.commands.batch import ray_workers
 from pnpdepth_cli.commands.batch.records import remove_all_leftovers
 from pnpdepth_cli.commands.batch.request import ClusterOptions
 from pnpdepth_cli.errors import ClusterError
-from tests.commands.batches import (
-    RecordingListener,
-    add_frame,
-    batch,
-    pairs_on_disk,
-    results,
-)
+from tests.commands.batches import RecordingListener, add_frame, batch, pairs_on_disk, results
 
 pytest.importorskip("ray")
 pytestmark = [

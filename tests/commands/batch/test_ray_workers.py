@@ -18,12 +18,7 @@ from pnpdepth_cli.commands.batch.ray_workers import (
     rows_of_actors,
     software,
 )
-from pnpdepth_cli.commands.batch.request import (
-    LOCAL,
-    ClusterOptions,
-    parse_address,
-    ray_workers_of,
-)
+from pnpdepth_cli.commands.batch.request import LOCAL, ClusterOptions, parse_address, ray_workers_of
 from pnpdepth_cli.errors import ClusterError, ModelError, StorageError, UsageError
 
 Refine = Callable[[Sequence[int], bool], list[dict[str, Any]]]
@@ -63,13 +58,9 @@ def dies() -> None:
 
 
 def results(
-    refine: Refine,
-    count: int,
-    *,
-    worked: bool = False,
-    starts: Callable[[], None] = lambda: None,
+    refine: Refine, count: int, *, worked: bool = False, starts: Callable[[], None] = lambda: None,
     stopped: Callable[[], bool] = lambda: False,
-) -> tuple[dict[Any, Any], list[str]]:
+) -> tuple[dict[Any, Any], list[str]]:  # fmt: skip
     """The row of each frame, which is a number, and the messages."""
     messages: list[str] = []
     to_do: Any = range(count)
@@ -185,18 +176,14 @@ def test_addresses_of_clusters_and_what_is_none() -> None:
 @pytest.mark.parametrize(
     ("device", "options", "expected"),
     [
-        ("cuda:1", {}, None),
-        ("cuda:0,cuda:2", {}, (LOCAL, "cuda", (0, 2))),
-        ("all", {}, (LOCAL, "cuda", ())),
-        ("cpu", {"ray": "auto"}, ("auto", "cpu", ())),
+        ("cuda:1", {}, None), ("cuda:0,cuda:2", {}, (LOCAL, "cuda", (0, 2))),
+        ("all", {}, (LOCAL, "cuda", ())), ("cpu", {"ray": "auto"}, ("auto", "cpu", ())),
         ("cuda:1", {"ray_workers": 2}, "are of Ray workers; add --ray"),
-        ("cuda:0,cuda:0", {}, "name each GPU once"),
-        ("cuda,cuda", {}, "name each GPU once"),
-        ("cpu,cuda:0", {}, "workers run on cpu, cuda"),
-        ("mps,mps", {}, "workers run on cpu, cuda"),
+        ("cuda:0,cuda:0", {}, "name each GPU once"), ("cuda,cuda", {}, "name each GPU once"),
+        ("cpu,cuda:0", {}, "workers run on cpu, cuda"), ("mps,mps", {}, "workers run on cpu, cuda"),
         ("cuda:0,cuda:1", {"ray": "auto"}, "take --device cuda, and --ray-workers 2"),
     ],
-)
+)  # fmt: skip
 def test_which_devices_are_workers(device: str, options: dict[str, Any], expected: Any) -> None:
     if isinstance(expected, str):
         with pytest.raises(UsageError, match=expected):

@@ -195,10 +195,7 @@ def test_presigned_addresses_are_read_and_never_recorded(root: Path, bucket: Buc
 
 
 def test_the_command_names_what_is_wrong_with_an_address(
-    root: Path,
-    bucket: Bucket,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    root: Path, bucket: Bucket, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def ended(source: str, output: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as ended:

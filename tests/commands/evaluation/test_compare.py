@@ -197,10 +197,13 @@ SCORES = {
 }
 
 
+WITH_MRE = {stage: scores | {"mre": 0.5} for stage, scores in SCORES.items()}
+
+
 def test_a_batch_is_compared_with_what_it_started_from(tmp_path: Path) -> None:
     frames = [
         {"name": "drive/1", "status": "done", "scores": SCORES},
-        {"name": "drive/2", "status": "done", "scores": SCORES},
+        {"name": "drive/2", "status": "done", "scores": WITH_MRE},
         {"name": "drive/3", "status": "failed", "scores": None},
     ]
     (tmp_path / "summary.json").write_text(json.dumps({"counts": {}, "frames": frames}))
@@ -214,15 +217,14 @@ def test_a_batch_is_compared_with_what_it_started_from(tmp_path: Path) -> None:
 
 
 BROKEN = [
-    ("{}", "holds no scores"),
-    ('{"frames": []}', "holds no scores"),
+    ("{}", "holds no scores"), ('{"frames": []}', "holds no scores"),
     ('{"scores": null}', "holds no scores"),
     ('{"command": "eval"}', "does not hold scores as pnpdepth writes them"),
     ('{"frames": [{"scores": {}}]}', "does not hold scores as pnpdepth writes them"),
     ('{"scores": {"after": {"rmse": 1}}}', "does not hold scores as pnpdepth writes them"),
     ('{"command": "eval", "protocol": {"name": "other"}, "measures": []}', "does not hold scores"),
     ("nonsense", "not valid JSON"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "message"), BROKEN)

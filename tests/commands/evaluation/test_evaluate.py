@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,12 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.frames import load_frame
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.commands.evaluation.scoring import filled
 from pnpdepth_cli.commands.evaluation.tables import worst
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
+from pnpdepth_cli.io.dataset import Protocol
 from pnpdepth_cli.io.depth import write_depth
 
 
@@ -187,6 +191,15 @@ def test_missing_pixels_are_skipped_clamped_or_refused(two: Path) -> None:
     assert "--missing fail refuses" in (refused.frames[1].error or "")
 
 
+def test_an_interval_ends_at_what_the_measure_can_be(tmp_path: Path) -> None:
+    for name, depth in zip("abcdefgh", [2.0] * 6 + [2.1, 9.0], strict=True):
+        depth_file(tmp_path / "out" / f"{name}.npy", [[depth]])
+        depth_file(tmp_path / "gt" / f"{name}.npy", [[2]])
+    found = scored(tmp_path, resamples=200).interval or {}
+    assert (found["rmse"][0], found["delta1"][1]) == (0.0, 1.0)
+    assert found["rmse"][1] > 7 / 8 > found["delta1"][0]
+
+
 def test_few_groups_of_frames_have_no_interval_but_a_note(tmp_path: Path) -> None:
     for drive in ("a", "b"):
         for number in range(4):
@@ -291,17 +304,18 @@ def test_sparse_input_in_the_ground_truth_causes_a_warning_and_can_be_excluded(
     points[0, :4] = gt[0, :4]  # the ground truth itself
     points[1, :3] = gt[1, :3] + 0.2  # measured anew
     prediction = np.where(points > 0, points, gt + 1)
+    points[2, 0], prediction[2, 0] = gt[2, 0], 0  # not scored
     depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", prediction)
     depth_file(tmp_path / "sparse.npy", points)
     result = scored(tmp_path, sparse=tmp_path / "sparse.npy")
-    (warning,) = (n for n in result.notes if n.startswith("warning"))
-    assert "4 of the scored pixels (4.00%) have a point of the sparse input" in warning
+    (warning,) = (n for n in result.notes if "sparse input" in n)
+    assert "4 of the scored pixels (4.04%) have a point of the sparse input" in warning
     assert "--exclude-sparse" in warning
     without = scored(tmp_path, sparse=tmp_path / "sparse.npy", exclude_sparse=True)
-    assert without.frames[0].known == 93
+    assert without.frames[0].known == 92
     assert without.mean["mae"] == pytest.approx(1)
-    assert not [n for n in without.notes if n.startswith("warning")]
+    assert not [n for n in without.notes if "sparse input" in n]
 
 
 def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) -> None:
@@ -345,6 +359,8 @@ def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) 
     for folder, codes in (("out", [[65535, 512]]), ("gt", [[256, 512]])):
         (tmp_path / folder).mkdir()
         cv2.imwrite(str(tmp_path / folder / "a.png"), np.array(codes, np.uint16))
+    assert filled(np.array([[0, 0.5, 0]], np.float32)).tolist() == [[0.5, 0.5, 0.5]]
+    assert filled(np.zeros((1, 2), np.float32)).tolist() == [[0, 0]]
     devkit = scored(tmp_path, protocol="kitti-devkit")
     assert devkit.mean["mae"] == pytest.approx((65535 / 256 - 1) / 2)
     assert scored(tmp_path).frames[0].pixels == 1
@@ -377,6 +393,7 @@ def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Pa
     result = scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole")
     error = (predictions - depths)[:, 45:471, 41:601].astype(np.float64)
     expected = np.sqrt((error**2).mean(axis=(1, 2))).mean()
+    assert "gt: .mat array" in result.notes
     assert result.mean["rmse"] == pytest.approx(expected, rel=1e-6)
     assert scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole").mean == result.mean
     with pytest.raises(InputError, match=r"no frame could be scored; the first: .*304×228"):
@@ -464,5 +481,10 @@ def test_measures_of_the_scene_need_intrinsics(sequences: Path) -> None:
     result = scored(sequences, groups=("cloud", "normals"), calib=sequences / "K.txt")
     assert 0 < result.mean["f_score"] < 1
     assert 0 < result.mean["normal_angle"] < 90
+    pair = result.frames[0].pair
+    cut = replace(pair.frame, protocol=Protocol(name="cut", crop=(4, 6)))
+    cut_out = load_frame(replace(pair, prediction=None, frame=cut), result.protocol, result.request)
+    assert cut_out.intrinsics is not None
+    assert cut_out.intrinsics.tolist() == [[50, 0, 15 - 12], [0, 50, 10 - 8], [0, 0, 1]]
     with pytest.raises(InputError, match="--measures distance needs the sparse depth of frame"):
         scored(sequences, groups=("distance",))

@@ -64,42 +64,29 @@ def test_a_stem_names_its_frame(stem: str, name: str) -> None:
 
 MATCHED = [
     (  # the files of a refinement, and ground truth without images
-        [
-            "b_depth.png",
-            "b_preview.png",
-            "b_sigma_preview.png",
-            "b_improvement.png",
-            "ä ö_depth.exr",
-            "b.png",
-        ],
+        [f"b_{part}.png" for part in ("depth", "preview", "sigma_preview", "improvement")]
+        + ["ä ö_depth.exr", "b.png"],
         ["b.png", "ä ö.npy"],
         {"b": "b_depth.png", "ä ö": "ä ö_depth.exr"},
         ["out: ignored, as there is a _depth of each: b.png"],
     ),
     (  # frames in folders of their own
-        ["one/1_depth.png", "two/1_depth.png"],
-        ["one/1.png", "two/1.png", "two/2.png"],
-        {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None},
-        [],
+        ["one/1_depth.png", "two/1_depth.png"], ["one/1.png", "two/1.png", "two/2.png"],
+        {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None}, [],
     ),
     (
-        ["a.png", "x.png", "y.png", ".b.png", ".hidden/c.png"],
-        ["a.png", "b.png"],
+        ["a.png", "x.png", "y.png", ".b.png", ".hidden/c.png"], ["a.png", "b.png"],
         {"a": "a.png", "b": None},
         ["warning: 2 of 3 predictions have no ground truth and are not scored: x, y"],
     ),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("predictions", "truths", "expected", "notes"), MATCHED)
 def test_files_are_matched_by_name_and_what_is_left_is_reported(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    predictions: list[str],
-    truths: list[str],
-    expected: dict[str, str | None],
-    notes: list[str],
-) -> None:
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, predictions: list[str], truths: list[str],
+    expected: dict[str, str | None], notes: list[str],
+) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     pairs, own_notes = pair_frames(*folders(Path(), predictions, truths))
     assert (matched(pairs), own_notes) == (expected, notes)
@@ -118,14 +105,9 @@ REFUSED = [
 
 @pytest.mark.parametrize(("predictions", "truths", "first", "second", "error", "message"), REFUSED)
 def test_what_cannot_be_matched_is_refused(
-    tmp_path: Path,
-    predictions: list[str],
-    truths: list[str],
-    first: str,
-    second: str,
-    error: type[Exception],
-    message: str,
-) -> None:
+    tmp_path: Path, predictions: list[str], truths: list[str], first: str, second: str,
+    error: type[Exception], message: str,
+) -> None:  # fmt: skip
     folders(tmp_path, predictions, truths)
     with pytest.raises(error, match=message):
         pair_frames(tmp_path / first, tmp_path / second)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pnpdepth_cli.commands.batch.running import reference_frames, registering
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames import resolve
 from pnpdepth_cli.frames.frame import Frame
@@ -88,6 +89,16 @@ def test_a_batch_compares_input_ranges_on_three_frames(tmp_path: Path, seen: Cou
     assert set(seen.values()) == {3}
     assert chosen == "unit"
     assert "mean of 3 frames" in notes
+
+
+def test_the_frames_that_decide_are_spread_from_the_first_readable_one_to_the_last() -> None:
+    numbers: list[Any] = list(range(40))
+    assert reference_frames(numbers, 3) == [22, 39]
+    assert [reference_frames(numbers[:n], 3) for n in (4, 5, 6)] == [[], [4], [4 + 1]]
+    assert registering(numbers, 3) == [
+        *(3, 5, 7, 10, 12, 15, 17, 19, 22, 24, 27, 29, 31, 34, 36, 39)
+    ]
+    assert registering(numbers[:6], 3) == [3, 4, 5]
 
 
 def test_a_single_frame_decides_alone(tmp_path: Path, seen: Counter[str]) -> None:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from pnpdepth_cli.commands.refinement.inputs import _scale_warning
 from pnpdepth_cli.errors import (
     DivergedError,
     InputError,
@@ -85,6 +86,9 @@ def test_ground_truth_whose_assumed_scale_is_another_one_in_use_stops_and_names_
 def test_ground_truth_that_no_two_scales_explain_is_warned_of(frame: FrameOnDisk) -> None:
     record = run(frame, gt=frame.gt, gt_scale=500.0, iterations=0).record
     assert noted(record, "warning: the ground truth is 2 times the sparse depth")
+    sparse = np.full((5, 5), 2, np.float32)
+    wild = np.where(np.eye(5) > 0, np.float32(1e5), sparse)
+    assert _scale_warning(sparse, wild, {}) == []
 
 
 def test_a_point_beyond_everything_is_dropped_with_a_note(frame: FrameOnDisk) -> None:
@@ -127,9 +131,7 @@ def test_a_depth_file_as_output_is_written_alone(frame: FrameOnDisk) -> None:
     assert files(frame.folder) - before == names
 
 
-def test_existing_results_are_replaced_only_on_request_and_inputs_never(
-    frame: FrameOnDisk,
-) -> None:
+def test_existing_results_are_replaced_only_on_request_and_inputs_never(frame: FrameOnDisk) -> None:
     run(frame)
     depth = frame.folder / "out" / "img_depth.png"
     old = depth.read_bytes()
@@ -237,12 +239,11 @@ BAD = [
     ({"image": None}, PnpDepthError, "takes an rgb image"),
     ({"device": "cuda:7"}, PnpDepthError, "--device cpu"),
     ({"device": "tpu"}, PnpDepthError, "--device cpu"),
-    ({"format": "jpg"}, UsageError, "not one of"),
-    ({"depth_scale": -1.0}, UsageError, "scale"),
+    ({"format": "jpg"}, UsageError, "not one of"), ({"depth_scale": -1.0}, UsageError, "scale"),
     ({"time_budget_s": 5.0}, UsageError, "--propagate makes none"),
     ({"gt": "small.npy"}, SizeError, "ground truth .* is 62×10 but the image is 62×46"),
     ({"gt": "empty.npy"}, InputError, "no pixel with known depth"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("changes", "error", "message"), BAD)

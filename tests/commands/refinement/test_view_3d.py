@@ -45,6 +45,8 @@ def test_depths_are_those_of_the_cloud_to_a_ten_thousandth(
         assert ((depth > 0) == kept).all()
         assert depth[kept] == pytest.approx(expected[kept], rel=1e-4)
     assert view["depths"]["before"] != view["depths"]["after"]
+    assert (view["stride"], view["whole"], view["farthest"]) == (1, view["size"], far)
+    assert view["spacing"] == pytest.approx(2 * math.tan(math.radians(30)) / width)
 
 
 def test_colours_are_those_of_the_image(view: dict[str, Any], tmp_path: Path) -> None:

@@ -20,13 +20,7 @@ from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.figure import figure_content
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.report import link_image
-from tests.commands.batches import (
-    NAMES,
-    RecordingListener,
-    batch,
-    pairs_on_disk,
-    refinement,
-)
+from tests.commands.batches import NAMES, RecordingListener, batch, pairs_on_disk, refinement
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
 
 _VIEWS = {"first", "second", "map", "image", "sparse"}
@@ -201,10 +195,7 @@ def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
     frames = frames_of(report)
     assert frames["a"]["values"]["rmse_gain"] is not None
     assert set(frames["b"]["values"].values()) == {None}
-    assert (frames["a"]["tag"], frames["b"]["tag"]) == (
-        "against ground truth",
-        "at points used",
-    )
+    assert (frames["a"]["tag"], frames["b"]["tag"]) == ("against ground truth", "at points used")
 
 
 def test_the_report_may_lie_in_the_results_and_the_results_among_the_frames(root: Path) -> None:

@@ -113,9 +113,7 @@ def test_the_image_is_shown_where_the_predictions_record_names_one(root: Path) -
     assert panel(root, "a", "image").mean((0, 1)) == pytest.approx([255, 0, 0], abs=3)
 
 
-def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
-    root: Path,
-) -> None:
+def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(root: Path) -> None:
     rng = np.random.default_rng(1)
     for name in NAMES:
         gt = np.load(root / "gt" / f"{name}.npy")

@@ -43,6 +43,8 @@ def test_a_bag_becomes_frames_with_a_calibration(
     messages = written(bag, tmp_path / "frames")
     topic = f"{IMAGES}/compressed" if compressed else IMAGES
     assert messages[0] == f"topics: images of {topic}, points of {POINTS}"
+    record = json.loads((tmp_path / "frames" / RECORD).read_text())
+    assert (record["image_topic"], record["points_topic"]) == (topic, POINTS)
     frames = read_frames(tmp_path / "frames")
     assert [frame.name for frame in frames] == [f"1700000000_0{n}0000" for n in (0, 3, 6)]
     pixels = read_rgb(frames[1].image).values  # type: ignore[arg-type]

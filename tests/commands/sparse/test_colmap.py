@@ -113,12 +113,7 @@ def test_points_of_a_real_model_project_onto_their_keypoints() -> None:
     [(None, "model units", 1.0, "scale"), (0.5, "m", 0.5, "none")],
 )
 def test_depth_is_in_model_units_or_with_a_scale_in_metres(
-    unit_scale: float | None,
-    unit: str,
-    factor: float,
-    align: str,
-    tmp_path: Path,
-    project: Path,
+    unit_scale: float | None, unit: str, factor: float, align: str, tmp_path: Path, project: Path
 ) -> None:
     colmap = ColmapOptions(unit_scale=unit_scale)
     record = refine(frame_on_disk(tmp_path), project, colmap=colmap)

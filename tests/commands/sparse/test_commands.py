@@ -165,9 +165,7 @@ def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
     return sample_depth(frame.gt, target, SamplePattern(**pattern), **more)
 
 
-def test_the_seed_is_in_the_png_and_in_the_record_and_decides_every_byte(
-    frame: ScanOnDisk,
-) -> None:
+def test_the_seed_is_in_the_png_and_in_the_record_and_decides_every_byte(frame: ScanOnDisk) -> None:
     for name in ("a", "b"):
         sampled(frame, f"{name}.png", count=100, seed=11, noise=SampleNoise(metres=0.1))
     assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()

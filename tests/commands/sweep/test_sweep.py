@@ -25,12 +25,7 @@ from pnpdepth_cli.commands.sweep.points import Sampling, frame_points, read_samp
 from pnpdepth_cli.commands.sweep.sweep import SweepRequest, run_sweep
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.errors import (
-    InputError,
-    OutputError,
-    PnpDepthError,
-    UsageError,
-)
+from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.frames import refiner as frame_refiner
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.sensors import (
@@ -53,13 +48,9 @@ def root(tmp_path: Path) -> Path:
 
 
 def sweep(
-    root: Path,
-    *vary: str,
-    listener: RecordingListener | None = None,
-    one_by_one: bool = False,
-    refine: dict[str, Any] | None = None,
-    **changes: Any,
-) -> dict[str, Any]:
+    root: Path, *vary: str, listener: RecordingListener | None = None, one_by_one: bool = False,
+    refine: dict[str, Any] | None = None, **changes: Any,
+) -> dict[str, Any]:  # fmt: skip
     fields: dict[str, Any] = {
         "source": root,
         "output": root / "out",
@@ -112,13 +103,11 @@ class Killed(RecordingListener):
 
 
 REFINEMENTS: list[dict[str, Any]] = [
-    {"iterations": 2, "lr": "10%"},
-    {"iterations": 8, "lr": "60%", "keep_best": True},
-    {"iterations": 4, "schedule": "linear"},
-    {"iterations": 0, "propagate": "gp"},
+    {"iterations": 2, "lr": "10%"}, {"iterations": 8, "lr": "60%", "keep_best": True},
+    {"iterations": 4, "schedule": "linear"}, {"iterations": 0, "propagate": "gp"},
     {"iterations": 3, "lr": "0.001", "parameters": "weights"},
     {"preset": "paper", "propagate": None},
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("settings", REFINEMENTS, ids=lambda settings: str(list(settings)))
@@ -432,31 +421,18 @@ def test_a_folder_that_holds_other_results_is_refused(root: Path) -> None:
 
 
 BAD = [
-    ("point=20", "no parameter 'point'"),
-    ("points", "give values after ="),
-    ("points=20,", "with commas"),
-    ("points=20,20", "comes twice"),
-    ("points=many", "neither a number"),
-    ("points=0", "at least one point"),
-    ("points=200%", "at most 100 %"),
-    ("iterations=1.5", "not a whole number"),
-    ("iterations=-1", ">= 0, got -1"),
-    ("lr=0", "a step size above 0"),
-    ("loss=l3", "one of l1, l2"),
-    ("update=newton", "sign"),
-    ("outliers=2", "from 0 to 1"),
-    ("noise=-1", "not negative"),
-    ("blur=inf", ">= 0, got inf"),
-    ("noise=nan", "not negative"),
-    ("noise=x", "'x' is not a number"),
-    ("line-search=yes", "neither on nor off"),
-    ("rotation-noise=400", "0 to 360"),
-    ("seed=99999999999999999999", "largest seed"),
-    ("sensor=vlp-17", "no sensor 'vlp-17'"),
-    ("sensor=gird:40", "no sensor 'gird:40'"),
-    ("sensor=grid:x", "neither a number"),
-    ("sensor=no.toml", "no.toml"),
-]
+    ("point=20", "no parameter 'point'"), ("points", "give values after ="),
+    ("points=20,", "with commas"), ("points=20,20", "comes twice"),
+    ("points=many", "neither a number"), ("points=0", "at least one point"),
+    ("points=200%", "at most 100 %"), ("iterations=1.5", "not a whole number"),
+    ("iterations=-1", ">= 0, got -1"), ("lr=0", "a step size above 0"),
+    ("loss=l3", "one of l1, l2"), ("update=newton", "sign"), ("outliers=2", "from 0 to 1"),
+    ("noise=-1", "not negative"), ("blur=inf", ">= 0, got inf"), ("noise=nan", "not negative"),
+    ("noise=x", "'x' is not a number"), ("line-search=yes", "neither on nor off"),
+    ("rotation-noise=400", "0 to 360"), ("seed=99999999999999999999", "largest seed"),
+    ("sensor=vlp-17", "no sensor 'vlp-17'"), ("sensor=gird:40", "no sensor 'gird:40'"),
+    ("sensor=grid:x", "neither a number"), ("sensor=no.toml", "no.toml"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "message"), BAD)
@@ -507,12 +483,10 @@ def test_the_cost_stands_beside_the_error_where_it_is_asked_for(root: Path) -> N
     ("first", "second", "along"),
     [
         ("points=20,60", "iterations=0,1,2", "iterations"),
-        ("iterations=0,1,2", "points=20,60", "iterations"),
-        ("loss=l1,l2,log", "lr=1%,3%", "lr"),
-        ("loss=l1,l2,log", "update=sign,sgd", "loss"),
-        ("points=20,60", "lr=1%,3%", "lr"),
+        ("iterations=0,1,2", "points=20,60", "iterations"), ("loss=l1,l2,log", "lr=1%,3%", "lr"),
+        ("loss=l1,l2,log", "update=sign,sgd", "loss"), ("points=20,60", "lr=1%,3%", "lr"),
     ],
-)
+)  # fmt: skip
 def test_numbers_are_on_the_x_axis_and_more_values_before_fewer(
     first: str, second: str, along: str
 ) -> None:

@@ -56,16 +56,8 @@ def _colmap(folder: Path, image: bytes) -> list[Seed]:
         [f"sparse/0/{part}.{suffix}" for part in ("cameras", "images", "points3D")]
         for suffix in ("txt", "bin")
     )
-    network = ("--model", "fcrn-tiny", "--propagate", "none", "--iterations", "1")
-    refine = (
-        "refine",
-        "photos/images/a.png",
-        "--sparse",
-        "model",
-        "--set",
-        "sparse-size-ok",
-        *network,
-    )
+    network = "--model fcrn-tiny --propagate none --iterations 1"
+    refine = f"refine photos/images/a.png --sparse model --set sparse-size-ok {network}".split()
     return [
         *_indices(*(f"photos/{name}" for name in text), *(f"binary/{name}" for name in binary)),
         *(

@@ -16,10 +16,7 @@ from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest, sample_pattern
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, find_protocol
-from pnpdepth_cli.io.dataset.reading import (
-    masked,
-    moved_to,
-)
+from pnpdepth_cli.io.dataset.reading import masked, moved_to
 from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames
 from tests.data_sets import (
     BENCHMARKS,
@@ -190,13 +187,11 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("\n", "has no poses"),
-        (_ROW, "000001.png has no pose: its sequence's file holds 1 poses"),
-        (_ROW[2:], "00.txt: line 1"),
-        (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt: line 3"),
+        ("\n", "has no poses"), (_ROW, "000001.png has no pose: its sequence's file holds 1 poses"),
+        (_ROW[2:], "00.txt: line 1"), (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt: line 3"),
         (_ROW.replace("1", "one"), "00.txt: line 1"),
     ],
-)
+)  # fmt: skip
 def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
     tmp_path: Path, text: str, message: str
 ) -> None:
@@ -221,8 +216,7 @@ def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "line",
-    ["0 depth/0.png 1.5 rgb/0.png", "1.5 rgb/0.png 1.51 depth/0.png  # TUM's own order"],
+    "line", ["0 depth/0.png 1.5 rgb/0.png", "1.5 rgb/0.png 1.51 depth/0.png  # TUM's own order"]
 )
 def test_associations_pair_images_and_depth(line: str, tmp_path: Path) -> None:
     (tmp_path / "associations.txt").write_text(f"# comment\n{line}\n")
@@ -291,11 +285,10 @@ def test_synthias_random_set_has_centimetres_in_either_folder(
 @pytest.mark.parametrize(
     ("stem", "size", "is_synthia"),
     [
-        ("kitchen", (760, 1280), False),
-        ("0000001", (480, 640), False),
+        ("kitchen", (760, 1280), False), ("0000001", (480, 640), False),
         ("0000001", (760, 1280), True),
     ],
-)
+)  # fmt: skip
 def test_rgb_and_depth_are_synthia_with_its_names_and_size_only(
     tmp_path: Path, stem: str, size: tuple[int, int], is_synthia: bool
 ) -> None:

@@ -123,7 +123,7 @@ def test_activations_of_old_and_new_opsets() -> None:
         check("Gelu", [X], opset=20, approximate=approximate)
     check("Clip", [X], opset=6, min=0.0, max=6.0)
     check("Clip", [X], opset=6, max=0.5)
-    check("Clip", [X, np.array(0, F32), np.array(6, F32)])
+    check("Clip", [X, np.array(0, F32), np.array(0.5, F32)], opset=11)
     check("Clip", [X, None, np.array(0.5, F32)])
     check("Clip", [X, np.array(2, F32), np.array(1, F32)])
     check("PRelu", [X, normal(4, 1, 1)])
@@ -131,6 +131,7 @@ def test_activations_of_old_and_new_opsets() -> None:
         check("IsInf", [np.array([np.inf, -np.inf, 1], F32)], **detect)
     check("Softmax", [X], opset=9)
     check("Softmax", [X], opset=11, axis=2)
+    check("Softmax", [X], opset=13)
 
 
 def test_matrices() -> None:
@@ -154,8 +155,8 @@ def test_reductions_of_old_and_new_opsets(op: str) -> None:
 
 
 PADS = [
-    {"pads": [1, 1, 1, 1]}, {"pads": [0, 1, 2, 1]}, {"auto_pad": "SAME_UPPER"},
-    {"auto_pad": "SAME_LOWER"}, {"auto_pad": "VALID"}, {},
+    {"pads": [1, 1, 1, 1]}, {"pads": [0, 1, 2, 1]}, {"pads": [0, 0, 1, 2]}, {},
+    {"auto_pad": "SAME_UPPER"}, {"auto_pad": "SAME_LOWER"}, {"auto_pad": "VALID"},
 ]  # fmt: skip
 
 
@@ -180,6 +181,7 @@ TRANSPOSED = [
     {"strides": [2, 2], "pads": [0, 0, 1, 1]}, {"strides": [2, 2], "output_shape": [14, 12]},
     {"strides": [2, 2], "auto_pad": "SAME_UPPER"}, {"strides": [2, 2], "auto_pad": "SAME_LOWER"},
     {"strides": [2, 2], "output_shape": [13, 12], "auto_pad": "SAME_UPPER"},
+    {"strides": [2, 2], "output_shape": [14, 12], "output_padding": [1, 0]},
     {"strides": [2, 1], "dilations": [2, 1]}, {"strides": [3, 3], "pads": [1, 0, 0, 1]},
 ]  # fmt: skip
 
@@ -225,12 +227,15 @@ def test_resize_to_sizes(mode: str, size: tuple[int, int], coordinates: str) -> 
         )  # fmt: skip
 
 
-@pytest.mark.parametrize("coordinates", COORDINATES)
-@pytest.mark.parametrize("scales", [(2, 2), (1.5, 1.7), (0.6, 0.5), (3, 1)])
+@pytest.mark.parametrize("coordinates", [*COORDINATES, "half_pixel_symmetric"])
+@pytest.mark.parametrize("scales", [(2, 2), (1.5, 1.7), (0.6, 0.5), (3, 1.1)])
 @pytest.mark.parametrize("mode", ["nearest", "linear", "cubic"])
 def test_resize_by_scales(mode: str, scales: tuple[float, float], coordinates: str) -> None:
+    if mode == "nearest" and coordinates == "asymmetric":
+        coordinates = "tf_half_pixel_for_nn"  # for nearest alone; asymmetric is in Upsample's test
+    opset = 19 if coordinates == "half_pixel_symmetric" else 11
     check(
-        "Resize", [X, np.array([], F32), np.array([1, 1, *scales], F32)], opset=13, mode=mode,
+        "Resize", [X, np.array([], F32), np.array([1, 1, *scales], F32)], opset=opset, mode=mode,
         coordinate_transformation_mode=coordinates, nearest_mode="floor",
     )  # fmt: skip
 
@@ -277,14 +282,21 @@ def test_normalisations() -> None:
     check("GroupNormalization", [X, normal(2), normal(2)], opset=18, num_groups=2)
 
 
-def test_dequantised_weights_are_folded_into_numbers() -> None:
-    x, quantised = normal(1, 3), np.random.default_rng(0).integers(-9, 9, (3, 4)).astype(np.int8)
-    scale, zero = np.abs(normal(4)) + 0.01, np.arange(4, dtype=np.int8)
+@pytest.mark.parametrize(
+    ("size", "scales", "axis"), [((3, 4), (1, 4), 1), ((3, 4), (3, 1), 0), ((3,), (), 1)]
+)
+def test_dequantised_weights_are_folded_into_numbers(
+    size: tuple[int, ...], scales: tuple[int, ...], axis: int
+) -> None:
+    x, quantised = normal(1, 3), np.random.default_rng(0).integers(-9, 9, size).astype(np.int8)
+    scale = np.abs(normal(*scales)).astype(F32) + F32(0.01)
+    zero = np.arange(scale.size, dtype=np.int8).reshape(scales)
     model = model_of("MatMul", [x, None], 13, 1)
-    dequantise = helper.make_node("DequantizeLinear", ["q", "s", "z"], ["w"], axis=1)
+    dequantise = helper.make_node("DequantizeLinear", ["q", "s", "z"], ["w"], axis=axis)
     model.graph.node[0].input[1] = "w"
     model.graph.node.insert(0, dequantise)
-    for value, name in ((quantised, "q"), (scale, "s"), (zero, "z")):
+    flat = -1 if scales else ()
+    for value, name in ((quantised, "q"), (scale.reshape(flat), "s"), (zero.reshape(flat), "z")):
         model.graph.initializer.append(numpy_helper.from_array(value, name))
     module = OnnxGraph(model, Path("x.onnx"))
     assert [name for name, _ in module.named_children()] == ["MatMul_out0"]
@@ -300,9 +312,11 @@ def test_shapes() -> None:
     check("Unsqueeze", [normal(3, 2), np.array([0, -1], I64)])
     check("Unsqueeze", [normal(3, 2)], opset=11, axes=[1, 3])
     check("Expand", [normal(3, 1), np.array([2, 1, 4], I64)])
+    check("Expand", [normal(2, 3, 1), np.array([3, 4], I64)])
     check("Tile", [normal(3, 2), np.array([2, 3], I64)])
     check("Concat", [normal(3, 2), normal(4, 2)], axis=0)
-    check("SpaceToDepth", [normal(1, 2, 4, 6)], blocksize=2)
+    check("SpaceToDepth", [normal(1, 2, 6, 9)], blocksize=3)
+    check("DepthToSpace", [normal(1, 18, 2, 3)], blocksize=3)
     check("CastLike", [X, np.array([1], I64)])
     check(
         "ConstantOfShape",
@@ -335,7 +349,7 @@ def test_pads(mode: str) -> None:
 SLICES = [
     ([1], [5], [2], [2]), ([-1], [-100], [3], [-1]), ([4], [0], [2], [-2]),
     ([0], [2**62], [1], [1]), ([1, -3], [3, -1], [1, -1], [1, 1]), ([5], [2], [2], [1]),
-    ([-100], [3], [3], [1]),
+    ([-100], [3], [3], [1]), ([-1], [-7], [2], [-1]), ([-1], [-8], [2], [-1]),
 ]  # fmt: skip
 
 

@@ -253,8 +253,7 @@ def test_modules_that_hold_themselves_again_and_again_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "opcode",
-    [b"\x82\x01", b"\x83\x01\x00", b"\x97", b"\x98", b"P1\n", b"(ios\nsystem\n", b"\xff"],
+    "opcode", [b"\x82\x01", b"\x83\x01\x00", b"\x97", b"\x98", b"P1\n", b"(ios\nsystem\n", b"\xff"]
 )
 def test_opcodes_of_extensions_and_of_things_outside_are_refused(
     opcode: bytes, tmp_path: Path

@@ -1,0 +1,101 @@
+"""Tables of errors and of compared runs, cell by cell, from the numbers they show."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from math import nan
+from typing import Any
+
+import pytest
+
+from pnpdepth_cli.commands.error_tables import change, error_table, format_error, refinement_table
+from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
+from pnpdepth_cli.commands.tables import Table
+from pnpdepth_cli.core.metrics import MEASURES
+
+
+@pytest.mark.parametrize(
+    ("key", "before", "after", "text", "style"),
+    [
+        ("mae", None, 1.0, "–", "dim"), ("mae", 1.0, None, "–", "dim"), ("mae", nan, 1, "–", "dim"),
+        ("mae", 1.0, nan, "–", "dim"), ("mae", 0.0, 1.0, "–", "dim"), ("mae", 2, 2, "+0.0%", "dim"),
+        ("mae", 1.0, 0.5, "-50.0%", "good"), ("mae", 0.5, 1.5, "+200.0%", "bad"),
+        ("delta1", 0.0, 0.25, "+25.00 pt", "good"), ("delta1", 0.75, 0.5, "-25.00 pt", "bad"),
+    ],
+)  # fmt: skip
+def test_a_change_is_relative_or_in_points_and_coloured_by_whether_it_is_better(
+    key: str, before: float | None, after: float | None, text: str, style: str
+) -> None:
+    cell = change(key, before, after)
+    assert (cell, cell.style) == (text, style)
+
+
+def test_an_error_has_its_unit_and_nothing_is_a_dash() -> None:
+    shown = [format_error(*case, "m") for case in (("mae", 1.25), ("mae", None), ("mae", nan))]
+    assert shown == ["1.2500 m", "–", "–"]
+
+
+def test_linear_interpolation_stands_beside_the_errors_and_points_used_show_no_gain() -> None:
+    of_points = {"before": {"mae": 2.0}, "after": {"mae": 1.0, "points": 1234}}
+    table = error_table(
+        "", {"scores": {"before": {"mae": 4.0}, "after": {"mae": 2.0}}, "held_out_error": of_points,
+             "sparse_error": of_points, "linear": {"scores": {"mae": 8.0}}}, "m",
+    )  # fmt: skip
+    assert table.rows == [
+        ["MAE", "4.0000 m", "2.0000 m", "-50.0%", "8.0000 m", "-75.0%"],
+        ["error at 1,234 held-out points, MAE", "2.0000 m", "1.0000 m", "-50.0%", "–", "–"],
+        ["error at 1,234 points used, MAE", "2.0000 m", "1.0000 m", "", "–", ""],
+    ]
+
+
+def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> None:
+    check = {"points": 12, "aligned": 4.0, "fused": 3.0, "propagated": 1.0, "linear": 2.0}
+    record: dict[str, Any] = {
+        "method": {"kind": "default", "networks": ["net"]}, "model": {"name": "net"}, "unit": "m",
+        "stages": None, "scores": None, "linear": {"check": check | {"result": 1.0}},
+    }  # fmt: skip
+    assert styled(refinement_table(record)) == [
+        [("net aligned", ""), ("4.0000 m", ""), ("+100.0%", "bad")],
+        [("residual propagated", "bold"), ("1.0000 m", "bold"), ("-50.0%", "good")],
+        [("linear interpolation", ""), ("2.0000 m", ""), ("", "")],
+    ]
+    record["method"]["networks"].append("other")
+    record["linear"]["check"]["result"] = 0.5
+    _, fused, _, result, _ = (row[0] for row in refinement_table(record).rows)
+    assert (fused, result) == ("with points, fused", "result")
+
+
+def styled(table: Table) -> list[list[tuple[str, str]]]:
+    return [[(cell, getattr(cell, "style", "")) for cell in row] for row in table.rows]
+
+
+def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -> None:
+    measures = [asdict(measure) for measure in MEASURES if measure.key in ("rmse", "delta1")]
+
+    def gain(percent: float | None, p: float | None) -> dict[str, Any]:
+        return {"percent": percent, "p_adjusted": p, "low_percent": None, "high_percent": 1.0}
+
+    means = [(2.0, 0.5), (1.0, 0.25), (3.0, None)]
+    comparison = {
+        "runs": [
+            {"label": label, "mean": {"rmse": rmse, "delta1": delta}}
+            for label, (rmse, delta) in zip("abc", means, strict=True)
+        ],
+        "measures": measures,
+        "gains": [
+            {"rmse": gain(50.0, 0.0009), "delta1": gain(-50.0, 0.01)},
+            {"rmse": gain(-50.0, 0.049), "delta1": gain(None, None)},
+        ],
+        "frames": ["1", "2"], "clusters": {"count": 2, "unit": "frames"}, "resamples": 1000,
+        "exact_p_values": False,
+    }  # fmt: skip
+    assert styled(methods_table(comparison)) == [
+        [("a", ""), ("2.0000", ""), ("50.00%", "bold")],
+        [("b", ""), ("1.0000***", "bold"), ("25.00%*", "")],
+        [("c", ""), ("3.0000*", ""), ("–", "")],
+    ]
+    gains = [row[3] for row in styled(comparison_table(comparison))]
+    plain, better, worse = ("–", ""), ("+50.00", "good"), ("-50.00", "bad")
+    assert gains == [plain, better, worse, plain, worse, ("–", "dim")]
+    assert comparison_table(comparison).rows[1][4:] == ["–", "+1.00", "0.0009"]
+    assert "from 1,000 random swaps, over 2 frames" in comparison_table(comparison).caption

@@ -1,0 +1,68 @@
+"""The bound on the size of a result, for every function that makes more than it is given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pnpdepth_cli.models.onnx.limits import _GROWING, SizeLimit
+from pnpdepth_cli.models.onnx.table import Unsupported
+
+X, W, AT = torch.ones(2, 3, 7, 6), torch.ones(3, 3, 3, 3), torch.zeros(5, dtype=torch.long)
+CALLS: dict[str, tuple[Callable[[], Tensor], float]] = {
+    "conv2d": (lambda: F.conv2d(X, W, None, 1, [1, 2], 1, 1), 2 * 3 * 9 * 10),
+    "conv_transpose2d": (
+        lambda: F.conv_transpose2d(X, torch.ones(3, 2, 3, 4), None, [2, 3], 0, 0, 3, [2, 1]),
+        2 * (2 * 3) * (7 * 2 + 3 * 2) * (6 * 3 + 4 * 1),
+    ),
+    "matmul": (lambda: torch.matmul(torch.ones(5, 1, 2, 3), torch.ones(4, 3, 6)), 5 * 4 * 2 * 6),
+    "matmul of vectors": (lambda: torch.matmul(torch.ones(4, 3), torch.ones(3)), 12),
+    "__matmul__": (lambda: torch.ones(2, 1) @ torch.ones(1, 6), 12),
+    "cat": (lambda: torch.cat([torch.ones(2, 3), torch.ones(4, 3)]), 18),
+    "stack": (lambda: torch.stack([torch.ones(2, 3)] * 3), 18),
+    "ones": (lambda: torch.ones(2, 3, dtype=torch.int8), 6),
+    "zeros": (lambda: torch.zeros(4, 3), 12),
+    "einsum": (lambda: torch.einsum("bi,bj->bij", torch.ones(2, 3), torch.ones(2, 5)), 30),
+    "grid_sample": (lambda: F.grid_sample(X, torch.zeros(2, 4, 5, 2), align_corners=False), 480),
+    "interpolate": (lambda: F.interpolate(X, (8, 9)), 2 * 3 * 8 * 9),
+    "index_select": (lambda: X.index_select(2, AT), 2 * 3 * 6 * 5),
+    "__getitem__": (lambda: X[AT[:, None], AT], 5 * 5 * 7 * 6),
+    "__getitem__ of a part": (lambda: X[:, 1:], X.numel()),
+    "expand": (lambda: torch.ones(3, 1).expand([2, 3, 4]), 24),
+    "repeat": (lambda: X.repeat([2, 1, 3, 1]), X.numel() * 6),
+    "repeat_interleave": (lambda: torch.ones(4).repeat_interleave(3), 12),
+    "arange": (lambda: torch.arange(2, 9, 3), 7 / 3 + 1),
+    "arange from 0": (lambda: torch.arange(5), 6),
+    "pad": (lambda: F.pad(torch.ones(2, 3), (1, 2, 0, 4)), 6 * 6),
+    "add": (lambda: torch.ones(3, 1) + torch.ones(2, 1, 4), 24),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_result_is_refused_from_its_bound_on_and_is_no_larger(name: str) -> None:
+    call, bound = CALLS[name]
+    assert call().numel() <= bound
+    with SizeLimit(math.ceil(bound)):
+        call()
+    with SizeLimit(math.ceil(bound) - 1), pytest.raises(Unsupported, match="a result of"):
+        call()
+
+
+def test_every_growing_function_is_bounded_here() -> None:
+    assert _GROWING.keys() - CALLS.keys() == {
+        f"conv{kind}{axes}d" for kind in ("", "_transpose") for axes in (1, 3)
+    }
+
+
+def test_all_results_together_are_bounded_and_views_count_nothing() -> None:
+    x = torch.ones(6)
+    with SizeLimit(6, in_all=12):
+        for _ in range(2):
+            (x + 1).reshape(2, 3)
+        with pytest.raises(Unsupported):
+            x + 1
