@@ -36,9 +36,16 @@ Make = Callable[..., Any]
 
 
 def write_bag(
-    path: Path, *, frames: int = 3, compressed: bool = False, static: bool = True,
-    info: bool = True, poses: str = "", compression: Any = None, view: View | None = None,
-) -> Path:  # fmt: skip
+    path: Path,
+    *,
+    frames: int = 3,
+    compressed: bool = False,
+    static: bool = True,
+    info: bool = True,
+    poses: str = "",
+    compression: Any = None,
+    view: View | None = None,
+) -> Path:
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.
@@ -159,11 +166,16 @@ def _camera_info(make: Make, header: Any, ros1: bool, view: View | None) -> Any:
     height, width = (HEIGHT, WIDTH) if view is None else view.pixels.shape[:2]
     whole = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
     return make(
-        "sensor_msgs/CameraInfo", header=header, height=height, width=width, binning_x=0,
-        binning_y=0, roi=make("sensor_msgs/RegionOfInterest", **whole),
+        "sensor_msgs/CameraInfo",
+        header=header,
+        height=height,
+        width=width,
+        binning_x=0,
+        binning_y=0,
+        roi=make("sensor_msgs/RegionOfInterest", **whole),
         distortion_model="plumb_bob",
         **{name.upper() if ros1 else name: value for name, value in values.items()},
-    )  # fmt: skip
+    )
 
 
 def _image(
@@ -177,9 +189,15 @@ def _image(
     padded = np.zeros((height, width * 3 + 8), np.uint8)  # rows may be longer than their pixels
     padded[:, : width * 3] = pixels.reshape(height, -1)
     message = make(
-        "sensor_msgs/Image", header=header, height=height, width=width, encoding="rgb8",
-        is_bigendian=0, step=padded.shape[1], data=padded.ravel(),
-    )  # fmt: skip
+        "sensor_msgs/Image",
+        header=header,
+        height=height,
+        width=width,
+        encoding="rgb8",
+        is_bigendian=0,
+        step=padded.shape[1],
+        data=padded.ravel(),
+    )
     return topic, time_ns, message
 
 
@@ -199,7 +217,14 @@ def _cloud(make: Make, header: Any, view: View | None) -> Any:
         for name, offset, kind in zip(names, offsets, [4, 7, 7, 8], strict=True)
     ]
     return make(
-        "sensor_msgs/PointCloud2", header=header, height=1, width=len(points), fields=fields,
-        is_bigendian=False, point_step=layout.itemsize, row_step=layout.itemsize * len(points),
-        data=np.frombuffer(points.tobytes(), np.uint8), is_dense=False,
-    )  # fmt: skip
+        "sensor_msgs/PointCloud2",
+        header=header,
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=layout.itemsize,
+        row_step=layout.itemsize * len(points),
+        data=np.frombuffer(points.tobytes(), np.uint8),
+        is_dense=False,
+    )

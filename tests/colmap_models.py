@@ -11,13 +11,21 @@ from pnpdepth_cli.io.colmap import MODELS
 
 WIDTH, HEIGHT = 64, 48
 _COEFFICIENTS = {
-    "SIMPLE_RADIAL": "-0.1", "RADIAL": "-0.1 0.02", "OPENCV": "-0.1 0.02 0.001 -0.002",
-    "OPENCV_FISHEYE": "-0.02 0.01 -0.003 0.001", "FOV": "0.9", "RADIAL_FISHEYE": "-0.03 0.01",
-    "FULL_OPENCV": "-0.1 0.02 0.001 -0.002 0.01 0.02 -0.01 0.003", "SIMPLE_RADIAL_FISHEYE": "-0.03",
-    "THIN_PRISM_FISHEYE": "-0.02 0.01 0.001 -0.002 -0.003 0.001 0.002 -0.001", "EUCM": "0.6 1.1",
+    "SIMPLE_RADIAL": "-0.1",
+    "RADIAL": "-0.1 0.02",
+    "OPENCV": "-0.1 0.02 0.001 -0.002",
+    "OPENCV_FISHEYE": "-0.02 0.01 -0.003 0.001",
+    "FOV": "0.9",
+    "RADIAL_FISHEYE": "-0.03 0.01",
+    "FULL_OPENCV": "-0.1 0.02 0.001 -0.002 0.01 0.02 -0.01 0.003",
+    "SIMPLE_RADIAL_FISHEYE": "-0.03",
+    "THIN_PRISM_FISHEYE": "-0.02 0.01 0.001 -0.002 -0.003 0.001 0.002 -0.001",
+    "EUCM": "0.6 1.1",
     "RAD_TAN_THIN_PRISM_FISHEYE": "-0.02 0.01 -0.003 0.001 0.002 -0.001 0.001 -0.002"
-    " 0.002 0.001 -0.001 0.001", "SIMPLE_DIVISION": "-0.15", "DIVISION": "-0.15",
-}  # fmt: skip
+    " 0.002 0.001 -0.001 0.001",
+    "SIMPLE_DIVISION": "-0.15",
+    "DIVISION": "-0.15",
+}
 CAMERAS = {
     name: f"{'50' if model.focals == 1 else '50 52'} 32.5 23 {_COEFFICIENTS.get(name, '')}".strip()
     for name, model in MODELS.items()
@@ -26,9 +34,12 @@ CAMERAS = {
 
 
 def write_text_model(
-    folder: Path, *, camera: str = "PINHOLE", names: tuple[str, ...] = ("a.png", "b.png", "c.png"),
+    folder: Path,
+    *,
+    camera: str = "PINHOLE",
+    names: tuple[str, ...] = ("a.png", "b.png", "c.png"),
     points: int = 40,
-) -> None:  # fmt: skip
+) -> None:
     """A wall 4 units away that cameras side by side see; each observes all points."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cameras.txt").write_text(

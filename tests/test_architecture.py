@@ -15,14 +15,22 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
 GROUND_FLOOR = {"errors", "choices", "points", "budget", "scan_pattern", "settings"}
 MAY_IMPORT = {
-    "errors": set(), "choices": {"errors"}, "budget": {"errors"}, "points": {"errors"},
-    "scan_pattern": {"errors"}, "settings": {"errors", "choices"}, "core": GROUND_FLOOR,
-    "sensors": GROUND_FLOOR, "io": GROUND_FLOOR, "completion": {*GROUND_FLOOR, "core"},
+    "errors": set(),
+    "choices": {"errors"},
+    "budget": {"errors"},
+    "points": {"errors"},
+    "scan_pattern": {"errors"},
+    "settings": {"errors", "choices"},
+    "core": GROUND_FLOOR,
+    "sensors": GROUND_FLOOR,
+    "io": GROUND_FLOOR,
+    "completion": {*GROUND_FLOOR, "core"},
     "models": {*GROUND_FLOOR, "core", "completion"},
     "frames": {*GROUND_FLOOR, "core", "completion", "models"},
     "commands": {*GROUND_FLOOR, "core", "completion", "models", "frames", "sensors", "io"},
-    "cli": {*GROUND_FLOOR, "commands"}, "api": {*GROUND_FLOOR, "core", "models", "frames"},
-}  # fmt: skip
+    "cli": {*GROUND_FLOOR, "commands"},
+    "api": {*GROUND_FLOOR, "core", "models", "frames"},
+}
 
 
 def imported_modules(file: Path) -> set[str]:
@@ -61,8 +69,11 @@ def test_a_network_file_knows_nothing_of_the_program_but_the_definition_contract
 
 AFTER_PYTHON_3_10 = {
     "typing": "Self override assert_never assert_type Never NotRequired Required",
-    "enum": "StrEnum", "datetime": "UTC", "contextlib": "chdir", "itertools": "batched",
-}  # fmt: skip
+    "enum": "StrEnum",
+    "datetime": "UTC",
+    "contextlib": "chdir",
+    "itertools": "batched",
+}
 """What the oldest supported Python lacks, and an import would fail on."""
 
 

@@ -51,10 +51,12 @@ def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_th
 @pytest.mark.parametrize(
     ("table", "implemented"),
     [
-        (choices.LOSSES, losses.TABLE), (choices.UPDATES, update_rules.TABLE),
-        (choices.BASELINES, baselines.TABLE), (choices.PROPAGATIONS, propagation.TABLE),
+        (choices.LOSSES, losses.TABLE),
+        (choices.UPDATES, update_rules.TABLE),
+        (choices.BASELINES, baselines.TABLE),
+        (choices.PROPAGATIONS, propagation.TABLE),
     ],
-)  # fmt: skip
+)
 def test_a_table_lists_the_names_of_its_module_in_their_order(
     table: Table, implemented: Mapping[str, object]
 ) -> None:

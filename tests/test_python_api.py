@@ -139,9 +139,12 @@ def test_depth_that_may_be_in_another_unit_needs_one(
     ],
 )
 def test_arrays_that_cannot_be_used_are_named(
-    image: NDArray[np.float64] | None, sparse: NDArray[np.float64], error: type[pnp.PnpDepthError],
-    message: str, network: pnp.Network,
-) -> None:  # fmt: skip
+    image: NDArray[np.float64] | None,
+    sparse: NDArray[np.float64],
+    error: type[pnp.PnpDepthError],
+    message: str,
+    network: pnp.Network,
+) -> None:
     with pytest.raises(error, match=message):
         pnp.refine(network, image, sparse)
 
@@ -150,12 +153,14 @@ def test_arrays_that_cannot_be_used_are_named(
     "form",
     [
         lambda rgb: np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)]),
-        lambda rgb: rgb.transpose(2, 0, 1), lambda rgb: rgb.transpose(2, 0, 1)[None],
-        lambda rgb: rgb.astype(np.float32), lambda rgb: torch.from_numpy(rgb),
+        lambda rgb: rgb.transpose(2, 0, 1),
+        lambda rgb: rgb.transpose(2, 0, 1)[None],
+        lambda rgb: rgb.astype(np.float32),
+        lambda rgb: torch.from_numpy(rgb),
         lambda rgb: rgb[:, :, 0],
     ],
     ids=["RGBA", "CHW", "NCHW", "float 0..255", "tensor", "grey"],
-)  # fmt: skip
+)
 def test_every_unambiguous_form_of_an_image_is_read_alike(
     form: Callable[[NDArray[Any]], Any],
 ) -> None:

@@ -32,12 +32,13 @@ def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
 @pytest.mark.parametrize(
     ("settings", "by"),
     [
-        (Settings(), ""), (Settings(seed=3, time_budget_s=5.0), ""),
+        (Settings(), ""),
+        (Settings(seed=3, time_budget_s=5.0), ""),
         (Settings(iterations=2, keep_best=True), "--iterations --set keep-best"),
         (Settings(tile=128), "--tile"),
         (Settings(preset="paper", iterations=2), "--preset paper --iterations"),
     ],
-)  # fmt: skip
+)
 def test_any_setting_of_the_method_fixes_it(settings: Settings, by: str) -> None:
     assert settings.fixed_by == by
 
@@ -50,10 +51,12 @@ def test_any_setting_of_the_method_fixes_it(settings: Settings, by: str) -> None
         *((field, value) for field in ("blur", "proximity") for value in (-1, NAN, INF, "1")),
         *((field, "foo") for field in ("preset", "loss", "update", "schedule", "align", "mask")),
         *(("mask_fraction", value) for value in (0, 1, 1.5)),
-        *(("mask_scale", value) for value in (0, 1.5)), ("align", ["auto"]), ("layer", 3),
+        *(("mask_scale", value) for value in (0, 1.5)),
+        ("align", ["auto"]),
+        ("layer", 3),
         ("seed", -1),
     ],
-)  # fmt: skip
+)
 def test_a_value_that_refinement_could_not_use_is_refused_by_its_name(
     field: str, value: Any
 ) -> None:

@@ -30,12 +30,20 @@ def test_times_are_in_milliseconds_and_forward_passes(capsys: pytest.CaptureFixt
     part = {"median_s": 1.25, "lower_s": 1.0, "upper_s": 1.5, "forwards": 2.0, "peak_mb": 1234.5}
     bench_command._print(
         {
-            "device": "cpu", "threads": 1, "versions": {"torch": "2"}, "notes": [],
-            "size": (24, 32), "points": 50, "model": "net", "layer": "z", "iterations": 5,
-            "parts": {"refinement": part, "other": part | {"peak_mb": None}}, "limit": 1.5,
+            "device": "cpu",
+            "threads": 1,
+            "versions": {"torch": "2"},
+            "notes": [],
+            "size": (24, 32),
+            "points": 50,
+            "model": "net",
+            "layer": "z",
+            "iterations": 5,
+            "parts": {"refinement": part, "other": part | {"peak_mb": None}},
+            "limit": 1.5,
             "precision": "fp32",
         }
-    )  # fmt: skip
+    )
     out, err = capsys.readouterr()
     *_, first, second, _, last = (" ".join(line.split()) for line in out.splitlines())
     assert err == "cpu, 1 thread, torch 2\n"

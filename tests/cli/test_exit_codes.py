@@ -12,46 +12,56 @@ from tests.commands.scan_frames import scan_on_disk
 NETWORK = "--model drive/net/my_net.py --checkpoint drive/net/my_net.safetensors"
 COMMANDS = {
     "refine": f"drive/rgb/a.png --sparse drive/sparse/a.png -o out {NETWORK}",
-    "batch": f"drive -o out {NETWORK}", "sweep": f"drive -o out {NETWORK} --plots none",
+    "batch": f"drive -o out {NETWORK}",
+    "sweep": f"drive -o out {NETWORK} --plots none",
     "bench": f"{NETWORK} --size 24x32 --points 50 --repeats 1",
-    "project": "img.bin --calib calib.txt -o sparse.png", "eval": "drive/gt drive/gt",
-}  # fmt: skip
+    "project": "img.bin --calib calib.txt -o sparse.png",
+    "eval": "drive/gt drive/gt",
+}
 
 
 @pytest.mark.parametrize(
     ("command", "more", "code", "message"),
     [
-        ("refine", "--iterations -2", 2, "iterations must be"), ("refine", "--loss l3", 2, "l3"),
-        ("refine", "--nonsense", 2, "--nonsense"), ("refine", "--gt missing.png", 3, "missing.png"),
+        ("refine", "--iterations -2", 2, "iterations must be"),
+        ("refine", "--loss l3", 2, "l3"),
+        ("refine", "--nonsense", 2, "--nonsense"),
+        ("refine", "--gt missing.png", 3, "missing.png"),
         ("refine", "--layer encod", 4, "encode"),
         ("refine", "--checkpoint missing.pt", 4, "does not exist"),
-        ("refine", "--device cuda", 6, "--device cpu"), ("batch", "--shard 0/2", 2, "1/4"),
+        ("refine", "--device cuda", 6, "--device cpu"),
+        ("batch", "--shard 0/2", 2, "1/4"),
         ("batch", "--workers 0", 2, "'--workers': 0 is not in the range x>=1"),
         ("batch", "--html-3d", 2, "name its folder with --html"),
         ("batch", "--sample many", 2, "500"),
         ("batch", "--layout tum", 3, "does not look like 'tum'"),
-        ("batch", "--layer encod", 4, "encode"), ("batch", "--device cuda:9", 6, "--device cpu"),
+        ("batch", "--layer encod", 4, "encode"),
+        ("batch", "--device cuda:9", 6, "--device cpu"),
         ("sweep", "--vary points=9 --set colour=red", 2, "no parameter 'colour'"),
         ("sweep", "--vary lr=1 --seeds 0", 2, "--seeds must be >= 1"),
         ("sweep", "--vary lr=1 --layout tum", 3, "does not look like 'tum'"),
         ("sweep", "--vary layer=encod,middle", 4, "encode"),
         ("bench", "--repeats 0", 2, "0 is not in the range x>=1"),
-        ("bench", "--layer encod", 4, "did you mean encode"), ("bench", "--size big", 2, "HxW"),
+        ("bench", "--layer encod", 4, "did you mean encode"),
+        ("bench", "--size big", 2, "HxW"),
         ("project", "--size 48", 2, "HxW"),
         ("project", "--size 48x64 --camera 1", 2, "leave out --camera"),
         ("project", "--size 48x64 --scan min-range=9,max-range=2", 2, "is empty"),
         ("project", "--image missing.png", 3, "missing.png"),
         ("project", "--size 48x64 --scan min-range=90", 3, "none of the scan's"),
-        ("eval", "--protocol kiti", 2, "kitti"), ("eval", "--delta 1,2", 2, "--delta"),
+        ("eval", "--protocol kiti", 2, "kitti"),
+        ("eval", "--delta 1,2", 2, "--delta"),
         ("eval", "--delta fast", 2, "--delta"),
         ("eval", "--missing max", 2, "scores empty predictions as --max-depth"),
         ("eval", "--json --csv -", 2, "can go to stdout"),
         ("eval drive/gt drive/gt/a.png", "", 2, "two files or two folders"),
-        ("eval drive/gt nowhere", "", 3, "nowhere"), ("eval", "--protocol nyu-eigen", 3, "640×480"),
-        ("eval", "--sparse nowhere", 3, "nowhere"), ("compare a.json", "", 2, "two runs"),
+        ("eval drive/gt nowhere", "", 3, "nowhere"),
+        ("eval", "--protocol nyu-eigen", 3, "640×480"),
+        ("eval", "--sparse nowhere", 3, "nowhere"),
+        ("compare a.json", "", 2, "two runs"),
         ("compare a.json b.json", "", 3, "a.json"),
     ],
-)  # fmt: skip
+)
 def test_the_exit_code_is_that_of_the_kind_of_error(
     root: Path, capsys: pytest.CaptureFixture[str], command: str, more: str, code: int, message: str
 ) -> None:

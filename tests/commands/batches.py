@@ -75,9 +75,13 @@ def refinement(root: Path, **changes: Any) -> RefineRequest:
 
 
 def batch(
-    root: Path, listener: RecordingListener | None = None, *, stopped: Any = lambda: False,
-    refine: dict[str, Any] | None = None, **changes: Any,
-) -> BatchOutcome:  # fmt: skip
+    root: Path,
+    listener: RecordingListener | None = None,
+    *,
+    stopped: Any = lambda: False,
+    refine: dict[str, Any] | None = None,
+    **changes: Any,
+) -> BatchOutcome:
     """A batch of the folder into its out/."""
     fields: dict[str, Any] = {
         "source": root,

@@ -107,11 +107,14 @@ def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path
 @pytest.mark.parametrize(
     "changes",
     [
-        {"intrinsics": [1, 2]}, {"intrinsics": [[0, 0, 0]] * 3},
-        {"intrinsics": [[1e999, 0, 0], [0, 1, 0], [0, 0, 1]]}, {"distortion": ["x"]},
-        {"lens": "pinhole"}, {"pose": [1, 2]},
+        {"intrinsics": [1, 2]},
+        {"intrinsics": [[0, 0, 0]] * 3},
+        {"intrinsics": [[1e999, 0, 0], [0, 1, 0], [0, 0, 1]]},
+        {"distortion": ["x"]},
+        {"lens": "pinhole"},
+        {"pose": [1, 2]},
     ],
-)  # fmt: skip
+)
 def test_a_damaged_camera_in_a_record_is_one_line(tmp_path: Path, changes: dict[str, Any]) -> None:
     path = with_camera(frame(tmp_path, "a"), None)
     record = json.loads((tmp_path / "a.json").read_text())
@@ -165,13 +168,14 @@ def test_frames_are_one_cloud_in_the_world_frame_in_which_voxels_merge_them(tmp_
     [
         ({"fov_deg": None}, UsageError, "give --calib or --fov"),
         ({"calib": Path("k.txt")}, UsageError, "--calib and --fov both"),
-        ({"fov_deg": 0.0}, UsageError, "--fov is 0"), ({"voxel": 0.0}, UsageError, "--voxel"),
+        ({"fov_deg": 0.0}, UsageError, "--fov is 0"),
+        ({"voxel": 0.0}, UsageError, "--voxel"),
         ({"edge": math.inf}, UsageError, "--edge"),
         ({"max_depth": 0.5}, InputError, "no pixel is left"),
         ({"min_views": 2}, UsageError, "--min-views 2 needs"),
         ({"max_sigma": 0.1}, InputError, "--uncertainty"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_done_is_one_line_and_writes_nothing(
     tmp_path: Path, values: dict[str, Any], error: type[Exception], message: str
 ) -> None:

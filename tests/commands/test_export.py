@@ -191,13 +191,18 @@ def test_a_lens_that_nerfstudio_does_not_know_is_refused_and_nothing_is_written(
 
 
 NO_CAMERA: dict[str, Any] = {
-    "intrinsics": np.eye(3).tolist(), "lens": "radial-tangential", "distortion": [], "pose": None,
+    "intrinsics": np.eye(3).tolist(),
+    "lens": "radial-tangential",
+    "distortion": [],
+    "pose": None,
     "source": "x",
-}  # fmt: skip
+}
 BAD_CAMERAS: list[dict[str, Any]] = [
-    {"intrinsics": [[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]}, {"pose": [[10**400, 0, 0, 0]] * 3},
-    {"distortion": [10**400]}, {"lens": 5},
-]  # fmt: skip
+    {"intrinsics": [[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]},
+    {"pose": [[10**400, 0, 0, 0]] * 3},
+    {"distortion": [10**400]},
+    {"lens": 5},
+]
 BAD_NAMES = ["../../../ESC", "/etc/x.png", "a\nb.png", 7, "..", "n" * 201, "a\\b.png", "x/../../y"]
 
 
@@ -216,15 +221,18 @@ def change(path: Path, **entries: Any) -> None:
         *(
             (entries, FileFormatError, "beside it is damaged; refine it again")
             for entries in (
-                {"points": None}, {"points": {"farthest": 10**400}}, {"points": {"farthest": -1}},
-                {"size": "big"}, {"size": [WIDTH, 1.5]},
+                {"points": None},
+                {"points": {"farthest": 10**400}},
+                {"points": {"farthest": -1}},
+                {"size": "big"},
+                {"size": [WIDTH, 1.5]},
                 *({"camera": NO_CAMERA | change} for change in BAD_CAMERAS),
                 *({"inputs": {"sparse": {"unit_scale": value}}} for value in (10**400, -1, "x")),
                 *({"inputs": {"sparse": {"image": name}}} for name in BAD_NAMES),
             )
         ),
     ],
-)  # fmt: skip
+)
 def test_results_that_cannot_be_exported_are_one_line(
     root: Path, entries: dict[str, Any], error: type[PnpDepthError], message: str
 ) -> None:

@@ -35,8 +35,10 @@ def test_refine_gives_the_same_where_python_has_neither_fcntl_nor_resource(tmp_p
                 *(sys.executable, "-c", code, "refine", SAMPLES / "indoor/rgb.png", "--sparse"),
                 *(SAMPLES / "indoor/sparse.png", "-o", tmp_path / name, "--iterations", "1"),
             ],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert done.returncode == 0, done.stderr
     one, other = (tmp_path / name / "rgb_depth.png" for name in ("with", "without"))
     assert one.read_bytes() == other.read_bytes()

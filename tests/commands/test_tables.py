@@ -17,12 +17,18 @@ from pnpdepth_cli.core.metrics import MEASURES
 @pytest.mark.parametrize(
     ("key", "before", "after", "text", "style"),
     [
-        ("mae", None, 1.0, "–", "dim"), ("mae", 1.0, None, "–", "dim"), ("mae", nan, 1, "–", "dim"),
-        ("mae", 1.0, nan, "–", "dim"), ("mae", 0.0, 1.0, "–", "dim"), ("mae", 2, 2, "+0.0%", "dim"),
-        ("mae", 1.0, 0.5, "-50.0%", "good"), ("mae", 0.5, 1.5, "+200.0%", "bad"),
-        ("delta1", 0.0, 0.25, "+25.00 pt", "good"), ("delta1", 0.75, 0.5, "-25.00 pt", "bad"),
+        ("mae", None, 1.0, "–", "dim"),
+        ("mae", 1.0, None, "–", "dim"),
+        ("mae", nan, 1, "–", "dim"),
+        ("mae", 1.0, nan, "–", "dim"),
+        ("mae", 0.0, 1.0, "–", "dim"),
+        ("mae", 2, 2, "+0.0%", "dim"),
+        ("mae", 1.0, 0.5, "-50.0%", "good"),
+        ("mae", 0.5, 1.5, "+200.0%", "bad"),
+        ("delta1", 0.0, 0.25, "+25.00 pt", "good"),
+        ("delta1", 0.75, 0.5, "-25.00 pt", "bad"),
     ],
-)  # fmt: skip
+)
 def test_a_change_is_relative_or_in_points_and_coloured_by_whether_it_is_better(
     key: str, before: float | None, after: float | None, text: str, style: str
 ) -> None:
@@ -38,9 +44,15 @@ def test_an_error_has_its_unit_and_nothing_is_a_dash() -> None:
 def test_linear_interpolation_stands_beside_the_errors_and_points_used_show_no_gain() -> None:
     of_points = {"before": {"mae": 2.0}, "after": {"mae": 1.0, "points": 1234}}
     table = error_table(
-        "", {"scores": {"before": {"mae": 4.0}, "after": {"mae": 2.0}}, "held_out_error": of_points,
-             "sparse_error": of_points, "linear": {"scores": {"mae": 8.0}}}, "m",
-    )  # fmt: skip
+        "",
+        {
+            "scores": {"before": {"mae": 4.0}, "after": {"mae": 2.0}},
+            "held_out_error": of_points,
+            "sparse_error": of_points,
+            "linear": {"scores": {"mae": 8.0}},
+        },
+        "m",
+    )
     assert table.rows == [
         ["MAE", "4.0000 m", "2.0000 m", "-50.0%", "8.0000 m", "-75.0%"],
         ["error at 1,234 held-out points, MAE", "2.0000 m", "1.0000 m", "-50.0%", "–", "–"],
@@ -51,9 +63,13 @@ def test_linear_interpolation_stands_beside_the_errors_and_points_used_show_no_g
 def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> None:
     check = {"points": 12, "aligned": 4.0, "fused": 3.0, "propagated": 1.0, "linear": 2.0}
     record: dict[str, Any] = {
-        "method": {"kind": "default", "networks": ["net"]}, "model": {"name": "net"}, "unit": "m",
-        "stages": None, "scores": None, "linear": {"check": check | {"result": 1.0}},
-    }  # fmt: skip
+        "method": {"kind": "default", "networks": ["net"]},
+        "model": {"name": "net"},
+        "unit": "m",
+        "stages": None,
+        "scores": None,
+        "linear": {"check": check | {"result": 1.0}},
+    }
     assert styled(refinement_table(record)) == [
         [("net aligned", ""), ("4.0000 m", ""), ("+100.0%", "bad")],
         [("residual propagated", "bold"), ("1.0000 m", "bold"), ("-50.0%", "good")],
@@ -86,9 +102,11 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -
             {"rmse": gain(50.0, 0.0009), "delta1": gain(-50.0, 0.01)},
             {"rmse": gain(-50.0, 0.049), "delta1": gain(None, None)},
         ],
-        "frames": ["1", "2"], "clusters": {"count": 2, "unit": "frames"}, "resamples": 1000,
+        "frames": ["1", "2"],
+        "clusters": {"count": 2, "unit": "frames"},
+        "resamples": 1000,
         "exact_p_values": False,
-    }  # fmt: skip
+    }
     assert styled(methods_table(comparison)) == [
         [("a", ""), ("2.0000", ""), ("50.00%", "bold")],
         [("b", ""), ("1.0000***", "bold"), ("25.00%*", "")],

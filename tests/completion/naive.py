@@ -44,9 +44,13 @@ def plain(network: nn.Module, x: Tensor) -> Any:
 
 
 def naive_refine(
-    network: nn.Module, layer: str, x: Tensor, points: SparsePoints, settings: Settings,
+    network: nn.Module,
+    layer: str,
+    x: Tensor,
+    points: SparsePoints,
+    settings: Settings,
     depth_of: Callable[[Any], Tensor],
-) -> tuple[Tensor, list[float]]:  # fmt: skip
+) -> tuple[Tensor, list[float]]:
     """(depth of z_K, L(z_0) … L(z_K))."""
     name, settings = LayerName.parse(layer), settings.complete()
     loss_of, update = LOSSES[settings.loss], UPDATES[settings.update]()

@@ -86,12 +86,15 @@ def test_auto_aligns_a_disparity_network_from_30_points_with_20_percent_outliers
 @pytest.mark.parametrize(
     ("output", "wanted"),
     [
-        (lambda d: d, ("depth", "none")), (lambda d: 0.2 * d, ("depth", "scale")),
-        (lambda d: 0.2 * d + 3, ("depth", "affine")), (lambda d: 5 - 0.2 * d, ("depth", "affine")),
-        (lambda d: 1 / d, ("inverse", "none")), (lambda d: 9 / d, ("inverse", "scale")),
+        (lambda d: d, ("depth", "none")),
+        (lambda d: 0.2 * d, ("depth", "scale")),
+        (lambda d: 0.2 * d + 3, ("depth", "affine")),
+        (lambda d: 5 - 0.2 * d, ("depth", "affine")),
+        (lambda d: 1 / d, ("inverse", "none")),
+        (lambda d: 9 / d, ("inverse", "scale")),
         (lambda d: -9 / d, ("inverse", "scale")),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("seed", range(4))
 def test_auto_takes_the_simplest_reading_that_explains_the_points(
     output: Callable[[Tensor], Tensor], wanted: tuple[str, str], seed: int

@@ -47,11 +47,14 @@ def test_what_aligns_a_prediction_leaves_unknown_what_is_unknown_and_needs_one(n
 @pytest.mark.parametrize(
     ("name", "prediction"),
     [
-        ("median", lambda d: d / 7), ("scale", lambda d: d / 7), ("affine", lambda d: (d + 2) / 7),
-        ("scale-disparity", lambda d: 7 * d), ("affine-disparity", lambda d: 1 / (3 / d + 0.5)),
+        ("median", lambda d: d / 7),
+        ("scale", lambda d: d / 7),
+        ("affine", lambda d: (d + 2) / 7),
+        ("scale-disparity", lambda d: 7 * d),
+        ("affine-disparity", lambda d: 1 / (3 / d + 0.5)),
         ("local", lambda d: (d + 2) / 7),
     ],
-)  # fmt: skip
+)
 def test_each_alignment_restores_the_prediction_it_models(name, prediction) -> None:  # type: ignore[no-untyped-def]
     depth = ground_truth()
     dense = BASELINES[name].depth(random_points(depth, 80), prediction(depth))

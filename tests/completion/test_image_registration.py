@@ -28,11 +28,12 @@ def evidence_of(
 @pytest.mark.parametrize(
     "registration",
     [
-        UNREGISTERED, ImageRegistration(zoom=1.08, right=6.0, down=0.0),
+        UNREGISTERED,
+        ImageRegistration(zoom=1.08, right=6.0, down=0.0),
         ImageRegistration(zoom=1.0, right=-9.0, down=5.0),
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_zoom_and_shift_between_the_cameras_are_found(
     seed: int, registration: ImageRegistration
 ) -> None:

@@ -27,9 +27,12 @@ from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
 FILLS: dict[str, Callable[[SparsePoints], Tensor]] = {
-    "nearest": nearest, "linear": linear, "linear log": partial(linear, space="log"),
-    "idw": inverse_distance, "morphological": morphological,
-}  # fmt: skip
+    "nearest": nearest,
+    "linear": linear,
+    "linear log": partial(linear, space="log"),
+    "idw": inverse_distance,
+    "morphological": morphological,
+}
 
 
 def points_at(

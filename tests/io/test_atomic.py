@@ -64,11 +64,13 @@ def test_a_link_is_followed_and_kept(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "fact"),
     [
-        ("missing/out.png", "its folder does not exist"), ("file.txt/out.png", "not a directory"),
-        ("folder", "is a folder"), ("/proc/out.png", "cannot be written|its folder does not exist"),
+        ("missing/out.png", "its folder does not exist"),
+        ("file.txt/out.png", "not a directory"),
+        ("folder", "is a folder"),
+        ("/proc/out.png", "cannot be written|its folder does not exist"),
         ("/dev/null", "not a regular file"),
     ],
-)  # fmt: skip
+)
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str, fact: str) -> None:
     (tmp_path / "file.txt").write_text("x")
     (tmp_path / "folder").mkdir()

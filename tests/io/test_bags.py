@@ -85,10 +85,11 @@ def test_a_bag_compressed_as_a_whole_is_refused(mode: str, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     "metadata",
     [
-        "[1, 2]", "rosbag2_bagfile_information: 3",
+        "[1, 2]",
+        "rosbag2_bagfile_information: 3",
         "a: &a [x, x]\nb: &b [*a, *a]\n" + "rosbag2_bagfile_information: {version: [*b, *b]}",
     ],
-)  # fmt: skip
+)
 def test_metadata_of_another_kind_and_aliases_are_one_line(metadata: str, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "ros2")
     (bag / "metadata.yaml").write_text(metadata)

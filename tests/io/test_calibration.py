@@ -303,9 +303,10 @@ def test_extrinsics_are_read_in_each_form(form: str, tmp_path: Path) -> None:
         ("1 2 3", "holds 3 numbers; extrinsics are 12 or 16"),
         ("1 0 0 0 0 2 0 0 0 0 1 0", "is no rotation"),
         ("0 0 0 1 1 1 1", "the quaternion has length 2"),
-        ("1e9 0 0 0 0 0 1", "is none of a sensor"), ("hello: 3", "holds no extrinsics"),
+        ("1e9 0 0 0 0 0 1", "is none of a sensor"),
+        ("hello: 3", "holds no extrinsics"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_pose_is_one_line(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=rf"\A.*{message}.*\Z"):
         read_extrinsics(write(tmp_path, text))

@@ -111,8 +111,9 @@ def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:
     )
     model = read_model(tmp_path)
     assert (model.points.xyz.tolist(), model.points.error.tolist()) == (
-        [[1, 2, 3], [4, 5, 6]], [0.5, 1],
-    )  # fmt: skip
+        [[1, 2, 3], [4, 5, 6]],
+        [0.5, 1],
+    )
     assert model.points.track.tolist() == [2, 0]
     assert model.images["b.png"].points.tolist() == [1, 2, 3]
     assert model.images["b.png"].translation.tolist() == [0.1, 0, 0]
@@ -130,7 +131,8 @@ IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"
         ("cameras", "1 PINHOLE 64 48\n", "line 1: a PINHOLE camera has 4 parameters, not 0"),
         ("cameras", "\n\n1 PINHOLE 64 48 1 2 3 x\n", "line 3: .* is not numbers of a camera"),
         (
-            "images", f"{IMAGE}5 5 -1\n\n{IMAGE}",
+            "images",
+            f"{IMAGE}5 5 -1\n\n{IMAGE}",
             "line 4: the line of keypoints after it is missing",
         ),
         ("images", f"{IMAGE}5 5\n", "line 1: .* is not an image and its keypoints"),
@@ -138,7 +140,7 @@ IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"
         ("points3D", "# x\n7 1 2 3 9 8 7 0.5 1\n", "line 2: .* is not a point and its track"),
         ("points3D", "7 1 2 3 9 8 7\n", "line 1: .* is not a point and its track"),
     ],
-)  # fmt: skip
+)
 def test_a_faulty_line_of_a_text_model_is_named(
     part: str, text: str, message: str, tmp_path: Path
 ) -> None:

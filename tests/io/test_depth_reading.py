@@ -56,10 +56,12 @@ def ones(*names: str) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("text", "scale", "used", "end"),
     [
-        (None, None, 256, "÷ 256"), (None, 1000, 1000, "÷ 1000"),
-        ("1000", None, 1000, "÷ 1000 (from the file)"), ("1000", 500, 500, "÷ 500"),
+        (None, None, 256, "÷ 256"),
+        (None, 1000, 1000, "÷ 1000"),
+        ("1000", None, 1000, "÷ 1000 (from the file)"),
+        ("1000", 500, 500, "÷ 500"),
     ],
-)  # fmt: skip
+)
 def test_a_given_scale_beats_that_in_the_file_which_beats_kittis(
     name: str, text: str | None, scale: float | None, used: float, end: str, tmp_path: Path
 ) -> None:
@@ -236,10 +238,12 @@ def test_a_subsampled_exr_channel_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("corner", "rows", "columns"),
     [
-        ((1, 1), (1, 3), (1, 4)), ((-1, -1), (0, 1), (0, 2)), ((3, 2), (2, 4), (3, 5)),
+        ((1, 1), (1, 3), (1, 4)),
+        ((-1, -1), (0, 1), (0, 2)),
+        ((3, 2), (2, 4), (3, 5)),
         ((9, 9), 0, 0),
     ],
-)  # fmt: skip
+)
 def test_a_cropped_exr_is_placed_in_its_display_window(
     tmp_path: Path, corner: tuple[int, int], rows: Any, columns: Any
 ) -> None:

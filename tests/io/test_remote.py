@@ -68,10 +68,11 @@ def test_a_list_in_a_store_names_files_beside_it() -> None:
         ("ftp://h/x.png", "ftp:// is no known store; stores are s3, gs, hf, https, http, file"),
         ("s3://b//x.png", "has an empty or relative part"),
         ("s3://b/../x.png", "has an empty or relative part"),
-        ("s3://", "has an empty or relative part"), ("file://host/x.png", "names a host"),
+        ("s3://", "has an empty or relative part"),
+        ("file://host/x.png", "names a host"),
         ("s3://me:pass@b/x.png", r"^(?!.*pass).*has a user name in it"),
     ],
-)  # fmt: skip
+)
 def test_other_addresses_are_refused(text: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         path_of(text)

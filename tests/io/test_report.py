@@ -29,9 +29,13 @@ from tests.commands.report_pages import page_data
 LABELS = {"first": "Before", "second": "After", "map": "Change"}
 HEAD = Head(kind="Test", title="a report", labels=LABELS)
 NAMES = [
-    "</script><script>alert(1)</script>", "<!-- \"'&amp; -->", "two\nlines", "ü \u2028 \U0001f600",
-    "not utf-8: \udcff", "@DATA@ @SCRIPT@",
-]  # fmt: skip
+    "</script><script>alert(1)</script>",
+    "<!-- \"'&amp; -->",
+    "two\nlines",
+    "ü \u2028 \U0001f600",
+    "not utf-8: \udcff",
+    "@DATA@ @SCRIPT@",
+]
 
 
 def frame(name: str, key: str | None = None) -> dict[str, Any]:

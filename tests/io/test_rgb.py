@@ -46,10 +46,15 @@ def test_other_colour_modes_become_rgb(tmp_path: Path, mode: str) -> None:
 
 # What is stored when the upright image is [[0, 1, 2], [3, 4, 5]], by EXIF orientation.
 STORED = {
-    1: [[0, 1, 2], [3, 4, 5]], 2: [[2, 1, 0], [5, 4, 3]], 3: [[5, 4, 3], [2, 1, 0]],
-    4: [[3, 4, 5], [0, 1, 2]], 5: [[0, 3], [1, 4], [2, 5]], 6: [[2, 5], [1, 4], [0, 3]],
-    7: [[5, 2], [4, 1], [3, 0]], 8: [[3, 0], [4, 1], [5, 2]],
-}  # fmt: skip
+    1: [[0, 1, 2], [3, 4, 5]],
+    2: [[2, 1, 0], [5, 4, 3]],
+    3: [[5, 4, 3], [2, 1, 0]],
+    4: [[3, 4, 5], [0, 1, 2]],
+    5: [[0, 3], [1, 4], [2, 5]],
+    6: [[2, 5], [1, 4], [0, 3]],
+    7: [[5, 2], [4, 1], [3, 0]],
+    8: [[3, 0], [4, 1], [5, 2]],
+}
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "PNG16", "WEBP", "TIFF", "TIFF16"])
@@ -103,12 +108,13 @@ def test_only_the_first_page_is_read_with_a_note(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "fact"),
     [
-        (b"", "is empty"), (b"hello, world", "is not an image"),
+        (b"", "is empty"),
+        (b"hello, world", "is not an image"),
         (b"\x93NUMPY\x01\x00", "not an im"),
         (b"\0\0\0\x18ftypavif\0\0\0\0", "AVIF photo; .* save it as JPEG"),
         (b"\0\0\0\x18ftypheic\0\0\0\0", "cannot be decoded|reads HEIC, or save it as JPEG"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes, fact: str) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)

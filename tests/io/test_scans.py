@@ -57,11 +57,14 @@ def npy_bytes(points: NDArray[np.float32], dtype: type = np.float64) -> bytes:
 
 
 FILES = {
-    "kitti.bin": bin_bytes, "scan.npy": npy_bytes, "binary.pcd": pcd_bytes,
-    "ascii.pcd": lambda points: pcd_bytes(points, "ascii"), "little.ply": ply_bytes,
+    "kitti.bin": bin_bytes,
+    "scan.npy": npy_bytes,
+    "binary.pcd": pcd_bytes,
+    "ascii.pcd": lambda points: pcd_bytes(points, "ascii"),
+    "little.ply": ply_bytes,
     "big.ply": lambda points: ply_bytes(points, "binary_big_endian"),
     "ascii.ply": lambda points: ply_bytes(points, "ascii"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -165,9 +168,12 @@ def nuscenes_bytes(points: NDArray[np.float32]) -> bytes:
     ],
 )
 def test_a_bin_of_kitti_or_nuscenes_is_recognised_by_name_and_content(
-    name: str, count: int, encoded: Callable[[NDArray[np.float32]], bytes], source: str,
+    name: str,
+    count: int,
+    encoded: Callable[[NDArray[np.float32]], bytes],
+    source: str,
     tmp_path: Path,
-) -> None:  # fmt: skip
+) -> None:
     points = np.resize(POINTS, (count, 3))
     (tmp_path / name).write_bytes(encoded(points))
     scan = read_scan(tmp_path / name)

@@ -288,10 +288,13 @@ def test_a_reduced_image_has_means_and_an_enlarged_one_squares() -> None:
 @pytest.mark.parametrize(
     ("ticks", "labels"),
     [
-        ([1.0, 1.05, 1.1], ["1.00", "1.05", "1.10"]), ([0.25, 8], ["0.2", "8.0"]),
-        ([10, 2000], ["10", "2,000"]), ([0, 0.5], ["0", "0"]), ([], []),
+        ([1.0, 1.05, 1.1], ["1.00", "1.05", "1.10"]),
+        ([0.25, 8], ["0.2", "8.0"]),
+        ([10, 2000], ["10", "2,000"]),
+        ([0, 0.5], ["0", "0"]),
+        ([], []),
     ],
-)  # fmt: skip
+)
 def test_ticks_have_as_many_decimals_as_tell_them_apart(
     ticks: list[float], labels: list[str]
 ) -> None:

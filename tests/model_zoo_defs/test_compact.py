@@ -39,9 +39,10 @@ def frame(height: int, width: int, count: int, seed: int = 0) -> tuple[Tensor, T
 
 
 PATTERNS = {
-    "row": (slice(40, 41), slice(None)), "column": (slice(None), slice(3, 4)),
+    "row": (slice(40, 41), slice(None)),
+    "column": (slice(None), slice(3, 4)),
     "corner": (slice(9), slice(9)),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("points", [0, 1, 2, 5, 500, 20_000, *PATTERNS, "one depth"])

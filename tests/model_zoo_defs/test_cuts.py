@@ -8,13 +8,16 @@ from pnpdepth_cli.models.registry import find_definition
 from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_does, built
 
 CUTS = {
-    "adnn": ("solve", (1, 32, 8, 12)), "eigen-tiny": ("coarse.conv5", (1, 64, 6, 8)),
-    "fcrn-tiny": ("layer1_BN", (1, 144, 2, 3)), "latefusion-tiny": ("decoder.s8", (1, 32, 8, 12)),
-    "sfmlearner-tiny": ("iconv5", (1, 48, 8, 26)), "sparse2dense-tiny": ("bn2", (1, 64, 8, 10)),
+    "adnn": ("solve", (1, 32, 8, 12)),
+    "eigen-tiny": ("coarse.conv5", (1, 64, 6, 8)),
+    "fcrn-tiny": ("layer1_BN", (1, 144, 2, 3)),
+    "latefusion-tiny": ("decoder.s8", (1, 32, 8, 12)),
+    "sfmlearner-tiny": ("iconv5", (1, 48, 8, 26)),
+    "sparse2dense-tiny": ("bn2", (1, 64, 8, 10)),
     "sparse2dense-tiny-kitti": ("bn2", (1, 64, 8, 29)),
     "sparseconv": ("sparse_convs.0[0]", (1, 16, 64, 96)),
     "sparseconv-nomask": ("sparse_convs.0[0]", (1, 16, 64, 96)),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CUTS)

@@ -23,11 +23,14 @@ PROCESSING: dict[str, dict[str, Any]] = {
     "prompt_depth_anything": {**IMAGENET, **ASPECT, "size": SQUARE, "ensure_multiple_of": 14},
     "dpt": {**HALF, "size": {"height": 64, "width": 64}},
     "zoedepth": {
-        **HALF, **ASPECT, "size": {"height": 64, "width": 96}, "ensure_multiple_of": 32,
+        **HALF,
+        **ASPECT,
+        "size": {"height": 64, "width": 96},
+        "ensure_multiple_of": 32,
     },
     "glpn": {"size_divisor": 32, "do_rescale": True},
     "depth_pro": {**HALF, "size": {"height": 64, "width": 64}},
-}  # fmt: skip
+}
 """A preprocessor_config.json by the type of the network."""
 
 
@@ -80,14 +83,15 @@ def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_
 @pytest.mark.parametrize(
     ("processing", "size"),
     [
-        ({"size": 56}, Fixed(56, 56)), ({"size": {"shortest_edge": 30}}, Fixed(30, 30)),
+        ({"size": 56}, Fixed(56, 56)),
+        ({"size": {"shortest_edge": 30}}, Fixed(30, 30)),
         ({"size": {"height": 1, "width": 1 << 16}}, Fixed(1, 1 << 16)),
         ({"size": 56, "keep_aspect_ratio": True}, Near(of=32, height=56, width=56)),
         ({**ASPECT, "size": 9, "ensure_multiple_of": 1 / 64}, Near(of=64, height=9, width=9)),
         ({"do_resize": False, "size": 56}, Near(of=32)),
         ({"size_divisor": 1 << 16}, Near(of=1 << 16)),
     ],
-)  # fmt: skip
+)
 def test_the_size_is_fixed_or_near_one_or_a_multiple(
     processing: dict[str, Any], size: Fixed | Near, folder: Path
 ) -> None:
@@ -98,13 +102,14 @@ def test_the_size_is_fixed_or_near_one_or_a_multiple(
 @pytest.mark.parametrize(
     ("processing", "mean", "std"),
     [
-        ({}, 0.0, 1.0), ({"do_normalize": True}, 0.5, 0.5),
+        ({}, 0.0, 1.0),
+        ({"do_normalize": True}, 0.5, 0.5),
         ({"do_normalize": True, "rescale_factor": 1 / 127.5}, 0.25, 0.25),
         ({"image_mean": [0.25] * 3, "image_std": [0.2] * 3}, 0.25, 0.2),
         ({"image_mean": [0.25] * 3, "do_normalize": False, "rescale_factor": 2 / 255}, 0.0, 0.5),
         ({"image_mean": [51] * 3, "image_std": [102] * 3, "do_rescale": False}, 0.2, 0.4),
     ],
-)  # fmt: skip
+)
 def test_normalisation_is_that_of_an_image_from_0_to_1(
     processing: dict[str, Any], mean: float, std: float, folder: Path
 ) -> None:
@@ -166,15 +171,20 @@ def test_plain_attention_is_taken(folder: Path) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"size_divisor": "x"}, {"size_divisor": [32]}, {"size_divisor": 10**12},
-        {"rescale_factor": None}, {"rescale_factor": 0}, {"rescale_factor": 10**400},
+        {"size_divisor": "x"},
+        {"size_divisor": [32]},
+        {"size_divisor": 10**12},
+        {"rescale_factor": None},
+        {"rescale_factor": 0},
+        {"rescale_factor": 10**400},
         {"do_normalize": True, "image_mean": {"r": 1}},
-        {"do_normalize": True, "image_std": [10**400] * 3}, {"size": [1, 2]},
+        {"do_normalize": True, "image_std": [10**400] * 3},
+        {"size": [1, 2]},
         {"size": {"height": "x", "width": 3}},
         *({"size": size} for size in (0, (1 << 16) + 1, 56.0)),
         *({"size_divisor": side} for side in (-1, (1 << 16) + 1, 1 / ((1 << 16) + 1), 1.0)),
     ],
-)  # fmt: skip
+)
 def test_settings_that_are_no_numbers_are_refused_in_one_line(
     change: dict[str, Any], folder: Path
 ) -> None:

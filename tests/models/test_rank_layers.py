@@ -32,9 +32,11 @@ def layer(name: str, field: int, cost: float) -> MeasuredLayer:
 
 
 LAYERS = [
-    layer("deep", 90, 0.9), layer("middle", 40, 0.5), layer("late", 9, 0.1),
+    layer("deep", 90, 0.9),
+    layer("middle", 40, 0.5),
+    layer("late", 9, 0.1),
     MeasuredLayer(name="never", problem="never runs"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(

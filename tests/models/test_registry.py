@@ -105,9 +105,10 @@ def test_an_entry_point_of_another_package_adds_networks(open_list: Path) -> Non
     ("entry_point", "reason"),
     [
         ("theirs = missing_package:definition", "ModuleNotFoundError"),
-        ("theirs = os.path", "gives a NoneType"), ("theirs = os.path:sep", "gives a str"),
+        ("theirs = os.path", "gives a NoneType"),
+        ("theirs = os.path:sep", "gives a str"),
     ],
-)  # fmt: skip
+)
 def test_a_package_that_cannot_be_loaded_is_reported_only_when_it_is_named(
     entry_point: str, reason: str, open_list: Path
 ) -> None:

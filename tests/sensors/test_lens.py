@@ -100,10 +100,11 @@ def test_a_fisheye_that_turns_back_shows_nothing_beyond() -> None:
 @pytest.mark.parametrize(
     ("lens", "radial"),
     [
-        ("radial-tangential", "11001"), ("thin-prism-fisheye", "11001100"),
+        ("radial-tangential", "11001"),
+        ("thin-prism-fisheye", "11001100"),
         ("rad-tan-thin-prism-fisheye", "111111000000"),
     ],
-)  # fmt: skip
+)
 def test_a_lens_turns_back_by_its_radial_coefficients_alone(lens: str, radial: str) -> None:
     for number, turns in enumerate(radial):
         alone = tuple(-9.0 if i == number else 0.0 for i in range(len(radial)))

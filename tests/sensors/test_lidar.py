@@ -10,11 +10,12 @@ from pnpdepth_cli.sensors import LIDARS, Lidar
 @pytest.mark.parametrize(
     ("name", "beams", "top", "bottom", "step", "most_m", "noise_m"),
     [
-        ("vlp-16", 16, 15.0, -15.0, 0.2, 100, 0.03), ("vlp-32c", 32, 15.0, -25.0, 0.2, 200, 0.03),
+        ("vlp-16", 16, 15.0, -15.0, 0.2, 100, 0.03),
+        ("vlp-32c", 32, 15.0, -25.0, 0.2, 200, 0.03),
         ("hdl-32e", 32, 10.67, -30.67, 0.166, 100, 0.02),
         ("hdl-64e", 64, 2.0, -24.33, 0.1728, 120, 0.02),
     ],
-)  # fmt: skip
+)
 def test_a_sensor_is_that_of_its_data_sheet(
     name: str, beams: int, top: float, bottom: float, step: float, most_m: float, noise_m: float
 ) -> None:

@@ -123,13 +123,17 @@ def test_jitter_moves_positions_and_keeps_depths() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"kind": "spiral", "count": 3}, "spiral"), ({"count": 0}, "at least one"),
-        ({"fraction": 1.5}, "100 %"), ({"fraction": 0.0}, "above 0"),
-        ({"count": 3, "fraction": 0.1}, "not both"), ({}, "needs a count"),
-        ({"kind": "lines"}, "number of lines"), ({"kind": "region", "count": 3}, "region"),
+        ({"kind": "spiral", "count": 3}, "spiral"),
+        ({"count": 0}, "at least one"),
+        ({"fraction": 1.5}, "100 %"),
+        ({"fraction": 0.0}, "above 0"),
+        ({"count": 3, "fraction": 0.1}, "not both"),
+        ({}, "needs a count"),
+        ({"kind": "lines"}, "number of lines"),
+        ({"kind": "region", "count": 3}, "region"),
         ({"count": 3, "region": (0, 0, 1, 1)}, "region"),
     ],
-)  # fmt: skip
+)
 def test_a_pattern_that_makes_no_sense_is_refused(options: dict[str, object], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         SamplePattern(**options)  # type: ignore[arg-type]

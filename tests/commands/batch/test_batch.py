@@ -85,9 +85,10 @@ def test_a_second_run_does_nothing_also_where_files_were_touched_or_moved(root: 
         (None, "out/b_preview.png", "result missing: b_preview.png"),
         ("rgb/c.png", "rgb/b.png", "input changed: image"),
         ("gt/a.png", "gt/b.png", "other input files"),
-        ("rgb/c.png", "out/b.json", "record damaged"), (None, "out/b.json", "interrupted"),
+        ("rgb/c.png", "out/b.json", "record damaged"),
+        (None, "out/b.json", "interrupted"),
     ],
-)  # fmt: skip
+)
 def test_only_what_is_missing_or_changed_is_done_again(
     root: Path, source: str | None, changed: str, why: str
 ) -> None:
@@ -243,7 +244,8 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Pa
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("../up", "leads out of the output folder"), ("/up", "leads out of the output folder"),
+        ("../up", "leads out of the output folder"),
+        ("/up", "leads out of the output folder"),
         ("summary", "needs a file of the batch's own"),
         ("summary.csv/x", "needs a file of the batch's own"),
         (".batch.lock/x", "needs a file of the batch's own"),
@@ -252,7 +254,7 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Pa
         ("ok.json/deep/x", "needs a file of frame 'ok'"),
         ("ok_sigma", "needs a file of frame 'ok'"),
     ],
-)  # fmt: skip
+)
 def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
     root: Path, name: str, why: str
 ) -> None:

@@ -58,9 +58,13 @@ def dies() -> None:
 
 
 def results(
-    refine: Refine, count: int, *, worked: bool = False, starts: Callable[[], None] = lambda: None,
+    refine: Refine,
+    count: int,
+    *,
+    worked: bool = False,
+    starts: Callable[[], None] = lambda: None,
     stopped: Callable[[], bool] = lambda: False,
-) -> tuple[dict[Any, Any], list[str]]:  # fmt: skip
+) -> tuple[dict[Any, Any], list[str]]:
     """The row of each frame, which is a number, and the messages."""
     messages: list[str] = []
     to_do: Any = range(count)

@@ -217,14 +217,15 @@ def test_a_batch_is_compared_with_what_it_started_from(tmp_path: Path) -> None:
 
 
 BROKEN = [
-    ("{}", "holds no scores"), ('{"frames": []}', "holds no scores"),
+    ("{}", "holds no scores"),
+    ('{"frames": []}', "holds no scores"),
     ('{"scores": null}', "holds no scores"),
     ('{"command": "eval"}', "does not hold scores as pnpdepth writes them"),
     ('{"frames": [{"scores": {}}]}', "does not hold scores as pnpdepth writes them"),
     ('{"scores": {"after": {"rmse": 1}}}', "does not hold scores as pnpdepth writes them"),
     ('{"command": "eval", "protocol": {"name": "other"}, "measures": []}', "does not hold scores"),
     ("nonsense", "not valid JSON"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("text", "message"), BROKEN)

@@ -84,9 +84,13 @@ MATCHED = [
 
 @pytest.mark.parametrize(("predictions", "truths", "expected", "notes"), MATCHED)
 def test_files_are_matched_by_name_and_what_is_left_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, predictions: list[str], truths: list[str],
-    expected: dict[str, str | None], notes: list[str],
-) -> None:  # fmt: skip
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    predictions: list[str],
+    truths: list[str],
+    expected: dict[str, str | None],
+    notes: list[str],
+) -> None:
     monkeypatch.chdir(tmp_path)
     pairs, own_notes = pair_frames(*folders(Path(), predictions, truths))
     assert (matched(pairs), own_notes) == (expected, notes)
@@ -105,9 +109,14 @@ REFUSED = [
 
 @pytest.mark.parametrize(("predictions", "truths", "first", "second", "error", "message"), REFUSED)
 def test_what_cannot_be_matched_is_refused(
-    tmp_path: Path, predictions: list[str], truths: list[str], first: str, second: str,
-    error: type[Exception], message: str,
-) -> None:  # fmt: skip
+    tmp_path: Path,
+    predictions: list[str],
+    truths: list[str],
+    first: str,
+    second: str,
+    error: type[Exception],
+    message: str,
+) -> None:
     folders(tmp_path, predictions, truths)
     with pytest.raises(error, match=message):
         pair_frames(tmp_path / first, tmp_path / second)

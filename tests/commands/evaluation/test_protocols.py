@@ -13,11 +13,14 @@ from pnpdepth_cli.errors import SizeError, UsageError
 
 # (protocol, frame, (top, bottom, left, right)) as the published evaluations cut them
 WINDOWS = [
-    ("paper", (228, 304), (0, 228, 0, 304)), ("nyu-eigen", (480, 640), (45, 471, 41, 601)),
-    ("garg", (375, 1242), (153, 371, 44, 1197)), ("garg", (370, 1224), (151, 366, 43, 1180)),
-    ("eigen", (375, 1242), (124, 342, 44, 1197)), ("eigen", (352, 1216), (117, 321, 43, 1172)),
+    ("paper", (228, 304), (0, 228, 0, 304)),
+    ("nyu-eigen", (480, 640), (45, 471, 41, 601)),
+    ("garg", (375, 1242), (153, 371, 44, 1197)),
+    ("garg", (370, 1224), (151, 366, 43, 1180)),
+    ("eigen", (375, 1242), (124, 342, 44, 1197)),
+    ("eigen", (352, 1216), (117, 321, 43, 1172)),
     ("kitti-devkit", (375, 1242), (0, 375, 0, 1242)),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("name", "size", "window"), WINDOWS)

@@ -18,10 +18,13 @@ hub = pytest.importorskip("huggingface_hub", reason="needs the extra [hf]")
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 FILES = {
-    "config.json": b'{"model_type": "glpn"}', "model.safetensors": bytes(range(256)) * 40,
-    "model.bin": b"a pickle", "net.py": b"code", "../escaped.safetensors": b"outside",
+    "config.json": b'{"model_type": "glpn"}',
+    "model.safetensors": bytes(range(256)) * 40,
+    "model.bin": b"a pickle",
+    "net.py": b"code",
+    "../escaped.safetensors": b"outside",
     "model/../../escaped.safetensors": b"outside",
-}  # fmt: skip
+}
 
 
 class Server(ThreadingHTTPServer):

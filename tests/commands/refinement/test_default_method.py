@@ -38,10 +38,11 @@ def test_without_options_of_the_method_it_is_the_default_one(frame: FrameOnDisk)
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"iterations": 2}, "--iterations"), ({"layer": "encode"}, "--layer"),
+        ({"iterations": 2}, "--iterations"),
+        ({"layer": "encode"}, "--layer"),
         ({"preset": "paper", "iterations": 2}, "--preset paper --iterations"),
     ],
-)  # fmt: skip
+)
 def test_an_option_of_the_method_fixes_it(
     frame: FrameOnDisk, options: dict[str, Any], reason: str
 ) -> None:

@@ -46,10 +46,14 @@ def refined_to(*depths: float, inputs: Inputs) -> Refined:
 @pytest.mark.parametrize(
     ("depths", "scale", "expected"),
     [
-        ((0.4, 80.0), None, 256), ((0.4, 80.0), 1000.0, 1000), ((5.0, 400.0), None, 100),
-        ((900.0, 3000.0), None, 10), ((0.005, 0.02), None, 10_000), ((0.005, 80.0), None, 256),
+        ((0.4, 80.0), None, 256),
+        ((0.4, 80.0), 1000.0, 1000),
+        ((5.0, 400.0), None, 100),
+        ((900.0, 3000.0), None, 10),
+        ((0.005, 0.02), None, 10_000),
+        ((0.005, 80.0), None, 256),
     ],
-)  # fmt: skip
+)
 def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points(
     depths: tuple[float, ...], scale: float | None, expected: float
 ) -> None:

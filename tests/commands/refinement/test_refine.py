@@ -239,11 +239,12 @@ BAD = [
     ({"image": None}, PnpDepthError, "takes an rgb image"),
     ({"device": "cuda:7"}, PnpDepthError, "--device cpu"),
     ({"device": "tpu"}, PnpDepthError, "--device cpu"),
-    ({"format": "jpg"}, UsageError, "not one of"), ({"depth_scale": -1.0}, UsageError, "scale"),
+    ({"format": "jpg"}, UsageError, "not one of"),
+    ({"depth_scale": -1.0}, UsageError, "scale"),
     ({"time_budget_s": 5.0}, UsageError, "--propagate makes none"),
     ({"gt": "small.npy"}, SizeError, "ground truth .* is 62×10 but the image is 62×46"),
     ({"gt": "empty.npy"}, InputError, "no pixel with known depth"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("changes", "error", "message"), BAD)

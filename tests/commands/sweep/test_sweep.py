@@ -48,9 +48,13 @@ def root(tmp_path: Path) -> Path:
 
 
 def sweep(
-    root: Path, *vary: str, listener: RecordingListener | None = None, one_by_one: bool = False,
-    refine: dict[str, Any] | None = None, **changes: Any,
-) -> dict[str, Any]:  # fmt: skip
+    root: Path,
+    *vary: str,
+    listener: RecordingListener | None = None,
+    one_by_one: bool = False,
+    refine: dict[str, Any] | None = None,
+    **changes: Any,
+) -> dict[str, Any]:
     fields: dict[str, Any] = {
         "source": root,
         "output": root / "out",
@@ -483,10 +487,12 @@ def test_the_cost_stands_beside_the_error_where_it_is_asked_for(root: Path) -> N
     ("first", "second", "along"),
     [
         ("points=20,60", "iterations=0,1,2", "iterations"),
-        ("iterations=0,1,2", "points=20,60", "iterations"), ("loss=l1,l2,log", "lr=1%,3%", "lr"),
-        ("loss=l1,l2,log", "update=sign,sgd", "loss"), ("points=20,60", "lr=1%,3%", "lr"),
+        ("iterations=0,1,2", "points=20,60", "iterations"),
+        ("loss=l1,l2,log", "lr=1%,3%", "lr"),
+        ("loss=l1,l2,log", "update=sign,sgd", "loss"),
+        ("points=20,60", "lr=1%,3%", "lr"),
     ],
-)  # fmt: skip
+)
 def test_numbers_are_on_the_x_axis_and_more_values_before_fewer(
     first: str, second: str, along: str
 ) -> None:

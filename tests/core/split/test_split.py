@@ -38,10 +38,13 @@ from tests.core.networks import (
 NO_CUT = {
     "unet": {"encoder.stages", "ups"},
     "vit": {"encoder.blocks", *(f"encoder.blocks.{i}.attention.out_proj" for i in range(3))},
-    "in place": {"flat"}, "side effects": {"many", "hide"},
+    "in place": {"flat"},
+    "side effects": {"many", "hide"},
     "direct": {"enter.parametrizations", "spectral.parametrizations"},
-    "scripted": {"enter.0", "enter.1"}, "sparse": {"to_sparse"}, "fx": {"2"},
-}  # fmt: skip
+    "scripted": {"enter.0", "enter.1"},
+    "sparse": {"to_sparse"},
+    "fx": {"2"},
+}
 """Layers that give no tensor or never run, and one whose cut would not be a cut (`torn`)."""
 
 

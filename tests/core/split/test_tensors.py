@@ -42,14 +42,24 @@ class Stack(list):  # type: ignore[type-arg]
 
 t = torch.ones(1)
 STRUCTURES: list[tuple[Any, list[tuple[str, ...]]]] = [
-    (t, [()]), ([t, (t, 5)], [("0",), ("1", "0")]), ({"a": t, 3: [t]}, [("a",), ("3", "0")]),
-    ({1: t, "1": t + 1}, [("1",), ("1",)]), (OrderedDict(b=t, a=None), [("b",)]),
-    (defaultdict(list, a=[t]), [("a", "0")]), (Two(t), [("0",)]),
-    (Frozen(t), [("a",), ("created",)]), (Slotted(t), [("a",)]), (Stack(t, t), [("0",), ("1",)]),
+    (t, [()]),
+    ([t, (t, 5)], [("0",), ("1", "0")]),
+    ({"a": t, 3: [t]}, [("a",), ("3", "0")]),
+    ({1: t, "1": t + 1}, [("1",), ("1",)]),
+    (OrderedDict(b=t, a=None), [("b",)]),
+    (defaultdict(list, a=[t]), [("a", "0")]),
+    (Two(t), [("0",)]),
+    (Frozen(t), [("a",), ("created",)]),
+    (Slotted(t), [("a",)]),
+    (Stack(t, t), [("0",), ("1",)]),
     (Encoded(last=t, hidden=(t,)), [("last",), ("hidden", "0")]),
-    (torch.ones(2, 2).max(0), [("0",), ("1",)]), (torch.Size([2, 3]), []), ((), []), ({}, []),
-    ("text", []), (None, []),
-]  # fmt: skip
+    (torch.ones(2, 2).max(0), [("0",), ("1",)]),
+    (torch.Size([2, 3]), []),
+    ((), []),
+    ({}, []),
+    ("text", []),
+    (None, []),
+]
 
 
 @pytest.mark.parametrize(("structure", "paths"), STRUCTURES)

@@ -32,7 +32,9 @@ class Behind(nn.Module):
 
 
 DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "z itself": lambda z, y: z, "detach": lambda z, y: z.detach() * 2, "data": lambda z, y: z.data,
+    "z itself": lambda z, y: z,
+    "detach": lambda z, y: z.detach() * 2,
+    "data": lambda z, y: z.data,
     "argmax": lambda z, y: y + z.argmax(1, keepdim=True),
     "a comparison": lambda z, y: torch.where(z > 0, y, -y),
     "a view": lambda z, y: z.detach()[:, [0]].expand(-1, 4, -1, -1),
@@ -47,12 +49,13 @@ DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "argmax as a list": lambda z, y: y + z.argmax(1).flatten().tolist()[5],
     "a mask": lambda z, y: y + y[z > 0].sum(),
     "foreach": lambda z, y: torch._foreach_add([y], [z.detach()])[0],
-}  # fmt: skip
+}
 
 INDEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "the features before z": lambda z, y: y, "the shape of z": lambda z, y: y * z.shape[1],
+    "the features before z": lambda z, y: y,
+    "the shape of z": lambda z, y: y * z.shape[1],
     "new zeros": lambda z, y: y + torch.zeros(z.shape),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("operation", [*DEPENDENT, *INDEPENDENT])
@@ -73,11 +76,14 @@ def test_a_branch_runs_again_where_it_depends_on_z_by_any_operation(operation: s
 @pytest.mark.parametrize(
     "escape",
     [
-        lambda y: bool(y.mean() > 0), lambda y: y.mean().item() > 0,
-        lambda y: y.mean((0, 2, 3)).tolist()[0] > 0, lambda y: y.numpy().mean() > 0,
-        lambda y: len(y[y > 0]) > 400, lambda y: int((y > 0).sum()) > 400,
+        lambda y: bool(y.mean() > 0),
+        lambda y: y.mean().item() > 0,
+        lambda y: y.mean((0, 2, 3)).tolist()[0] > 0,
+        lambda y: y.numpy().mean() > 0,
+        lambda y: len(y[y > 0]) > 400,
+        lambda y: int((y > 0).sum()) > 400,
     ],
-)  # fmt: skip
+)
 def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], bool]) -> None:
     torch.manual_seed(0)
     network, x = Branching(escape), image()
@@ -98,12 +104,18 @@ def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], 
 @pytest.mark.parametrize(
     "write",
     [
-        lambda t: t.add_(1), lambda t: t[1:].zero_(), lambda t: torch.add(t, 1, out=t),
-        lambda t: torch._foreach_mul_([t], 2.0), lambda t: F.relu_(t.view(3, 1)),
-        lambda t: t.detach().exp_(), lambda t: t.__setitem__(0, 9.0),
-        lambda t: nn.ReLU(inplace=True)(t), lambda t: t.clamp_(max=0), lambda t: t.data.fill_(4),
+        lambda t: t.add_(1),
+        lambda t: t[1:].zero_(),
+        lambda t: torch.add(t, 1, out=t),
+        lambda t: torch._foreach_mul_([t], 2.0),
+        lambda t: F.relu_(t.view(3, 1)),
+        lambda t: t.detach().exp_(),
+        lambda t: t.__setitem__(0, 9.0),
+        lambda t: nn.ReLU(inplace=True)(t),
+        lambda t: t.clamp_(max=0),
+        lambda t: t.data.fill_(4),
     ],
-)  # fmt: skip
+)
 def test_every_form_of_writing_is_seen(write: Callable[[Tensor], object]) -> None:
     tensor = torch.tensor([-1.0, 2.0, 3.0])
     saved = SavedTensors(tensor)
@@ -126,14 +138,20 @@ def test_reading_makes_no_copy() -> None:
 
 CONSTANT = torch.ones(2, 3)
 REPLACEABLE: list[tuple[Callable[[Tensor], object], bool]] = [
-    (lambda t: t + 1, True), (lambda t: {"a": [t + 1, 5, "text", None]}, True),
-    (lambda t: (t + 1).relu_().view(3, 2), True), (lambda t: t, False),
-    (lambda t: t.view(3, 2), False), (lambda t: t.add_(1), False),
-    (lambda t: (t.add_(1), t + 1)[1], False), (lambda t: (CONSTANT.add_(1), t + 1)[1], False),
-    (lambda t: CONSTANT, False), (lambda t: iter([t + 1]), False),
-    (lambda t: {"a": t + 1, "b": object()}, False), (lambda t: [(t + 1)] * 2, False),
+    (lambda t: t + 1, True),
+    (lambda t: {"a": [t + 1, 5, "text", None]}, True),
+    (lambda t: (t + 1).relu_().view(3, 2), True),
+    (lambda t: t, False),
+    (lambda t: t.view(3, 2), False),
+    (lambda t: t.add_(1), False),
+    (lambda t: (t.add_(1), t + 1)[1], False),
+    (lambda t: (CONSTANT.add_(1), t + 1)[1], False),
+    (lambda t: CONSTANT, False),
+    (lambda t: iter([t + 1]), False),
+    (lambda t: {"a": t + 1, "b": object()}, False),
+    (lambda t: [(t + 1)] * 2, False),
     (lambda t: (t + 1).unbind(0), False),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("call", "replaceable"), REPLACEABLE)

@@ -103,12 +103,15 @@ def test_a_damaged_scene_is_refused_in_one_line(text: str, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("table", "change"),
     [
-        ("scene", {"name": None}), ("sample_data", {"filename": None}),
-        ("sample_data", {"height": "x"}), ("sample_data", {"height": 10**400}),
-        ("ego_pose", {"rotation": [10**400, 0, 0, 0]}), ("ego_pose", {"token": "other"}),
+        ("scene", {"name": None}),
+        ("sample_data", {"filename": None}),
+        ("sample_data", {"height": "x"}),
+        ("sample_data", {"height": 10**400}),
+        ("ego_pose", {"rotation": [10**400, 0, 0, 0]}),
+        ("ego_pose", {"token": "other"}),
         ("scene", None),
     ],
-)  # fmt: skip
+)
 def test_odd_values_in_the_tables_of_nuscenes_are_one_line(
     table: str, change: dict[str, Any] | None, tmp_path: Path
 ) -> None:

@@ -187,11 +187,13 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("\n", "has no poses"), (_ROW, "000001.png has no pose: its sequence's file holds 1 poses"),
-        (_ROW[2:], "00.txt: line 1"), (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt: line 3"),
+        ("\n", "has no poses"),
+        (_ROW, "000001.png has no pose: its sequence's file holds 1 poses"),
+        (_ROW[2:], "00.txt: line 1"),
+        (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt: line 3"),
         (_ROW.replace("1", "one"), "00.txt: line 1"),
     ],
-)  # fmt: skip
+)
 def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
     tmp_path: Path, text: str, message: str
 ) -> None:
@@ -285,10 +287,11 @@ def test_synthias_random_set_has_centimetres_in_either_folder(
 @pytest.mark.parametrize(
     ("stem", "size", "is_synthia"),
     [
-        ("kitchen", (760, 1280), False), ("0000001", (480, 640), False),
+        ("kitchen", (760, 1280), False),
+        ("0000001", (480, 640), False),
         ("0000001", (760, 1280), True),
     ],
-)  # fmt: skip
+)
 def test_rgb_and_depth_are_synthia_with_its_names_and_size_only(
     tmp_path: Path, stem: str, size: tuple[int, int], is_synthia: bool
 ) -> None:

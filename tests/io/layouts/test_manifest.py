@@ -33,12 +33,19 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
     assert from_json == from_csv
     assert from_csv == [
         Frame(
-            name="first", image=tmp_path / "i.png", sparse=tmp_path / "s.bin",
-            gt=tmp_path / "deep/g.png", calib=tmp_path / "c.txt", camera=3, gt_scale=1000,
-            protocol=PROTOCOLS["kitti-odometry"], masks=(tmp_path / "m.png",), gt_other_size=True,
+            name="first",
+            image=tmp_path / "i.png",
+            sparse=tmp_path / "s.bin",
+            gt=tmp_path / "deep/g.png",
+            calib=tmp_path / "c.txt",
+            camera=3,
+            gt_scale=1000,
+            protocol=PROTOCOLS["kitti-odometry"],
+            masks=(tmp_path / "m.png",),
+            gt_other_size=True,
             group="room",
         )
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.parametrize(
@@ -103,11 +110,13 @@ def test_names_stay_but_for_dots_and_double_slashes(tmp_path: Path) -> None:
     ("name", "problem"),
     [
         *((name, "leads out of the output folder") for name in ("../a", "/a", "x/../../a")),
-        *((name, "on Windows") for name in ("a\\b", "C:/frames/a")), ("a\0b", "NUL"),
-        (".", "names no file"), ("n" * 240, "is longer than 239 bytes"),
+        *((name, "on Windows") for name in ("a\\b", "C:/frames/a")),
+        ("a\0b", "NUL"),
+        (".", "names no file"),
+        ("n" * 240, "is longer than 239 bytes"),
         ("x/" + "é" * 120, "is longer than 239 bytes"),
     ],
-)  # fmt: skip
+)
 def test_a_name_that_leads_elsewhere_or_is_none_of_a_file_has_no_results(
     name: str, problem: str
 ) -> None:

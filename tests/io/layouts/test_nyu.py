@@ -71,10 +71,12 @@ def test_an_hdf5_file_that_is_damaged_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("external link", "stored outside the file"), ("soft link", "stored outside the file"),
-        ("external storage", "stored outside the file"), ("another name", "has no array depth"),
+        ("external link", "stored outside the file"),
+        ("soft link", "stored outside the file"),
+        ("external storage", "stored outside the file"),
+        ("another name", "has no array depth"),
     ],
-)  # fmt: skip
+)
 def test_an_array_that_is_elsewhere_is_refused(tmp_path: Path, kind: str, message: str) -> None:
     with h5py.File(tmp_path / "secret.h5", "w") as file:
         file["depth"] = np.ones((4, 4), np.float32)

@@ -10,10 +10,16 @@ from onnx import TensorProto, helper, numpy_helper, save
 
 
 def write_network(
-    path: Path, *, shape: tuple[Any, ...] = (1, 3, 32, 48), opset: int = 13,
-    channels_last: bool = False, sign: float = 1.0, nodes: tuple[Any, ...] = (),
-    outputs: tuple[str, ...] = ("depth",), domain: str = "",
-) -> Path:  # fmt: skip
+    path: Path,
+    *,
+    shape: tuple[Any, ...] = (1, 3, 32, 48),
+    opset: int = 13,
+    channels_last: bool = False,
+    sign: float = 1.0,
+    nodes: tuple[Any, ...] = (),
+    outputs: tuple[str, ...] = ("depth",),
+    domain: str = "",
+) -> Path:
     """An encoder, a bottleneck at stride 4, and an upsampled positive output near 2."""
     rng = np.random.default_rng(0)
 

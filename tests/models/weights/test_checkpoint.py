@@ -102,11 +102,13 @@ def save_uncounted(state: Mapping[str, Tensor], path: Path) -> None:
     [
         (save_file, ".safetensors"),
         *((torch.save, suffix) for suffix in (".pth", ".pt", ".pth.tar", ".ckpt", "")),
-        (save_older, ".pth"), (save_layers, ".npy"), (save_numbered, ".npz"),
+        (save_older, ".pth"),
+        (save_layers, ".npy"),
+        (save_numbered, ".npz"),
         (save_uncounted, ".pth"),
         *((save_beside(key), ".pth") for key in ("state_dict", "model_state_dict", "model", "net")),
     ],
-)  # fmt: skip
+)
 def test_every_format_and_layout_gives_the_same_weights(
     save: Callable[[Any, Path], None], suffix: str, tmp_path: Path
 ) -> None:
@@ -295,10 +297,13 @@ def test_a_pointer_to_a_file_that_was_not_fetched_is_named(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("save", "suffix"),
     [
-        (torch.save, ".pth"), (save_older, ".pth"), (save_file, ".safetensors"),
-        (save_layers, ".npy"), (save_numbered, ".npz"),
+        (torch.save, ".pth"),
+        (save_older, ".pth"),
+        (save_file, ".safetensors"),
+        (save_layers, ".npy"),
+        (save_numbered, ".npz"),
     ],
-)  # fmt: skip
+)
 def test_a_file_cut_anywhere_is_refused(
     save: Callable[[Any, Path], None], suffix: str, tmp_path: Path
 ) -> None:

@@ -82,14 +82,18 @@ def test_an_array_named_twice_is_read_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ([1, 2], "no dict of arrays"), ("text", "no dict of arrays"), ({"a": 1}, "a is a int"),
-        ({"a": {"b": "text"}}, "a.b is a str"), ({"a": np.array(["x", "y"])}, "a is an array of"),
+        ([1, 2], "no dict of arrays"),
+        ("text", "no dict of arrays"),
+        ({"a": 1}, "a is a int"),
+        ({"a": {"b": "text"}}, "a.b is a str"),
+        ({"a": np.array(["x", "y"])}, "a is an array of"),
         ({"a": np.array([1 + 2j])}, "a is an array of <c16, not of numbers"),
         ({"a": np.array([{}, 1], dtype=object)}, "a holds objects"),
         ({"a": {"b": {"c": {"d": np.ones(1)}}}}, "nested deeper than the layers"),
-        (RING, "nested deeper than the layers"), ({"a": torch.nn.Identity()}, "a is a torch.nn"),
+        (RING, "nested deeper than the layers"),
+        ({"a": torch.nn.Identity()}, "a is a torch.nn"),
     ],
-)  # fmt: skip
+)
 def test_other_contents_are_named(content: Any, message: str, tmp_path: Path) -> None:
     assert message in refused(npy_of(tmp_path / "x.npy", pickled(content, "4")))
 

@@ -101,9 +101,17 @@ def test_what_tensorflow_wrote_is_read_to_the_bit_and_text_is_left_out(tmp_path:
 
 def test_types_have_the_numbers_of_tensorflows_types_proto(tmp_path: Path) -> None:
     types = {
-        1: torch.float32, 2: torch.float64, 3: torch.int32, 4: torch.uint8, 5: torch.int16,
-        6: torch.int8, 9: torch.int64, 10: torch.bool, 14: torch.bfloat16, 19: torch.float16,
-    }  # fmt: skip
+        1: torch.float32,
+        2: torch.float64,
+        3: torch.int32,
+        4: torch.uint8,
+        5: torch.int16,
+        6: torch.int8,
+        9: torch.int64,
+        10: torch.bool,
+        14: torch.bfloat16,
+        19: torch.float16,
+    }
     entries = {str(number): entry(number, (), 0, kind.itemsize) for number, kind in types.items()}
     tensors = read_tensor_bundle(bundle(tmp_path, entries, bytes(64)))
     assert {int(name): tensor.dtype for name, tensor in tensors.items()} == types
