@@ -46,7 +46,7 @@ _WINDOW = 9  # pixels
 _WITHIN = (0.68, 0.95)  # of normal errors within one and two standard deviations
 _TAIL = 0.75  # weight of the second in the scale: both cannot hold where tails are heavy
 _TYPICAL, _PER_POINT = 1.75, -0.18  # factor with 100 points, and its power of their number
-_MOST_POINTS = 500  # more change nothing
+_FEWEST_POINTS, _MOST_POINTS = 20, 500  # fewer and more change nothing
 _TYPICAL_WEIGHT = 20  # hidden points that the typical factor counts as
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point are valid
 _BEYOND_HULL = 2.0  # typical distances to the nearest point, outside the hull of the points
@@ -131,7 +131,8 @@ def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
         sigma: (M,) their standard deviations, in the same unit.
         points: Number of points that the depth was fitted to.
     """
-    typical = _TYPICAL * math.pow(min(max(points, 1), _MOST_POINTS) / 100, _PER_POINT)
+    points = min(max(points, _FEWEST_POINTS), _MOST_POINTS)
+    typical = _TYPICAL * math.pow(points / 100, _PER_POINT)
     ratio = (residual.double().abs() / sigma.double()).flatten()
     ratio = ratio[ratio.isfinite()].sort().values
     if not len(ratio):

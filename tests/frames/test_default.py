@@ -18,7 +18,7 @@ from pnpdepth_cli.frames import default
 from pnpdepth_cli.frames.default import FOLDS, MIN_POINTS, refine_default, split_hidden
 from pnpdepth_cli.frames.frame import Check, Frame, Refined
 from pnpdepth_cli.frames.fuse import Fusion, Member, weighted_mean
-from pnpdepth_cli.frames.uncertainty import relative_shape, with_uncertainty
+from pnpdepth_cli.frames.uncertainty import calibration, relative_shape, with_uncertainty
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -53,11 +53,12 @@ def test_the_stages_follow_each_other_and_the_last_is_the_result() -> None:
     assert errors[-1] < errors[0]
 
 
-def test_without_a_check_the_uncertainty_is_the_relative_shape_alone() -> None:
+def test_without_a_check_the_uncertainty_has_the_typical_scale() -> None:
     result = refined(frame_in_memory(MIN_POINTS - 1), member(Brightness))
     got = with_uncertainty(result)
     depths = (torch.from_numpy(depth) for depth in (result.before, result.after))
-    expected = relative_shape(result.used, *depths).numpy() * result.after
+    typical = calibration(torch.empty(0), torch.empty(0), MIN_POINTS - 1)
+    expected = typical * relative_shape(result.used, *depths).numpy() * result.after
     assert np.array_equal(got.sigma, expected.astype(np.float32))
     assert "too few points to calibrate it with" in got.notes[-1]
 

@@ -19,7 +19,7 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.decoding import check_tags
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import check_pixel_count
-from pnpdepth_cli.io.formats.images import _check_header
+from pnpdepth_cli.io.formats.images import _claimed_bytes
 from pnpdepth_cli.io.rgb import read_rgb
 from tests.exr_files import (
     DEEP,
@@ -212,9 +212,9 @@ def test_a_pixel_is_one_channel_of_one_byte_unless_told(sixteen: str) -> None:
 def test_an_exr_has_four_bytes_a_pixel_of_every_channel() -> None:
     channel = SimpleNamespace(name="Z", xSampling=1, ySampling=1)
     header = dict.fromkeys(("dataWindow", "displayWindow"), ((0, 0), (3999, 3999)))
-    _check_header(Path("a.exr"), header | {"channels": [channel] * 8}, 1 << 30)
+    _claimed_bytes(Path("a.exr"), header | {"channels": [channel] * 8}, 1 << 30)
     with pytest.raises(FileFormatError, match="in 576,000,000 bytes, more than 512,000,000"):
-        _check_header(Path("a.exr"), header | {"channels": [channel] * 9}, 1 << 30)
+        _claimed_bytes(Path("a.exr"), header | {"channels": [channel] * 9}, 1 << 30)
 
 
 def test_the_tags_of_a_tiff_claim_as_many_bytes_as_their_types_have() -> None:

@@ -227,6 +227,7 @@ def web_head(status: str, length: object) -> bytes:
     return f"HTTP/1.1 {status}\r\nContent-Length: {length}\r\n\r\n".encode()
 
 
+@pytest.mark.slow  # fsspec's thread stays, with which standard error is not silenced
 @pytest.mark.parametrize(
     ("answer", "then_s", "message"),
     [
