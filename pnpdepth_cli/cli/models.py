@@ -182,7 +182,8 @@ def layers(
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     if row["problem"]:
-        return (row["name"], "–", *[""] * 5, row["problem"])
+        reason = row["problem"].partition(": ")[2] or row["problem"]
+        return (row["name"], "–", *[""] * 5, reason)
     return (
         row["name"],
         "×".join(str(n) for n in row["shape"]),

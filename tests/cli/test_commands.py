@@ -98,6 +98,8 @@ def test_layers_lists_shape_stride_cost_and_field_and_why_some_cannot_be_cut(
     assert shown["middle"][6:] == ["ms", "2×2", "6×6"]
     assert int(shown["middle"][5]) < 1000
     assert shown["unused"] == ["–", *problem.split()]
+    assert code_of(["layers", "--model", "eigen-tiny", "--all"]) == 0
+    assert "fine.relu – fine.relu#1, fine.relu#2" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("command", ["sample", "simulate", "compare"])
