@@ -41,6 +41,8 @@ GAIN = 0.75
 points. Else the image may not belong to the points, and half of the result leaves it out."""
 ENOUGH_FOR_GAIN = 60
 """Fewer hidden points show no gain even where there is one."""
+MANY_OUTLIERS = 0.05
+"""With a larger fraction of outliers left out, so do any: outliers remain among the points."""
 LOSS = 2.0
 """Standard errors by which it has to be worse for linear interpolation to be half of the result."""
 ENOUGH_FOR_LOSS = 20
@@ -242,7 +244,9 @@ def _moved(
 ) -> tuple[Tensor, Check, tuple[str, ...]]:
     """The result (H, W), moved away from an image that does not fit its points, and why."""
     count, gain = len(check.hidden), check.gain(PROPAGATED, LINEAR)
-    worse = count >= ENOUGH_FOR_LOSS and gain < (GAIN if count >= ENOUGH_FOR_GAIN else -LOSS)
+    outliers = 0 if frame.outliers is None else len(frame.outliers)
+    shows_gain = count >= ENOUGH_FOR_GAIN and outliers <= MANY_OUTLIERS * len(frame.points)
+    worse = count >= ENOUGH_FOR_LOSS and gain < (GAIN if shows_gain else -LOSS)
     if not worse and not frame.unrelated:
         return depth, check, ()
     at_points, what = check.predicted[PROPAGATED], []

@@ -216,6 +216,21 @@ def test_a_method_that_is_worse_beyond_chance_gives_half_to_linear_interpolation
     assert any("half is linear interpolation" in note for note in result.notes) == half_linear
 
 
+@pytest.mark.parametrize(("outliers", "moved"), [(20, True), (21, False)])
+def test_a_method_without_gain_uses_the_image_less_unless_many_points_were_outliers(
+    monkeypatch: pytest.MonkeyPatch, outliers: int, moved: bool
+) -> None:
+    hidden = 80
+    depth = torch.full((hidden,), 2.0)
+    check = check_of(dict.fromkeys(("propagated", "linear", "result"), depth * 1.01), depth)
+    monkeypatch.setattr(default, "_check", lambda *_: check)
+    frame = frame_in_memory(5 * hidden)
+    left_out = frame.points.select(torch.arange(5 * hidden) < outliers)
+    result = refined(replace(frame, outliers=left_out), compact())
+    assert any("half of the result leaves the image out" in note for note in result.notes) == moved
+    assert np.array_equal(result.after, result.stages["propagated"]) != moved
+
+
 def test_a_completion_network_is_no_prior_where_the_hidden_points_speak_against_it() -> None:
     frame = frame_in_memory(60)
     poor = refined(frame, member(Nearest), compact())
