@@ -58,6 +58,12 @@ def test_frames_with_few_points_show_together_what_each_does_not() -> None:
     assert found.zoom == pytest.approx(UNREGISTERED.zoom, abs=0.02)
 
 
+def test_a_pair_of_points_says_the_same_in_either_order() -> None:
+    known = evidence_of(0)
+    turned = replace(known, ends=known.ends[:, ::-1])
+    assert turned.unmoved == pytest.approx(known.unmoved, abs=0.02 * known.unmoved.std())
+
+
 def test_frames_of_another_size_than_the_first_are_left_out() -> None:
     first, other = evidence_of(0, UNREGISTERED), evidence_of(1)
     assert estimated([first, replace(other, size=(200, 320))]) == estimated([first])
