@@ -178,3 +178,11 @@ def test_what_other_threads_do_with_tensors_meanwhile_is_their_own_matter() -> N
         assert not watch.data_dependent
         z.numpy()
         assert watch.data_dependent
+
+
+@pytest.mark.parametrize("reads", [True, False])
+def test_a_tensor_counts_as_read_where_reads_are_not_noted(reads: bool) -> None:
+    read, other = torch.ones(2), torch.ones(2)
+    with Watch([], reads=reads) as watch:
+        _ = read + 1
+    assert (watch.was_read(read), watch.was_read(other)) == (True, not reads)

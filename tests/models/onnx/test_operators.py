@@ -138,6 +138,7 @@ def test_matrices() -> None:
     check("MatMul", [normal(2, 3, 5), normal(5, 4)])
     check("Gemm", [normal(3, 5), normal(4, 5), normal(4)], transB=1, alpha=0.5, beta=2.0)
     check("Gemm", [normal(5, 3), normal(5, 4)], transA=1)
+    check("Gemm", [normal(3, 5), normal(5, 4), normal(4)])
     check("Einsum", [normal(2, 3, 5), normal(2, 5, 4)], equation="bij,bjk->bik")
     for more in ({}, {"reverse": 1}, {"exclusive": 1}, {"reverse": 1, "exclusive": 1}):
         check("CumSum", [X, np.array(2, I64)], **more)
@@ -373,6 +374,7 @@ def test_picking_and_putting_back() -> None:
     grid = np.clip(normal(1, 3, 3, 2), -1, 1)
     for mode, corners in (("linear", 0), ("linear", 1), ("nearest", 0)):
         check("GridSample", [X, grid], opset=20, mode=mode, align_corners=corners)
+    check("GridSample", [X, grid], opset=20)
 
 
 INDEX = np.array([[0, 1]], I64)
