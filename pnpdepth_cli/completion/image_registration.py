@@ -40,8 +40,9 @@ which it is not moved, under whose negative it counts as unrelated, and which th
 registrations exceeds by chance: once for one frame, twice for more."""
 
 ENOUGH = 2.0
-"""Mean of that of images that belong to their points, 2.0 with 260 points, from which it decides:
-with 100 points, 0.7, it is below −1.8 in 2 of 40 such draws of ICL-NUIM."""
+"""An image is called unrelated only where an image that belongs to its points would have at least
+this log Bayes factor in the mean, as with 260 points. With 100 points it has 0.7, and 2 of 40 draws
+of registered frames of ICL-NUIM are below −1.8."""
 
 _ZOOMS = np.exp(np.linspace(-0.4, 0.4, 81))  # 0.67 to 1.49
 _LARGEST_SHIFT = 0.05  # of the image's sides
