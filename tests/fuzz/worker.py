@@ -31,6 +31,28 @@ from tests.fuzz.seeds import Seed, write_seeds
 
 FORBIDDEN = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect")
 """Audit events that no input may cause."""
+CHANGES = {
+    "os.rename": 2,
+    "os.link": 2,
+    "os.symlink": 2,
+    "os.remove": 1,
+    "os.mkdir": 1,
+    "os.rmdir": 1,
+}
+"""Audit events that change files, and how many paths each has; none may lead outside."""
+
+
+def problem(event: str, arguments: tuple[Any, ...], folder: Path) -> str | None:
+    """Returns what an input caused that none may: a process, a connection, a change outside."""
+    if event in FORBIDDEN:
+        return event
+    writes = event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+    for path in arguments[: CHANGES.get(event, int(bool(writes)))]:
+        if isinstance(path, str | bytes | os.PathLike) and os.fsdecode(path) != os.devnull:
+            real = Path(os.path.realpath(os.fsdecode(path)))
+            if not real.is_relative_to(folder):
+                return f"{event} {real}"
+    return None
 
 
 def peak_bytes() -> int:
@@ -99,7 +121,16 @@ def main() -> None:
         if result["code"] not in (0, 7):
             raise SystemExit(f"the valid {each.file} fails: {result}")
     events: list[str] = []
-    sys.addaudithook(lambda event, _: events.append(event) if event in FORBIDDEN else None)
+    tempfile.tempdir, inside = str(Path("tmp").resolve()), Path().resolve()
+    Path("tmp").mkdir()
+    sys.dont_write_bytecode = True
+
+    def watch(event: str, arguments: tuple[Any, ...]) -> None:
+        found = problem(event, arguments, inside)
+        if found is not None:
+            events.append(found)
+
+    sys.addaudithook(watch)
     for number in range(first, first + count):
         chosen = seeds[number % len(seeds)]
         data = mutated(Path(chosen.file).read_bytes(), np.random.default_rng((seed, number)))
