@@ -184,6 +184,12 @@ def test_a_plain_text_file_and_its_json_are_read_the_same(tmp_path: Path) -> Non
         read_calibration(tmp_path / "calib.txt", 1)
 
 
+def test_an_image_of_one_column_without_distortion_is_read(tmp_path: Path) -> None:
+    text = PLAIN.replace("[1242, 375]", "[1, 375]").replace("[-0.3, 0.1, 0.0, 0.001]", "[]")
+    calibration = read_calibration(write(tmp_path, text))
+    assert (calibration.size, calibration.distortion) == ((375, 1), ())
+
+
 def test_nine_numbers_are_intrinsics_alone(tmp_path: Path) -> None:
     got = read_calibration(write(tmp_path, "585 0 320\n0 585 240\n0 0 1\n"))
     assert facts(got)[0] == [[585, 0, 320], [0, 585, 240], [0, 0, 1]]
