@@ -163,6 +163,21 @@ def test_frames_are_one_cloud_in_the_world_frame_in_which_voxels_merge_them(tmp_
     assert merged == len(np.unique(np.floor(points / 0.5), axis=0))
 
 
+def test_pixels_that_too_few_views_agree_on_are_left_out(tmp_path: Path) -> None:
+    poses = "1 0 0 0 0 1 0 0 0 0 1 0\n"  # three cameras at one place, of which one is wrong
+    (tmp_path / "poses.txt").write_text(3 * poses)
+    for name, depth in (("a", 2.0), ("b", 2.0), ("c", 3.0)):
+        frame(tmp_path / "out", name, depth)
+    values = {"poses": tmp_path / "poses.txt", "overwrite": True}
+    found = {
+        views: written(tmp_path / "out", tmp_path / "o.ply", min_views=views, **values)["points"]
+        for views in (1, 2)
+    }
+    assert found == {1: 3 * HEIGHT * WIDTH, 2: 2 * HEIGHT * WIDTH}
+    with pytest.raises(UsageError, match="--min-views 4 needs as many frames with poses"):
+        written(tmp_path / "out", tmp_path / "o.ply", min_views=4, **values)
+
+
 @pytest.mark.parametrize(
     ("values", "error", "message"),
     [
