@@ -92,9 +92,10 @@ def test_a_full_stderr_does_not_stop_the_work_and_a_full_stdout_is_one_line(tmp_
         (["sample", str(GT), "--count", "5", "-o", "{long}.png"], 2),
         (["refine", str(GT), "--sparse", "{long}"], 3),
         (["refine", str(GT), "--sparse", str(GT), "--model", "{long}.onnx", "-o", "a"], 4),
-        (["batch", "{long}", "-o", "out"], 3), (["eval", "{long}", "{long}"], 3),
+        (["batch", "{long}", "-o", "out"], 3),
+        (["eval", "{long}", "{long}"], 3),
     ],
-)  # fmt: skip
+)
 def test_names_of_5000_characters_are_one_line(
     arguments: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -110,12 +111,16 @@ def test_names_of_5000_characters_are_one_line(
 @pytest.mark.parametrize(
     ("path", "number", "code"),
     [
-        ("in.png", errno.EACCES, 3), ("out/x_depth.png", errno.EACCES, 2),
-        ("net.onnx", errno.EACCES, 4), ("weights/a/b", errno.EACCES, 4),
-        ("table.csv", errno.ENAMETOOLONG, 2), ("in_refined", errno.EACCES, 2),
-        (None, errno.ENOSPC, 2), (None, errno.EIO, 3),
+        ("in.png", errno.EACCES, 3),
+        ("out/x_depth.png", errno.EACCES, 2),
+        ("net.onnx", errno.EACCES, 4),
+        ("weights/a/b", errno.EACCES, 4),
+        ("table.csv", errno.ENAMETOOLONG, 2),
+        ("in_refined", errno.EACCES, 2),
+        (None, errno.ENOSPC, 2),
+        (None, errno.EIO, 3),
     ],
-)  # fmt: skip
+)
 def test_the_code_of_an_error_follows_from_the_option_of_its_file(
     path: str | None, number: int, code: int
 ) -> None:

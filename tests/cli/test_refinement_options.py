@@ -64,10 +64,12 @@ def test_names_and_values_reach_the_settings(command: click.Command) -> None:
     ("text", "message"),
     [
         ("lr=1", "choose from sparse-size-ok, .*, schedule, blur"),
-        ("blur", "--set blur must be blur=S"), ("keep-best=1", "must be keep-best"),
-        ("mask=all", "'all' is not one of"), ("blur=x", "'x' is not a valid float"),
+        ("blur", "--set blur must be blur=S"),
+        ("keep-best=1", "must be keep-best"),
+        ("mask=all", "'all' is not one of"),
+        ("blur=x", "'x' is not a valid float"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_name_or_no_value_is_refused(text: str, message: str) -> None:
     with pytest.raises((UsageError, click.UsageError), match=message):
         refine.make_context("refine", ["a.png", "--sparse", "s.png", "--set", text])

@@ -418,9 +418,10 @@ def test_a_loss_or_rule_of_a_file_that_gives_the_wrong_shape_is_refused_on_one_l
 
 
 OTHERS = (
-    POINTS, SparsePoints(xy=torch.tensor([[2.5, 7.0]]), depth=torch.tensor([9.0]), size=(16, 16)),
+    POINTS,
+    SparsePoints(xy=torch.tensor([[2.5, 7.0]]), depth=torch.tensor([9.0]), size=(16, 16)),
     SparsePoints(xy=POINTS.xy.flip(1), depth=POINTS.depth * 3, size=(16, 16)),
-)  # fmt: skip
+)
 IMAGES = torch.cat([image(), image().flip(-1) * 2, image() - 1])
 
 

@@ -108,9 +108,13 @@ def depth_pro() -> Any:
 
 
 MAKERS = {
-    "depth_anything": depth_anything, "prompt_depth_anything": prompt_depth_anything, "dpt": dpt,
-    "zoedepth": zoedepth, "glpn": glpn, "depth_pro": depth_pro,
-}  # fmt: skip
+    "depth_anything": depth_anything,
+    "prompt_depth_anything": prompt_depth_anything,
+    "dpt": dpt,
+    "zoedepth": zoedepth,
+    "glpn": glpn,
+    "depth_pro": depth_pro,
+}
 
 
 def saved(folder: Path, name: str) -> Path:

@@ -180,14 +180,18 @@ def test_addresses_of_clusters_and_what_is_none() -> None:
 @pytest.mark.parametrize(
     ("device", "options", "expected"),
     [
-        ("cuda:1", {}, None), ("cuda:0,cuda:2", {}, (LOCAL, "cuda", (0, 2))),
-        ("all", {}, (LOCAL, "cuda", ())), ("cpu", {"ray": "auto"}, ("auto", "cpu", ())),
+        ("cuda:1", {}, None),
+        ("cuda:0,cuda:2", {}, (LOCAL, "cuda", (0, 2))),
+        ("all", {}, (LOCAL, "cuda", ())),
+        ("cpu", {"ray": "auto"}, ("auto", "cpu", ())),
         ("cuda:1", {"ray_workers": 2}, "are of Ray workers; add --ray"),
-        ("cuda:0,cuda:0", {}, "name each GPU once"), ("cuda,cuda", {}, "name each GPU once"),
-        ("cpu,cuda:0", {}, "workers run on cpu, cuda"), ("mps,mps", {}, "workers run on cpu, cuda"),
+        ("cuda:0,cuda:0", {}, "name each GPU once"),
+        ("cuda,cuda", {}, "name each GPU once"),
+        ("cpu,cuda:0", {}, "workers run on cpu, cuda"),
+        ("mps,mps", {}, "workers run on cpu, cuda"),
         ("cuda:0,cuda:1", {"ray": "auto"}, "take --device cuda, and --ray-workers 2"),
     ],
-)  # fmt: skip
+)
 def test_which_devices_are_workers(device: str, options: dict[str, Any], expected: Any) -> None:
     if isinstance(expected, str):
         with pytest.raises(UsageError, match=expected):

@@ -71,15 +71,18 @@ MATCHED = [
         ["out: ignored, as there is a _depth of each: b.png"],
     ),
     (  # frames in folders of their own
-        ["one/1_depth.png", "two/1_depth.png"], ["one/1.png", "two/1.png", "two/2.png"],
-        {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None}, [],
+        ["one/1_depth.png", "two/1_depth.png"],
+        ["one/1.png", "two/1.png", "two/2.png"],
+        {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None},
+        [],
     ),
     (
-        ["a.png", "x.png", "y.png", ".b.png", ".hidden/c.png"], ["a.png", "b.png"],
+        ["a.png", "x.png", "y.png", ".b.png", ".hidden/c.png"],
+        ["a.png", "b.png"],
         {"a": "a.png", "b": None},
         ["warning: 2 of 3 predictions have no ground truth and are not scored: x, y"],
     ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("predictions", "truths", "expected", "notes"), MATCHED)

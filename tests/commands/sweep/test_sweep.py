@@ -107,11 +107,13 @@ class Killed(RecordingListener):
 
 
 REFINEMENTS: list[dict[str, Any]] = [
-    {"iterations": 2, "lr": "10%"}, {"iterations": 8, "lr": "60%", "keep_best": True},
-    {"iterations": 4, "schedule": "linear"}, {"iterations": 0, "propagate": "gp"},
+    {"iterations": 2, "lr": "10%"},
+    {"iterations": 8, "lr": "60%", "keep_best": True},
+    {"iterations": 4, "schedule": "linear"},
+    {"iterations": 0, "propagate": "gp"},
     {"iterations": 3, "lr": "0.001", "parameters": "weights"},
     {"preset": "paper", "propagate": None},
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("settings", REFINEMENTS, ids=lambda settings: str(list(settings)))
@@ -425,18 +427,31 @@ def test_a_folder_that_holds_other_results_is_refused(root: Path) -> None:
 
 
 BAD = [
-    ("point=20", "no parameter 'point'"), ("points", "give values after ="),
-    ("points=20,", "with commas"), ("points=20,20", "comes twice"),
-    ("points=many", "neither a number"), ("points=0", "at least one point"),
-    ("points=200%", "at most 100 %"), ("iterations=1.5", "not a whole number"),
-    ("iterations=-1", ">= 0, got -1"), ("lr=0", "a step size above 0"),
-    ("loss=l3", "one of l1, l2"), ("update=newton", "sign"), ("outliers=2", "from 0 to 1"),
-    ("noise=-1", "not negative"), ("blur=inf", ">= 0, got inf"), ("noise=nan", "not negative"),
-    ("noise=x", "'x' is not a number"), ("line-search=yes", "neither on nor off"),
-    ("rotation-noise=400", "0 to 360"), ("seed=99999999999999999999", "largest seed"),
-    ("sensor=vlp-17", "no sensor 'vlp-17'"), ("sensor=gird:40", "no sensor 'gird:40'"),
-    ("sensor=grid:x", "neither a number"), ("sensor=no.toml", "no.toml"),
-]  # fmt: skip
+    ("point=20", "no parameter 'point'"),
+    ("points", "give values after ="),
+    ("points=20,", "with commas"),
+    ("points=20,20", "comes twice"),
+    ("points=many", "neither a number"),
+    ("points=0", "at least one point"),
+    ("points=200%", "at most 100 %"),
+    ("iterations=1.5", "not a whole number"),
+    ("iterations=-1", ">= 0, got -1"),
+    ("lr=0", "a step size above 0"),
+    ("loss=l3", "one of l1, l2"),
+    ("update=newton", "sign"),
+    ("outliers=2", "from 0 to 1"),
+    ("noise=-1", "not negative"),
+    ("blur=inf", ">= 0, got inf"),
+    ("noise=nan", "not negative"),
+    ("noise=x", "'x' is not a number"),
+    ("line-search=yes", "neither on nor off"),
+    ("rotation-noise=400", "0 to 360"),
+    ("seed=99999999999999999999", "largest seed"),
+    ("sensor=vlp-17", "no sensor 'vlp-17'"),
+    ("sensor=gird:40", "no sensor 'gird:40'"),
+    ("sensor=grid:x", "neither a number"),
+    ("sensor=no.toml", "no.toml"),
+]
 
 
 @pytest.mark.parametrize(("text", "message"), BAD)

@@ -349,10 +349,11 @@ def test_what_is_far_larger_than_the_file_is_refused_before_allocation(
 
 
 QUANTISED = [
-    constant("qs", np.float32(0.02)), constant("qz", np.uint8(0)),
+    constant("qs", np.float32(0.02)),
+    constant("qz", np.uint8(0)),
     helper.make_node("QuantizeLinear", ["depth", "qs", "qz"], ["q"]),
     helper.make_node("DequantizeLinear", ["q", "qs", "qz"], ["dq"]),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("kind", ["Range", "Concat", "Pad", "Expand", "Resize", "MatMul"])
@@ -394,23 +395,24 @@ def test_a_quantised_network_takes_larger_images_than_the_first_and_no_loops(
 
 CONSTANT_WORK = {
     "Conv": [
-        constant("n", [1, 1, 2048, 2048]), helper.make_node("ConstantOfShape", ["n"], ["a1"]),
-        constant("m", [1, 1, 1024, 1024]), helper.make_node("ConstantOfShape", ["m"], ["a2"]),
+        constant("n", [1, 1, 2048, 2048]),
+        helper.make_node("ConstantOfShape", ["n"], ["a1"]),
+        constant("m", [1, 1, 1024, 1024]),
+        helper.make_node("ConstantOfShape", ["m"], ["a2"]),
         helper.make_node("Conv", ["a1", "a2"], ["big"]),
     ],
     "ReduceSum": [
-        constant("n", [4096, 4096]), helper.make_node("ConstantOfShape", ["n"], ["a1"]),
-        *(
-            helper.make_node("ReduceSum", ["a1"], [f"r{n}"], keepdims=0)
-            for n in range(2000)
-        ),
+        constant("n", [4096, 4096]),
+        helper.make_node("ConstantOfShape", ["n"], ["a1"]),
+        *(helper.make_node("ReduceSum", ["a1"], [f"r{n}"], keepdims=0) for n in range(2000)),
         helper.make_node("Sum", [f"r{n}" for n in range(2000)], ["big"]),
     ],
     "Einsum": [
-        constant("a1", np.ones((60_000, 1))), constant("a2", np.ones((1, 60_000))),
+        constant("a1", np.ones((60_000, 1))),
+        constant("a2", np.ones((1, 60_000))),
         helper.make_node("Einsum", ["a1", "a2", "a1"], ["big"], equation="ij,jk,kl->il"),
     ],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", CONSTANT_WORK)
