@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, NoPointsError, SizeError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, write_depth
+from pnpdepth_cli.io.depth import (
+    DepthKind,
+    depth_from_stored,
+    known_metres,
+    load_stored,
+    write_depth,
+)
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, KITTI_SCALE, check_scale, kind_of
 from pnpdepth_cli.points import SparsePoints
@@ -38,6 +44,11 @@ class SparseFile:
     assumed_scale: bool
     """Whether the scale of an integer file was assumed, because neither user nor file states it."""
     scale: float | None = None  # codes per metre of an integer file
+
+    @property
+    def kind(self) -> DepthKind:
+        """What was read."""
+        return DepthKind(self.source, self.scale, self.assumed_scale)
 
 
 def read_sparse(

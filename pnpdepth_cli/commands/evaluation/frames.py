@@ -202,7 +202,7 @@ def _known_sparse(
     inside = in_frame(xy, (height, width))
     depth = sparse.points.depth[inside]
     points = SparsePoints(xy=xy[inside], depth=depth, size=(height, width))
-    return as_depth_image(points), DepthKind(sparse.source, sparse.scale, assumed)
+    return as_depth_image(points), sparse.kind._replace(assumed=assumed)
 
 
 def image_of(pair: FramePair, size: Size) -> Depth | None:

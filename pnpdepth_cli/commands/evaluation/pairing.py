@@ -30,7 +30,7 @@ from pnpdepth_cli.io.dataset import (
 )
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray
-from pnpdepth_cli.io.formats.arrays import parse_npy
+from pnpdepth_cli.io.formats.arrays import COMPRESSIONS, parse_npy
 from pnpdepth_cli.io.layouts import find_layout, list_frames
 from pnpdepth_cli.io.remote import RemotePath
 from pnpdepth_cli.models.weights.numpy_file import read_pickled_arrays
@@ -350,4 +350,4 @@ def _can_be_true(path: Path, member: zipfile.ZipInfo) -> bool:
     """Whether an array in an archive may have the size that it claims."""
     most = max(budget().max_image_bytes, _MOST_COMPRESSED * path.stat().st_size)
     size_ok = member.file_size <= min(most, budget().max_decoded_bytes)
-    return size_ok and member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+    return size_ok and member.compress_type in COMPRESSIONS

@@ -54,6 +54,8 @@ class Inputs(Frame):
     """All points of the frame's own files, also those held out."""
     sparse_scale: float | None = None
     """Integers per metre of the sparse depth file. None if it holds metres."""
+    assumed: tuple[str, ...] = ()
+    """Files whose scale is assumed, and how they were read."""
     record: dict[str, Any] = field(default_factory=dict)
     """Files and digests, for a record."""
     notes: tuple[str, ...] = ()
@@ -111,6 +113,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         size = whole or (truth.values.shape[0], truth.values.shape[1])
     else:
         size = whole or own.size
+    kinds = {"gt": None if files.gt is None else truth.kind, "sparse": sparse.kind}
     camera = camera_of_frame(request, sparse, size)
     used, held_out = _split(own, request.hold_out.holdout, method.seed)
     points, neighbours, lost = read_neighbours(
@@ -119,7 +122,8 @@ def read_inputs(request: RefineRequest) -> Inputs:
     if gt is not None and files.sparse is not None:
         depth = own.scatter()[0, 0].numpy()
         notes += _leak_warning(depth, gt)
-        notes += _scale_warning(depth, gt, {"--depth-scale": sparse.kind, "--gt-scale": truth.kind})
+        by_option = {"--depth-scale": kinds["sparse"], "--gt-scale": kinds["gt"]}
+        notes += _scale_warning(depth, gt, by_option)
     notes += (*(() if camera is None else camera.notes), *lost)
     if neighbours:
         record["neighbours"] = neighbours
@@ -132,6 +136,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         register=_register(request),
         gt=gt,
         sparse_scale=sparse.scale,
+        assumed=tuple(f"{side}: {kind}" for side, kind in kinds.items() if kind and kind.assumed),
         record=record,
         notes=tuple(notes),
         unit=sparse.unit,
@@ -286,8 +291,7 @@ def _read_points(
             f" {size[1]}×{size[0]}; --set sparse-size-ok maps the points if both show the same view"
         )
     described = describe_range(depth, sparse.source, assumed_scale=sparse.assumed_scale)
-    kind = DepthKind(sparse.source, sparse.scale, sparse.assumed_scale)
-    notes, record = [f"sparse: {described}"], _file_record(path) | {"read_as": str(kind)}
+    notes, record = [f"sparse: {described}"], _file_record(path) | {"read_as": str(sparse.kind)}
     hidden = None if keep_occluded else occluded_in_map(visible)
     if hidden is not None and hidden.any():
         visible, count = visible.select(~hidden), int(hidden.sum())
@@ -304,7 +308,7 @@ def _read_points(
     return SparseDepth(
         points=points,
         scale=sparse.scale,
-        kind=kind,
+        kind=sparse.kind,
         record=record,
         notes=tuple(notes),
     )

@@ -329,11 +329,7 @@ def _network(
         base=base,
         sampling=sampling,
         seeds=request.seeds,
-        assumed=tuple(
-            f"{side}: {inputs.record[side]['read_as']}"
-            for side in ("gt", "sparse")
-            if inputs.record[side].get("read_as", "").endswith("assumed")
-        ),
+        assumed=inputs.assumed,
     )
     own = network.settings({})
     listener.say(

@@ -77,7 +77,7 @@ NPY = DepthFormat(
 )
 
 
-_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Those that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
 
 
@@ -93,7 +93,7 @@ def parse_npz(path: Path, data: bytes, key: str | None) -> tuple[str, NDArray[An
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             name = _choose(path, list(members), key)
-            if members[name].compress_type not in _COMPRESSIONS:
+            if members[name].compress_type not in COMPRESSIONS:
                 raise FileFormatError(
                     f"{path}: array {name} has a compression that numpy does not write;"
                     " save it with numpy.savez_compressed"

@@ -132,7 +132,7 @@ def _coordinates(mode: str, size: int, out: int, factor: float) -> Tensor:
         return (o + 0.5) / scale
     if mode == "pytorch_half_pixel" and out == 1:
         return torch.zeros(out)
-    if mode == "half_pixel_symmetric":
+    if mode == "half_pixel_symmetric":  # in onnxruntime's order, which decides how ties round
         return size / 2 * (1 - out / (scale * size)) + (o + 0.5) / scale - 0.5
     if mode in ("half_pixel", "pytorch_half_pixel"):
         return (o + 0.5) / scale - 0.5
