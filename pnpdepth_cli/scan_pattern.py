@@ -43,10 +43,9 @@ def scan_pattern(xy: NDArray[np.floating], size: tuple[int, int]) -> ScanPattern
     """Returns the spacing along rows and columns of (N, 2) pixel coordinates in an image (H, W)."""
     import numpy as np
 
-    known = np.zeros(size, bool)
-    column, row = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp).T
-    known[row.clip(0, size[0] - 1), column.clip(0, size[1] - 1)] = True
-    return ScanPattern(points=len(xy), along_px=_median_gap(known), across_px=_median_gap(known.T))
+    xy = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp)
+    x, y = xy.clip(0, np.array(size)[::-1] - 1).T
+    return ScanPattern(points=len(xy), along_px=_median_gap(x, y), across_px=_median_gap(y, x))
 
 
 def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.intp] | None:
@@ -82,16 +81,19 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
     return number
 
 
-def _median_gap(known: NDArray[np.bool_]) -> float:
+def _median_gap(column: NDArray[np.intp], row: NDArray[np.intp]) -> float:
     """The median distance in pixels from a point to the next in its row or a row beside it."""
     import numpy as np
 
-    band = known.copy()
-    band[1:] |= known[:-1]
-    band[:-1] |= known[1:]
-    width = known.shape[1]
-    column = np.where(band, np.arange(width), np.inf)
-    next_column = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
-    next_column = np.pad(next_column[:, 1:], ((0, 0), (0, 1)), constant_values=np.inf)
-    gaps = next_column[known] - np.nonzero(known)[1]
-    return float(np.median(gaps)) if len(gaps) else float("inf")
+    if not len(column):
+        return float("inf")
+    width = int(column.max()) + 1
+    pixels = np.unique(row * width + column)
+    row, column = np.divmod(pixels, width)
+    gaps = np.full(len(pixels), np.inf)
+    for beside in row - 1, row, row + 1:
+        after = np.searchsorted(pixels, beside * width + column, "right")
+        next_row, next_column = np.divmod(pixels[after.clip(max=len(pixels) - 1)], width)
+        found = (after < len(pixels)) & (next_row == beside)
+        gaps = np.where(found, np.minimum(gaps, next_column - column), gaps)
+    return float(np.median(gaps))
