@@ -4,9 +4,9 @@
 
 One expression of a file is changed: a comparison, an arithmetic operator, a constant, `and`, a
 returned value, min, any, floor, mean and the like. In a temporary copy of the tree the test files
-that mirror the module or import it run first, then the others of its folder. A test that fails with
-the mutant and passes without it kills it; so does a run without end. Prints a table by package, and
-each survivor with its place and change.
+that mirror the module or import it run first, then the others of its folder, then those of whole
+commands. A test that fails with the mutant and passes without it kills it; so does a run without
+end. Prints a table by package, and each survivor with its place and change.
 """
 
 from __future__ import annotations
@@ -126,7 +126,9 @@ def mutants(only: str) -> list[Mutant]:
 
 
 def matching_tests(file: Path) -> list[list[str]]:
-    """Returns the test files that mirror a module or import it, and the others of its folder."""
+    """Returns the test files that mirror a module or import it, the others of its folder, and
+    those of whole commands.
+    """
     parts = file.parts[1:-1] if file.parts[0] == "pnpdepth_cli" else file.parts[:1]
     folder = ROOT.joinpath("tests", *parts)
     module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
@@ -137,7 +139,8 @@ def matching_tests(file: Path) -> list[list[str]]:
     first = dict.fromkeys([*sorted(folder.glob(f"test_{file.stem}*.py")), *importing])
     while not (near := sorted(folder.glob("test_*.py"))):  # such as io/formats, tested in io
         folder = folder.parent
-    chosen = ([*first], [path for path in near if path not in first])
+    commands = ROOT / "tests" / "test_golden.py"
+    chosen = ([*first], [path for path in near if path not in first], [commands])
     return [[path.relative_to(ROOT).as_posix() for path in paths] for paths in chosen if paths]
 
 
@@ -240,7 +243,7 @@ def main() -> None:
         ("--seed", 0, "of the choice of mutants"),
         ("--only", "", "a file or folder, from the root of the tree"),
         ("--jobs", 1, "mutants at once"),
-        ("--limit", 40.0, "seconds of processor time for a mutant's tests"),
+        ("--limit", 90.0, "seconds of processor time for a mutant's tests"),
         ("--marked", "not slow", "pytest's -m"),
     ):
         parser.add_argument(name, type=type(default), default=default, help=text)

@@ -11,6 +11,7 @@ paths are left out. All runs on one thread: sums over several depend on how many
 output holds for one kind of processor and one set of libraries; make it where you compare.
 
     --only 'batch*'      commands whose name fits (with `write`, the others in the file stay)
+    --portable          write what another processor gives as well, for tests/test_golden.py
     --messages off       compare exit codes, data, files and depth, but no messages
     --jobs 2             commands at once
     --keep FOLDER        keep everything that the commands wrote
@@ -23,16 +24,17 @@ import fnmatch
 import gc
 import importlib
 import json
+import multiprocessing
 import os
 import platform
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.golden.differences import compared
+from benchmarks.golden.differences import compared, portable
 from benchmarks.golden.inputs import ROOT, make_inputs
 from benchmarks.golden.running import Observer, Runner, files_in
 from benchmarks.golden.steps import Group, groups
@@ -51,6 +53,8 @@ ENVIRONMENT = {
     "PYTHONHASHSEED": "0",
 }
 """Of all commands; the first ones are read when the libraries are imported."""
+PROCESSOR = " processor"
+"""The entry of portable output that says with what it was made."""
 LIBRARIES = (
     *("numpy", "scipy.spatial", "scipy.ndimage", "scipy.sparse.linalg", "scipy.io", "cv2", "PIL"),
     *("OpenEXR", "h5py", "torch", "torch.export", "safetensors.torch", "click", "rich.console"),
@@ -59,15 +63,20 @@ LIBRARIES = (
 """What commands import and start sooner with; those that are absent here are left out."""
 
 
-def _made_with() -> dict[str, str]:
+def processor() -> str:
+    """What decides how sums are rounded."""
     import torch
 
+    return f"{torch.backends.cpu.get_cpu_capability()}, torch {torch.__version__}"
+
+
+def _made_with() -> dict[str, str]:
     return {
-        "processor": torch.backends.cpu.get_cpu_capability(),
+        "processor": processor(),
         "python": platform.python_version(),
         **{
             name: importlib.import_module(name).__version__
-            for name in ("torch", "numpy", "cv2", "scipy", "PIL")
+            for name in ("numpy", "cv2", "scipy", "PIL")
         },
     }
 
@@ -100,6 +109,15 @@ def _steady_environment() -> None:
         os.execve(sys.executable, command, kept | wanted)
 
 
+def _in_a_fork(work: Callable[[], None]) -> None:
+    """Does what would leave threads behind, which must not be when commands are forked."""
+    process = multiprocessing.get_context("fork").Process(target=work)
+    process.start()
+    process.join()
+    if process.exitcode:
+        sys.exit("the inputs of the commands cannot be made")
+
+
 def _measure(options: argparse.Namespace, observe: Observer | None = None) -> Runner:
     shared = None if options.shared is None else Path(options.shared).resolve()
     if shared is not None and not shared.is_dir():
@@ -113,7 +131,7 @@ def _measure(options: argparse.Namespace, observe: Observer | None = None) -> Ru
         work.mkdir(parents=True)
     runner = Runner(work, shared, options.jobs, observe)
     try:
-        make_inputs(work / "in", shared)
+        _in_a_fork(lambda: make_inputs(work / "in", shared))
         before = files_in(work / "in")
         runner.run(wanted)
         for name, state in files_in(work / "in").items():
@@ -140,11 +158,24 @@ def write(options: argparse.Namespace) -> int:
     path = Path(options.file)
     results = _measure(options).results
     if options.only is not None and path.exists():
-        results = json.loads(path.read_text("utf-8"))["steps"] | results
-    golden = {"made_with": _made_with(), "steps": dict(sorted(results.items()))}
-    path.write_text(json.dumps(golden, ensure_ascii=False, indent=0) + "\n", "utf-8")
+        kept = json.loads(path.read_text("utf-8"))
+        results = (kept if options.portable else kept["steps"]) | results
+    if options.portable:
+        results = {name: portable(each) for name, each in results.items()}
+        lines = [
+            f"{json.dumps(name)}: {_line(each)}"
+            for name, each in sorted((results | {PROCESSOR: processor()}).items())
+        ]
+        path.write_text("{\n" + ",\n".join(lines) + "\n}\n", "utf-8")
+    else:
+        golden = {"made_with": _made_with(), "steps": dict(sorted(results.items()))}
+        path.write_text(json.dumps(golden, ensure_ascii=False, indent=0) + "\n", "utf-8")
     print(f"{len(results)} commands kept in {path}, {path.stat().st_size / 1e6:.1f} MB")
     return 0
+
+
+def _line(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
 
 
 def check(options: argparse.Namespace) -> int:
@@ -192,7 +223,9 @@ def main() -> int:
         one.add_argument("--jobs", type=int, default=1, help="commands at once")
         one.add_argument("--keep", metavar="FOLDER", help="for all that the commands write")
         one.add_argument("--slowest", type=int, default=0, metavar="N", help="print the N slowest")
-        if verb is check:
+        if verb is write:
+            one.add_argument("--portable", action="store_true", help="for tests/test_golden.py")
+        else:
             one.add_argument("--messages", choices=("on", "off"), default="on")
     options = parser.parse_args()
     _steady_environment()

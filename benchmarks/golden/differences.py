@@ -8,6 +8,11 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+RELATIVE = 0.002
+"""Of numbers that differ no more than this, or by one in the last digit, one is rounded."""
+LEAST_DIGITS = 5
+"""One in a later digit is rounded as well."""
+_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 _MESSAGES = re.compile(r"(^|\.)(notes|warnings|message|messages|problem|why)(\.|\[|$)")
 
 
@@ -75,6 +80,50 @@ def _other_lines(kept: Sequence[str], now: Sequence[str], path: str) -> Iterator
 def _short(value: Any) -> str:
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 160 else f"{text[:150]}… ({len(text)} characters)"
+
+
+def portable(output: Any) -> Any:
+    """The output of a step without hashes, which rounding changes, and bytes of files."""
+    if isinstance(output, dict):
+        left_out = {"hash", "bytes", "sha256"}
+        return {name: portable(each) for name, each in output.items() if name not in left_out}
+    return [portable(each) for each in output] if isinstance(output, list) else output
+
+
+def nearly(kept: Any, now: Any, *, numbers: bool = True, path: str = "") -> Iterator[str]:
+    """A line for each difference between portable outputs that is no matter of rounding.
+
+    Args:
+        numbers: Compare them.
+    """
+    if isinstance(kept, dict) and isinstance(now, dict) and kept.keys() == now.keys():
+        for name in kept:
+            yield from nearly(
+                kept[name], now[name], numbers=numbers, path=f"{path}.{name}" if path else name
+            )
+    elif isinstance(kept, list) and isinstance(now, list) and len(kept) == len(now):
+        for number, (one, other) in enumerate(zip(kept, now, strict=True)):
+            yield from nearly(one, other, numbers=numbers, path=f"{path}[{number}]")
+    elif kept != now and not _only_rounded(kept, now, numbers):
+        yield f"{path}: {_short(kept)} -> {_short(now)}"
+
+
+def _only_rounded(kept: Any, now: Any, numbers: bool) -> bool:
+    if isinstance(kept, bool) or type(kept) is not type(now):
+        return False
+    if isinstance(kept, int | float):
+        return not numbers or _near(repr(kept), repr(now))
+    if not isinstance(kept, str) or _NUMBER.sub("#", kept) != _NUMBER.sub("#", now):
+        return False
+    pairs = zip(_NUMBER.findall(kept), _NUMBER.findall(now), strict=True)
+    return not numbers or all(_near(*pair) for pair in pairs)
+
+
+def _near(kept: str, now: str) -> bool:
+    one, other = (float(text.replace(",", "")) for text in (kept, now))
+    digits = len(kept.partition(".")[2]) if "e" not in kept else 12
+    unit = 0.0 if "." not in kept else 10.0 ** -min(digits, LEAST_DIGITS)
+    return abs(one - other) <= RELATIVE * max(abs(one), abs(other)) + 1.5 * unit
 
 
 def compared(kept: Mapping[str, Any], now: Mapping[str, Any], *, messages: bool) -> list[str]:

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import runpy
 import shutil
-import sys
-import traceback
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +71,11 @@ _PREPROCESSOR = {
 }
 
 
-def make_inputs(root: Path, shared: Path | None) -> None:
-    """Writes the small inputs of all commands into `root`, from the samples and the real frames."""
+def make_inputs(root: Path, shared: Path | None = None) -> None:
+    """Writes the small inputs of all commands into `root`, from the samples and the real frames.
+
+    Leaves threads of torch behind.
+    """
     shutil.copytree(ROOT / "samples", root, dirs_exist_ok=True)
     indoor = {name: Image.open(root / "indoor" / f"{name}.png") for name in ("rgb", "gt")}
     rgb = np.asarray(indoor["rgb"].convert("RGB"))
@@ -99,7 +98,7 @@ def make_inputs(root: Path, shared: Path | None) -> None:
     _make_pairs(root, rgb, gt)
     _make_street(root)
     _make_layouts(root, rgb, gt)
-    _in_a_fork(lambda: _make_networks(root))
+    _make_networks(root)
     if shared is not None:
         (root.parent / "shared").symlink_to(shared, target_is_directory=True)
         for kind in ("image", "velodyne_raw", "groundtruth"):
@@ -109,22 +108,6 @@ def make_inputs(root: Path, shared: Path | None) -> None:
             scale = None if kind == "image" else 256
             part = part if kind == "image" else part.astype(np.uint16)
             _save(root / "kitti_small" / kind / "0000000005.png", part, scale=scale)
-
-
-def _in_a_fork(work: Callable[[], None]) -> None:
-    """Does what would leave threads behind, which must not be when commands are forked."""
-    pid = os.fork()
-    if pid == 0:
-        code = 1
-        try:
-            work()
-            code = 0
-        except Exception:
-            traceback.print_exc()
-        finally:
-            os._exit(code)
-    if os.waitpid(pid, 0)[1]:
-        sys.exit("the networks of the commands cannot be built")
 
 
 def _save(path: Path, values: Array, *, scale: int | None = None) -> None:

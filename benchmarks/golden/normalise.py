@@ -25,6 +25,7 @@ _TIME = re.compile(r"(?<![\w.,–-])\d[\d,]*(?:\.\d+)?(?:–\d[\d,.]*)? (?:ms|s|
 _MEASURED_TEXT = (
     (re.compile(r"\d+(?:\.\d+)? × as fast"), "# × as fast"),
     (re.compile(r"\d+(?:\.\d+)? a second\b"), "# a second"),
+    (re.compile(r", [\d#]+ (?:s|min|h)(?: [\d#]+ \w+)? left\b"), ", # left"),
     (re.compile(r"(pnpdepth,? (?:version )?)\d+\.\d+\.\d+\w*"), r"\1#"),
 )
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")

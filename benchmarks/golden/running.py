@@ -20,6 +20,8 @@ from benchmarks.golden.steps import Group, Step
 
 Observer = Callable[[str, Mapping[str, Any]], None]
 """Called with the name of each step that ended, and its output."""
+State = tuple[int, int, int]
+"""Size, modification time and inode of a file."""
 LONGEST_S = 1200
 """A command that takes longer is ended, and has the signal as its exit code."""
 
@@ -63,7 +65,7 @@ class _Running:
     group: Group
     folder: Path
     next_step: int = 0
-    known: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
+    known: Mapping[str, State] = field(default_factory=dict)
 
     @property
     def step(self) -> Step:
@@ -128,28 +130,45 @@ class Runner:
         texts = {kind: path.read_bytes().decode() for kind, path in streams.items()}
         for path in streams.values():
             path.unlink()
-        now = files_in(each.folder)
-        files = {
-            name: self._norm.file(each.folder / name, step)
-            for name, state in now.items()
-            if each.known.get(name) != state
-        }
-        self.results[step.name] = {
-            "line": step.line,
-            "exit": code,
-            "stdout": self._norm.printed(texts["stdout"], step),
-            "stderr": self._norm.printed(texts["stderr"], step),
-            "files": files,
-            "gone": sorted(set(each.known) - set(now)),
-        }
+        self.results[step.name] = output_of(
+            step, each.folder, each.known, {"exit": code, **texts}, self._norm
+        )
         if self._observe is not None:
             self._observe(step.name, self.results[step.name])
         if step.save is not None:
             (each.folder / step.save).write_text(texts["stdout"], "utf-8")
 
 
-def files_in(folder: Path) -> dict[str, tuple[int, int, int]]:
-    """Size, modification time and inode of every file below the folder, by relative path."""
+def output_of(
+    step: Step,
+    folder: Path,
+    before: Mapping[str, State],
+    printed: Mapping[str, Any],
+    norm: Normaliser,
+) -> dict[str, Any]:
+    """What is kept of a step: its line, exit code, messages, files written, and files deleted.
+
+    Args:
+        before: The files of the folder, as of `files_in`, when the step began.
+        printed: The exit code, stdout and stderr.
+    """
+    now = files_in(folder)
+    return {
+        "line": step.line,
+        "exit": printed["exit"],
+        "stdout": norm.printed(printed["stdout"], step),
+        "stderr": norm.printed(printed["stderr"], step),
+        "files": {
+            name: norm.file(folder / name, step)
+            for name, state in now.items()
+            if before.get(name) != state
+        },
+        "gone": sorted(set(before) - set(now)),
+    }
+
+
+def files_in(folder: Path) -> dict[str, State]:
+    """The state of every file below the folder, by relative path."""
     return {
         path.relative_to(folder).as_posix(): (
             (state := path.stat()).st_size, state.st_mtime_ns, state.st_ino
