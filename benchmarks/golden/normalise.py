@@ -20,12 +20,11 @@ from benchmarks.golden.steps import Step
 
 Array = NDArray[Any]
 
-_PROGRESS = re.compile(r"^\w+:\s+\d+%\|")
+_PROGRESS = re.compile(r"^\w+:\s+\d+%\||^\d+ of \d+ \w+, .* left")
 _TIME = re.compile(r"(?<![\w.,–-])\d[\d,]*(?:\.\d+)?(?:–\d[\d,.]*)? (?:ms|s|MB|frames/s)\b")
 _MEASURED_TEXT = (
     (re.compile(r"\d+(?:\.\d+)? × as fast"), "# × as fast"),
     (re.compile(r"\d+(?:\.\d+)? a second\b"), "# a second"),
-    (re.compile(r", [\d#]+ (?:s|min|h)(?: [\d#]+ \w+)? left\b"), ", # left"),
     (re.compile(r"(pnpdepth,? (?:version )?)\d+\.\d+\.\d+\w*"), r"\1#"),
 )
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
@@ -66,6 +65,8 @@ class Normaliser:
         lines: list[str] = []
         for line in text.split("\n"):
             parts = [part for part in line.split("\r") if not _PROGRESS.match(part)]
+            if line and not parts:  # from time to time, on a slow machine
+                continue
             if "\r" in line:  # a bar, and the blanks that wiped it out
                 parts = [part for part in parts if part.strip()]
                 if not parts:
