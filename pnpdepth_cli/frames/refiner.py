@@ -23,7 +23,9 @@ from pnpdepth_cli.completion.image_registration import (
 )
 from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
+from pnpdepth_cli.frames.adapt import learnt
 from pnpdepth_cli.frames.default import check_fixed, refine_default, split_hidden
 from pnpdepth_cli.frames.frame import (
     METRES,
@@ -73,9 +75,14 @@ class Refiner:
         check: Whether the result is checked at hidden points also with a fixed method.
         registration: Whether images are moved into the frame of the points: "auto", if their depth
             edges show that they are not registered; "off"; or by (zoom, right, down), pixels.
+        adapt: Frames of the same sequence, (image, sparse) each, whose points the weights of
+            `network`, which must take points, learn from before the first frame is refined. The
+            learnt weights are used while the refiner is open, if hidden points show that they are
+            better.
 
     Raises:
         UsageError: The settings contradict each other.
+        InputError: A frame of `adapt` cannot be used.
     """
 
     def __init__(
@@ -86,6 +93,7 @@ class Refiner:
         uncertainty: bool = False,
         check: bool = False,
         registration: Registration = "auto",
+        adapt: Sequence[tuple[ArrayLike | None, ArrayLike | SparsePoints]] = (),
     ) -> None:
         self._networks = tuple(network) if isinstance(network, Sequence) else (network,)
         if not self._networks or not all(isinstance(each, Network) for each in self._networks):
@@ -96,6 +104,8 @@ class Refiner:
         self.is_default = not self.asked.fixed_by
         self._uncertainty, self._check = uncertainty, check or uncertainty
         self._register = registration_to_make(registration, self.asked)
+        self._adapt = [frame_of_arrays(*pair, self._register, None) for pair in adapt]
+        self._learnt: MovingWeights | None = None
         self.members: tuple[Member, ...] = ()
         self.registrations: Mapping[tuple[int, int], Register] = MappingProxyType({})
         self._stack = ExitStack()
@@ -253,6 +263,9 @@ class Refiner:
             resolve_definition(network, first, lambda: [each.registered() for each in more()])
             for network in self._networks
         ]
+        if self._adapt:
+            self._learnt, note = learnt(networks[0], self._adapt, self.asked.seed)
+            networks[0] = replace(networks[0], notes=(*networks[0].notes, note))
         named = {network.definition.name for network in networks}
         if self.is_default and first.rgb is not None and COMPANION not in named:
             device, precision = str(networks[0].device), networks[0].precision
@@ -286,6 +299,8 @@ class Refiner:
         if frame.register == "auto" and frame.size in self.registrations:
             frame = replace(frame, register=self.registrations[frame.size])
         if self._opened is None:
+            if self._learnt is not None:
+                self._stack.enter_context(self._learnt.in_place())
             network: Split | Fusion
             if self.is_default:
                 network = Fusion(self.members)

@@ -22,13 +22,8 @@ from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.record import read_json, write_json
 from pnpdepth_cli.io.remote import RemotePath
 
-LEAST_FRAMES = 8
-"""Of a sequence; fewer teach too little."""
 MOST_FRAMES = 64
 """Frames of a sequence that are learnt from, spread over it."""
-STEPS = 100
-SIGNIFICANT = 0.05
-"""Of the one-sided paired t test over the frames for validation."""
 
 
 def with_adapted_weights(
@@ -92,15 +87,13 @@ def _learn(
     stopped: Callable[[], bool],
 ) -> str | None:
     """Writes adapted weights if they are better beyond chance; returns why they are not."""
-    if len(tasks) < LEAST_FRAMES:
-        return f"{len(tasks)} frames; at least {LEAST_FRAMES} are needed"
     from pnpdepth_cli.commands.adapt import adapt_to  # these import torch
     from pnpdepth_cli.commands.batch.request import AdaptRequest
     from pnpdepth_cli.commands.refinement.inputs import read_inputs
-    from pnpdepth_cli.frames.frame import is_dense
+    from pnpdepth_cli.frames import adapt
 
-    if is_dense(read_inputs(tasks[0].request).points):
-        return "points as dense as a LiDAR's teach nothing"
+    if why := adapt.too_little(len(tasks), read_inputs(tasks[0].request)):
+        return why
 
     def on_step(done: int, of: int, text: str) -> None:
         if stopped():
@@ -111,20 +104,18 @@ def _learn(
         source=request.source,
         output=weights,
         refine=request.refine.with_fields(overwrite=True),
-        steps=STEPS,
-        validated=max(2, min(5, len(tasks) // 3)),
+        steps=adapt.STEPS,
+        validated=adapt.validated_of(len(tasks)),
         checks=1,
     )
     try:
         adapted = adapt_to(tasks, asked, say, on_step)
     except UsageError as error:
-        raise UsageError(
-            "--adapt needs a network that takes points, such as compact, as the first --model"
-        ) from error
+        raise UsageError(adapt.NEEDS_POINTS) from error
     change = (
         f"{adapted['change']:+.1%} loss at hidden points of {adapted['validation_frames']} frames"
     )
-    if adapted["p_value"] is not None and adapted["p_value"] < SIGNIFICANT:
+    if adapted["p_value"] is not None and adapted["p_value"] < adapt.SIGNIFICANT:
         say(f"adapt: {change}")
         return None
     for path in (weights, asked.card):
@@ -135,5 +126,5 @@ def _learn(
 def _digest(settings: dict[str, Any], tasks: Sequence[Task]) -> str:
     """The SHA-256 of the settings and files that the weights are learnt from."""
     files = [{part: fingerprint(p).sha256 for part, p in task.inputs.items()} for task in tasks]
-    text = json.dumps([settings, files, STEPS], sort_keys=True)
+    text = json.dumps([settings, files], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -9,9 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.commands import adapt as adapting
-from pnpdepth_cli.commands.batch import adapted
-from pnpdepth_cli.frames import frame as frames
+from pnpdepth_cli.frames import adapt as adapting
 from tests.commands.drives import drive_on_disk
 
 NETWORK = ("--model", "sparse2dense-tiny", "--iterations", "0")
@@ -20,8 +18,8 @@ NETWORK = ("--model", "sparse2dense-tiny", "--iterations", "0")
 @pytest.fixture
 def drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Eight frames whose points do not count as dense."""
-    monkeypatch.setattr(frames, "is_dense", lambda points: False)
-    monkeypatch.setattr(adapted, "STEPS", 4)
+    monkeypatch.setattr(adapting, "is_dense", lambda points: False)
+    monkeypatch.setattr(adapting, "STEPS", 4)
     return drive_on_disk(tmp_path / "drive", frames=8)
 
 
@@ -33,9 +31,7 @@ def test_better_weights_are_used_for_every_frame_and_found_again(
     drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(adapting, "ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.01))
-    monkeypatch.setattr(
-        adapting._Adaptation, "_validated", falling(adapting._Adaptation._validated)
-    )
+    monkeypatch.setattr(adapting.Adaptation, "_validated", falling(adapting.Adaptation._validated))
     assert batch(drive) == 0
     weights = drive.parent / "out/adapted/drive.safetensors"
     for number in range(8):
