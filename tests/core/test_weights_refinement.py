@@ -304,3 +304,20 @@ def test_points_set_aside_are_a_tenth_but_at_least_a_few() -> None:
     counts = [int(set_aside(points(count), 0.1, generator).sum()) for count in (2, 8, 40, 200)]
     assert counts == [0, 2, 4, 20]
     assert not set_aside(points(40), 0.0, generator).any()
+
+
+def test_a_network_that_reads_values_of_the_points_runs_as_a_whole() -> None:
+    class Reads(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.image = nn.Conv2d(3, 1, 1)
+
+        def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+            return self.image(rgb * float(sparse.max())) + sparse
+
+    torch.manual_seed(0)
+    network, rgb = Reads(), image()
+    near, far = (torch.full((1, 1, *rgb.shape[2:]), depth) for depth in (1.0, 5.0))
+    with InputSplit(network) as split, torch.no_grad():
+        assert torch.equal(split.first(rgb, near, varying=(1,)), network(rgb, near))
+        assert torch.equal(split.again(rgb, far), network(rgb, far))

@@ -96,3 +96,20 @@ def test_a_frame_to_learn_from_needs_two_points(network: pnp.Network) -> None:
         pytest.raises(pnp.NoPointsError, match=r"frame 8: 1 points; hiding some needs 2"),
     ):
         refiner.refine(*FRAMES[0])
+
+
+def test_frames_for_validation_are_looked_at_as_often_as_asked(network: pnp.Network) -> None:
+    frames = [frame_in_memory(seed=seed) for seed in range(5)]
+    with pnp.Refiner(network) as refiner:
+        resolved = refiner.decide(frames[0]).network
+    adaptation = adapt.Adaptation(
+        resolved,
+        adapt.adaptation_settings(resolved, frames[0]),
+        {str(number): lambda frame=frame: frame for number, frame in enumerate(frames)},  # type: ignore[misc]
+        validated=2,
+        checks=2,
+    )
+    assert (adaptation.training, adaptation.validation) == ([0, 2, 4], [1, 3])
+    losses = adaptation.run()
+    assert sorted(losses) == [0, 8, 12]
+    assert losses[adaptation.kept] == min(losses.values())

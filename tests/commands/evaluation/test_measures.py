@@ -129,6 +129,7 @@ def test_an_extra_edge_costs_completeness_alone_and_holes_make_none() -> None:
     assert edge_errors(holes, step(30)) == (0, 0)
     sparse = np.where(np.random.default_rng(0).random((40, 60)) < 0.1, step(30), 0)
     assert np.isnan(edge_errors(step(30), sparse.astype(np.float32))).all()
+    assert np.isnan(edge_errors(step(30), np.full((40, 60), 2, np.float32))).all()
 
 
 def test_boundary_errors_are_ibims_formulas_over_all_pairs_of_edge_pixels() -> None:

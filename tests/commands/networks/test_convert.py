@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import load_file
 
 from pnpdepth_cli.commands.networks.weights import convert_checkpoint
-from pnpdepth_cli.errors import CheckpointError, UsageError
+from pnpdepth_cli.errors import CheckpointError, OutputError, UsageError
 
 
 def saved(content: Any, path: Path) -> Path:
@@ -73,6 +73,16 @@ def test_complex_tensors_are_stored(tmp_path: Path) -> None:
     source = saved({"w": torch.ones(2, dtype=torch.complex64)}, tmp_path / "w.pt")
     convert_checkpoint(source, tmp_path / "w.safetensors")
     assert load_file(tmp_path / "w.safetensors")["w"].dtype == torch.complex64
+
+
+def test_a_file_is_replaced_only_where_that_is_asked_for(tmp_path: Path) -> None:
+    source, target = saved({"w": torch.ones(2)}, tmp_path / "w.pt"), tmp_path / "w.safetensors"
+    target.write_bytes(b"other")
+    with pytest.raises(OutputError, match="exists"):
+        convert_checkpoint(source, target)
+    assert target.read_bytes() == b"other"
+    convert_checkpoint(source, target, overwrite=True)
+    assert torch.equal(load_file(target)["w"], torch.ones(2))
 
 
 def test_a_checkpoint_does_not_replace_itself(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "a view": lambda z, y: z.detach()[:, [0]].expand(-1, 4, -1, -1),
     "written into a new tensor": lambda z, y: torch.zeros_like(y).copy_(z.detach()),
     "written by out=": lambda z, y: torch.add(z.detach(), 1, out=torch.empty_like(y)),
+    "written by out= alone": lambda z, y: torch.neg(z.detach(), out=torch.empty_like(y)),
     "written into a part": lambda z, y: y.clone().add_(z[0, 0].detach()),
     "a value": lambda z, y: y * float(z.detach().mean()),
     "numpy": lambda z, y: torch.from_numpy(z.detach().numpy() * 2),
