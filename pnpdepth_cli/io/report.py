@@ -50,7 +50,7 @@ def column(key: str, title: str, **shown: Any) -> dict[str, Any]:
         key: Of the value.
         title: Without the unit.
         **shown: `unit` of value × `factor`; `decimals`; `percent`; `higher_is_better`; `signed` if
-            values above 0 are better and below 0 worse; `listed` in the list of frames, not only in
+            values below 0 are better and above 0 worse; `listed` in the list of frames, not only in
             a frame's own view.
     """
     defaults = {"unit": "", "decimals": 4, "factor": 1.0, "percent": False, "signed": False}

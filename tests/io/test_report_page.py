@@ -116,13 +116,13 @@ def test_names_stay_text_and_what_failed_is_listed_with_its_reason(page: webdriv
 def test_the_worst_frame_is_first_and_it_sorts_by_every_column_and_can_be_searched(
     page: webdriver.Chrome, report: Path
 ) -> None:
-    worst_first = shown_by(report, "rmse_gain")
+    worst_first = shown_by(report, "rmse_change")[::-1]
     assert names(page) == worst_first
     header = one(page, "#head th[data-column='0']")
-    assert header.get_attribute("aria-sort") == "ascending"
+    assert header.get_attribute("aria-sort") == "descending"
     header.find_element(By.TAG_NAME, "button").click()
     assert names(page) == worst_first[::-1]
-    assert header.get_attribute("aria-sort") == "descending"
+    assert header.get_attribute("aria-sort") == "ascending"
     one(page, "#sort-column option[value='2']").click()  # an error: the largest is the worst
     assert names(page) == shown_by(report, page_data(report)["columns"][2]["key"])[::-1]
     one(page, "#sort-column option[value='-1']").click()
@@ -183,7 +183,8 @@ def test_the_histogram_counts_all_frames_and_has_a_text_alternative(page: webdri
     counts = [int(b.get_attribute("textContent").split(": ")[1].split()[0]) for b in bars]
     assert sum(counts) == 4
     label = one(page, "#chart svg").get_attribute("aria-label")
-    assert label.startswith("Histogram of RMSE gain: 4 frames, median ")
+    assert label.startswith("Histogram of RMSE change: 4 frames, median ")
+    assert label.endswith("; 4 better, 0 worse")
     one(page, "#chart-column option[value='1']").click()
     assert "RMSE before" in one(page, "#chart svg").get_attribute("aria-label")
 

@@ -124,7 +124,7 @@ def _entry(row: Row, columns: Sequence[Mapping[str, Any]], mixed: bool) -> dict[
     basis = _basis(row)
     values = _values(row, basis)
     if basis == USED and columns[0]["signed"]:
-        values = {}  # others have a gain that means something
+        values = {}  # others have a change that means something
     tag = BASES[basis] if mixed and basis else ""
     return {
         "name": row["name"],
@@ -179,19 +179,19 @@ def _measures(basis: str) -> tuple[str, ...]:
 
 
 def _columns(best: str, unit: str) -> list[dict[str, Any]]:
-    """Errors before and after on the best basis; with gains unless it is the points used."""
+    """Errors before and after on the best basis; with changes unless it is the points used."""
     columns = []
-    percent: dict[str, Any] = {"decimals": 1, "percent": True, "higher_is_better": True}
+    percent: dict[str, Any] = {"decimals": 1, "percent": True}
     for key in _measures(best):
         title = key.upper()
         if best != USED:
-            columns.append(column(key=f"{key}_gain", title=f"{title} gain", signed=True, **percent))
+            columns.append(column(key=f"{key}_change", title=f"{title} change", signed=True, **percent))
         columns += [
             column(key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
             for stage in ("before", "after")
         ]
     if best != HIDDEN:  # the map is then of the points used
-        columns.append(column(key="improved", title="Improved", **percent))
+        columns.append(column(key="improved", title="Improved", higher_is_better=True, **percent))
     return columns
 
 
@@ -202,8 +202,8 @@ def _values(row: Row, basis: str | None) -> dict[str, float | None]:
     values: dict[str, float | None] = {"improved": row.get("improved_fraction")}
     for key in ("rmse", "mae"):
         before, after = (errors[stage].get(key) for stage in ("before", "after"))
-        gain = 1 - after / before if before and after is not None else None
-        values |= {f"{key}_before": before, f"{key}_after": after, f"{key}_gain": gain}
+        change = after / before - 1 if before and after is not None else None
+        values |= {f"{key}_before": before, f"{key}_after": after, f"{key}_change": change}
     return values
 
 
@@ -214,7 +214,7 @@ def _notes(row: Row, basis: str | None) -> list[str]:
         count = f"{after['pixels']:,} pixels" if basis == GT else f"{after['points']:,} points"
         notes.append(f"Errors are {BASES[basis]}, {count}.")
     if basis == USED:
-        notes.append("Refinement fits these points, so its gain there proves nothing.")
+        notes.append("Refinement fits these points, so the change there proves nothing.")
     return [*notes, *row["warnings"]]
 
 

@@ -112,7 +112,7 @@ function drawChart() {
       svg("text", { x: left - 8, y: y(n) + 4, class: "left" }, String(n)));
   }
   bins.forEach((bin, i) => {
-    const kind = !column.signed ? "" : bin.low < -1e-12 ? "worse" : "better";
+    const kind = !column.signed ? "" : bin.low < -1e-12 ? "better" : "worse";
     const bar = svg("rect", { x: x(i) + 1, width: Math.max(1, x(1) - x(0) - 2), y: y(bin.frames),
       height: y(0) - y(bin.frames), class: `bar ${kind}` });
     const range = `${shown(column, bin.low)} to ${shown(column, bin.high)}`;
@@ -127,8 +127,8 @@ function drawChart() {
   }
   const label = titled(column) + (column.percent ? " [%]" : "");
   chart.append(svg("text", { x: (left + W - right) / 2, y: H - 3 }, label));
-  const better = values.filter((v) => v > 0).length;
-  const worse = values.filter((v) => v < 0).length;
+  const better = values.filter((v) => v < 0).length;
+  const worse = values.filter((v) => v > 0).length;
   const count = values.length.toLocaleString("en");
   const summary = `${count} frames, median ${shown(column, median)} ${column.unit}`.trim() +
     (column.signed ? `; ${better} better, ${worse} worse` : "");
@@ -218,7 +218,7 @@ function makeRow(index) {
     if (!column.listed) return;
     const value = frame.values[i];
     const text = shown(column, value);
-    const kind = !column.signed || !/[1-9]/.test(text) ? "" : value > 0 ? "better" : "worse";
+    const kind = !column.signed || !/[1-9]/.test(text) ? "" : value < 0 ? "better" : "worse";
     row.append(make("td", { "data-label": titled(column), class: kind, text }));
   });
   return row;

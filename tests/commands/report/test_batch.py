@@ -72,8 +72,8 @@ def test_every_frame_is_on_the_page_which_links_the_panels_of_its_files_on_disk(
     values = frames_of(report)["b"]["values"]
     assert values["mae_before"] == pytest.approx(before, abs=3e-3)  # the files are 16-bit
     assert values["mae_after"] == pytest.approx(after, abs=3e-3)
-    assert values["mae_gain"] == 1 - values["mae_after"] / values["mae_before"]
-    assert values["mae_gain"] != 0
+    assert values["mae_change"] == values["mae_after"] / values["mae_before"] - 1
+    assert values["mae_change"] != 0
     assert 0 < values["improved"] < 1
     (table,) = page_data(report)["tables"]
     assert table["header"] == ["", "before", "after", "change", "linear", "vs linear"]
@@ -141,7 +141,7 @@ def test_a_report_of_the_default_method_says_what_was_before(root: Path, report:
     assert facts["Before"] == "the network's depth, aligned with the points"
 
 
-def test_without_ground_truth_gains_are_those_at_held_out_points_and_settings_are_stated(
+def test_without_ground_truth_changes_are_those_at_held_out_points_and_settings_are_stated(
     root: Path, report: Path
 ) -> None:
     shutil.rmtree(root / "gt")
@@ -151,13 +151,13 @@ def test_without_ground_truth_gains_are_those_at_held_out_points_and_settings_ar
     assert (facts["Alignment"], facts["Propagation"]) == ("none", "gp")
     assert facts["Held out"] == "30% of the points, seed 0"
     frame = frames_of(report)["a"]
-    assert frame["values"]["rmse_gain"] is not None
+    assert frame["values"]["rmse_change"] is not None
     assert any("at held-out points" in note for note in frame["notes"])
     (table,) = page_data(report)["tables"]
     assert table["caption"] == "means over frames: 4 at held-out points, 4 at points used"
 
 
-def test_with_neither_ground_truth_nor_held_out_points_there_is_no_gain(
+def test_with_neither_ground_truth_nor_held_out_points_there_is_no_change(
     root: Path, report: Path
 ) -> None:
     shutil.rmtree(root / "gt")
@@ -180,7 +180,7 @@ def test_the_default_method_without_ground_truth_headlines_its_hidden_points(
     check = summary["linear"]["check"]
     assert [label for label, *_ in data["tiles"]] == ["Frames refined", "MAE [m]"]
     assert data["tiles"][1][1] == f"{check['aligned']:.4f} → {check['result']:.4f}"
-    assert [column["key"] for column in data["columns"]] == ["mae_gain", "mae_before", "mae_after"]
+    assert [column["key"] for column in data["columns"]] == ["mae_change", "mae_before", "mae_after"]
     frame = frames_of(report)["a"]
     assert frame["values"]["mae_after"] == summary["frames"][0]["linear"]["check"]["result"]
     assert frame["notes"][0].startswith("Errors are at hidden points")
@@ -193,7 +193,7 @@ def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
         (root / f"gt/{name}.png").unlink()
     batch(root, html=report)
     frames = frames_of(report)
-    assert frames["a"]["values"]["rmse_gain"] is not None
+    assert frames["a"]["values"]["rmse_change"] is not None
     assert set(frames["b"]["values"].values()) == {None}
     assert (frames["a"]["tag"], frames["b"]["tag"]) == ("against ground truth", "at points used")
 
@@ -241,7 +241,7 @@ def test_a_preview_that_went_missing_costs_one_frame_its_images(root: Path, repo
     frames = frames_of(report)
     assert frames["b"]["key"] is None
     assert all(frames[name]["key"] for name in "acd")
-    assert frames["b"]["values"]["rmse_gain"] is not None
+    assert frames["b"]["values"]["rmse_change"] is not None
 
 
 def test_a_disk_that_is_full_while_linking_ends_the_run_and_the_next_one_goes_on(
