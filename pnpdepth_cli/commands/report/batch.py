@@ -185,7 +185,9 @@ def _columns(best: str, unit: str) -> list[dict[str, Any]]:
     for key in _measures(best):
         title = key.upper()
         if best != USED:
-            columns.append(column(key=f"{key}_change", title=f"{title} change", signed=True, **percent))
+            columns.append(
+                column(key=f"{key}_change", title=f"{title} change", signed=True, **percent)
+            )
         columns += [
             column(key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
             for stage in ("before", "after")

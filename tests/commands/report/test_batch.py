@@ -180,7 +180,11 @@ def test_the_default_method_without_ground_truth_headlines_its_hidden_points(
     check = summary["linear"]["check"]
     assert [label for label, *_ in data["tiles"]] == ["Frames refined", "MAE [m]"]
     assert data["tiles"][1][1] == f"{check['aligned']:.4f} → {check['result']:.4f}"
-    assert [column["key"] for column in data["columns"]] == ["mae_change", "mae_before", "mae_after"]
+    assert [column["key"] for column in data["columns"]] == [
+        "mae_change",
+        "mae_before",
+        "mae_after",
+    ]
     frame = frames_of(report)["a"]
     assert frame["values"]["mae_after"] == summary["frames"][0]["linear"]["check"]["result"]
     assert frame["notes"][0].startswith("Errors are at hidden points")
