@@ -132,7 +132,10 @@ UPDATES = Table(
 """U: each entry creates a rule that turns gradients into directions of z."""
 
 PROPAGATIONS = Table(
-    "completion/propagation", group="propagations", noun="propagation", names=("gp", "diffusion")
+    "completion/propagation",
+    group="propagations",
+    noun="propagation",
+    names=("gp", "local", "diffusion"),
 )
 """How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
 

@@ -19,8 +19,9 @@ from torch import Tensor
 from pnpdepth_cli.choices import PROPAGATIONS
 from pnpdepth_cli.completion import gaussian_process
 from pnpdepth_cli.completion.diffusion import diffuse
+from pnpdepth_cli.completion.local_lines import local_lines
 from pnpdepth_cli.completion.outliers import without_outliers
-from pnpdepth_cli.completion.residual_field import Kernel, ResidualField, residual_field
+from pnpdepth_cli.completion.residual_field import DEPTH, Kernel, ResidualField, residual_field
 from pnpdepth_cli.points import SparsePoints
 
 NONE = "none"
@@ -42,6 +43,15 @@ class Propagation:
     """Residual (M,) at the coordinates of M points. None: it is sampled from `dense`."""
 
 
+def _residual_by_lines(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
+    """The residual by lines over the predicted log depth, (H, W) or at the queries (M,)."""
+    xy = None if queries is None else queries.xy
+    depth = field.features[DEPTH] if queries is None else field.features_at(queries)[:, DEPTH]
+    at, weights = field.at[:, DEPTH].double(), torch.ones_like(field.residual)
+    shift, slope = local_lines(field.points, xy, field.residual, at, weights)
+    return (shift + slope * depth).float()
+
+
 TABLE = {
     "gp": Propagation(
         title="Gaussian process",
@@ -50,6 +60,11 @@ TABLE = {
         at=lambda field, queries: gaussian_process.predict_at(
             field, queries.xy, field.features_at(queries)
         ),
+    ),
+    "local": Propagation(
+        title="lines through the nearest points",
+        dense=_residual_by_lines,
+        at=_residual_by_lines,
     ),
     "diffusion": Propagation(title="edge-aware diffusion", dense=diffuse),
 }
@@ -61,7 +76,7 @@ class Propagated:
     """Depth after propagation."""
 
     depth: Tensor  # (H, W) float32 metres, 0 = unknown
-    kernel: Kernel | None = None  # the kernel that fits the residual best. None with "none".
+    kernel: Kernel | None = None  # that fits the residual best; None with "none"
 
 
 def propagate(

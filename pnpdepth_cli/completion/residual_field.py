@@ -16,6 +16,8 @@ from pnpdepth_cli.completion.alignment import where_predicted
 from pnpdepth_cli.completion.interpolation import distinct
 from pnpdepth_cli.points import SparsePoints, in_frame
 
+DEPTH = 2
+"""Position of the predicted log depth among the features."""
 _FLAT_DEPTH, _FLAT_COLOUR = 1e-3, 1.0  # added to standard deviations: a flat image has no edges
 _XYZ_OF_RGB = (
     (0.4124564, 0.3575761, 0.1804375),

@@ -6,7 +6,8 @@ import torch
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import BEYOND, aligned, from_space, to_space
-from pnpdepth_cli.completion.baselines import RIDGE, locally_aligned
+from pnpdepth_cli.completion.baselines import locally_aligned
+from pnpdepth_cli.completion.local_lines import RIDGE
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene_depth
@@ -105,5 +106,5 @@ def test_a_coarser_grid_is_near_the_alignment_of_every_pixel(
     gt = scene_depth()
     prediction = gt * torch.linspace(0.6, 1.5, SIZE[1])
     whole = locally_aligned(prediction, random_points(gt, 60))
-    monkeypatch.setattr("pnpdepth_cli.completion.baselines._NODES", gt.numel() // 4)
+    monkeypatch.setattr("pnpdepth_cli.completion.local_lines._NODES", gt.numel() // 4)
     assert mean_log_error(locally_aligned(prediction, random_points(gt, 60)), whole) < 0.01

@@ -53,6 +53,18 @@ def test_the_stages_follow_each_other_and_the_last_is_the_result() -> None:
     assert errors[-1] < errors[0]
 
 
+def test_the_residual_of_scan_lines_is_propagated_by_lines_through_the_nearest_points() -> None:
+    y, x = np.mgrid[2 : SIZE[0] : 8, 0 : SIZE[1] : 2]
+    xy = torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32))
+    every = SparsePoints(xy=xy, depth=torch.ones(len(xy)), size=SIZE)
+    points = replace(every, depth=every.sample(depth_of_scene()))
+    frame = replace(frame_in_memory(), points=points)
+    result = refined(frame, member(Brightness, settings=UPDATES))
+    updated = torch.from_numpy(result.stages["updated"])
+    expected = propagate(updated, result.used, frame.rgb, kind="local").depth
+    assert np.array_equal(result.stages["propagated"], expected.numpy())
+
+
 def test_without_a_check_the_uncertainty_has_the_typical_scale() -> None:
     result = refined(frame_in_memory(MIN_POINTS - 1), member(Brightness))
     got = with_uncertainty(result)
