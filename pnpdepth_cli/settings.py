@@ -228,8 +228,9 @@ class Settings:
     align_every: bool = option(False, "Repeat the alignment at every update of z.", within="--set")
     propagate: str = option(
         None,
-        "Propagate the residuals at the points to all pixels: Gaussian process or edge-aware"
-        " diffusion.  [default: none, with other options of the method]",
+        "Propagate the residuals at the points to all pixels: by a Gaussian process, lines through"
+        " the nearest points, or edge-aware diffusion.  [default: none, with other options of the"
+        " method]",
         choices=("none", *choices.PROPAGATIONS),
         axis=Axis(title="propagation of the residual"),
     )
