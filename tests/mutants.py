@@ -4,9 +4,10 @@
 
 One expression of a file is changed: a comparison, an arithmetic operator, a constant, `and`, a
 returned value, min, any, floor, mean and the like. In a temporary copy of the tree the test files
-that mirror the module or import it run first, then the others of its folder, then those of whole
-commands. A test that fails with the mutant and passes without it kills it; so does a run without
-end. Prints a table by package, and each survivor with its place and change.
+that mirror the module or import it run first, then those of the modules that import it and the
+others of its folder, then those of whole commands. A test that fails with the mutant and passes
+without it kills it; so does a run without end. Prints a table by package, and each survivor with
+its place and change.
 """
 
 from __future__ import annotations
@@ -126,22 +127,36 @@ def mutants(only: str) -> list[Mutant]:
 
 
 def matching_tests(file: Path) -> list[list[str]]:
-    """Returns the test files that mirror a module or import it, the others of its folder, and
-    those of whole commands.
+    """Returns the test files that mirror a module or import it, those that mirror modules which
+    import it with the others of its folder, and those of whole commands.
     """
-    parts = file.parts[1:-1] if file.parts[0] == "pnpdepth_cli" else file.parts[:1]
-    folder = ROOT.joinpath("tests", *parts)
+    folder, first = _mirrored(file)
     module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
     parent, _, last = module.rpartition(".")
     imports = re.compile(rf"{module}\b|from {parent} import [^)\n]*\b{last}\b")
-    tests = sorted((ROOT / "tests").rglob("test_*.py"))
-    importing = [path for path in tests if imports.search(path.read_text("utf-8"))]
-    first = dict.fromkeys([*sorted(folder.glob(f"test_{file.stem}*.py")), *importing])
-    while not (near := sorted(folder.glob("test_*.py"))):  # such as io/formats, tested in io
+
+    def importing(root: Path) -> list[Path]:
+        return [path for path in sorted(root.rglob("*.py")) if imports.search(path.read_text())]
+
+    first += [path for path in importing(ROOT / "tests") if path.name.startswith("test_")]
+    near = [
+        test
+        for path in importing(ROOT / PACKAGES[0])
+        for test in _mirrored(path.relative_to(ROOT))[1]
+    ]
+    while not (others := sorted(folder.glob("test_*.py"))):  # such as io/formats, tested in io
         folder = folder.parent
-    commands = ROOT / "tests" / "test_golden.py"
-    chosen = ([*first], [path for path in near if path not in first], [commands])
-    return [[path.relative_to(ROOT).as_posix() for path in paths] for paths in chosen if paths]
+    lists = first, near + others, [ROOT / "tests" / "test_golden.py"]
+    chosen = [[path.relative_to(ROOT).as_posix() for path in dict.fromkeys(each)] for each in lists]
+    chosen[1] = [path for path in chosen[1] if path not in chosen[0]]
+    return [paths for paths in chosen if paths]
+
+
+def _mirrored(file: Path) -> tuple[Path, list[Path]]:
+    """The folder of tests of a module's package, and the test files of the module's name there."""
+    parts = file.parts[1:-1] if file.parts[0] == "pnpdepth_cli" else file.parts[:1]
+    folder = ROOT.joinpath("tests", *parts)
+    return folder, sorted(folder.glob(f"test_{file.stem}*.py"))
 
 
 class Trees:
