@@ -233,6 +233,7 @@ def test_ticks_lie_within_the_scale_and_in_order(low: float, ratio: float) -> No
 def test_steps_are_round_and_a_few_wild_depths_do_not_stretch_the_scale() -> None:
     assert round_steps(0.9, 3.1) == [1.0, 1.5, 2.0, 2.5, 3.0]
     assert round_steps(2, 63) == [10, 20, 30, 40, 50, 60]
+    assert round_steps(0, 10) == list(range(11))
     depth = np.linspace(1, 2, 1000)
     depth[:5] = 1e6
     assert depth_scale(depth).high_m < 2.1

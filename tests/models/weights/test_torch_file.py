@@ -6,6 +6,7 @@ import argparse
 import collections
 import io
 import pickle
+import pickletools
 import struct
 import sys
 import zipfile
@@ -63,6 +64,20 @@ def test_a_published_layout_gives_the_modules_own_state(tmp_path: Path, new: boo
         assert state[name].dtype == tensor.dtype
         assert torch.equal(state[name], tensor)
     assert {"argparse.Namespace", "torch.optim.sgd.SGD"} <= set(named)
+
+
+def test_a_row_of_pickles_that_does_not_name_all_its_storages_is_refused(tmp_path: Path) -> None:
+    path = save({"a": torch.ones(2), "b": torch.zeros(2)}, tmp_path / "two.pt", new=False)
+    file = io.BytesIO(path.read_bytes())
+    for _ in ("magic", "protocol", "system", "content"):
+        pickletools.dis(file, io.StringIO())
+    end = file.tell()
+    keys = pickle.load(file)
+    assert len(keys) == 2
+    row = file.getvalue()[:end] + pickle.dumps(keys[:1], 2) + file.read()
+    path.write_bytes(row)
+    with pytest.raises(CheckpointError, match="its storages are not those that its pickle names"):
+        read_checkpoint(path)
 
 
 @both_layouts
