@@ -26,13 +26,6 @@ def test_listed_elevations_are_taken_as_they_stand(tmp_path: Path) -> None:
     }
 
 
-def test_even_elevations_go_down_from_the_top(tmp_path: Path) -> None:
-    text = "top_deg = 3\nstep_deg = 1.5\nbeams = 4\nazimuth_step_deg = 1\n"
-    got = read_sensor(write(tmp_path, text))
-    assert got["elevations_deg"] == (3, 1.5, 0, -1.5)
-    assert got["name"] == "mine"
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -31,15 +31,6 @@ def test_every_pattern_gives_known_pixels_once_with_their_own_depth(kind: str) -
     assert len({*zip(row, column, strict=True)}) == len(row)
 
 
-@pytest.mark.parametrize("kind", PATTERNS)
-def test_the_same_seed_gives_the_same_points(kind: str) -> None:
-    first, again = (sample_points(HOLES, pattern(kind), 5, image=checkerboard()) for _ in "ab")
-    assert np.array_equal(first.xy, again.xy)
-    if kind in ("uniform", "bernoulli", "edges", "region"):
-        other = sample_points(HOLES, pattern(kind), 6, image=checkerboard())
-        assert not np.array_equal(as_depth_image(first), as_depth_image(other))
-
-
 @pytest.mark.parametrize("count", [1, 40, 3000])
 def test_uniform_returns_exactly_the_requested_number(count: int) -> None:
     known = np.count_nonzero(HOLES)

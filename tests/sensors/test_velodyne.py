@@ -66,13 +66,6 @@ def test_an_empty_range_is_a_mistake_of_the_user() -> None:
         project_velodyne(np.ones((1, 3)), camera(), SIZE, limits=(5, 5))
 
 
-def test_a_scan_outside_the_image_is_an_error_that_counts_its_points() -> None:
-    scan = np.array([[-5.0, 0, 0], [1.0, 50, 0], [1.0, 40, 0]])
-    with pytest.raises(NoPointsError, match=r"1 behind the camera, 2 outside the image") as error:
-        project_velodyne(scan, camera(), SIZE)
-    assert "\n" not in str(error.value)
-
-
 def test_the_outermost_half_pixels_belong_to_the_image_and_no_more() -> None:
     # u = 50 - 10 y: the left border of the image is at -0.5, the right one at 100.5
     scan = np.array([[10.0, y, 0] for y in (5.0499, 5.0501, -5.0499, -5.0501)])
