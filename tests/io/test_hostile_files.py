@@ -114,7 +114,6 @@ def _part(number: int, window: tuple[int, ...], kind: str = "scanlineimage") -> 
 
 EXRS = {
     "every pixel there is": exr_file(exr_header((LOW, LOW, HIGH, HIGH))),
-    "a window of 900 megapixels": exr_file(exr_header((0, 0, 29_999, 29_999))),
     "a window upside down": exr_file(exr_header((5, 5, 4, 4))),
     "a display of every pixel": exr_file(exr_header(SMALL, display=(0, 0, HIGH, HIGH)), LINES),
     "no rows": exr_file(exr_header(SMALL)),
@@ -123,9 +122,7 @@ EXRS = {
     "100,000 channels": exr_file(exr_header(SMALL, names=[f"c{n}" for n in range(100_000)])),
     "a channel twice": exr_file(exr_header(SMALL, names=("Z", "Z")), LINES),
     "a sampling of 0": exr_file(exr_header(SMALL, sampling=0), LINES),
-    "a negative sampling": exr_file(exr_header(SMALL, sampling=-1), LINES),
     "an attribute of 2 GB": exr_file(exr_header(SMALL, more=b"a\0string\0\xff\xff\xff\x7f")),
-    "a negative attribute": exr_file(exr_header(SMALL, more=b"a\0string\0\xff\xff\xff\xff")),
     "tiles of one pixel": exr_file(exr_header((0, 0, 5000, 5000), more=_tiles(1, 1, 2)), (), TILED),
     "tiles of no pixel": exr_file(exr_header(SMALL, more=_tiles(0, 0, 0)), LINES, TILED),
     "endless tiles": exr_file(exr_header(SMALL, more=_tiles(2**32 - 1, 1, 1)), LINES, TILED),

@@ -195,34 +195,6 @@ def test_a_build_may_import_what_lies_beside_the_file_as_late_as_it_likes(tmp_pa
     assert sys.path == before
 
 
-FORWARDS = """
-import torch
-from torch import nn
-class Plain(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.down = nn.AvgPool2d(2)
-    def forward(self, rgb):
-        return self.down(rgb).mean(1, keepdim=True)
-class NoGrad(Plain):
-    forward = torch.no_grad()(Plain.forward)
-class Nothing(Plain):
-    def forward(self, rgb):
-        self.down(rgb)
-"""
-
-
-def test_a_forward_without_gradient_or_output_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "nets.py"
-    file.write_text(FORWARDS)
-    assert load_network(f"{file}:Plain", None).definition.layers == ("down",)
-    with pytest.raises(ModelError, match=r"no gradient comes back .* torch.no_grad") as error:
-        load_network(f"{file}:NoGrad", None)
-    assert error.value.exit_code == 4
-    with pytest.raises(ModelError, match=r"'nets.Nothing' returns a NoneType without a tensor"):
-        load_network(f"{file}:Nothing", None)
-
-
 # ------------------------------------------------------------------ the device
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, Lidar, simulate_lidar
 
 K = np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.sensors import FORWARD_LEFT_UP, Camera, as_depth_image, project_velodyne
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
