@@ -62,11 +62,6 @@ def test_depth_is_positive_and_repeatable_wherever_the_points_lie(
     assert bool((depth > 0).all())
 
 
-@pytest.mark.parametrize("size", [(32, 32), (32, 256), (224, 64)])
-def test_any_multiple_of_32_is_taken(network: Compact, size: tuple[int, int]) -> None:
-    assert network(*frame(*size, 40)).shape == (1, 1, *size)
-
-
 @pytest.mark.parametrize("with_prior", [False, True])
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_inputs_ten_times_as_far_give_depth_ten_times_as_far(

@@ -104,13 +104,6 @@ def test_the_size_of_the_chunks_changes_nothing(
     torch.testing.assert_close(shaken.log_odds(whole), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_depths_ten_times_larger_have_the_same_weights(shaken: InlierWeights) -> None:
-    sparse = sparse_map(200)
-    near, far = (
-        shaken(points, Cloud.of(points, images(1)))
-        for points in (Points(sparse), Points(10 * sparse))
-    )
-    torch.testing.assert_close(far, near, rtol=1e-2, atol=1e-3)
 
 
 def test_the_colour_of_a_point_is_the_mean_of_25_pixels() -> None:
