@@ -104,8 +104,6 @@ def test_the_size_of_the_chunks_changes_nothing(
     torch.testing.assert_close(shaken.log_odds(whole), expected, rtol=1e-4, atol=1e-5)
 
 
-
-
 def test_the_colour_of_a_point_is_the_mean_of_25_pixels() -> None:
     rgb = images(1)
     sparse = torch.zeros(1, 1, *SIZE)

@@ -20,6 +20,7 @@ from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 pytest.importorskip("safetensors")
 tiny = pytest.importorskip("model_zoo_defs.training.learning.tiny")
+train = pytest.importorskip("model_zoo_defs.training.learning.train")
 
 pytestmark = pytest.mark.slow
 
@@ -130,9 +131,12 @@ def test_the_logarithm_goes_on_below_the_nearest_depth_and_can_climb_back() -> N
 
 
 LOSSES = (
-    recipes.log_error, recipes.log_error_up_to_scale,
-    recipes.relative_error, recipes.inverse_error,
-)  # fmt: skip
+    recipes.log_error,
+    recipes.log_error_up_to_scale,
+    recipes.relative_error,
+    recipes.inverse_error,
+    train.depth_loss,
+)
 
 
 @pytest.mark.parametrize("loss", LOSSES)

@@ -158,8 +158,7 @@ def test_weights_come_from_the_file_named_or_the_definitions_own(file: Path) -> 
 
 
 def test_random_weights_are_never_used(file: Path) -> None:
-    message = "comes without weights; name them with --checkpoint, .* say complete=True"
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(CheckpointError, match="comes without weights"):
         load_network(str(file), None)
     (file.parent / "own.safetensors").unlink()
     with pytest.raises(CheckpointError, match="does not exist"):

@@ -131,8 +131,6 @@ def test_a_pattern_that_makes_no_sense_is_refused(options: dict[str, object], me
 
 
 def test_what_the_depth_map_cannot_give_is_refused() -> None:
-    with pytest.raises(UsageError, match="ask for fewer"):
-        sample_points(HOLES, SamplePattern(count=DEPTH.size), 0)
     with pytest.raises(NoPointsError):
         sample_points(np.zeros((5, 5), np.float32), SamplePattern(count=1), 0)
     plain = np.full((60, 80, 3), 0.5, np.float32)
@@ -140,8 +138,6 @@ def test_what_the_depth_map_cannot_give_is_refused() -> None:
         sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=plain)
     with pytest.raises(NoPointsError, match="100,0,5,5"):
         sample_points(DEPTH, SamplePattern(kind="region", region=(100, 0, 5, 5)), 0)
-    with pytest.raises(UsageError, match="needs the image"):
-        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0)
     with pytest.raises(SizeError, match="40×30"):
         sample_points(
             DEPTH, SamplePattern(kind="edges", count=3), 0, image=np.zeros((30, 40, 3), np.float32)
