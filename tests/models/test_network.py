@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
+from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import FARTHEST_DEPTH, Network, find_device, load_network
@@ -46,12 +46,6 @@ def test_a_image_is_normalised_and_points_are_scattered() -> None:
     )
     assert rgb[0, :, 0, 0].tolist() == [0.0, 1.0, 0.25]
     assert sparse.tolist() == [[[[4, 0, 0], [0, 0, 2]]]]
-
-
-def test_a_network_of_points_alone_needs_no_image_and_one_of_images_does() -> None:
-    assert len(arguments(network(input_kind="sparse"), None)) == 1
-    with pytest.raises(UsageError, match="takes an rgb image"):
-        arguments(network(), None)
 
 
 def test_arguments_that_raise_or_are_no_tuple_are_the_definitions_fault() -> None:
