@@ -80,6 +80,15 @@ def test_the_scanner_in_front_of_the_camera_needs_no_parallax_to_be_defined() ->
     assert hidden.tolist() == [False, True, False, False]
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("pixels", [-11, -10, 10, 11])
+def test_what_hides_a_point_is_at_most_ten_pixels_away(axis: int, pixels: int) -> None:
+    step = np.eye(3)[axis] * np.sign(pixels)  # the beam passes 6.4 pixels to that side
+    xy = 100.0 + np.array([abs(pixels) * step[:2], (0, 0)])
+    hidden = hidden_points(xy, np.array([1.0, 5.0]), SIZE, focal_px=700.0, scanner=8 * step)
+    assert hidden.tolist() == [False, abs(pixels) == 10]  # 0.8 degrees
+
+
 @pytest.mark.parametrize("focal_px", [240.0, 300.0])
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.3, -0.1, -0.2)])
 def test_a_point_is_hidden_by_a_nearer_one_beside_its_beam(
