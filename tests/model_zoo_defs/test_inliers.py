@@ -59,16 +59,6 @@ def test_neighbours_are_the_nearest_points_of_the_cells_around(seed: int, count:
         torch.testing.assert_close(own[known], row[row < torch.inf], rtol=1e-3, atol=1e-4)
 
 
-def test_on_a_grid_they_are_the_nearest_twelve() -> None:
-    rows, columns = torch.meshgrid(torch.arange(9.0), torch.arange(9.0), indexing="ij")
-    position = torch.stack([rows, columns], -1).flatten(0, 1) + 0.5
-    near, found = neighbours(position)
-    middle = 4 * 9 + 4
-    assert bool(found[middle].all())
-    square = (position[near[middle]] - position[middle]).square().sum(1)
-    assert square.tolist() == [1.0] * 4 + [2.0] * 4 + [4.0] * 4
-
-
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_points_without_neighbours_have_a_weight(shaken: InlierWeights, count: int) -> None:
     points = Points(sparse_map(count))

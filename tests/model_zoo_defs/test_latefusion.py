@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from model_zoo_defs.latefusion import Encoder, Halved, LateFusion, averaged, definitions
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.network import load_network
 from tests.model_zoo_defs.cuts import built
 
 TINY = definitions["latefusion-tiny"]
@@ -57,12 +52,6 @@ def test_depth_is_between_0_and_200_m_whatever_the_points(fraction: float) -> No
             depth = network(scale * torch.randn(1, 3, 32, 64), sparse)
         assert depth.shape == (1, 1, 32, 64)
         assert 0 <= float(depth.min()) <= float(depth.max()) <= 200.01
-
-
-def test_weights_of_the_other_size_name_it(tmp_path: Path) -> None:
-    save_file(TINY.build().state_dict(), tmp_path / "w.safetensors")
-    with pytest.raises(CheckpointError, match="this is latefusion-tiny; use --model"):
-        load_network("latefusion", tmp_path / "w.safetensors")
 
 
 def test_the_full_network_is_cut_at_the_same_layer() -> None:

@@ -23,8 +23,6 @@ def test_every_known_name_has_a_definition_of_that_name() -> None:
 def test_an_unknown_name_suggests_a_near_one() -> None:
     with pytest.raises(ModelError, match="did you mean 'compact'"):
         find_definition("compat")
-    with pytest.raises(ModelError, match="did you mean 'fcrn-tiny'"):
-        find_definition("fcrn-tyni")
     with pytest.raises(ModelError, match="did you mean 'sparse2dense-r50-upproj'"):
         find_definition("sparse2dense-r50-upprj")
     with pytest.raises(ModelError, match="`pnpdepth models` lists all"):
