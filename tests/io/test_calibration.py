@@ -92,6 +92,12 @@ POSES = {
     "R and t": "R: [0, -1, 0, 0, 0, -1, 1, 0, 0]\nt: [0.1, -0.2, -0.3]\n",
 }
 
+ODD = [
+    *("!!int ''", "!!bool x", "!!timestamp x", "!!binary é", "!!float z", "{? [] : 1}"),
+    *("!!python/name:os.system ''", "1e999", "9" * 5000),
+]
+"""Values of YAML that are no matrix."""
+
 
 def write(folder: Path, text: str, name: str = "calib.txt") -> Path:
     path = folder / name
@@ -262,6 +268,7 @@ def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
         ("camera_matrix: [" * 2000, "is not valid YAML"),
         ("camera_matrix: 1\n" + " " * 300_000, "more than a calibration"),
         ("camera_matrix: !!python/object/apply:os.system ['true']", "not made of finite numbers"),
+        *((f"camera_matrix: {value}\ndistortion_model: plumb_bob\n", "calib.txt") for value in ODD),
     ],
 )
 @pytest.mark.filterwarnings("error")

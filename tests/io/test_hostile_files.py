@@ -15,7 +15,6 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.decoding import check_tags
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import check_pixel_count
@@ -184,18 +183,6 @@ def test_a_header_of_npy_that_is_no_header_is_damaged(
     path.write_bytes(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + bytes(4 * 6 * 8))
     with pytest.raises(FileFormatError, match=r"NPY cannot be read|holds .* values") as caught:
         read_depth(path)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "value", ["!!int ''", "!!bool x", "!!timestamp x", "!!binary é", "!!float z", "{? [] : 1}",
-              "!!python/name:os.system ''", "1e999", "9" * 5000],
-)  # fmt: skip
-def test_tags_and_odd_values_of_yaml_are_no_crash(tmp_path: Path, value: str) -> None:
-    path = tmp_path / "camera.yaml"
-    path.write_text(f"camera_matrix: {value}\ndistortion_model: plumb_bob\n", encoding="utf-8")
-    with pytest.raises(FileFormatError) as caught:
-        read_calibration(path)
     assert "\n" not in str(caught.value)
 
 

@@ -1,13 +1,11 @@
-"""latefusion: NASNet's own size, features of the paper's strides, depth that is always depth."""
+"""latefusion: NASNet's own size, depth that is always depth."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 
 from model_zoo_defs.latefusion import Encoder, Halved, LateFusion, averaged, definitions
-from pnpdepth_cli.core.split import Split
 from tests.model_zoo_defs.cuts import built
 
 TINY = definitions["latefusion-tiny"]
@@ -52,12 +50,3 @@ def test_depth_is_between_0_and_200_m_whatever_the_points(fraction: float) -> No
             depth = network(scale * torch.randn(1, 3, 32, 64), sparse)
         assert depth.shape == (1, 1, 32, 64)
         assert 0 <= float(depth.min()) <= float(depth.max()) <= 200.01
-
-
-def test_the_full_network_is_cut_at_the_same_layer() -> None:
-    network = definitions["latefusion"].build().eval()
-    rgb, sparse = torch.rand(1, 3, 32, 64), torch.rand(1, 1, 32, 64)
-    with torch.no_grad(), Split(network, "decoder.s8") as split:
-        z: Tensor = split.front(rgb, sparse)
-        assert z.shape == (1, 88, 4, 8)
-        assert torch.equal(split.rear(z), network(rgb, sparse))
