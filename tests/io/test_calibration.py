@@ -51,7 +51,7 @@ TOPIC = """header:
 height: 480
 width: 640
 distortion_model: plumb_bob
-d: [-0.1, 0.02, 0.001, -0.002, 0.0]
+d: [-0.1, 0.02, 0.001, -0.002, 0.01]
 k: [500.5, 0.0, 320.0, 0.0, 501.0, 240.0, 0.0, 0.0, 1.0]
 ---
 height: 480
@@ -92,6 +92,12 @@ POSES = {
     "R and t": "R: [0, -1, 0, 0, 0, -1, 1, 0, 0]\nt: [0.1, -0.2, -0.3]\n",
 }
 
+ODD = [
+    *("!!int ''", "!!bool x", "!!timestamp x", "!!binary é", "!!float z", "{? [] : 1}"),
+    *("!!python/name:os.system ''", "1e999", "9" * 5000),
+]
+"""Values of YAML that are no matrix."""
+
 
 def write(folder: Path, text: str, name: str = "calib.txt") -> Path:
     path = folder / name
@@ -99,15 +105,14 @@ def write(folder: Path, text: str, name: str = "calib.txt") -> Path:
     return path
 
 
-def opencv_file(folder: Path, coefficients: list[float], **others: int) -> Path:
-    path = folder / "opencv.yml"
-    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+def opencv_file(coefficients: list[float], **others: int) -> str:
+    """What OpenCV writes."""
+    file = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for name, value in {"image_width": 640, "image_height": 480, **others}.items():
         file.write(name, value)
     file.write("camera_matrix", np.array(K))
     file.write("distortion_coefficients", np.array(coefficients)[:, None])
-    file.release()
-    return path
+    return file.releaseAndGetString()
 
 
 def facts(calibration: Calibration) -> tuple[Any, ...]:
@@ -198,41 +203,32 @@ def test_nine_numbers_are_intrinsics_alone(tmp_path: Path) -> None:
     assert got.translation.tolist() == [0, 0, 0]
 
 
-@pytest.mark.parametrize(
-    ("coefficients", "others", "lens"),
-    [
-        ([-0.1, 0.02, 0.001, -0.002, 0.01], {}, "radial-tangential"),
-        ([-0.1, 0.02, 0.001, -0.002], {"fisheye_model": 0}, "radial-tangential"),
-        ([-0.1, 0.02, 0, 0.01], {"fisheye_model": 1}, "fisheye"),
-    ],
-)
-def test_a_file_that_opencv_wrote_is_read(
-    coefficients: list[float], others: dict[str, int], lens: str, tmp_path: Path
+FIVE = [-0.1, 0.02, 0.001, -0.002, 0.01]
+FOUR = [-0.02, 0.01, -0.003, 0.001]
+EIGHT = [0.1, 0.2, 0.0, 0.0, 0.1, 0.2, 0.1, 0.01]
+NAMED = {
+    "of OpenCV": (opencv_file(FIVE), FIVE, "radial-tangential"),
+    "of OpenCV, not fisheye": (opencv_file(FOUR, fisheye_model=0), FOUR, "radial-tangential"),
+    "of OpenCV, fisheye": (opencv_file(FOUR, fisheye_model=1), FOUR, "fisheye"),
+    "of ROS": (ROS.format(model="plumb_bob", data=FIVE), FIVE, "radial-tangential"),
+    "of ROS, rational": (
+        ROS.format(model="rational_polynomial", data=EIGHT),
+        EIGHT,
+        "radial-tangential",
+    ),
+    "of ROS, fisheye": (ROS.format(model="equidistant", data=FOUR), FOUR, "fisheye"),
+    "of ROS, without a model": (ROS.format(model="''", data=FOUR), FOUR, "radial-tangential"),
+    "an echoed topic": (TOPIC, FIVE, "radial-tangential"),
+}
+"""Text, coefficients and lens of files that name what they hold, of one camera."""
+
+
+@pytest.mark.parametrize(("text", "coefficients", "lens"), NAMED.values(), ids=NAMED)
+def test_files_of_opencv_and_ros_are_read(
+    text: str, coefficients: list[float], lens: str, tmp_path: Path
 ) -> None:
-    got = read_calibration(opencv_file(tmp_path, coefficients, **others))
+    got = read_calibration(write(tmp_path, text))
     assert facts(got) == (K, (480, 640), lens, tuple(coefficients), False)
-
-
-@pytest.mark.parametrize(
-    ("model", "data", "lens"),
-    [
-        ("plumb_bob", [-0.1, 0.02, 0.001, -0.002, 0.01], "radial-tangential"),
-        ("rational_polynomial", [0.1, 0.2, 0.0, 0.0, 0.1, 0.2, 0.1, 0.01], "radial-tangential"),
-        ("equidistant", [-0.02, 0.01, -0.003, 0.001], "fisheye"),
-        ("''", [-1e-1, 0.5, 0.0, 0.0], "radial-tangential"),
-    ],
-)
-def test_a_camera_info_file_of_ros_is_read(
-    model: str, data: list[float], lens: str, tmp_path: Path
-) -> None:
-    got = read_calibration(write(tmp_path, ROS.format(model=model, data=data)))
-    assert facts(got) == (K, (480, 640), lens, tuple(data), False)
-
-
-def test_an_echoed_camera_info_topic_is_read_from_its_first_message(tmp_path: Path) -> None:
-    got = read_calibration(write(tmp_path, TOPIC))
-    distortion = (-0.1, 0.02, 0.001, -0.002, 0.0)
-    assert facts(got) == (K, (480, 640), "radial-tangential", distortion, False)
 
 
 def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
@@ -248,11 +244,8 @@ def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (KITTI.replace("R0_rect", "R0"), "has no R0_rect"),
         (KITTI.replace("Tr_velo_to_cam", "Tr_v"), "has no Tr_velo_to_cam"),
-        (KITTI.replace("P2: 700", "P2: seven"), "P2 is not made of finite numbers"),
         (KITTI.replace("P2: 700", "P2: nan"), "P2 is not made of finite numbers"),
-        (KITTI.replace("P2: 700", "P2:"), "P2 has 11 numbers instead of 12"),
         (KITTI.replace("P2: 700", "P2: -700"), "intrinsics are not of the form"),
         (KITTI.replace("R0_rect: 1", "R0_rect: 1.2"), "rectification is no rotation"),
         (KITTI.replace("velo_to_cam: 0 -1", "velo_to_cam: 0 1"), "scanner is no rotation"),
@@ -265,22 +258,17 @@ def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
         ("1 2 3", "K has 3 numbers instead of 9"),
         ('{"K": [1, 2', "is not valid JSON"),
         ("\0\0\0\0", "not a text file"),
-        # numbers that no camera has, and whose products would overflow
+        # its products would overflow
         (PLAIN.replace("700.5", "1e308"), "which no camera has"),
-        (PLAIN.replace("0.06", "-1e308"), "which no camera has"),
-        (PLAIN.replace("[0, -1, 0]", "[0, -1e308, 1e308]"), "which no camera has"),
-        (PLAIN.replace("-0.3", "1e300"), "which no camera has"),
         (PLAIN.replace("[1242, 375]", "[1000000000, 1000000000]"), "pixels, more than"),
-        (PLAIN.replace("[1242, 375]", "[50000, 50000]"), "pixels, more than"),
         (KALIBR.replace("pinhole", "omni"), "only pinhole (4) and eucm (6) are known"),
         (KALIBR.replace("equidistant", "wobbly"), "distortion model 'wobbly' is not known"),
-        (ROS.format(model="plumb_bob", data=[1, 2]), "2 coefficients of radial-tangential"),
         # YAML that is more than plain texts
         ("a: &a [1, 1]\ncamera_matrix: *a\n", "has an alias"),
         ("camera_matrix: [" * 2000, "is not valid YAML"),
         ("camera_matrix: 1\n" + " " * 300_000, "more than a calibration"),
         ("camera_matrix: !!python/object/apply:os.system ['true']", "not made of finite numbers"),
-        ("camera_matrix: [1, 2, .inf]", "is not made of finite numbers"),
+        *((f"camera_matrix: {value}\ndistortion_model: plumb_bob\n", "calib.txt") for value in ODD),
     ],
 )
 @pytest.mark.filterwarnings("error")

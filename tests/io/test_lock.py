@@ -1,9 +1,5 @@
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -13,15 +9,6 @@ import pytest
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io import lock
 from pnpdepth_cli.io.lock import in_turn, locked_folder
-
-HOLDER = """
-import sys, time
-from pathlib import Path
-from pnpdepth_cli.io.lock import locked_folder
-with locked_folder(Path(sys.argv[1])):
-    print("held", flush=True)
-    time.sleep(600)
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -55,19 +42,6 @@ def test_shards_run_together_but_not_twice_nor_beside_a_whole_run(tmp_path: Path
         with locked_folder(tmp_path, (2, 3)):
             pass
     with locked_folder(tmp_path), pytest.raises(OutputError), locked_folder(tmp_path, (1, 2)):
-        pass
-
-
-def test_the_lock_ends_with_its_process_however_it_ends(tmp_path: Path) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True
-    ) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "held\n"
-        with pytest.raises(OutputError), locked_folder(tmp_path):
-            pass
-        os.kill(holder.pid, signal.SIGKILL)
-    with locked_folder(tmp_path):
         pass
 
 

@@ -154,13 +154,3 @@ def test_inputs_and_other_files_are_safe(tmp_path: Path, monkeypatch: pytest.Mon
         for overwrite in (False, True) if folder != "full" else (False,):
             with pytest.raises(OutputError, match=message):
                 check_report_folder(Path(folder), [Path("in")], made_of=None, overwrite=overwrite)
-
-
-def test_a_report_of_the_same_may_be_written_again_and_no_other(tmp_path: Path) -> None:
-    own = {"command": "batch", "output": "../out"}
-    begin_report(tmp_path, own)
-    check_report_folder(tmp_path, [], made_of=own, overwrite=False)
-    for other in (None, own | {"output": "../other"}):
-        with pytest.raises(OutputError, match="not empty"):
-            check_report_folder(tmp_path, [], made_of=other, overwrite=False)
-    check_report_folder(tmp_path, [], made_of=None, overwrite=True)

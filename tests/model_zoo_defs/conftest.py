@@ -6,10 +6,7 @@ import pytest
 
 from pnpdepth_cli.models import registry
 
-KNOWN = [
-    *("eigen-kitti", "latefusion-tiny", "sparseconv-nomask"),
-    *("sparse2dense-r18-upconv-d", "sparse2dense-r18-upconv-d-kitti"),
-]
+KNOWN = ["eigen-kitti", "sparse2dense-r18-upconv-d", "sparse2dense-r18-upconv-d-kitti"]
 
 
 @pytest.fixture(autouse=True)

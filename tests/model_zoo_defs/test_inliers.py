@@ -59,16 +59,6 @@ def test_neighbours_are_the_nearest_points_of_the_cells_around(seed: int, count:
         torch.testing.assert_close(own[known], row[row < torch.inf], rtol=1e-3, atol=1e-4)
 
 
-def test_on_a_grid_they_are_the_nearest_twelve() -> None:
-    rows, columns = torch.meshgrid(torch.arange(9.0), torch.arange(9.0), indexing="ij")
-    position = torch.stack([rows, columns], -1).flatten(0, 1) + 0.5
-    near, found = neighbours(position)
-    middle = 4 * 9 + 4
-    assert bool(found[middle].all())
-    square = (position[near[middle]] - position[middle]).square().sum(1)
-    assert square.tolist() == [1.0] * 4 + [2.0] * 4 + [4.0] * 4
-
-
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_points_without_neighbours_have_a_weight(shaken: InlierWeights, count: int) -> None:
     points = Points(sparse_map(count))
@@ -102,15 +92,6 @@ def test_the_size_of_the_chunks_changes_nothing(
     monkeypatch.setattr(inliers, "CHUNK", 7)
     assert torch.equal(Cloud.of(points, images(1)).near, whole.near)
     torch.testing.assert_close(shaken.log_odds(whole), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_depths_ten_times_larger_have_the_same_weights(shaken: InlierWeights) -> None:
-    sparse = sparse_map(200)
-    near, far = (
-        shaken(points, Cloud.of(points, images(1)))
-        for points in (Points(sparse), Points(10 * sparse))
-    )
-    torch.testing.assert_close(far, near, rtol=1e-2, atol=1e-3)
 
 
 def test_the_colour_of_a_point_is_the_mean_of_25_pixels() -> None:

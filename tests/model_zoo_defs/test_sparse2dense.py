@@ -12,7 +12,6 @@ from torch import Tensor
 
 from model_zoo_defs.sparse2dense import DECODERS, SparseToDense, definitions
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import load_network
 from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_does, built
 
@@ -186,16 +185,11 @@ def test_every_variant_computes_what_the_published_tensors_say(depth: int, decod
     assert reference.used == set(state) - counters
 
 
-def test_sizes_names_and_inputs_are_those_of_the_protocols() -> None:
+def test_images_are_from_0_to_1_and_short_names_are_those_of_the_papers_networks() -> None:
     for name, definition in definitions.items():
-        if name != "sparse2dense-selfsup":
-            height_and_width = (228, 912) if name.endswith("-kitti") else (228, 304)
-            assert isinstance(definition.size, Fixed)
-            assert (definition.size.height, definition.size.width) == height_and_width
-            kind = {"d": "sparse", "rgb": "rgb"}.get(name.removesuffix("-kitti").split("-")[-1])
-            assert definition.input_kind == (kind or "rgb+sparse")
-            assert definition.normalisation is not None
-            assert definition.normalisation.std == (1.0, 1.0, 1.0)
+        assert definition.normalisation is not None
+        deviation = (1 / 255 if name == "sparse2dense-selfsup" else 1.0,) * 3
+        assert definition.normalisation.std == pytest.approx(deviation)
     assert definitions["sparse2dense"].name == "sparse2dense-r50-upproj"
     assert definitions["sparse2dense-kitti"].name == "sparse2dense-r18-upproj-kitti"
 
@@ -215,9 +209,7 @@ def test_the_sizes_of_z_are_those_of_the_paper() -> None:
 
 
 @pytest.mark.parametrize("counters", [True, False], ids=["now", "before PyTorch 0.4.1"])
-def test_a_published_file_loads_whole_and_gives_what_its_tensors_say(
-    counters: bool, tmp_path: Path
-) -> None:
+def test_a_published_file_loads_whole(counters: bool, tmp_path: Path) -> None:
     state = filled(published(18, "upproj"))
     kept = {n: t for n, t in state.items() if counters or not n.endswith("num_batches_tracked")}
     args = argparse.Namespace(data="nyudepthv2", arch="resnet18", modality="rgbd")
@@ -230,10 +222,6 @@ def test_a_published_file_loads_whole_and_gives_what_its_tensors_say(
     assert own.keys() == state.keys()
     assert all(torch.equal(own[name], tensor) for name, tensor in kept.items())
     assert any("data nyudepthv2" in note for note in network.notes)  # its weights fit -kitti too
-    with torch.no_grad():
-        depth = network.depth_of(network.module(*frame()))
-        expected = Reference(state).depth(torch.cat(frame(), dim=1), 18, "upproj")
-    torch.testing.assert_close(depth, expected, rtol=1e-3, atol=1e-4 * float(expected.std()))
 
 
 def test_misfits_are_named_and_weights_of_another_variant_name_the_right_one(
@@ -275,9 +263,6 @@ def test_the_self_supervised_file_loads_and_gives_what_its_tensors_say(tmp_path:
     content = {"epoch": 11, "model": state, "args": argparse.Namespace(input="rgbd", layers=34)}
     torch.save(content, tmp_path / "model_best.pth.tar")
     network = load_network("sparse2dense-selfsup", tmp_path / "model_best.pth.tar")
-    assert network.definition.normalisation is not None
-    assert network.definition.normalisation.std[0] * 255 == pytest.approx(1)
-
     w, (rgb, sparse) = Reference(state), frame(48, 64)
 
     def first(x: Tensor, name: str, stride: int = 1) -> Tensor:

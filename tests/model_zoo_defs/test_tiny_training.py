@@ -20,11 +20,11 @@ from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 pytest.importorskip("safetensors")
 tiny = pytest.importorskip("model_zoo_defs.training.learning.tiny")
+train = pytest.importorskip("model_zoo_defs.training.learning.train")
 
 pytestmark = pytest.mark.slow
 
 SHAPE = (48, 64)
-WEIGHTS = Path(tiny.__file__).parents[2] / "weights"
 
 
 def slope(seed: int) -> np.ndarray:
@@ -130,9 +130,12 @@ def test_the_logarithm_goes_on_below_the_nearest_depth_and_can_climb_back() -> N
 
 
 LOSSES = (
-    recipes.log_error, recipes.log_error_up_to_scale,
-    recipes.relative_error, recipes.inverse_error,
-)  # fmt: skip
+    recipes.log_error,
+    recipes.log_error_up_to_scale,
+    recipes.relative_error,
+    recipes.inverse_error,
+    train.depth_loss,
+)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -258,16 +261,3 @@ def test_every_tiny_edition_can_be_trained(name: str, shards: Path, tmp_path: Pa
     known = run.depth(batch)
     assert known.shape[:2] == (2, 1)
     assert bool(torch.isfinite(known).all())
-
-
-def test_the_shipped_weights_are_small_and_fit_their_definitions() -> None:
-    from safetensors.torch import load_file
-
-    total = 0
-    for name in tiny.RECIPES:
-        path = WEIGHTS / f"{name}.safetensors"
-        total += path.stat().st_size
-        assert path.stat().st_size <= 3_000_000
-        network = tiny.tiny_definition(name).build()
-        network.load_state_dict(load_file(path))
-    assert total <= 15_000_000

@@ -217,14 +217,6 @@ def test_linear_interpolation_of_a_plane_is_the_plane_inside_the_hull() -> None:
     assert (dense[9, 3], dense[9, 26]) == (plane[0, 0], plane[0, -1])
 
 
-def test_the_loss_is_least_for_the_ground_truth_and_ignores_unknown_depth() -> None:
-    ground_truth = torch.from_numpy(room(1))[None, None]
-    guess = torch.where(ground_truth > 0, ground_truth, 7.0)
-    assert train.depth_loss(guess, ground_truth) < train.depth_loss(guess * 1.01, ground_truth)
-    other = torch.where(ground_truth > 0, guess, 70.0)
-    assert train.depth_loss(guess, ground_truth) == train.depth_loss(other, ground_truth)
-
-
 def test_the_target_of_an_inlier_falls_with_the_error_of_the_point() -> None:
     ground_truth = torch.tensor([2.0, 2.0, 2.0, 0.0])
     sparse = torch.tensor([2.02, 2.0 * math.exp(0.125), 5.0, 2.0])

@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
+from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import FARTHEST_DEPTH, Network, find_device, load_network
@@ -46,12 +46,6 @@ def test_a_image_is_normalised_and_points_are_scattered() -> None:
     )
     assert rgb[0, :, 0, 0].tolist() == [0.0, 1.0, 0.25]
     assert sparse.tolist() == [[[[4, 0, 0], [0, 0, 2]]]]
-
-
-def test_a_network_of_points_alone_needs_no_image_and_one_of_images_does() -> None:
-    assert len(arguments(network(input_kind="sparse"), None)) == 1
-    with pytest.raises(UsageError, match="takes an rgb image"):
-        arguments(network(), None)
 
 
 def test_arguments_that_raise_or_are_no_tuple_are_the_definitions_fault() -> None:
@@ -158,8 +152,7 @@ def test_weights_come_from_the_file_named_or_the_definitions_own(file: Path) -> 
 
 
 def test_random_weights_are_never_used(file: Path) -> None:
-    message = "comes without weights; name them with --checkpoint, .* say complete=True"
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(CheckpointError, match="comes without weights"):
         load_network(str(file), None)
     (file.parent / "own.safetensors").unlink()
     with pytest.raises(CheckpointError, match="does not exist"):
@@ -193,34 +186,6 @@ def test_a_build_may_import_what_lies_beside_the_file_as_late_as_it_likes(tmp_pa
     before = list(sys.path)
     assert isinstance(load_network(f"{tmp_path / 'net.py'}:make", None).module, nn.AvgPool3d)
     assert sys.path == before
-
-
-FORWARDS = """
-import torch
-from torch import nn
-class Plain(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.down = nn.AvgPool2d(2)
-    def forward(self, rgb):
-        return self.down(rgb).mean(1, keepdim=True)
-class NoGrad(Plain):
-    forward = torch.no_grad()(Plain.forward)
-class Nothing(Plain):
-    def forward(self, rgb):
-        self.down(rgb)
-"""
-
-
-def test_a_forward_without_gradient_or_output_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "nets.py"
-    file.write_text(FORWARDS)
-    assert load_network(f"{file}:Plain", None).definition.layers == ("down",)
-    with pytest.raises(ModelError, match=r"no gradient comes back .* torch.no_grad") as error:
-        load_network(f"{file}:NoGrad", None)
-    assert error.value.exit_code == 4
-    with pytest.raises(ModelError, match=r"'nets.Nothing' returns a NoneType without a tensor"):
-        load_network(f"{file}:Nothing", None)
 
 
 # ------------------------------------------------------------------ the device

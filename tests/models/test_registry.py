@@ -20,21 +20,9 @@ def test_every_known_name_has_a_definition_of_that_name() -> None:
         assert find_definition(name).name == name
 
 
-PAPER = ("eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense", "latefusion")
-
-
-def test_each_network_of_the_paper_can_be_named_and_has_a_tiny_edition() -> None:
-    for family in PAPER:
-        assert find_definition(family).name.startswith(family)
-        assert find_definition(f"{family}-tiny").name == f"{family}-tiny"
-        assert find_definition(f"{family}-tiny").checkpoint is not None
-
-
 def test_an_unknown_name_suggests_a_near_one() -> None:
     with pytest.raises(ModelError, match="did you mean 'compact'"):
         find_definition("compat")
-    with pytest.raises(ModelError, match="did you mean 'fcrn-tiny'"):
-        find_definition("fcrn-tyni")
     with pytest.raises(ModelError, match="did you mean 'sparse2dense-r50-upproj'"):
         find_definition("sparse2dense-r50-upprj")
     with pytest.raises(ModelError, match="`pnpdepth models` lists all"):

@@ -210,9 +210,6 @@ def test_pickles_libraries_and_code_in_an_archive_are_left_alone(
     rgb = torch.rand(1, 3, 64, 96)
     assert torch.equal(network.module(rgb), load_network(str(archive), None).module(rgb))
     assert not trap.exists()
-    with pytest.raises(Exception):  # noqa: B017
-        torch.export.load(hostile)
-    assert trap.exists()  # where torch itself reads the file, it is run
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -237,45 +234,29 @@ def test_a_torchscript_archive_and_a_pickled_module_are_named_with_the_lines_tha
 
 
 BARE = """
-import torch
 from torch import nn
 
-class Block(nn.Module):
-    def __init__(self, channels=4):
-        super().__init__()
-        self.conv = nn.Conv2d(channels, channels, 3, 2, 1)
-    def forward(self, x):
-        return torch.relu(self.conv(x))
-
-class Net(nn.Module):
+class Net(nn.Sequential):
     def __init__(self):
-        super().__init__()
-        self.inward, self.block, self.out = nn.Conv2d(3, 4, 3, 2, 1), Block(), nn.Conv2d(4, 1, 1)
-    def forward(self, rgb):
-        y = nn.functional.interpolate(self.out(self.block(self.inward(rgb))), scale_factor=4)
-        return 1 + torch.sigmoid(y)
-
-def make():
-    return Net()
+        block = nn.Sequential(nn.Conv2d(4, 4, 3, 2, 1), nn.Softplus())
+        super().__init__(nn.Conv2d(3, 4, 3, 2, 1), block, nn.PixelShuffle(2))
 
 def needs(width):
     return Net()
 """
 
 
-@pytest.mark.parametrize("attribute", ["", ":Net", ":make"])
-def test_a_bare_class_or_factory_is_a_network_and_its_assumptions_are_printed(
-    tmp_path: Path, attribute: str
+def test_the_only_class_of_a_file_is_a_network_and_its_assumptions_are_printed(
+    tmp_path: Path,
 ) -> None:
-    file = tmp_path / "bare.py"
-    file.write_text(BARE)
-    spec = f"{file}{attribute}"
+    spec = str(tmp_path / "bare.py")
+    Path(spec).write_text(BARE)
     with pytest.raises(CheckpointError, match="--checkpoint"):
         load_network(spec, None)
     torch.save(find_definition(spec).build().state_dict(), tmp_path / "w.pt")
     network = load_network(spec, tmp_path / "w.pt")
-    assert network.definition.layers[0] == "block"
+    assert network.definition.layers[0] == "1"
     assert network.definition.default_alignment == "auto"
     assert "assumed: one rgb image in" in network.notes[0]
     with pytest.raises(ModelError, match=r"needs arguments \(width\)"):
-        find_definition(f"{file}:needs")
+        find_definition(f"{spec}:needs")

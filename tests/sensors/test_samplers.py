@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
-from pnpdepth_cli.sensors import PATTERNS, SampleNoise, SamplePattern, as_depth_image, sample_points
+from pnpdepth_cli.sensors import PATTERNS, SampleNoise, SamplePattern, sample_points
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)
 HOLES = np.where(np.random.default_rng(8).random((60, 80)) < 0.3, 0, DEPTH).astype(np.float32)
@@ -29,15 +29,6 @@ def test_every_pattern_gives_known_pixels_once_with_their_own_depth(kind: str) -
     assert np.array_equal(got.depth, HOLES[row, column])
     assert (got.depth > 0).all()
     assert len({*zip(row, column, strict=True)}) == len(row)
-
-
-@pytest.mark.parametrize("kind", PATTERNS)
-def test_the_same_seed_gives_the_same_points(kind: str) -> None:
-    first, again = (sample_points(HOLES, pattern(kind), 5, image=checkerboard()) for _ in "ab")
-    assert np.array_equal(first.xy, again.xy)
-    if kind in ("uniform", "bernoulli", "edges", "region"):
-        other = sample_points(HOLES, pattern(kind), 6, image=checkerboard())
-        assert not np.array_equal(as_depth_image(first), as_depth_image(other))
 
 
 @pytest.mark.parametrize("count", [1, 40, 3000])
@@ -140,8 +131,6 @@ def test_a_pattern_that_makes_no_sense_is_refused(options: dict[str, object], me
 
 
 def test_what_the_depth_map_cannot_give_is_refused() -> None:
-    with pytest.raises(UsageError, match="ask for fewer"):
-        sample_points(HOLES, SamplePattern(count=DEPTH.size), 0)
     with pytest.raises(NoPointsError):
         sample_points(np.zeros((5, 5), np.float32), SamplePattern(count=1), 0)
     plain = np.full((60, 80, 3), 0.5, np.float32)
@@ -149,8 +138,6 @@ def test_what_the_depth_map_cannot_give_is_refused() -> None:
         sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=plain)
     with pytest.raises(NoPointsError, match="100,0,5,5"):
         sample_points(DEPTH, SamplePattern(kind="region", region=(100, 0, 5, 5)), 0)
-    with pytest.raises(UsageError, match="needs the image"):
-        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0)
     with pytest.raises(SizeError, match="40×30"):
         sample_points(
             DEPTH, SamplePattern(kind="edges", count=3), 0, image=np.zeros((30, 40, 3), np.float32)

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.sensors import FORWARD_LEFT_UP, Camera, as_depth_image, project_velodyne
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
@@ -59,18 +57,6 @@ def test_minimum_and_maximum_range_are_distances_from_the_scanner() -> None:
     got = project_velodyne(scan, ahead, SIZE, limits=(4, 9), keep_occluded=True)
     assert got.depth.tolist() == [6]  # the last is 9.2 m away
     assert got.dropped["out of range"] == 2
-
-
-def test_an_empty_range_is_a_mistake_of_the_user() -> None:
-    with pytest.raises(UsageError, match="5 to 5 m is empty"):
-        project_velodyne(np.ones((1, 3)), camera(), SIZE, limits=(5, 5))
-
-
-def test_a_scan_outside_the_image_is_an_error_that_counts_its_points() -> None:
-    scan = np.array([[-5.0, 0, 0], [1.0, 50, 0], [1.0, 40, 0]])
-    with pytest.raises(NoPointsError, match=r"1 behind the camera, 2 outside the image") as error:
-        project_velodyne(scan, camera(), SIZE)
-    assert "\n" not in str(error.value)
 
 
 def test_the_outermost_half_pixels_belong_to_the_image_and_no_more() -> None:

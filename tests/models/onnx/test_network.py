@@ -274,19 +274,6 @@ CONSTANT_BOMBS = {
     "Concat": [
         constant("d0", [1.0]), *DOUBLING, helper.make_node("Identity", ["d34"], ["big"])
     ],
-    "MatMul": [
-        constant("n", [100_000, 1]), constant("m", [1, 100_000]),
-        helper.make_node("ConstantOfShape", ["n"], ["a1"]),
-        helper.make_node("ConstantOfShape", ["m"], ["a2"]),
-        helper.make_node("MatMul", ["a1", "a2"], ["big"]),
-    ],
-    "Tile": [
-        constant("a1", [[1.0]]), size_of(100_000, 100_000),
-        helper.make_node("Tile", ["a1", "n"], ["big"]),
-    ],
-    "Pad": [
-        constant("a1", [1.0]), size_of(10**10, 0), helper.make_node("Pad", ["a1", "n"], ["big"]),
-    ],
 }  # fmt: skip
 NONE = [
     constant("z", [0]), constant("o", [1]), constant("axis", [3]),
@@ -308,12 +295,6 @@ ACTIVATION_BOMBS = {
         constant("s", np.float32([1, 1, 1000, 1000])),
         helper.make_node("Resize", ["depth", "", "s"], ["big"], mode="linear"),
     ],
-    "Conv of doubles": [
-        helper.make_node("Cast", ["depth"], ["d64"], to=11),
-        size_of(1, 1, 1500, 1500), helper.make_node("ConstantOfShape", ["n"], ["k32"]),
-        helper.make_node("Cast", ["k32"], ["k64"], to=11),
-        helper.make_node("Conv", ["d64", "k64"], ["big"], pads=[800] * 4),
-    ],
     "MatMul": [
         constant("n", [-1, 1]), constant("m", [1, -1]), constant("k", [1, 1, 1, 20]),
         helper.make_node("Tile", ["depth", "k"], ["long"]),
@@ -321,15 +302,6 @@ ACTIVATION_BOMBS = {
         helper.make_node("Reshape", ["long", "m"], ["a2"]),
         helper.make_node("MatMul", ["a1", "a2"], ["big"]),
     ],
-} | {
-    f"{op} of {axes} axes": [
-        size_of(1, 1, *[1] * (axes - 1), -1), helper.make_node("Reshape", ["depth", "n"], ["a1"]),
-        constant("w", np.ones((1, 1, *[1] * axes), np.float32)),
-        helper.make_node(op, ["a1", "w"], ["big"], **more),
-    ]
-    for axes in (1, 2, 3)
-    for op, more in (("ConvTranspose", {"strides": [10**7] * axes}),
-                     ("Conv", {"pads": [10**9 // 10 ** (2 * axes - 2), *[10] * (2 * axes - 1)]}))
 }  # fmt: skip
 
 
@@ -356,7 +328,7 @@ QUANTISED = [
 ]
 
 
-@pytest.mark.parametrize("kind", ["Range", "Concat", "Pad", "Expand", "Resize", "MatMul"])
+@pytest.mark.parametrize("kind", ["Concat", "Expand", "MatMul"])
 def test_what_onnxruntime_allocates_for_a_quantised_network_is_bounded(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -207,14 +207,16 @@ def test_every_kind_of_misfit_is_listed_and_nothing_is_loaded(tmp_path: Path) ->
     del state["norm.weight"], state["norm.bias"]
     state |= {f"extra{n}": torch.ones(1) for n in range(5)}
     state["conv.bias"] = torch.ones(7)
+    state["conv.weight"] = state["conv.weight"] * 1j
     torch.save(state, tmp_path / "w.pth")
     network = Net()
     before = {k: v.clone() for k, v in network.state_dict().items()}
     with pytest.raises(CheckpointError) as error:
         load_checkpoint(network, definition(), tmp_path / "w.pth")
     assert str(error.value).endswith(
-        "does not fit network 'net': 2 missing (norm.weight, norm.bias); 5 unexpected (extra0,"
-        " extra1, extra2, extra3 and 1 more); 1 of another shape (conv.bias (7,) for (4,))"
+        "does not fit network 'net': 2 missing (norm.weight, norm.bias); 1 complex (conv.weight);"
+        " 5 unexpected (extra0, extra1, extra2, extra3 and 1 more); 1 of another shape (conv.bias"
+        " (7,) for (4,))"
     )
     assert error.value.exit_code == 4
     assert equal(network.state_dict(), before)
@@ -320,49 +322,29 @@ def tensor(kind: str | None = "F32", shape: Any = (2,), at: Any = (0, 8)) -> dic
     return {"dtype": kind, "shape": shape, "data_offsets": at}
 
 
-HEADERS: dict[str, Any] = {
-    "a negative offset": {"a": tensor(at=(-8, 0))},
-    "an end before its beginning": {"a": tensor(at=(8, 0))},
-    "an offset of 2⁶²": {"a": tensor(at=(0, 2**62))},
-    "an offset of 2⁶⁴": {"a": tensor(at=(0, 2**64))},
-    "tensors that overlap": {"a": tensor(), "b": tensor(at=(4, 12))},
-    "tensors that share": {"a": tensor(), "b": tensor()},
-    "a hole": {"a": tensor(), "b": tensor(at=(16, 24))},
-    "an unknown type": {"a": tensor("F33")},
-    "no type": {"a": tensor(None)},
-    "a type that torch lacks": {"a": tensor("F6_E2M3", (8,), (0, 6))},
-    "a shape whose product overflows": {"a": tensor(shape=(2**32, 2**32))},
-    "an empty one that overflows": {"a": tensor(shape=(2**62, 2**62, 0), at=(0, 0))},
-    "a side of 2⁶⁴ − 1": {"a": tensor(shape=(0, 2**64 - 1), at=(0, 0))},
-    "a negative side": {"a": tensor(shape=(-2,))},
-    "half a side": {"a": tensor(shape=(2.0,))},
-    "metadata of text": {"__metadata__": "x", "a": tensor()},
-    "metadata of numbers": {"__metadata__": {"x": 1}, "a": tensor()},
-    "metadata of metadata": {"__metadata__": {"x": {"y": "z"}}, "a": tensor()},
-    "metadata for a tensor": {"__metadata__": tensor()},
-    "a list": [],
+LYING = {
+    "a negative offset": ({"a": tensor(at=(-8, 0))}, 8),
+    "an offset of 2⁶²": ({"a": tensor(at=(0, 2**62))}, 8),
+    "tensors that overlap": ({"a": tensor(), "b": tensor(at=(4, 12))}, 8),
+    "an unknown type": ({"a": tensor("F33")}, 8),
+    "a type that torch lacks": ({"a": tensor("F6_E2M3", (8,), (0, 6))}, 6),
+    "a shape whose product overflows": ({"a": tensor(shape=(2**32, 2**32))}, 8),
+    "an empty one that overflows": ({"a": tensor(shape=(2**62, 2**62, 0), at=(0, 0))}, 0),
+    "a list": ([], 8),
 }
+"""Headers, and how many bytes of tensors follow."""
 
 
-@pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS)
-@pytest.mark.parametrize("length", [None, 0, 100_000_001, 2**63, 2**64 - 1])
+@pytest.mark.parametrize(("header", "size"), LYING.values(), ids=LYING)
+@pytest.mark.parametrize("length", [None, 2**64 - 1])
 def test_a_safetensors_header_that_lies_is_refused(
-    header: Any, length: int | None, tmp_path: Path
+    header: Any, size: int, length: int | None, tmp_path: Path
 ) -> None:
     text = json.dumps(header).encode()
     start = struct.pack("<Q", len(text) if length is None else length)
-    size = 6 if "F6" in str(header) else 0 if "[0, 0]" in str(text) else 8
     (tmp_path / "w.safetensors").write_bytes(start + text + bytes(size))
     with little():
         refused(tmp_path / "w.safetensors")
-
-
-def test_complex_weights_are_not_cut_to_their_real_part(tmp_path: Path) -> None:
-    network = Net()
-    state = network.state_dict()
-    torch.save(state | {"conv.bias": state["conv.bias"] * 1j}, tmp_path / "w.pth")
-    with pytest.raises(CheckpointError, match=r"net': 1 complex \(conv\.bias\)"):
-        load_checkpoint(network, definition(), tmp_path / "w.pth")
 
 
 def test_garbage_is_refused(tmp_path: Path) -> None:
