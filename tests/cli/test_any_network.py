@@ -6,42 +6,8 @@ import json
 
 import pytest
 
-from tests.cli.test_commands import code_of, refine
+from tests.cli.test_commands import code_of
 from tests.commands.frames import FrameOnDisk
-
-
-def test_an_unaligned_network_is_aligned_and_recorded(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source = frame.model.read_text()
-    wrong = frame.folder / "wrong.py"
-    wrong.write_text(source.replace("return 2 + 3 *", "return -50 * (2 + 3 *").replace(
-        "(self.encode(rgb))))", "(self.encode(rgb)))))"))  # fmt: skip
-    options = ("--json", "--iterations", "0", "--overwrite")
-    plain = refine(frame, "--model", str(wrong), *options)
-    assert code_of(plain) == 0
-    record = json.loads(capsys.readouterr().out)
-    assert record["alignment"] is None
-    assert any(note.startswith("warning") and "--align auto" in note for note in record["notes"])
-    for kind in ("scale", "affine", "median", "auto"):
-        assert code_of([*plain, "--align", kind]) == 0
-        record = json.loads(capsys.readouterr().out)
-        assert (record["alignment"]["scale"] < 0) or kind in ("affine", "auto")
-        assert record["settings"]["align"] == kind
-        assert record["sparse_error"]["before"]["mae"] < 1
-        assert any(note.startswith("alignment") for note in record["notes"])
-
-
-def test_align_every_fits_at_each_update(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    fits = []
-    for more in ([], ["--set", "align-every"]):
-        assert code_of(refine(frame, "--align", "scale", "--json", "--overwrite", *more)) == 0
-        record = json.loads(capsys.readouterr().out)
-        fits.append(record["alignment"]["scale"])
-        assert record["loss"][-1] < record["loss"][0]
-    assert fits[0] != fits[1]
 
 
 def test_an_onnx_file_is_refined_layers_listed_and_checked(

@@ -15,22 +15,6 @@ BATCH = (
 )
 
 
-def test_a_batch_and_its_evaluation_each_have_a_report(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of(*BATCH, "--html", "report") == 0
-    assert "wrote report/index.html" in capsys.readouterr().err
-    assert code_of(*BATCH, "--html", "report") == 0
-    assert list(frames_of(Path("report"))) == ["a", "b"]
-    capsys.readouterr()
-    assert code_of("eval", "out", "drive", "--html", "scores", "--json") == 0
-    out, err = capsys.readouterr()
-    assert out.startswith("{")
-    assert "wrote scores/index.html" in err
-    frame = frames_of(Path("scores"))["b"]
-    assert list(frame["views"]) == ["first", "second", "map", "image"]  # the record names the image
-
-
 def test_an_evaluation_replaces_a_report_only_if_asked(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
