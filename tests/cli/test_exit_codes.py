@@ -45,6 +45,7 @@ COMMANDS = {
         ("project", "--size 48", 2, "HxW"),
         ("project", "--size 48x64 --camera 1", 2, "leave out --camera"),
         ("project", "--size 48x64 --scan min-range=9,max-range=2", 2, "is empty"),
+        ("project", "--size 48x64 --overlay o.png", 2, "needs the image"),
         ("project", "--image missing.png", 3, "missing.png"),
         ("project", "--size 48x64 --scan min-range=90", 3, "none of the scan's"),
         ("eval", "--protocol kiti", 2, "kitti"),

@@ -176,20 +176,6 @@ def test_a_network_that_fails_on_one_frame_only_fails_there(root: Path) -> None:
         assert (counts["done"], counts["failed"]) == (4, 1)
 
 
-def test_files_without_a_partner_are_reported(root: Path) -> None:
-    (root / "sparse/b.png").unlink()
-    shutil.copy(root / "gt/a.png", root / "gt/lost.png")
-    listener = RecordingListener()
-    outcome = batch(root, listener)
-    assert outcome.summary["counts"] == {
-        "frames": 3, "done": 3, "diverged": 0, "failed": 0, "pending": 0, "with_warnings": 0,
-    }  # fmt: skip
-    messages = "\n".join(listener.messages)
-    for name in ("rgb/b.png", "gt/lost.png"):
-        assert f"warning: {root / name} has no partner" in messages
-        assert any(str(root / name) in text for text in outcome.summary["unmatched"])
-
-
 ODD = ("with space", "ümlaut 深度", "new\nline", "-dash", "quote'\"", "perc%ent", "[x]*", "=1+1")
 
 
@@ -281,14 +267,6 @@ def test_a_folder_cannot_lie_where_the_results_of_a_later_frame_go(root: Path) -
     (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]))
     batch(root, source=root / "list.csv", refine={"iterations": 0})
     assert [row["status"] for row in summary(root)["frames"]] == ["failed", "done"]
-
-
-def test_a_listed_file_that_is_not_there_is_a_failed_frame(root: Path) -> None:
-    (root / "list.csv").write_text("image,sparse\nrgb/a.png,sparse/a.png\nno.png,sparse/b.png\n")
-    listener = RecordingListener()
-    counts = batch(root, listener, source=root / "list.csv").summary["counts"]
-    assert (counts["done"], counts["failed"]) == (1, 1)
-    assert any("no.png does not exist; correct line 3" in text for text in listener.messages)
 
 
 def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: Path) -> None:

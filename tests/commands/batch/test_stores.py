@@ -46,18 +46,13 @@ def bucket(endpoint: str) -> Bucket:
 
 @pytest.fixture
 def root(tmp_path: Path, bucket: Bucket) -> Path:
-    """Frames on disk and in the bucket, and lists of both."""
+    """Frames on disk and in the bucket, with a list."""
     root = pairs_on_disk(tmp_path / "drive")
     bucket.put_folder(root, "drive")
-    write_list(root / "local.csv", "")
-    write_list(root / "remote.csv", f"{bucket.address}/drive/")
+    lines = [f"{n},rgb/{n}.png,sparse/{n}.png,gt/{n}.png\n" for n in NAMES]
+    (root / "local.csv").write_text("name,image,sparse,gt\n" + "".join(lines))
     bucket.put("drive/list.csv", (root / "local.csv").read_bytes())
     return root
-
-
-def write_list(path: Path, start: str) -> None:
-    lines = [f"{n},{start}rgb/{n}.png,{start}sparse/{n}.png,{start}gt/{n}.png\n" for n in NAMES]
-    path.write_text("name,image,sparse,gt\n" + "".join(lines))
 
 
 def in_store(
@@ -97,17 +92,6 @@ def test_frames_and_results_in_a_store_equal_those_on_disk_also_on_ray_workers(
     batch(root, source=root / "local.csv")
     assert without_names(there) == without_names(results(root / "out"))
     assert len(there) == 4 * len(NAMES)
-
-
-def test_a_local_list_may_name_files_in_a_store(root: Path, bucket: Bucket) -> None:
-    listener = RecordingListener()
-    batch(root, listener, source=root / "remote.csv")
-    assert {row["status"] for row in listener.rows} == {"done"}
-    first = listener.rows[0]["inputs"]["image"]
-    assert first == f"{bucket.address}/drive/rgb/a.png"
-    again = RecordingListener()
-    batch(root, again, source=root / "remote.csv")
-    assert again.to_do == 0
 
 
 def test_a_second_run_does_only_what_changed_in_the_store(root: Path, bucket: Bucket) -> None:
@@ -207,8 +191,6 @@ def test_the_command_names_what_is_wrong_with_an_address(
         raise ImportError("s3fs")
 
     good, out = f"{bucket.address}/drive/list.csv", str(root / "out")
-    assert ended("ftp://h/list.csv", out)[0] == 2
-    assert "ftp:// is no known store; stores are s3, gs, hf" in ended("ftp://h/list.csv", out)[1]
     code, text = ended("s3://me:pass@b/list.csv", out)
     assert (code, "pass" in text, "leave it out" in text) == (2, False, True)
     assert "folders in a store are not searched" in ended(f"{bucket.address}/drive", out)[1]

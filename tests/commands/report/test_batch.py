@@ -18,7 +18,6 @@ from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.colours import paint_signed
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.figure import figure_content
-from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.report import link_image
 from tests.commands.batches import NAMES, RecordingListener, batch, pairs_on_disk, refinement
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
@@ -75,12 +74,6 @@ def test_every_frame_is_on_the_page_which_links_the_panels_of_its_files_on_disk(
     assert values["mae_gain"] == 1 - values["mae_after"] / values["mae_before"]
     assert values["mae_gain"] != 0
     assert 0 < values["improved"] < 1
-    (table,) = page_data(report)["tables"]
-    assert table["header"] == ["", "before", "after", "change", "linear", "vs linear"]
-    mean = read_json(root / "out/summary.json")["mean"]["scores"]
-    before, after = mean["before"]["rmse"], mean["after"]["rmse"]
-    changed = [f"{before:.4f} m", f"{after:.4f} m", f"{after / before - 1:+.1%}"]
-    assert table["rows"][0][:4] == ["RMSE", *changed]
 
 
 def test_what_runs_before_and_what_was_lost_is_in_the_next_report_without_being_drawn_again(
@@ -134,13 +127,6 @@ def test_a_failed_frame_is_listed_with_its_reason(root: Path, report: Path) -> N
     assert len(page_data(report)["without"]) == 4
 
 
-def test_a_report_of_the_default_method_says_what_was_before(root: Path, report: Path) -> None:
-    batch(root, html=report, limit=1, refine={"propagate": None})
-    facts = dict(page_data(report)["facts"])
-    assert facts["Refinement"] == "networks refined, fused and propagated (the default method)"
-    assert facts["Before"] == "the network's depth, aligned with the points"
-
-
 def test_without_ground_truth_gains_are_those_at_held_out_points_and_settings_are_stated(
     root: Path, report: Path
 ) -> None:
@@ -169,21 +155,6 @@ def test_with_neither_ground_truth_nor_held_out_points_there_is_no_gain(
     assert [label for label, *_ in data["tiles"]] == ["Frames refined"]
     assert "no error is measured" in data["notes"][0]
     assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
-
-
-def test_the_default_method_without_ground_truth_headlines_its_hidden_points(
-    root: Path, report: Path
-) -> None:
-    shutil.rmtree(root / "gt")
-    batch(root, html=report, refine={"propagate": None, "iterations": None})
-    data, summary = page_data(report), read_json(root / "out/summary.json")
-    check = summary["linear"]["check"]
-    assert [label for label, *_ in data["tiles"]] == ["Frames refined", "MAE [m]"]
-    assert data["tiles"][1][1] == f"{check['aligned']:.4f} → {check['result']:.4f}"
-    assert [column["key"] for column in data["columns"]] == ["mae_gain", "mae_before", "mae_after"]
-    frame = frames_of(report)["a"]
-    assert frame["values"]["mae_after"] == summary["frames"][0]["linear"]["check"]["result"]
-    assert frame["notes"][0].startswith("Errors are at hidden points")
 
 
 def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(

@@ -24,8 +24,6 @@ from pnpdepth_cli.commands.sparse.make import (
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.commands.sparse.scans import camera_of, read_scan_points
 from pnpdepth_cli.errors import (
-    FileFormatError,
-    NoPointsError,
     OutputError,
     PnpDepthError,
     SizeError,
@@ -76,15 +74,6 @@ def test_a_projected_scan_lands_where_it_was_made_to_in_every_format(
     np.testing.assert_allclose(got, want, atol=0.002 if suffix == ".png" else 1e-4)
 
 
-def test_the_overlay_is_written_beside(frame: ScanOnDisk) -> None:
-    target = SparseTarget(output=frame.folder / "s.png", overlay=frame.folder / "o" / "over.png")
-    projected(frame, target=target)
-    assert cv2.imread(str(frame.folder / "o" / "over.png")).shape[1] > 300
-    again = replace(target, overwrite=True)
-    with pytest.raises(UsageError, match="needs the image"):
-        projected(frame, target=again, image=None, size=(48, 64))
-
-
 def test_the_size_comes_from_image_option_or_calibration(frame: ScanOnDisk) -> None:
     with pytest.raises(SizeError, match="does not give the image's size"):
         projected(frame, image=None)
@@ -101,25 +90,6 @@ def refused(frame: ScanOnDisk, error: type[PnpDepthError], message: str, **more:
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
     assert sorted(frame.folder.rglob("*")) == before
-
-
-def test_bad_input_is_refused_in_one_line_and_nothing_is_written(frame: ScanOnDisk) -> None:
-    cut = frame.folder / "cut.bin"
-    cut.write_bytes(frame.scan.read_bytes()[:-3])
-    refused(frame, FileFormatError, "multiple of 16", scan=cut)
-    values = np.fromfile(frame.scan, "<f4")
-    values[9] = np.nan
-    values.tofile(cut)
-    refused(frame, FileFormatError, "1 of 150 points", scan=cut)
-    refused(frame, FileFormatError, "not a scan", scan=frame.image)
-    refused(frame, FileFormatError, "is not an image", image=frame.scan)
-    refused(frame, UsageError, "needs --calib", options=ScanOptions())
-    plain = frame.folder / "k.txt"
-    plain.write_text("60 0 31.5 0 60 23.5 0 0 1")
-    refused(frame, UsageError, "has no pose of the scanner", options=ScanOptions(calib=plain))
-    behind = np.fromfile(frame.scan, "<f4").reshape(-1, 4) * [-1, 1, 1, 1]
-    behind.astype("<f4").tofile(cut)
-    refused(frame, NoPointsError, "150 behind the camera", scan=cut)
 
 
 def test_an_image_of_another_camera_is_an_error_or_gets_a_warning(frame: ScanOnDisk) -> None:
