@@ -20,9 +20,8 @@ from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import _SCORES, Tally
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.commands.report.batch import write_batch_report
-from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.core.metrics import Scores
-from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.sensors import SamplePattern
@@ -112,7 +111,7 @@ def test_other_settings_or_other_code_in_the_same_file_do_all_again(root: Path) 
         "def loss(predicted, measured):\n    return (predicted - measured).abs().mean()"
     )
     batch(root, limit=2)
-    for settings in ({"holdout": 0.2}, {"format": "exr"}, {"loss": str(loss)}):
+    for settings in ({"precision": "bf16"}, {"format": "exr"}, {"loss": str(loss)}):
         listener = RecordingListener()
         batch(root, listener, limit=2, refine=settings)
         assert listener.names == ["a", "b"]
@@ -151,17 +150,6 @@ def test_a_divergence_keeps_the_last_good_depth_and_is_counted(root: Path) -> No
     assert batch(root, refine={"lr": "1e4"}).summary["counts"]["diverged"] == 4
     assert (read_depth(root / "out/a_depth.png").values > 0).all()
     assert done(root, refine={"lr": "1e4"}) == []
-
-
-def test_a_mistake_that_concerns_all_frames_stops_the_batch_at_once(root: Path) -> None:
-    with pytest.raises(LayerError, match="did you mean middle"):
-        batch(root, refine={"layer": "midle"})
-    with pytest.raises(UsageError, match="is no scan"):
-        batch(root, refine={"scan": ScanOptions(max_range=10)})
-    model = root / "net/my_net.py"
-    model.write_text(model.read_text() + "\nraise ValueError('no')\n")
-    with pytest.raises(ModelError):
-        batch(root)
 
 
 def test_a_network_that_fails_on_one_frame_only_fails_there(root: Path) -> None:
@@ -380,11 +368,7 @@ def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
     assert read_depth(root / "out/a_depth.png").values.shape == size
 
 
-def test_an_empty_folder_is_an_error_that_names_the_layouts(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"any layout; put images into rgb/ .* known layouts: .*nyu-mat"
-    ):
-        batch(tmp_path)
+def test_empty_folders_are_an_error_that_names_the_layouts(tmp_path: Path) -> None:
     for part in ("rgb", "sparse"):
         (tmp_path / part).mkdir()
     with pytest.raises(InputError, match=r"has no frame in it; layouts are manifest, .*pairs"):

@@ -95,6 +95,7 @@ def test_two_single_files_raise_their_error(two: Path) -> None:
         SizeError, match=r"a_depth\.npy is 3×1 but the ground truth .*a\.npy is 2×1; --res"
     ):
         evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
+    depth_file(prediction, [[1, 1]])
     depth_file(gt, [[0, 0]])
     with pytest.raises(InputError, match=r"a\.npy has no known depth where protocol paper scores"):
         evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
