@@ -13,9 +13,9 @@ import pytest
 from pnpdepth_cli.choices import FRAME_PROTOCOLS
 from pnpdepth_cli.cli import batch as command
 from pnpdepth_cli.cli import progress
+from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.progress import BatchProgress
 from pnpdepth_cli.io.dataset import PROTOCOLS
-from tests.cli.test_commands import code_of
 from tests.commands.batches import add_frame
 
 PROGRAM = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
@@ -33,7 +33,7 @@ def test_a_profile_without_a_refined_frame_has_no_times(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for text in ("where the time went", "no frame was refined; there are no times"):
-        assert code_of(arguments("--profile")) == 0
+        assert run(arguments("--profile")) == 0
         assert text in capsys.readouterr().err
 
 
@@ -43,7 +43,7 @@ def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
     (root / "rgb/b.png").write_bytes(b"")
     for part in ("rgb", "sparse"):
         (root / part / "b.png").rename(root / part / "b\nb\x1b.png")
-    assert code_of(arguments()) == 7
+    assert run(arguments()) == 7
     err = capsys.readouterr().err
     (line,) = [line for line in err.splitlines() if line.startswith("failed")]
     assert line.startswith("failed: b\\nb\\x1b: drive/rgb/b\\nb\\x1b.png is empty")
@@ -57,24 +57,24 @@ def test_ray_without_an_address_is_this_machine(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)  # it would be imported only to run
-    assert code_of(arguments("--dry-run", "--ray")) == 0
-    assert code_of(arguments("--ray", "--workers", "1")) == 2
+    assert run(arguments("--dry-run", "--ray")) == 0
+    assert run(arguments("--ray", "--workers", "1")) == 2
 
 
 def test_a_dry_run_lists_as_json_what_would_be_done(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of(arguments()) == 0
+    assert run(arguments()) == 0
     capsys.readouterr()
-    assert code_of(arguments("--dry-run", "--json")) == 0
+    assert run(arguments("--dry-run", "--json")) == 0
     assert json.loads(capsys.readouterr().out) == []
-    assert code_of(arguments("--dry-run", "--json", "--seed", "1")) == 0
+    assert run(arguments("--dry-run", "--json", "--seed", "1")) == 0
     planned = json.loads(capsys.readouterr().out)
     assert planned[0] == {"name": "a", "why": "other settings"}
 
 
 def test_neither_a_dry_run_nor_one_with_nothing_to_do_needs_torch(root: Path) -> None:
-    assert code_of(arguments()) == 0
+    assert run(arguments()) == 0
     code = (
         "import sys\n"
         "from pnpdepth_cli.cli.main import main\n"
@@ -116,7 +116,7 @@ def test_ctrl_c_finishes_the_frame_prints_how_to_continue_and_exits_130(
     depths = {path.name[0] for path in Path("out").glob("*_depth.png")}
     assert depths == {path.stem for path in Path("out").glob("?.json")}
     assert not [p for p in Path("out").iterdir() if p.name[0] == "." and p.suffix != ".lock"]
-    assert code_of(arguments()) == 0
+    assert run(arguments()) == 0
 
 
 def test_the_second_ctrl_c_interrupts_and_the_old_handling_comes_back() -> None:

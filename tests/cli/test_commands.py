@@ -7,37 +7,22 @@ import sys
 
 import pytest
 
-from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.options import request_of
 from pnpdepth_cli.cli.refine import refine as refine_command
 from tests.commands.frames import FrameOnDisk
-
-
-def code_of(arguments: list[str]) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    return int(stop.value.code or 0)
-
-
-def refine(frame: FrameOnDisk, *more: str) -> list[str]:
-    model = [] if "--model" in more else ["--model", str(frame.model)]
-    return [
-        "refine", str(frame.image), "--sparse", str(frame.sparse), "-o", str(frame.folder / "out"),
-        *model, "--checkpoint", str(frame.checkpoint),
-        "--propagate", "none", *more,
-    ]  # fmt: skip
 
 
 def test_layers_says_why_a_layer_cannot_be_cut_at(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["layers", "--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
-    assert code_of([*arguments, "--json", "--all"]) == 0
+    assert run([*arguments, "--json", "--all"]) == 0
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
     assert set(rows) == {"encode", "encode.0", "encode.1", "middle", "unused", "decode"}
     problem = rows["unused"]["problem"]
     assert "never runs" in problem
-    assert code_of([*arguments, "--all"]) == 0
+    assert run([*arguments, "--all"]) == 0
     lines = capsys.readouterr().out.splitlines()
     shown = {words[0]: words[1:] for words in map(str.split, lines) if words}
     assert shown["unused"] == ["–", *problem.split()]
@@ -48,7 +33,7 @@ def test_layers_says_why_a_layer_cannot_be_cut_at(
 def test_a_seed_that_no_generator_takes_is_refused(
     command: str, seed: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of([command, "a", "b", "--seed", seed]) == 2
+    assert run([command, "a", "b", "--seed", seed]) == 2
     assert "--seed" in capsys.readouterr().err
 
 
@@ -86,3 +71,23 @@ def test_several_models_are_the_first_and_more() -> None:
     values = {name: value for name, value in context.params.items() if name != "as_json"}
     network = request_of(values).network
     assert (network.model, network.more_models) == ("fcrn-tiny", ("eigen-tiny",))
+
+
+def test_an_onnx_file_is_refined_and_checked(
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
+    from tests.models.onnx.onnx_files import write_network
+
+    net = str(write_network(frame.folder / "net.onnx"))
+    out = frame.folder / "o.exr"
+    arguments = ["refine", str(frame.image), "--sparse", str(frame.sparse), "--model", net]
+    assert run([*arguments, "-o", str(out), "--iterations", "2", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["settings"]["layer"] == "Relu_d"
+    assert any("agrees with onnxruntime" in note for note in record["notes"])
+    assert any("rgb range" in note for note in record["notes"])
+    assert len(record["model"]["checkpoint_sha256"]) == 64
+    assert run(["models", "check", net, "--image", str(frame.image), "--json"]) == 0
+    layers = json.loads(capsys.readouterr().out)
+    assert set(layers["layers"].values()) == {"ok"}

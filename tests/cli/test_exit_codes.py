@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.test_commands import code_of
+from pnpdepth_cli.cli.main import run
 from tests.commands.scan_frames import scan_on_disk
 
 NETWORK = "--model drive/net/my_net.py --checkpoint drive/net/my_net.safetensors"
@@ -30,6 +30,7 @@ COMMANDS = {
         ("batch", "--shard 0/2", 2, "1/4"),
         ("batch", "--workers 0", 2, "'--workers': 0 is not in the range x>=1"),
         ("batch", "--html-3d", 2, "name its folder with --html"),
+        ("batch", "--html calib.txt/report", 2, "cannot be written (not a directory)"),
         ("batch", "--sample many", 2, "500"),
         ("batch", "--layer encod", 4, "encode"),
         ("batch", "--device cuda:9", 6, "--device cpu"),
@@ -64,7 +65,7 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
 ) -> None:
     scan_on_disk(root.parent)
     before = sorted(root.rglob("*"))
-    assert code_of(f"{command} {COMMANDS.get(command, '')} {more}".split()) == code
+    assert run(f"{command} {COMMANDS.get(command, '')} {more}".split()) == code
     out, err = capsys.readouterr()
     assert message in err.splitlines()[-1]
     assert (out, "Traceback" in err) == ("", False)

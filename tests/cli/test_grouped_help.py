@@ -41,13 +41,6 @@ def test_all_options_are_in_the_longer_help(name: str) -> None:
             assert f" {long_name(parameter)}" in shown
 
 
-@pytest.mark.parametrize("name", GROUPED)
-def test_the_common_options_exist(name: str) -> None:
-    grouped = command(name)
-    options = {long_name(p) for p in grouped.params if isinstance(p, click.Option)}
-    assert (grouped.common or frozenset()) <= options
-
-
 @pytest.mark.parametrize("arguments", [("refine",), ("models", "check")])
 def test_the_help_states_that_a_python_file_is_run(arguments: tuple[str, ...]) -> None:
     assert "is Python code and is run" in " ".join(help_of(*arguments, "--help").split())

@@ -14,16 +14,14 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.choices import EVAL_PROTOCOLS
-from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS
 from pnpdepth_cli.io.depth import write_depth
 from tests.commands.frames import frame_on_disk
 
 
 def code_of(*arguments: str | Path) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(argument) for argument in arguments])
-    return int(stop.value.code or 0)
+    return run([str(argument) for argument in arguments])
 
 
 @pytest.fixture
@@ -59,9 +57,7 @@ def test_json_is_the_whole_result_with_every_option_and_the_same_with_more_worke
     assert record["interval"]["level"] == 0.95
 
 
-def test_csv_has_a_line_for_each_frame_also_those_without_score(
-    frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_csv_has_a_line_for_each_frame_also_those_without_score(frames: Path) -> None:
     Path("out/a.npy").unlink()
     assert code_of("eval", "out", "gt", "--csv", "scores.csv") == 7
     text = Path("scores.csv").read_bytes().decode()
@@ -71,11 +67,6 @@ def test_csv_has_a_line_for_each_frame_also_those_without_score(
     )  # fmt: skip
     assert c["name"] == "c\nd"
     assert float(b["mre"]) == pytest.approx(0.1, rel=1e-5)
-    err = capsys.readouterr().err
-    assert err.splitlines()[-1] == (
-        "pnpdepth: 1 of 6 frames were not scored (1 without prediction, 0 with a faulty file); the"
-        " means are over the other 5"
-    )
 
 
 def test_columns_choose_measures_and_latex_has_no_thousands_separators(
@@ -181,3 +172,33 @@ def test_a_name_that_is_no_utf_8_is_scored_and_printed(
 
 def test_the_help_names_every_protocol() -> None:
     assert tuple(PROTOCOLS) == EVAL_PROTOCOLS
+
+
+def test_an_evaluation_replaces_a_report_only_if_asked(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("eval", "drive/gt", "drive/gt", "--html")
+    assert code_of(*arguments, "scores") == 0
+    before = Path("scores/index.html").stat().st_mtime_ns
+    capsys.readouterr()
+    assert code_of(*arguments, "scores") == 2
+    assert capsys.readouterr().err == (
+        "pnpdepth: scores is not empty; --overwrite replaces the report in it, or name another"
+        " folder\n"
+    )
+    assert Path("scores/index.html").stat().st_mtime_ns == before
+    assert code_of(*arguments, "drive/net/my_net.py/report") == 2
+    assert code_of(*arguments, "scores", "--overwrite") == 0
+    assert Path("scores/index.html").stat().st_mtime_ns > before
+
+
+@pytest.mark.parametrize("folder", ["drive/gt", "drive/gt/report", "drive", "."])
+def test_an_evaluation_writes_neither_into_its_inputs_nor_around_them(
+    root: Path, capsys: pytest.CaptureFixture[str], folder: str
+) -> None:
+    before = sorted(root.rglob("*"))
+    assert code_of("eval", "drive/gt", "drive/gt", "--html", folder, "--overwrite") == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert "which is read; name another folder" in err
+    assert sorted(root.rglob("*")) == before

@@ -9,9 +9,9 @@ from typing import Any
 import click
 import pytest
 
+from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.sweep import sweep
 from pnpdepth_cli.commands.sweep.axes import PARAMETERS
-from tests.cli.test_commands import code_of
 
 
 def arguments(*more: str, source: str = "drive") -> list[str]:
@@ -26,9 +26,7 @@ def test_what_is_set_is_not_varied_and_is_recorded(
 ) -> None:
     fixed = ("lr=10%", "line-search=on", "noise=0.1", "seed=3", "points=20")
     options = [part for text in fixed for part in ("--set", text)]
-    assert (
-        code_of(arguments(*options, "--vary", "iterations=0,2", "--plots", "none", "--json")) == 0
-    )
+    assert run(arguments(*options, "--vary", "iterations=0,2", "--plots", "none", "--json")) == 0
     record = json.loads(capsys.readouterr().out)
     base = record["base"]
     assert (base["lr"], base["line_search"], base["noise"]) == ("10%", True, 0.1)
@@ -41,7 +39,7 @@ def test_what_is_set_is_not_varied_and_is_recorded(
 def test_why_a_frame_failed_is_reported_once(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of(arguments("--vary", "points=500", "--vary", "lr=1,2", "--plots", "none")) == 7
+    assert run(arguments("--vary", "points=500", "--vary", "lr=1,2", "--plots", "none")) == 7
     *_, last = lines = capsys.readouterr().err.splitlines()
     assert "4 of 4 runs failed" in last
     assert [line for line in lines if line.startswith("failed")] == [
@@ -66,9 +64,9 @@ def test_ctrl_c_prints_how_to_continue_and_exits_130(
 
     monkeypatch.setattr(sweep_running, "refine_frame", interrupted)
     vary = ("--vary", "lr=1%,3%", "--plots", "none")
-    assert code_of(arguments(*vary)) == 130
+    assert run(arguments(*vary)) == 130
     assert "stopped; run the same command to continue" in capsys.readouterr().err
-    assert code_of(arguments(*vary)) == 0
+    assert run(arguments(*vary)) == 0
     assert "4 runs: 1 done already, 3 to do" in capsys.readouterr().err
 
 

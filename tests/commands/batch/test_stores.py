@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.batch.batch import plan_batch
 from pnpdepth_cli.commands.batch.request import LOCAL, BatchRequest, ClusterOptions
 from pnpdepth_cli.errors import OutputError
@@ -182,10 +182,9 @@ def test_the_command_names_what_is_wrong_with_an_address(
     root: Path, bucket: Bucket, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def ended(source: str, output: str) -> tuple[int, str]:
-        with pytest.raises(SystemExit) as ended:
-            main(["batch", source, "-o", output])
+        code = run(["batch", source, "-o", output])
         line = capsys.readouterr().err.strip().splitlines()[-1]
-        return int(str(ended.value.code)), line.removeprefix("pnpdepth: ")
+        return code, line.removeprefix("pnpdepth: ")
 
     def missing(*_: Any, **__: Any) -> None:
         raise ImportError("s3fs")

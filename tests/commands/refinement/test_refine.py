@@ -182,13 +182,6 @@ def test_the_networks_crop_leaves_the_rest_unknown_and_refuses_points_only_there
         run(frame, model=str(model), sparse=left)
 
 
-@pytest.mark.parametrize(("share", "layer"), [("0", "encode"), ("1", "middle"), ("0.2", "encode")])
-def test_a_layer_can_be_a_share_of_the_definitions_layers(
-    frame: FrameOnDisk, share: str, layer: str
-) -> None:
-    assert run(frame, layer=share, iterations=0).record["settings"]["layer"] == layer
-
-
 BAD = [
     ({"holdout": 1.0}, UsageError, "--holdout must be a fraction"),
     ({"layer": "1.5"}, UsageError, "between 0 and 1"),
