@@ -53,6 +53,11 @@ def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
     assert "\x1b" not in err
 
 
+def test_a_report_that_cannot_be_written_is_wrong_usage(root: Path) -> None:
+    Path("file").write_text("mine")
+    assert run(arguments("--html", "file/report")) == 2
+
+
 def test_ray_without_an_address_is_this_machine(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

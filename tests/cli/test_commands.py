@@ -28,15 +28,6 @@ def test_layers_says_why_a_layer_cannot_be_cut_at(
     assert shown["unused"] == ["–", *problem.split()]
 
 
-@pytest.mark.parametrize("command", ["sample", "simulate", "compare"])
-@pytest.mark.parametrize("seed", ["-1", "99999999999999999999"])
-def test_a_seed_that_no_generator_takes_is_refused(
-    command: str, seed: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run([command, "a", "b", "--seed", seed]) == 2
-    assert "--seed" in capsys.readouterr().err
-
-
 def test_a_stdout_that_cannot_show_every_character_shows_the_others(frame: FrameOnDisk) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "pnpdepth_cli", "eval", frame.gt, frame.gt],

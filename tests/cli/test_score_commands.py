@@ -190,15 +190,3 @@ def test_an_evaluation_replaces_a_report_only_if_asked(
     assert code_of(*arguments, "drive/net/my_net.py/report") == 2
     assert code_of(*arguments, "scores", "--overwrite") == 0
     assert Path("scores/index.html").stat().st_mtime_ns > before
-
-
-@pytest.mark.parametrize("folder", ["drive/gt", "drive/gt/report", "drive", "."])
-def test_an_evaluation_writes_neither_into_its_inputs_nor_around_them(
-    root: Path, capsys: pytest.CaptureFixture[str], folder: str
-) -> None:
-    before = sorted(root.rglob("*"))
-    assert code_of("eval", "drive/gt", "drive/gt", "--html", folder, "--overwrite") == 2
-    out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert "which is read; name another folder" in err
-    assert sorted(root.rglob("*")) == before

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.batch.request import SequenceOptions
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
 from pnpdepth_cli.errors import UsageError
@@ -177,17 +176,3 @@ def test_neighbours_of_sampled_frames_are_sampled(tmp_path: Path) -> None:
     record = record_of(root, "drive_000")
     assert record["points"]["moved"] > 20
     assert record["inputs"]["neighbours"][0]["path"].endswith("gt/drive_001.png")
-
-
-def test_the_command_names_what_is_missing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = drive_on_disk(tmp_path, frames=2)
-    command = ["batch", str(root), "-o", str(root / "out"), "--iterations", "1"]
-    command += ["--model", str(root / "net/my_net.py")]
-    (root / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
-    assert run([*command, "--accumulate", "2", "--poses", str(root / "poses.txt")]) == 3
-    assert "has 1 poses for 2 frames" in capsys.readouterr().err
-    assert run([*command, "--poses", str(root / "poses.txt")]) == 2
-    assert run([*command, "--accumulate", "-1"]) == 2
-    assert not (root / "out").exists()

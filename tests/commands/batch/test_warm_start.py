@@ -10,9 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.batch.request import SequenceOptions
-from pnpdepth_cli.errors import UsageError
 from tests.commands.batches import RecordingListener, batch
 from tests.commands.drives import drive_on_disk, without_results
 
@@ -91,19 +89,6 @@ def test_a_frame_that_fails_does_not_end_its_window(tmp_path: Path) -> None:
     warm(root, listener=listener)
     assert [row["status"] for row in listener.rows] == ["done", "failed", "done"]
     assert records(root)[-1]["warm_start"] is True
-
-
-def test_the_default_method_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root = drive_on_disk(tmp_path, frames=2)
-    command = ["batch", str(root), "-o", str(root / "out"), "--warm-start"]
-    assert run([*command, "4"]) == 2
-    assert "--warm-start goes with a fixed method" in capsys.readouterr().err
-    assert run([*command, "1", "--propagate", "gp"]) == 2
-    assert run([*command, "2", "--propagate", "gp", "--ray-workers", "2", "--ray"]) == 2
-    assert "in one process" in capsys.readouterr().err
-    with pytest.raises(UsageError, match="--tile"):
-        warm(root, refine={"tile": 64})
-    assert not (root / "out").exists()
 
 
 @pytest.mark.slow
