@@ -67,8 +67,6 @@ def test_the_standard_deviation_is_positive_and_rounded_in_a_png(frame: FrameOnD
     assert sigma.shape == frame.depth.shape
     assert (sigma > 0).all()
     assert np.abs(exact - sigma).max() < 0.00051
-    with pytest.raises(UsageError, match="--uncertainty writes a second file"):
-        run(frame, uncertainty=True, output=frame.folder / "depth.exr")
 
 
 def test_a_time_budget_is_spent_on_steps_by_hidden_points(frame: FrameOnDisk) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -74,22 +73,6 @@ def test_exif_is_used_where_nothing_else_gives_the_camera(frame: FrameOnDisk) ->
     record = run(replace(frame, image=photo), ply=True).record
     assert "26 mm" in record["camera"]["source"]
     assert any("no distortion (EXIF" in note for note in record["notes"])
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({}, r"--ply needs the camera, .* give --calib or --fov"),
-        ({"fov_deg": 180.0}, "--fov is 180 degrees"),
-        ({"fov_deg": 60.0, "output": Path("a.exr")}, "--ply writes a second file"),
-    ],
-)
-def test_requests_that_cannot_be_met_are_one_line_and_write_nothing(
-    frame: FrameOnDisk, changes: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(UsageError, match=message):
-        run(frame, ply=True, **changes)
-    assert not (frame.folder / "out").exists()
 
 
 def test_a_colmap_model_gives_camera_and_pose(tmp_path: Path) -> None:

@@ -22,9 +22,6 @@ from pnpdepth_cli.io.report import link_image
 from tests.commands.batches import NAMES, RecordingListener, batch, pairs_on_disk, refinement
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
 
-_VIEWS = {"first", "second", "map", "image", "sparse"}
-_FILES = {"preview.png", "improvement.png"}
-
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
@@ -36,17 +33,11 @@ def report(tmp_path: Path) -> Path:
     return tmp_path / "report"
 
 
-def test_every_frame_is_on_the_page_which_links_the_panels_of_its_files_on_disk(
+def test_the_page_links_the_panels_of_a_frames_files_and_shows_their_errors(
     root: Path, report: Path
 ) -> None:
     batch(root, html=report)
-    frames, images = frames_of(report), images_of(report)
-    assert tuple(frames) == NAMES
-    assert len(images) == len(NAMES) * len(_FILES)
-    for frame in frames.values():
-        assert {n.partition("_")[2] for n in images if n.startswith(frame["key"])} == _FILES
-        assert set(frame["views"]) == _VIEWS
-    frame = frames["c"]
+    frame = frames_of(report)["c"]
     for view, kind, title in (
         ("first", "preview", "Depth before"),
         ("second", "preview", "Depth after"),
