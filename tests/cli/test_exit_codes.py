@@ -66,6 +66,7 @@ COMMANDS = {
         ("eval", "--delta 1,2", 2, "--delta"),
         ("eval", "--delta fast", 2, "--delta"),
         ("eval", "--missing max", 2, "scores empty predictions as --max-depth"),
+        ("eval", "--columns rmse,none", 2, "--columns none is not one of rmse, mae"),
         ("eval", "--csv x --markdown ./x", 2, "--csv and --markdown are the same file"),
         ("eval", "--latex x --markdown ./x", 2, "--markdown and --latex are the same file"),
         ("eval", "--html drive/gt --overwrite", 2, "which is read; name another folder"),

@@ -30,6 +30,7 @@ from tests.commands.batches import (
     RecordingListener,
     add_frame,
     batch,
+    done,
     pairs_on_disk,
     refine_one_by_one,
     refinement,
@@ -47,13 +48,6 @@ def root(tmp_path: Path) -> Path:
 def summary(root: Path) -> dict[str, Any]:
     content: dict[str, Any] = json.loads((root / "out" / "summary.json").read_text())
     return content
-
-
-def done(root: Path, **changes: Any) -> list[str]:
-    """The names of the frames that a batch does."""
-    listener = RecordingListener()
-    batch(root, listener, **changes)
-    return listener.names
 
 
 def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> None:
@@ -188,10 +182,8 @@ def test_any_name_that_a_file_can_have_will_do(tmp_path: Path) -> None:
 def test_results_inside_the_input_are_never_taken_as_input(root: Path) -> None:
     output = root / "gt" / "deep" / "out"
     batch(root, output=output, refine={"format": "exr"})
-    listener = RecordingListener()
-    outcome = batch(root, listener, output=output)
-    assert listener.names == list(NAMES)
-    assert outcome.summary["unmatched"] == []
+    assert done(root, output=output) == list(NAMES)
+    assert json.loads((output / "summary.json").read_text())["unmatched"] == []
 
 
 @pytest.mark.parametrize("output", [".", "rgb", ".."])

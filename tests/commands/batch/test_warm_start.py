@@ -11,23 +11,20 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.batch.request import SequenceOptions
-from tests.commands.batches import RecordingListener, batch
+from tests.commands.batches import RecordingListener, batch, depths, done
 from tests.commands.drives import drive_on_disk, without_results
 
 REFINE = {"iterations": 3, "update": "sign", "lr": "0.02"}
 
 
-def warm(root: Path, length: int = 3, **changes: Any) -> Any:
+def warm(root: Path, length: int = 3, **changes: Any) -> list[str]:
+    """The names of the frames that are done."""
     sequence = SequenceOptions(warm_start=length)
-    return batch(root, **{"sequence": sequence, "refine": REFINE} | changes)
+    return done(root, **{"sequence": sequence, "refine": REFINE} | changes)
 
 
 def records(root: Path) -> list[Any]:
     return [json.loads(path.read_text()) for path in sorted((root / "out").glob("drive_*.json"))]
-
-
-def depths(root: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted((root / "out").glob("*_depth.png"))}
 
 
 def test_a_frame_begins_where_the_one_before_ended_and_a_window_anew(tmp_path: Path) -> None:
@@ -47,13 +44,12 @@ def test_a_frame_begins_where_the_one_before_ended_and_a_window_anew(tmp_path: P
 
 
 def test_a_shard_has_whole_windows_so_the_bytes_do_not_depend_on_it(tmp_path: Path) -> None:
-    root, listener = drive_on_disk(tmp_path, frames=5), RecordingListener()
+    root = drive_on_disk(tmp_path, frames=5)
     warm(root, length=2)
     whole = depths(root)
     without_results(root)
-    for number in (2, 1):
-        warm(root, listener=listener, length=2, shard=(number, 2))
-    assert listener.names == [f"drive_00{number}" for number in (2, 3, 0, 1, 4)]
+    parts = [warm(root, length=2, shard=(number, 2)) for number in (2, 1)]
+    assert parts == [["drive_002", "drive_003"], ["drive_000", "drive_001", "drive_004"]]
     assert depths(root) == whole
 
 
@@ -62,15 +58,11 @@ def test_a_missing_result_is_made_again_from_the_start_of_its_window(tmp_path: P
     warm(root)
     whole = depths(root)
     (root / "out/drive_002_depth.png").unlink()
-    listener = RecordingListener()
-    warm(root, listener=listener)
-    assert listener.names == ["drive_002"]
+    assert warm(root) == ["drive_002"]
     assert depths(root) == whole
     image = cv2.imread(str(root / "rgb/drive_001.png"))
     cv2.imwrite(str(root / "rgb/drive_001.png"), 255 - image)
-    listener = RecordingListener()
-    warm(root, listener=listener)
-    assert listener.names == ["drive_001", "drive_002"]
+    assert warm(root) == ["drive_001", "drive_002"]
 
 
 def test_no_start_is_taken_across_a_cut(tmp_path: Path) -> None:

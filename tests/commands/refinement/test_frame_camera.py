@@ -19,7 +19,7 @@ from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.cloud import depth_edges
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
-from tests.commands.batches import RecordingListener, batch, pairs_on_disk
+from tests.commands.batches import batch, done, pairs_on_disk
 from tests.commands.frames import FrameOnDisk, frame_on_disk, run
 from tests.commands.scan_frames import FOCAL_PX, scan_on_disk
 from tests.kitti_drives import write_calibrations
@@ -130,16 +130,10 @@ def test_a_batch_writes_a_cloud_of_each_frame_and_a_lost_one_again(tmp_path: Pat
     root = pairs_on_disk(tmp_path, ("a", "b"))
     with pytest.raises(UsageError, match="--ply needs the camera"):
         batch(root, refine={"ply": True})
-
-    def refined() -> list[str]:
-        listener = RecordingListener()
-        batch(root, listener, refine={"ply": True})
-        return listener.names
-
     (root / "calib.txt").write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\n")
-    assert refined() == ["a", "b"]
+    assert done(root, refine={"ply": True}) == ["a", "b"]
     (root / "out/b.ply").unlink()
-    assert refined() == ["b"]
+    assert done(root, refine={"ply": True}) == ["b"]
     assert len(points_of(root / "out/b.ply")) > 100
     (root / "calib.txt").write_text("K: [60, 0, 30, 0, 60, 20, 0, 0, 1]\n")
-    assert refined() == ["a", "b"]
+    assert done(root, refine={"ply": True}) == ["a", "b"]

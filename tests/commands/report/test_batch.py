@@ -19,7 +19,7 @@ from pnpdepth_cli.io.colours import paint_signed
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.figure import figure_content
 from pnpdepth_cli.io.report import link_image
-from tests.commands.batches import NAMES, RecordingListener, batch, pairs_on_disk, refinement
+from tests.commands.batches import NAMES, batch, done, pairs_on_disk, refinement
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
 
 
@@ -76,9 +76,7 @@ def test_what_runs_before_and_what_was_lost_is_in_the_next_report_without_being_
     assert page_data(report)["tiles"][0][2] == "3 pending"
     batch(root, html=report, shard=(1, 2))  # a and c
     shutil.rmtree(report)
-    listener = RecordingListener()
-    batch(root, listener, html=report)
-    assert listener.names == ["b", "d"]
+    assert done(root, html=report) == ["b", "d"]
     before = everything(report)
     missing = report / "images" / f"{frames_of(report)['b']['key']}_preview.png"
     drawn = {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
