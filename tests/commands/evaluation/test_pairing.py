@@ -106,7 +106,6 @@ REFUSED = [
      "file: predictions are 1; ground truth is 0001"),
     (["a.png"], ["a.png"], "out/a.png", "gt", UsageError, "two files or two folders"),
     (["a.png"], ["a.png"], "out", "gt/a.png", UsageError, "two files or two folders"),
-    (["a.png"], ["a.png"], "out", "nothing", InputError, "no such file or folder"),
 ]  # fmt: skip
 
 
