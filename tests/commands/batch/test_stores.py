@@ -20,6 +20,7 @@ from tests.commands.batches import (
     NAMES,
     RecordingListener,
     batch,
+    done,
     pairs_on_disk,
     refinement,
     results,
@@ -57,12 +58,13 @@ def root(tmp_path: Path, bucket: Bucket) -> Path:
 
 def in_store(
     root: Path, bucket: Bucket, listener: RecordingListener | None = None, **changes: Any
-) -> Any:
+) -> list[str]:
+    """The names of the frames that are done."""
     fields = {
         "source": path_of(f"{bucket.address}/drive/list.csv"),
         "output": path_of(f"{bucket.address}/out"),
     }
-    return batch(root, listener, **fields | changes)
+    return done(root, listener, **fields | changes)
 
 
 def fetched(bucket: Bucket, folder: Path) -> Any:
@@ -96,9 +98,7 @@ def test_frames_and_results_in_a_store_equal_those_on_disk_also_on_ray_workers(
 
 def test_a_second_run_does_only_what_changed_in_the_store(root: Path, bucket: Bucket) -> None:
     in_store(root, bucket)
-    listener = RecordingListener()
-    in_store(root, bucket, listener)
-    assert listener.to_do == 0
+    assert in_store(root, bucket) == []
     bucket.put("drive/rgb/b.png", bucket.get("drive/rgb/c.png"))
     bucket.client.delete_object(Bucket=bucket.name, Key="out/d_depth.png")
     request = BatchRequest(
@@ -107,8 +107,7 @@ def test_a_second_run_does_only_what_changed_in_the_store(root: Path, bucket: Bu
     )  # fmt: skip
     planned = list(plan_batch(request, lambda text: None))
     assert planned == [("b", "input changed: image"), ("d", "result missing: d_depth.png")]
-    in_store(root, bucket, listener)
-    assert listener.names == ["b", "d"]
+    assert in_store(root, bucket) == ["b", "d"]
     summary = json.loads(bucket.get("out/summary.json"))
     assert [row["name"] for row in summary["frames"]] == list(NAMES)
 
@@ -120,9 +119,7 @@ def test_a_stopped_run_is_resumed_from_the_store_alone(
     in_store(root, bucket, stopped=lambda: next(stops))
     bucket.put("out/b_depth.png", b"of a run that was killed before it wrote the record")
     bucket.client.delete_object(Bucket=bucket.name, Key="out/summary.json")
-    listener = RecordingListener()
-    in_store(root, bucket, listener)
-    assert listener.names == ["b", "c", "d"]
+    assert in_store(root, bucket) == ["b", "c", "d"]
     resumed = fetched(bucket, tmp_path / "resumed")
     in_store(root, bucket, output=path_of(f"{bucket.address}/whole"))
     bucket.fetch("whole", tmp_path / "whole")
