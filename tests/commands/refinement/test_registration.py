@@ -12,8 +12,6 @@ import pytest
 import torch
 
 from pnpdepth_cli import Refiner, load_network
-from pnpdepth_cli.commands.batch.batch import run_batch
-from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.refine import load_refiner
 from pnpdepth_cli.commands.refinement.request import RefineRequest, parse_registration
@@ -22,7 +20,7 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.settings import Settings
-from tests.commands.batches import RecordingListener
+from tests.commands.batches import batch
 from tests.commands.frames import FrameOnDisk, run
 from tests.completion.unregistered import SIZE, UNREGISTERED, frame
 
@@ -95,7 +93,7 @@ def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> Non
     assert record["registration"]["right"] != whole.right
 
 
-def batch_records(folder: Path, own: FrameOnDisk, count: int, **options: Any) -> list[Any]:
+def batch_records(folder: Path, own: FrameOnDisk, count: int) -> list[Any]:
     """Writes eight frames, refines them as a batch, and returns the registration of each."""
     for seed in range(8):
         files = write_frame(folder / "in", seed, count)
@@ -103,11 +101,8 @@ def batch_records(folder: Path, own: FrameOnDisk, count: int, **options: Any) ->
             target = folder / "in" / name / f"{seed:03}.png"
             target.parent.mkdir(exist_ok=True)
             files[kind].rename(target)
-    refine = RefineRequest.from_fields(
-        model=str(own.model), checkpoint=own.checkpoint, propagate="none", **options
-    )
-    request = BatchRequest(source=folder / "in", output=folder / "out", refine=refine)
-    run_batch(request, RecordingListener())
+    network = {"model": str(own.model), "checkpoint": own.checkpoint}
+    batch(folder, source=folder / "in", refine=network)
     records = sorted((folder / "out").glob("0*.json"))
     return [json.loads(path.read_text())["registration"] for path in records]
 
