@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from pnpdepth_cli.cli import bench as bench_command
-from tests.cli.test_commands import code_of
+from pnpdepth_cli.cli.main import run
 from tests.commands.frames import FrameOnDisk
 
 
@@ -17,7 +17,7 @@ def bench(frame: FrameOnDisk, *more: str) -> list[str]:
 def test_the_table_goes_to_stdout_and_what_it_was_measured_with_to_stderr(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of(bench(frame, "--layer", "encode", "--iterations", "2")) == 0
+    assert run(bench(frame, "--layer", "encode", "--iterations", "2")) == 0
     out, err = capsys.readouterr()
     assert "cut at encode, 32×24, 50 points, K = 2, fp32" in " ".join(out.split())
     for part in ("forward", "rear and gradient", "refinement"):

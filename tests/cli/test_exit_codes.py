@@ -6,15 +6,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.test_commands import code_of
+from pnpdepth_cli.cli.main import run
 from tests.commands.scan_frames import scan_on_disk
 
 NETWORK = "--model drive/net/my_net.py --checkpoint drive/net/my_net.safetensors"
 COMMANDS = {
     "refine": f"drive/rgb/a.png --sparse drive/sparse/a.png -o out {NETWORK}",
     "batch": f"drive -o out {NETWORK}",
+    "adapt": "drive -o w.safetensors --model sparse2dense-tiny",
     "sweep": f"drive -o out {NETWORK} --plots none",
     "bench": f"{NETWORK} --size 24x32 --points 50 --repeats 1",
+    "sample": "drive/gt/a.png -o sparse.png",
+    "simulate": "drive/gt/a.png --calib calib.txt --sensor vlp-16 -o sparse.png",
     "project": "img.bin --calib calib.txt -o sparse.png",
     "eval": "drive/gt drive/gt",
 }
@@ -23,10 +26,6 @@ COMMANDS = {
 @pytest.mark.parametrize(
     ("command", "more", "code", "message"),
     [
-        ("refine", "--iterations -2", 2, "iterations must be"),
-        ("refine", "--loss l3", 2, "l3"),
-        ("refine", "--nonsense", 2, "--nonsense"),
-        ("refine", "--gt missing.png", 3, "missing.png"),
         ("refine", "--layer encod", 4, "encode"),
         ("refine", "--checkpoint missing.pt", 4, "does not exist"),
         ("refine", "--device cuda", 6, "--device cpu"),
@@ -34,9 +33,19 @@ COMMANDS = {
         ("batch", "--workers 0", 2, "'--workers': 0 is not in the range x>=1"),
         ("batch", "--html-3d", 2, "name its folder with --html"),
         ("batch", "--sample many", 2, "500"),
-        ("batch", "--layout tum", 3, "does not look like 'tum'"),
         ("batch", "--layer encod", 4, "encode"),
+        ("batch", "--warm-start 4 --model eigen-tiny", 2, "--warm-start goes with a fixed method"),
+        ("batch", "--warm-start 1 --propagate gp", 2, "2 or more, got 1"),
+        ("batch", "--warm-start 2 --propagate gp --ray-workers 2 --ray", 2, "in one process"),
+        ("batch", "--warm-start 2 --tile 64", 2, "--tile"),
+        ("batch", "--accumulate 2 --poses one_pose.txt", 3, "has 1 poses for 2 frames"),
+        ("batch", "--poses one_pose.txt", 2, "--poses is for --accumulate"),
+        ("batch", "--accumulate -1", 2, "-1 is not in the range x>=0"),
+        ("batch", "--adapt --shard 1/2", 2, "--adapt does not go with --shard"),
         ("batch", "--device cuda:9", 6, "--device cpu"),
+        ("adapt", "--steps 0", 2, "'--steps': 0 is not in the range"),
+        ("adapt", "--limit 1", 3, "gives 1 frame; an adaptation needs 2 or more"),
+        ("adapt drive -o w.safetensors --model fcrn-tiny", "", 2, "takes no sparse depth"),
         ("sweep", "--vary points=9 --set colour=red", 2, "no parameter 'colour'"),
         ("sweep", "--vary lr=1 --seeds 0", 2, "--seeds must be >= 1"),
         ("sweep", "--vary lr=1 --layout tum", 3, "does not look like 'tum'"),
@@ -44,21 +53,38 @@ COMMANDS = {
         ("bench", "--repeats 0", 2, "0 is not in the range x>=1"),
         ("bench", "--layer encod", 4, "did you mean encode"),
         ("bench", "--size big", 2, "HxW"),
+        ("sample", "--count many", 2, "neither a number such as 500 nor 5%"),
+        ("sample", "--pattern region:1,2,3", 2, "region:X,Y,W,H"),
+        ("sample", "--seed -1", 2, "--seed"),
+        ("simulate", "--position 0,0", 2, "--position must be X,Y,Z"),
+        ("simulate", "--seed 99999999999999999999", 2, "--seed"),
         ("project", "--size 48", 2, "HxW"),
         ("project", "--size 48x64 --camera 1", 2, "leave out --camera"),
         ("project", "--size 48x64 --scan min-range=9,max-range=2", 2, "is empty"),
+        ("project", "--size 48x64 --overlay o.png", 2, "needs the image"),
         ("project", "--image missing.png", 3, "missing.png"),
         ("project", "--size 48x64 --scan min-range=90", 3, "none of the scan's"),
         ("eval", "--protocol kiti", 2, "kitti"),
         ("eval", "--delta 1,2", 2, "--delta"),
         ("eval", "--delta fast", 2, "--delta"),
         ("eval", "--missing max", 2, "scores empty predictions as --max-depth"),
+        ("eval", "--columns rmse,none", 2, "--columns none is not one of rmse, mae"),
+        ("eval", "--csv x --markdown ./x", 2, "--csv and --markdown are the same file"),
+        ("eval", "--latex x --markdown ./x", 2, "--markdown and --latex are the same file"),
+        ("eval", "--html drive/gt --overwrite", 2, "which is read; name another folder"),
+        ("eval", "--html drive/gt/report --overwrite", 2, "which is read; name another folder"),
+        ("eval", "--html drive --overwrite", 2, "which is read; name another folder"),
+        ("eval", "--html . --overwrite", 2, "which is read; name another folder"),
         ("eval", "--json --csv -", 2, "can go to stdout"),
-        ("eval drive/gt drive/gt/a.png", "", 2, "two files or two folders"),
-        ("eval drive/gt nowhere", "", 3, "nowhere"),
         ("eval", "--protocol nyu-eigen", 3, "640×480"),
         ("eval", "--sparse nowhere", 3, "nowhere"),
-        ("compare a.json", "", 2, "two runs"),
+        ("compare a.json b.json", "--seed -1", 2, "--seed"),
+        (
+            "compare a.json b.json",
+            "--csv x --markdown ./x",
+            2,
+            "--csv and --markdown are the same file",
+        ),
         ("compare a.json b.json", "", 3, "a.json"),
     ],
 )
@@ -66,10 +92,13 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
     root: Path, capsys: pytest.CaptureFixture[str], command: str, more: str, code: int, message: str
 ) -> None:
     scan_on_disk(root.parent)
+    Path("one_pose.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
     before = sorted(root.rglob("*"))
-    assert code_of(f"{command} {COMMANDS.get(command, '')} {more}".split()) == code
+    assert run(f"{command} {COMMANDS.get(command, '')} {more}".split()) == code
     out, err = capsys.readouterr()
     assert message in err.splitlines()[-1]
     assert (out, "Traceback" in err) == ("", False)
     assert sorted(root.rglob("*")) == before
-    assert not (root.parent / "sparse.png").exists()
+    # a network is loaded in the folder of its results, which stays
+    outputs = ("sparse.png", "w.safetensors", "x", *(["out"] if code < 4 else []))
+    assert not any(Path(name).exists() for name in outputs)

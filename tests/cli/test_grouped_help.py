@@ -41,23 +41,6 @@ def test_all_options_are_in_the_longer_help(name: str) -> None:
             assert f" {long_name(parameter)}" in shown
 
 
-@pytest.mark.parametrize("name", GROUPED)
-def test_the_common_options_exist(name: str) -> None:
-    grouped = command(name)
-    options = {long_name(p) for p in grouped.params if isinstance(p, click.Option)}
-    assert (grouped.common or frozenset()) <= options
-
-
-def test_the_help_of_refine_is_at_most_60_lines_in_four_groups() -> None:
-    short = help_of("refine", "--help")
-    assert len(short.splitlines()) <= 60
-    titles = [line for line in short.splitlines() if line.endswith(":") and line[0] != " "]
-    assert titles == ["Input:", "Network:", "Method:", "Output:", "Help:"]
-    assert "--set" not in short
-    assert "--help-all" in short
-    assert "line-search" in help_of("refine", "--help-all")
-
-
 @pytest.mark.parametrize("arguments", [("refine",), ("models", "check")])
 def test_the_help_states_that_a_python_file_is_run(arguments: tuple[str, ...]) -> None:
     assert "is Python code and is run" in " ".join(help_of(*arguments, "--help").split())

@@ -193,15 +193,3 @@ def test_little_memory_ends_with_code_6_or_works(tmp_path: Path) -> None:
     done = shell(line, tmp_path)
     assert done.returncode == 6, done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_several_outputs_to_one_file_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    table = str(tmp_path / "x")
-    other = str(tmp_path / "." / "x")
-    for command in ("eval", "compare"):
-        assert run([command, str(GT), str(GT), "--csv", table, "--markdown", other]) == 2
-        assert "--csv and --markdown are the same file" in capsys.readouterr().err
-        assert run([command, str(GT), str(GT), "--latex", table, "--markdown", other]) == 2
-        assert "--markdown and --latex are the same file" in capsys.readouterr().err

@@ -91,6 +91,13 @@ def batch(
     return run_batch(BatchRequest(**fields | changes), listener or RecordingListener(), stopped)
 
 
+def done(root: Path, listener: RecordingListener | None = None, **changes: Any) -> list[str]:
+    """The names of the frames that a batch does."""
+    listener = listener or RecordingListener()
+    batch(root, listener, **changes)
+    return listener.names
+
+
 def refine_one_by_one(root: Path, names: tuple[str, ...], **changes: Any) -> None:
     """Each of these frames refined by itself, into out/."""
     for name in names:
@@ -114,6 +121,11 @@ def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
         else:
             contents[name] = path.read_bytes()
     return contents
+
+
+def depths(root: Path) -> dict[str, bytes]:
+    """The depth files of a batch."""
+    return {path.name: path.read_bytes() for path in sorted((root / "out").glob("*_depth.png"))}
 
 
 def times(folder: Path) -> dict[str, int]:

@@ -64,23 +64,6 @@ def test_weights_that_get_worse_are_not_written(tmp_path: Path) -> None:
     assert "after 0 updates" in (root / "adapted.md").read_text()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "says"),
-    [
-        (["--steps", "0"], 2, "'--steps': 0 is not in the range"),
-        (["--limit", "1"], 3, "gives 1 frame; an adaptation needs 2 or more"),
-        (["--model", "fcrn-tiny"], 2, "takes no sparse depth"),
-    ],
-)
-def test_what_cannot_be_adapted_is_named(
-    arguments: list[str], code: int, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = drive_on_disk(tmp_path, frames=2)
-    assert adapted(root, *arguments) == code
-    assert says in capsys.readouterr().err
-    assert not (root / "adapted.safetensors").exists()
-
-
 def test_existing_files_are_not_replaced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

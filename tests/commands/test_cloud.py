@@ -16,7 +16,7 @@ import pytest
 from pnpdepth_cli.budget import budget
 from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
-from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.camera import Camera
@@ -102,26 +102,6 @@ def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path
     write_depth(path, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))
     with pytest.raises(SizeError, match="unlike its record"):
         written(path, cloud, fov_deg=None)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"intrinsics": [1, 2]},
-        {"intrinsics": [[0, 0, 0]] * 3},
-        {"intrinsics": [[1e999, 0, 0], [0, 1, 0], [0, 0, 1]]},
-        {"distortion": ["x"]},
-        {"lens": "pinhole"},
-        {"pose": [1, 2]},
-    ],
-)
-def test_a_damaged_camera_in_a_record_is_one_line(tmp_path: Path, changes: dict[str, Any]) -> None:
-    path = with_camera(frame(tmp_path, "a"), None)
-    record = json.loads((tmp_path / "a.json").read_text())
-    record["camera"] |= changes
-    (tmp_path / "a.json").write_text(json.dumps(record).replace("Infinity", "1e999"))
-    with pytest.raises(FileFormatError, match="the camera in the record beside it is damaged"):
-        written(path, tmp_path / "o.ply", fov_deg=None)
 
 
 def test_pixels_beyond_the_limits_are_left_out(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -199,15 +200,22 @@ NO_CAMERA: dict[str, Any] = {
 }
 BAD_CAMERAS: list[dict[str, Any]] = [
     {"intrinsics": [[10**400, 0, 0], [0, 1, 0], [0, 0, 1]]},
+    {"intrinsics": [[math.inf, 0, 0], [0, 1, 0], [0, 0, 1]]},
+    {"intrinsics": [[0, 0, 0]] * 3},
+    {"intrinsics": [1, 2]},
     {"pose": [[10**400, 0, 0, 0]] * 3},
+    {"pose": [1, 2]},
     {"distortion": [10**400]},
+    {"distortion": ["x"]},
     {"lens": 5},
+    {"lens": "pinhole"},
 ]
 BAD_NAMES = ["../../../ESC", "/etc/x.png", "a\nb.png", 7, "..", "n" * 201, "a\\b.png", "x/../../y"]
 
 
 def change(path: Path, **entries: Any) -> None:
-    path.write_text(json.dumps(json.loads(path.read_text()) | entries))
+    text = json.dumps(json.loads(path.read_text()) | entries)
+    path.write_text(text.replace("Infinity", "1e999"))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pnpdepth_cli.commands.error_tables import change, error_table, format_error, refinement_table
+from pnpdepth_cli.commands.error_tables import change, format_error, refinement_table
 from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
 from pnpdepth_cli.commands.tables import Table
 from pnpdepth_cli.core.metrics import MEASURES
@@ -39,25 +39,6 @@ def test_a_change_is_relative_or_in_points_and_coloured_by_whether_it_is_better(
 def test_an_error_has_its_unit_and_nothing_is_a_dash() -> None:
     shown = [format_error(*case, "m") for case in (("mae", 1.25), ("mae", None), ("mae", nan))]
     assert shown == ["1.2500 m", "–", "–"]
-
-
-def test_linear_interpolation_stands_beside_the_errors_and_points_used_show_no_gain() -> None:
-    of_points = {"before": {"mae": 2.0}, "after": {"mae": 1.0, "points": 1234}}
-    table = error_table(
-        "",
-        {
-            "scores": {"before": {"mae": 4.0}, "after": {"mae": 2.0}},
-            "held_out_error": of_points,
-            "sparse_error": of_points,
-            "linear": {"scores": {"mae": 8.0}},
-        },
-        "m",
-    )
-    assert table.rows == [
-        ["MAE", "4.0000 m", "2.0000 m", "-50.0%", "8.0000 m", "-75.0%"],
-        ["error at 1,234 held-out points, MAE", "2.0000 m", "1.0000 m", "-50.0%", "–", "–"],
-        ["error at 1,234 points used, MAE", "2.0000 m", "1.0000 m", "", "–", ""],
-    ]
 
 
 def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> None:

@@ -11,30 +11,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.batch.request import SequenceOptions
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.sensors import SamplePattern
-from tests.commands.batches import RecordingListener, batch
+from tests.commands.batches import RecordingListener, batch, depths, done
 from tests.commands.drives import drive_on_disk, without_results
 from tests.commands.frames import frame_on_disk
 
 DRIVE = Path(__file__).parents[3] / "samples/drive"
 
 
-def accumulating(root: Path, **changes: Any) -> Any:
+def accumulating(root: Path, **changes: Any) -> list[str]:
+    """The names of the frames that are done."""
     sequence = SequenceOptions(accumulate=1, poses=root / "poses.txt")
-    return batch(root, **{"sequence": sequence, "refine": {"iterations": 2}} | changes)
+    return done(root, **{"sequence": sequence, "refine": {"iterations": 2}} | changes)
 
 
 def record_of(root: Path, name: str) -> Any:
     return json.loads((root / "out" / f"{name}.json").read_text())
-
-
-def depths(root: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted((root / "out").glob("*_depth.png"))}
 
 
 def test_a_frame_takes_the_points_of_its_neighbours_and_held_out_points_score_better(
@@ -72,14 +68,10 @@ def test_a_frame_is_done_again_when_a_neighbours_points_or_poses_change(tmp_path
     root = drive_on_disk(tmp_path)
     accumulating(root)
     (root / "sparse/drive_000.png").write_bytes((root / "sparse/drive_003.png").read_bytes())
-    listener = RecordingListener()
-    accumulating(root, listener=listener)
-    assert listener.names == ["drive_000", "drive_001"]
+    assert accumulating(root) == ["drive_000", "drive_001"]
     rows = (root / "poses.txt").read_text().splitlines()
     (root / "poses.txt").write_text("\n".join([*rows[:3], "1 0 0 0 0 1 0 0 0 0 1 0.35"]))
-    listener = RecordingListener()
-    accumulating(root, listener=listener)
-    assert listener.names == ["drive_002", "drive_003"]
+    assert accumulating(root) == ["drive_002", "drive_003"]
 
 
 STILL = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -135,7 +127,7 @@ def rendered_drive(root: Path) -> Path:
     return root
 
 
-def without_poses(root: Path, **changes: Any) -> Any:
+def without_poses(root: Path, **changes: Any) -> list[str]:
     return accumulating(root, limit=1, sequence=SequenceOptions(accumulate=1), **changes)
 
 
@@ -153,11 +145,10 @@ def test_without_poses_the_motion_is_estimated_and_recorded(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_a_frame_is_done_again_when_the_image_of_its_motion_changes(tmp_path: Path) -> None:
-    root, listener = rendered_drive(tmp_path), RecordingListener()
+    root = rendered_drive(tmp_path)
     without_poses(root)
     shutil.copy(root / "rgb/drive_002.jpg", root / "rgb/drive_001.jpg")
-    without_poses(root, listener=listener)
-    assert listener.names == ["drive_000"]
+    assert without_poses(root) == ["drive_000"]
 
 
 def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: Path) -> None:
@@ -177,17 +168,3 @@ def test_neighbours_of_sampled_frames_are_sampled(tmp_path: Path) -> None:
     record = record_of(root, "drive_000")
     assert record["points"]["moved"] > 20
     assert record["inputs"]["neighbours"][0]["path"].endswith("gt/drive_001.png")
-
-
-def test_the_command_names_what_is_missing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = drive_on_disk(tmp_path, frames=2)
-    command = ["batch", str(root), "-o", str(root / "out"), "--iterations", "1"]
-    command += ["--model", str(root / "net/my_net.py")]
-    (root / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
-    assert run([*command, "--accumulate", "2", "--poses", str(root / "poses.txt")]) == 3
-    assert "has 1 poses for 2 frames" in capsys.readouterr().err
-    assert run([*command, "--poses", str(root / "poses.txt")]) == 2
-    assert run([*command, "--accumulate", "-1"]) == 2
-    assert not (root / "out").exists()

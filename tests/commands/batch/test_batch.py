@@ -20,9 +20,8 @@ from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import _SCORES, Tally
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.commands.report.batch import write_batch_report
-from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.core.metrics import Scores
-from pnpdepth_cli.errors import InputError, LayerError, ModelError, OutputError, UsageError
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.sensors import SamplePattern
@@ -31,6 +30,7 @@ from tests.commands.batches import (
     RecordingListener,
     add_frame,
     batch,
+    done,
     pairs_on_disk,
     refine_one_by_one,
     refinement,
@@ -48,13 +48,6 @@ def root(tmp_path: Path) -> Path:
 def summary(root: Path) -> dict[str, Any]:
     content: dict[str, Any] = json.loads((root / "out" / "summary.json").read_text())
     return content
-
-
-def done(root: Path, **changes: Any) -> list[str]:
-    """The names of the frames that a batch does."""
-    listener = RecordingListener()
-    batch(root, listener, **changes)
-    return listener.names
 
 
 def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> None:
@@ -112,7 +105,7 @@ def test_other_settings_or_other_code_in_the_same_file_do_all_again(root: Path) 
         "def loss(predicted, measured):\n    return (predicted - measured).abs().mean()"
     )
     batch(root, limit=2)
-    for settings in ({"holdout": 0.2}, {"format": "exr"}, {"loss": str(loss)}):
+    for settings in ({"precision": "bf16"}, {"format": "exr"}, {"loss": str(loss)}):
         listener = RecordingListener()
         batch(root, listener, limit=2, refine=settings)
         assert listener.names == ["a", "b"]
@@ -153,17 +146,6 @@ def test_a_divergence_keeps_the_last_good_depth_and_is_counted(root: Path) -> No
     assert done(root, refine={"lr": "1e4"}) == []
 
 
-def test_a_mistake_that_concerns_all_frames_stops_the_batch_at_once(root: Path) -> None:
-    with pytest.raises(LayerError, match="did you mean middle"):
-        batch(root, refine={"layer": "midle"})
-    with pytest.raises(UsageError, match="is no scan"):
-        batch(root, refine={"scan": ScanOptions(max_range=10)})
-    model = root / "net/my_net.py"
-    model.write_text(model.read_text() + "\nraise ValueError('no')\n")
-    with pytest.raises(ModelError):
-        batch(root)
-
-
 def test_a_network_that_fails_on_one_frame_only_fails_there(root: Path) -> None:
     add_frame(root, "e", np.zeros((50, 40, 3), np.uint8))
     for part in ("sparse", "gt"):
@@ -174,20 +156,6 @@ def test_a_network_that_fails_on_one_frame_only_fails_there(root: Path) -> None:
     for _ in range(2):  # the second run has nothing but this frame to do
         counts = batch(root, refine={"depth_scale": 1000}).summary["counts"]
         assert (counts["done"], counts["failed"]) == (4, 1)
-
-
-def test_files_without_a_partner_are_reported(root: Path) -> None:
-    (root / "sparse/b.png").unlink()
-    shutil.copy(root / "gt/a.png", root / "gt/lost.png")
-    listener = RecordingListener()
-    outcome = batch(root, listener)
-    assert outcome.summary["counts"] == {
-        "frames": 3, "done": 3, "diverged": 0, "failed": 0, "pending": 0, "with_warnings": 0,
-    }  # fmt: skip
-    messages = "\n".join(listener.messages)
-    for name in ("rgb/b.png", "gt/lost.png"):
-        assert f"warning: {root / name} has no partner" in messages
-        assert any(str(root / name) in text for text in outcome.summary["unmatched"])
 
 
 ODD = ("with space", "ümlaut 深度", "new\nline", "-dash", "quote'\"", "perc%ent", "[x]*", "=1+1")
@@ -214,10 +182,8 @@ def test_any_name_that_a_file_can_have_will_do(tmp_path: Path) -> None:
 def test_results_inside_the_input_are_never_taken_as_input(root: Path) -> None:
     output = root / "gt" / "deep" / "out"
     batch(root, output=output, refine={"format": "exr"})
-    listener = RecordingListener()
-    outcome = batch(root, listener, output=output)
-    assert listener.names == list(NAMES)
-    assert outcome.summary["unmatched"] == []
+    assert done(root, output=output) == list(NAMES)
+    assert json.loads((output / "summary.json").read_text())["unmatched"] == []
 
 
 @pytest.mark.parametrize("output", [".", "rgb", ".."])
@@ -283,14 +249,6 @@ def test_a_folder_cannot_lie_where_the_results_of_a_later_frame_go(root: Path) -
     assert [row["status"] for row in summary(root)["frames"]] == ["failed", "done"]
 
 
-def test_a_listed_file_that_is_not_there_is_a_failed_frame(root: Path) -> None:
-    (root / "list.csv").write_text("image,sparse\nrgb/a.png,sparse/a.png\nno.png,sparse/b.png\n")
-    listener = RecordingListener()
-    counts = batch(root, listener, source=root / "list.csv").summary["counts"]
-    assert (counts["done"], counts["failed"]) == (1, 1)
-    assert any("no.png does not exist; correct line 3" in text for text in listener.messages)
-
-
 def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: Path) -> None:
     (root / "sparse/a.png").write_bytes(b"no depth")
     parts = [done(root, shard=(number, 3)) for number in (1, 2, 3)]
@@ -321,12 +279,8 @@ def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path
     assert baseline["mae"] == pytest.approx(np.mean([each["scores"]["mae"] for each in of_rows]))
     held_out = [each["held_out_mae"] for each in of_rows]
     assert baseline["held_out_mae"] == pytest.approx(np.mean(held_out))
-    record = json.loads((root / "out/b.json").read_text())
     row = rows[1]
-    assert row["scores"] == record["scores"]
-    assert row["seconds"].keys() == {"read", "refine", "write"}
-    assert row["inputs"] == {p: record["inputs"][p]["path"] for p in ("image", "sparse", "gt")}
-    assert all((root / "out" / path).is_file() for path in row["outputs"].values())
+    assert row["scores"] == json.loads((root / "out/b.json").read_text())["scores"]
     with (root / "out/summary.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     assert [line["name"] for line in table] == list(NAMES)
@@ -402,11 +356,7 @@ def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
     assert read_depth(root / "out/a_depth.png").values.shape == size
 
 
-def test_an_empty_folder_is_an_error_that_names_the_layouts(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"any layout; put images into rgb/ .* known layouts: .*nyu-mat"
-    ):
-        batch(tmp_path)
+def test_empty_folders_are_an_error_that_names_the_layouts(tmp_path: Path) -> None:
     for part in ("rgb", "sparse"):
         (tmp_path / part).mkdir()
     with pytest.raises(InputError, match=r"has no frame in it; layouts are manifest, .*pairs"):

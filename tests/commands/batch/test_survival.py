@@ -13,7 +13,7 @@ import pytest
 
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io import lock
-from tests.commands.batches import NAMES, RecordingListener, batch, pairs_on_disk, results
+from tests.commands.batches import NAMES, RecordingListener, batch, done, pairs_on_disk, results
 from tests.io.test_atomic import no_room_on_disk
 
 ROOT = Path(__file__).parents[3]
@@ -40,9 +40,7 @@ def test_a_disk_that_is_full_stops_it_and_with_room_it_goes_on(tmp_path: Path) -
     with no_room_on_disk(), pytest.raises(StorageError, match="file too large"):
         batch(root)
     assert results(root / "out") == {}
-    listener = RecordingListener()
-    batch(root, listener)
-    assert listener.names == list(NAMES)
+    assert done(root) == list(NAMES)
 
 
 def test_a_second_run_on_the_same_folder_is_refused_and_other_shards_are_not(

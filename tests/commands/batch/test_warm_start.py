@@ -10,26 +10,21 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.batch.request import SequenceOptions
-from pnpdepth_cli.errors import UsageError
-from tests.commands.batches import RecordingListener, batch
+from tests.commands.batches import RecordingListener, batch, depths, done
 from tests.commands.drives import drive_on_disk, without_results
 
 REFINE = {"iterations": 3, "update": "sign", "lr": "0.02"}
 
 
-def warm(root: Path, length: int = 3, **changes: Any) -> Any:
+def warm(root: Path, length: int = 3, **changes: Any) -> list[str]:
+    """The names of the frames that are done."""
     sequence = SequenceOptions(warm_start=length)
-    return batch(root, **{"sequence": sequence, "refine": REFINE} | changes)
+    return done(root, **{"sequence": sequence, "refine": REFINE} | changes)
 
 
 def records(root: Path) -> list[Any]:
     return [json.loads(path.read_text()) for path in sorted((root / "out").glob("drive_*.json"))]
-
-
-def depths(root: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted((root / "out").glob("*_depth.png"))}
 
 
 def test_a_frame_begins_where_the_one_before_ended_and_a_window_anew(tmp_path: Path) -> None:
@@ -49,13 +44,12 @@ def test_a_frame_begins_where_the_one_before_ended_and_a_window_anew(tmp_path: P
 
 
 def test_a_shard_has_whole_windows_so_the_bytes_do_not_depend_on_it(tmp_path: Path) -> None:
-    root, listener = drive_on_disk(tmp_path, frames=5), RecordingListener()
+    root = drive_on_disk(tmp_path, frames=5)
     warm(root, length=2)
     whole = depths(root)
     without_results(root)
-    for number in (2, 1):
-        warm(root, listener=listener, length=2, shard=(number, 2))
-    assert listener.names == [f"drive_00{number}" for number in (2, 3, 0, 1, 4)]
+    parts = [warm(root, length=2, shard=(number, 2)) for number in (2, 1)]
+    assert parts == [["drive_002", "drive_003"], ["drive_000", "drive_001", "drive_004"]]
     assert depths(root) == whole
 
 
@@ -64,15 +58,11 @@ def test_a_missing_result_is_made_again_from_the_start_of_its_window(tmp_path: P
     warm(root)
     whole = depths(root)
     (root / "out/drive_002_depth.png").unlink()
-    listener = RecordingListener()
-    warm(root, listener=listener)
-    assert listener.names == ["drive_002"]
+    assert warm(root) == ["drive_002"]
     assert depths(root) == whole
     image = cv2.imread(str(root / "rgb/drive_001.png"))
     cv2.imwrite(str(root / "rgb/drive_001.png"), 255 - image)
-    listener = RecordingListener()
-    warm(root, listener=listener)
-    assert listener.names == ["drive_001", "drive_002"]
+    assert warm(root) == ["drive_001", "drive_002"]
 
 
 def test_no_start_is_taken_across_a_cut(tmp_path: Path) -> None:
@@ -91,19 +81,6 @@ def test_a_frame_that_fails_does_not_end_its_window(tmp_path: Path) -> None:
     warm(root, listener=listener)
     assert [row["status"] for row in listener.rows] == ["done", "failed", "done"]
     assert records(root)[-1]["warm_start"] is True
-
-
-def test_the_default_method_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root = drive_on_disk(tmp_path, frames=2)
-    command = ["batch", str(root), "-o", str(root / "out"), "--warm-start"]
-    assert run([*command, "4"]) == 2
-    assert "--warm-start goes with a fixed method" in capsys.readouterr().err
-    assert run([*command, "1", "--propagate", "gp"]) == 2
-    assert run([*command, "2", "--propagate", "gp", "--ray-workers", "2", "--ray"]) == 2
-    assert "in one process" in capsys.readouterr().err
-    with pytest.raises(UsageError, match="--tile"):
-        warm(root, refine={"tile": 64})
-    assert not (root / "out").exists()
 
 
 @pytest.mark.slow

@@ -122,26 +122,14 @@ def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path
     rng = np.random.default_rng(0)
     first = {f"{n:04}": rng.uniform(1, 2, 4).tolist() for n in range(9)}
     second = {name: (np.array(row) * rng.uniform(0.4, 0.6)).tolist() for name, row in first.items()}
-    plain = [run(tmp_path, name, errors) for name, errors in (("a", first), ("b", second))]
     paths = [run(tmp_path, f"{n}", e, **FLICKER) for n, e in (("c", first), ("d", second))]
     comparison = compare(paths, all_measures=True, grouped=False)
-    (gains,) = comparison["gains"]
-    (mae,) = (g["mae"] for g in compare(plain, all_measures=True, grouped=False)["gains"])
-    for name in ("percent", "low_percent", "high_percent", "difference", "p_value"):
-        assert gains["mae"][name] == pytest.approx(mae[name], rel=1e-9)
-    assert mae["high_percent"] - mae["low_percent"] > 1
     # the first frame of a sequence has no flicker
     saved = [json.loads(Path(path).read_text())["frames"][1:] for path in paths]
     one, two = (np.array([frame["values"]["flicker"] for frame in of]) for of in saved)
-    flicker = gains["flicker"]
+    flicker = comparison["gains"][0]["flicker"]
     assert comparison["runs"][0]["mean"]["flicker"] == pytest.approx(one.mean())
     assert flicker["percent"] == pytest.approx(100 * (1 - two.mean() / one.mean()))
-    assert (
-        flicker["low_percent"]
-        < flicker["percent"] - 1
-        < flicker["percent"] + 1
-        < flicker["high_percent"]
-    )
     assert flicker["p_value"] == 2 / 2**8
     assert any("flicker" in note and "1 lack it" in note for note in comparison["notes"])
 
@@ -158,15 +146,8 @@ def test_frames_of_one_group_are_swapped_together(tmp_path: Path) -> None:
     assert alone["gains"][0]["mae"]["p_value"] == 2 / 4096
 
 
-def test_different_rules_are_refused_and_named(tmp_path: Path) -> None:
+def test_different_definitions_are_refused_and_named(tmp_path: Path) -> None:
     one = run(tmp_path, "one", FIRST)
-    two = run(tmp_path, "two", FIRST, max_depth=50.0)
-    with pytest.raises(InputError) as error:
-        compare([one, two])
-    assert str(error.value) == (
-        f"{one} and {two} were scored by different rules (max_depth None and 50.0); score both by"
-        " one protocol"
-    )
     devkit = run(tmp_path, "three", FIRST, protocol="kitti-devkit")
     with pytest.raises(InputError, match="definitions usual and kitti-devkit"):
         compare([one, devkit])
@@ -224,7 +205,6 @@ BROKEN = [
     ('{"frames": [{"scores": {}}]}', "does not hold scores as pnpdepth writes them"),
     ('{"scores": {"after": {"rmse": 1}}}', "does not hold scores as pnpdepth writes them"),
     ('{"command": "eval", "protocol": {"name": "other"}, "measures": []}', "does not hold scores"),
-    ("nonsense", "not valid JSON"),
 ]
 
 
@@ -236,12 +216,10 @@ def test_a_file_without_scores_is_refused(tmp_path: Path, text: str, message: st
         compare([one, str(tmp_path / "broken.json")])
 
 
-def test_before_is_only_for_what_has_one_and_one_run_is_none_to_compare(tmp_path: Path) -> None:
+def test_before_is_only_for_what_has_one_and_resamples_are_needed(tmp_path: Path) -> None:
     one = run(tmp_path, "one", FIRST)
     with pytest.raises(UsageError, match="leave out :before"):
         compare([one, f"{one}:before"])
-    with pytest.raises(UsageError, match="two runs"):
-        compare([one])
     with pytest.raises(UsageError, match="--bootstrap must be >= 1, got 0"):
         compare([one, one], resamples=0)
 

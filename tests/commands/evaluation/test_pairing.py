@@ -106,7 +106,6 @@ REFUSED = [
      "file: predictions are 1; ground truth is 0001"),
     (["a.png"], ["a.png"], "out/a.png", "gt", UsageError, "two files or two folders"),
     (["a.png"], ["a.png"], "out", "gt/a.png", UsageError, "two files or two folders"),
-    (["a.png"], ["a.png"], "out", "nothing", InputError, "no such file or folder"),
 ]  # fmt: skip
 
 
@@ -151,17 +150,6 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     frames, _ = pair_frames(out, gt)
     assert [(f.sparse, f.image) for f in frames] == [(sparse, image), (None, None), (None, None)]
     assert not frames[0].sparse_named
-
-
-def test_the_ground_truth_can_be_a_data_set_of_a_known_layout(tmp_path: Path) -> None:
-    out, _ = folders(tmp_path, ["a_depth.png", "b_depth.png"], [])
-    data = tmp_path / "data"
-    for name in ("rgb/a.png", "rgb/b.png", "sparse/a.png", "sparse/b.png", "gt/a.png"):
-        depth_at(data / name)
-    pairs, notes = pair_frames(out, data)
-    assert matched(pairs) == {"a": "a_depth.png"}
-    assert notes[0] == "gt: layout pairs; frames with ground truth: 1"
-    assert pairs[0].sparse == data / "sparse" / "a.png"
 
 
 def test_stacked_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -80,19 +79,6 @@ def test_a_setting_without_sense_is_refused(
 def test_unset_fields_stay_as_published() -> None:
     changed = choose_protocol("eigen", max_depth=50.0, crop=None, clip=None)
     assert changed == replace(PROTOCOLS["eigen"], max_depth=50.0)
-
-
-def test_the_description_states_what_is_scored_and_whether_it_was_changed() -> None:
-    assert PROTOCOLS["eigen"].describe() == (
-        "eigen: all known ground truth in 0.001–80 m, crop eigen, predictions clipped to the same"
-        " range, empty predictions scored as the lower bound, δ below 1.25, 1.5625, 1.95312,"
-        " mean over the images"
-    )
-    changed = choose_protocol("kitti", average="pooled", mask=Path("m.png"), exclude_sparse=True)
-    assert changed.describe() == (
-        "kitti (changed): all known ground truth, no crop, mask m.png, without the pixels of sparse"
-        " points, δ below 1.25, 1.5625, 1.95312, mean over all pixels together"
-    )
 
 
 def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:

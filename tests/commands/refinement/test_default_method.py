@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -18,38 +15,6 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.refiner import HIDDEN_POINT_STEPS
 from pnpdepth_cli.io.depth import read_depth
 from tests.commands.frames import FrameOnDisk, run
-
-
-def test_without_options_of_the_method_it_is_the_default_one(frame: FrameOnDisk) -> None:
-    record = run(frame, propagate=None, gt=frame.gt).record
-    networks = ["tiny", "compact"]
-    assert record["method"] == {"kind": "default", "reason": "default", "networks": networks}
-    stages = {stage["stage"]: stage["scores"]["mae"] for stage in record["stages"]}
-    assert list(stages) == ["aligned", "fused", "updated", "propagated"]
-    assert stages["aligned"] == record["scores"]["before"]["mae"]
-    assert record["scores"]["after"]["mae"] < stages["aligned"]
-    check = record["linear"]["check"]
-    assert check["points"] == 12
-    assert set(check) == {"points", "aligned", "fused", "propagated", "linear", "result"}
-    saved = json.loads((frame.folder / "out" / "img.json").read_text())
-    assert saved["linear"] == json.loads(json.dumps(record["linear"]))
-
-
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        ({"iterations": 2}, "--iterations"),
-        ({"layer": "encode"}, "--layer"),
-        ({"preset": "paper", "iterations": 2}, "--preset paper --iterations"),
-    ],
-)
-def test_an_option_of_the_method_fixes_it(
-    frame: FrameOnDisk, options: dict[str, Any], reason: str
-) -> None:
-    record = run(frame, **({"propagate": None} | options)).record
-    assert record["method"] == {"kind": "fixed", "reason": reason, "networks": ["tiny"]}
-    assert (record["stages"], record["linear"]["check"]) == (None, None)
-    assert record["settings"] == record["settings"] | options
 
 
 def test_the_papers_preset_is_the_papers_setting_bit_for_bit(frame: FrameOnDisk) -> None:
@@ -75,17 +40,6 @@ def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:
         run(frame, **(request | {"propagate": "none", "overwrite": True}))
 
 
-def test_linear_interpolation_is_beside_every_result(frame: FrameOnDisk) -> None:
-    compared = run(frame, gt=frame.gt).record["linear"]
-    assert compared["scores"]["mae"] < 0.05
-    assert compared["worse"] is True
-    compared = run(frame, output=frame.folder / "b").record["linear"]
-    assert compared == {"scores": None, "held_out_error": None, "check": None, "worse": None}
-    compared = run(frame, output=frame.folder / "c", holdout=0.2).record["linear"]
-    assert 0 < compared["held_out_error"]["mae"] < 0.5
-    assert compared["worse"] is True
-
-
 @pytest.mark.parametrize("propagate", [None, "none"])
 def test_baselines_are_scored_at_hidden_points_and_against_the_truth(
     frame: FrameOnDisk, propagate: str | None
@@ -102,33 +56,17 @@ def test_baselines_are_scored_at_hidden_points_and_against_the_truth(
     assert baselines["network"]["scores"] == plain["scores"]["before"]
 
 
-def test_the_standard_deviation_is_positive_and_the_same_twice(frame: FrameOnDisk) -> None:
-    records = [
-        run(frame, uncertainty=True, propagate=None, output=frame.folder / name).record
-        for name in ("a", "b")
-    ]
-    outputs = records[0]["outputs"]
-    sigma = read_depth(Path(outputs["sigma"])).values
-    valid = cv2.imread(outputs["valid"], cv2.IMREAD_UNCHANGED)
-    assert sigma.shape == valid.shape == frame.depth.shape
+def test_the_standard_deviation_is_positive_and_rounded_in_a_png(frame: FrameOnDisk) -> None:
+    sigma, exact = (
+        read_depth(Path(refined.record["outputs"]["sigma"])).values
+        for refined in (
+            run(frame, uncertainty=True, propagate=None, format=name, output=frame.folder / name)
+            for name in ("png", "npy")
+        )
+    )
+    assert sigma.shape == frame.depth.shape
     assert (sigma > 0).all()
-    assert set(np.unique(valid)) <= {0, 255}
-    exact = run(frame, uncertainty=True, propagate=None, format="npy", output=frame.folder / "c")
-    assert np.abs(np.load(exact.record["outputs"]["sigma"]) - sigma).max() < 0.00051
-    assert any("calibrated with 12 hidden points" in note for note in records[0]["notes"])
-    for name in ("img_depth.png", "img_sigma.png", "img_sigma_preview.png"):
-        first, again = (frame.folder / folder / name for folder in ("a", "b"))
-        assert first.read_bytes() == again.read_bytes()
-    with pytest.raises(UsageError, match="--uncertainty writes a second file"):
-        run(frame, uncertainty=True, output=frame.folder / "depth.exr")
-
-
-def test_propagation_follows_refinement(frame: FrameOnDisk) -> None:
-    errors = [
-        run(frame, propagate=name, output=frame.folder / name).record["sparse_error"]["after"]
-        for name in ("gp", "none")
-    ]
-    assert errors[0]["mae"] < errors[1]["mae"]
+    assert np.abs(exact - sigma).max() < 0.00051
 
 
 def test_a_time_budget_is_spent_on_steps_by_hidden_points(frame: FrameOnDisk) -> None:

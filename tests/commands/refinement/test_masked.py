@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from pnpdepth_cli import Refiner, load_network
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.definition import MASKED_DEFAULTS, WEIGHTS_DENSE_DEFAULTS
@@ -68,27 +67,6 @@ def test_a_network_is_as_before_after_the_refiner_closes(frame: FrameOnDisk) -> 
         refined = refiner.refine(rgb, sparse)
     assert same(before, state_of(network.module))
     assert 0 < len(refined.losses) <= MASKED_DEFAULTS.iterations
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"parameters": "channels"}, "--target masked updates weights"),
-        ({"parameters": "lora:0"}, "none of elements, channels, weights"),
-        ({"layer": "decoder.s8"}, "--layer is where z is"),
-        ({"preset": "paper"}, "--preset paper updates z"),
-        ({"line_search": True}, "--set line-search is for updates of z"),
-        ({"mask_fraction": 1.0}, "mask-fraction must be between 0 and 1, got 1.0"),
-        ({"mask_scale": 1.5}, "mask-scale must be above 0 and at most 1"),
-        ({"target": "given", "mask": "lines"}, "--set mask is for points hidden"),
-        ({"model": "eigen-tiny"}, "takes no sparse depth"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(
-    frame: FrameOnDisk, wrong: dict[str, object], message: str
-) -> None:
-    with pytest.raises(UsageError, match=message):
-        run(frame, **MASKED | wrong)
 
 
 @pytest.mark.parametrize(

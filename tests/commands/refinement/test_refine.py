@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from PIL import Image
 
 from pnpdepth_cli.commands.refinement.inputs import _scale_warning
 from pnpdepth_cli.errors import (
-    DivergedError,
     InputError,
     LayerError,
     NoPointsError,
@@ -37,14 +35,6 @@ def noted(record: dict[str, Any], text: str) -> bool:
     return any(text in note for note in record["notes"])
 
 
-def test_a_folder_gets_depth_preview_improvement_map_and_record(frame: FrameOnDisk) -> None:
-    outcome, out = run(frame), frame.folder / "out"
-    assert files(out) == {"img_depth.png", "img_preview.png", "img_improvement.png", "img.json"}
-    assert json.loads((out / "img.json").read_text()) == json.loads(json.dumps(outcome.record))
-    written = read_depth(out / "img_depth.png")
-    assert (written.values.shape, written.scale) == (frame.depth.shape, 1000)  # of the sparse file
-
-
 def test_refinement_lowers_the_error_and_the_scores_are_those_of_the_file(
     frame: FrameOnDisk,
 ) -> None:
@@ -61,13 +51,6 @@ def test_refinement_lowers_the_error_and_the_scores_are_those_of_the_file(
     range_of_points = record["points"]["nearest"], record["points"]["farthest"]
     known = read_depth(frame.sparse).values
     assert range_of_points == (float(known[known > 0].min()), float(known.max()))
-
-
-def test_ground_truth_that_is_the_sparse_depth_is_warned_of(frame: FrameOnDisk) -> None:
-    record = run(frame, gt=frame.sparse, iterations=0).record
-    assert noted(record, "warning: 60 of 60 pixels (100.0%) of the ground truth are the sparse")
-    record = run(frame, gt=frame.gt, iterations=0, overwrite=True).record
-    assert not noted(record, "warning")
 
 
 @pytest.mark.parametrize("scale", [1000.0, 5000.0, 1.0])
@@ -121,14 +104,6 @@ def test_held_out_points_are_a_seeded_share_that_the_loss_never_sees(frame: Fram
     assert first["loss"] == again["loss"] != other["loss"]
     for path in (frame.folder / "a").glob("*.png"):
         assert path.read_bytes() == (frame.folder / "b" / path.name).read_bytes()
-
-
-def test_a_depth_file_as_output_is_written_alone(frame: FrameOnDisk) -> None:
-    before = files(frame.folder)
-    names = {f"depth.{suffix}" for suffix in ("exr", "npy", "npz", "pfm", "tiff", "png")}
-    for name in names:
-        run(frame, output=frame.folder / name, iterations=0)
-    assert files(frame.folder) - before == names
 
 
 def test_existing_results_are_replaced_only_on_request_and_inputs_never(frame: FrameOnDisk) -> None:
@@ -190,20 +165,6 @@ def test_a_list_of_points_with_x_and_y_swapped_is_refused(frame: FrameOnDisk) ->
         run(frame, sparse=points)
 
 
-def test_a_divergence_writes_the_last_good_depth_and_is_reported(frame: FrameOnDisk) -> None:
-    model = frame.folder / "bad.py"
-    text = frame.model.read_text().replace(
-        "2 + 3 * self.decode(torch.tanh(self.middle(self.encode(rgb))))",
-        "torch.exp(self.decode(self.middle(self.encode(rgb))))",
-    )
-    model.write_text(text)
-    outcome = run(frame, model=str(model), lr="1e4", gt=frame.gt)
-    assert isinstance(outcome.diverged, DivergedError)
-    assert outcome.record["diverged"] == str(outcome.diverged)
-    written = read_depth(frame.folder / "out" / "img_depth.png").values
-    assert (np.isfinite(written) & (written > 0)).all()
-
-
 def test_the_networks_crop_leaves_the_rest_unknown_and_refuses_points_only_there(
     frame: FrameOnDisk,
 ) -> None:
@@ -221,16 +182,8 @@ def test_the_networks_crop_leaves_the_rest_unknown_and_refuses_points_only_there
         run(frame, model=str(model), sparse=left)
 
 
-@pytest.mark.parametrize(("share", "layer"), [("0", "encode"), ("1", "middle"), ("0.2", "encode")])
-def test_a_layer_can_be_a_share_of_the_definitions_layers(
-    frame: FrameOnDisk, share: str, layer: str
-) -> None:
-    assert run(frame, layer=share, iterations=0).record["settings"]["layer"] == layer
-
-
-BAD = [
-    ({"iterations": -1}, UsageError, "iterations must be a whole number >= 0, got -1"),
-    ({"lr": "fast"}, UsageError, "lr must be a step size above 0"),
+MASKED = {"model": "compact", "checkpoint": None, "target": "masked"}
+BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"holdout": 1.0}, UsageError, "--holdout must be a fraction"),
     ({"layer": "1.5"}, UsageError, "between 0 and 1"),
     ({"layer": "-0.5"}, UsageError, "between 0 and 1"),
@@ -244,6 +197,19 @@ BAD = [
     ({"time_budget_s": 5.0}, UsageError, "--propagate makes none"),
     ({"gt": "small.npy"}, SizeError, "ground truth .* is 62×10 but the image is 62×46"),
     ({"gt": "empty.npy"}, InputError, "no pixel with known depth"),
+    ({"ply": True}, UsageError, r"--ply needs the camera, .* give --calib or --fov"),
+    ({"ply": True, "fov_deg": 180.0}, UsageError, "--fov is 180 degrees"),
+    ({"ply": True, "fov_deg": 60.0, "output": Path("a.exr")}, UsageError, "--ply writes a second"),
+    ({"uncertainty": True, "output": Path("a.exr")}, UsageError, "--uncertainty writes a second"),
+    (MASKED | {"parameters": "channels"}, UsageError, "--target masked updates weights"),
+    (MASKED | {"parameters": "lora:0"}, UsageError, "none of elements, channels, weights"),
+    (MASKED | {"layer": "decoder.s8"}, UsageError, "--layer is where z is"),
+    (MASKED | {"preset": "paper"}, UsageError, "--preset paper updates z"),
+    (MASKED | {"line_search": True}, UsageError, "--set line-search is for updates of z"),
+    (MASKED | {"mask_fraction": 1.0}, UsageError, "mask-fraction must be between 0 and 1, got"),
+    (MASKED | {"mask_scale": 1.5}, UsageError, "mask-scale must be above 0 and at most 1"),
+    (MASKED | {"target": "given", "mask": "lines"}, UsageError, "--set mask is for points hidden"),
+    (MASKED | {"model": "eigen-tiny"}, UsageError, "takes no sparse depth"),
 ]
 
 

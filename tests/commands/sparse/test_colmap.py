@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.cli.main import run as run_command
 from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
 from pnpdepth_cli.commands.sparse.options import ColmapOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError, UsageError
@@ -218,9 +218,8 @@ def test_a_batch_takes_each_registered_photo(
     assert ["is not registered" in str(each) for each in listing.spare] == [True]
     network = ["--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
     for text in ("2 to do (2 new)", "all of them done already"):
-        with pytest.raises(SystemExit) as ended:
-            main(["batch", str(project), "-o", str(tmp_path / "batch"), *network])
-        assert ended.value.code == 0
+        command = ["batch", str(project), "-o", str(tmp_path / "batch"), *network]
+        assert run_command(command) == 0
         printed = capsys.readouterr().err
         assert text in printed
         assert "all of them" in text or "model units (COLMAP model" in printed

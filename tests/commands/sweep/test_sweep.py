@@ -133,26 +133,12 @@ def test_a_row_has_the_scores_of_refine_and_of_linear_interpolation(
     assert (line["status"], line["points_used"]) == ("done", "60")
 
 
-def test_a_grid_has_a_cell_for_each_combination_and_loads_the_network_once(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_grid_loads_the_network_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded: list[object] = []
     own = refining.load_network
     monkeypatch.setattr(refining, "load_network", lambda *a, **k: loaded.append(a) or own(*a, **k))
-    sampling = read_sampling("grid:20")
-    record = sweep(root, "layer=encode,1", "lr=1%,10%", sampling=sampling, refine={"loss": "l2"})
-    assert [cell["parameters"] for cell in record["studies"][0]["cells"]] == [
-        {"layer": layer, "lr": lr} for layer in ("encode", "1") for lr in ("1%", "10%")
-    ]
-    base = record["base"]
-    assert [base[name] for name in ("layer", "loss", "iterations", "sensor", "points")] == [
-        "middle", "l2", 5, "grid", "20",
-    ]  # fmt: skip
+    sweep(root, "layer=encode,1", "lr=1%,10%")
     assert len(loaded) == 1
-    text = (root / "out" / "sweep.tex").read_text().splitlines()
-    mae = record["studies"][0]["cells"][0]["measures"]["mae"]["refined"]
-    assert text[text.index(r"\midrule") + 1].startswith(r"encode & 1\% & ")
-    assert text[text.index(r"\midrule") + 1].split(" & ")[6] == f"{mae:.4f}"
 
 
 def test_the_tables_say_which_scale_of_the_files_is_assumed(root: Path) -> None:
@@ -355,9 +341,6 @@ def row(frame: str, seed: int, refined: Sequence[float], plain: float = 2.0) -> 
             "time_s": 1.0 + seed, **scores}  # fmt: skip
 
 
-FAILED = {"frame": "b", "seed": 1, "status": "failed", "points_used": 0}
-
-
 def test_a_mean_is_over_frames_of_each_frames_mean_over_seeds() -> None:
     summary = summarise(
         [row("a", 0, [1, 1, 1, 3]), row("a", 1, [2, 1, 1, 3]), row("b", 0, [3, 1, 1, 3])],
@@ -388,14 +371,6 @@ def test_the_interval_of_a_cell_is_over_its_frames() -> None:
     assert summarise(two_sequences, resamples=50)["measures"]["rmse"]["refined_low"] is None
 
 
-def test_a_frame_that_failed_once_is_left_out() -> None:
-    summary = summarise([row("a", 0, [1] * 4), row("b", 0, [9] * 4), FAILED], resamples=10)
-    assert (summary["frames"], summary["failed"]) == (1, 1)
-    rmse = summary["measures"]["rmse"]
-    assert (rmse["refined"], rmse["refined_low"]) == (1, None)
-    assert summarise([FAILED], resamples=10)["measures"] is None
-
-
 # what can be wrong
 
 
@@ -408,6 +383,8 @@ def test_a_failed_frame_is_reported_counted_and_left_out_of_the_mean(root: Path)
         assert [row["status"] for row in listener.rows if row["name"] == "b"] == ["failed"] * 2
     cell = record["studies"][0]["cells"][1]
     assert (cell["frames"], cell["failed"]) == (1, 1)
+    mae = cell["measures"]["mae"]
+    assert (mae["refined"], mae["refined_low"]) == (alone(root, iterations=2)["after"]["mae"], None)
 
 
 def test_frames_without_ground_truth_are_reported(root: Path) -> None:
@@ -435,13 +412,10 @@ BAD = [
     ("points=0", "at least one point"),
     ("points=200%", "at most 100 %"),
     ("iterations=1.5", "not a whole number"),
-    ("iterations=-1", ">= 0, got -1"),
     ("lr=0", "a step size above 0"),
     ("loss=l3", "one of l1, l2"),
-    ("update=newton", "sign"),
     ("outliers=2", "from 0 to 1"),
     ("noise=-1", "not negative"),
-    ("blur=inf", ">= 0, got inf"),
     ("noise=nan", "not negative"),
     ("noise=x", "'x' is not a number"),
     ("line-search=yes", "neither on nor off"),
