@@ -98,8 +98,9 @@ def check_report_folder(
         made_of: What an earlier report in it was made of, as given to `begin_report`.
         overwrite: Whether any other content may be replaced.
     """
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder} is a file; name a folder for the report")
+    there = next((path for path in (folder, *folder.parents) if path.exists()), folder)
+    if there.is_file():
+        raise OutputError(f"{there} is a file; name a folder for the report")
     resolved = folder.resolve()
     for source in inputs:
         read = source.resolve()

@@ -147,7 +147,8 @@ def test_inputs_and_other_files_are_safe(tmp_path: Path, monkeypatch: pytest.Mon
         ("in", "lies in in, which is read"),
         ("in/deep/report", "lies in in, which is read"),
         (".", "holds in, which is read"),
-        ("file", "is a file"),
+        ("file", "file is a file"),
+        ("file/deep/report", "file is a file"),
         ("full", "not empty; --overwrite replaces the report"),
         ("link", "lies in in, which is read"),
     ):

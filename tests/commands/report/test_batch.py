@@ -130,7 +130,7 @@ def test_with_neither_ground_truth_nor_held_out_points_there_is_no_change(
     shutil.rmtree(root / "gt")
     batch(root, html=report)
     data = page_data(report)
-    assert not [column for column in data["columns"] if "gain" in column["title"]]
+    assert not [column for column in data["columns"] if "change" in column["title"]]
     assert data["columns"][data["sort_by"]]["key"] == "rmse_after"
     assert {row[3] for row in data["tables"][0]["rows"]} == {""}  # no change
     assert [label for label, *_ in data["tiles"]] == ["Frames refined"]
