@@ -272,6 +272,7 @@ def _make_networks(root: Path) -> None:
         import transformers
     except ImportError:
         return
+    transformers.utils.logging.disable_progress_bar()  # whose monitor is a thread that stays
     backbone = transformers.Dinov2Config(
         hidden_size=24, num_hidden_layers=4, num_attention_heads=2, image_size=56, patch_size=14,
         out_indices=[1, 2, 3, 4], reshape_hidden_states=False, apply_layernorm=True,
