@@ -83,10 +83,17 @@ def _short(value: Any) -> str:
 
 
 def portable(output: Any) -> Any:
-    """The output of a step without hashes, which rounding changes, and bytes of files."""
+    """The output of a step without what libraries, their versions and rounding change: hashes,
+    bytes and sizes of files, and digests of settings.
+    """
     if isinstance(output, dict):
-        left_out = {"hash", "bytes", "sha256"}
-        return {name: portable(each) for name, each in output.items() if name not in left_out}
+        return {
+            name: portable(each)
+            for name, each in output.items()
+            if name not in ("hash", "bytes", "sha256")
+            and not (name == "size" and isinstance(each, int))
+            and not (name == "settings" and isinstance(each, str))
+        }
     return [portable(each) for each in output] if isinstance(output, list) else output
 
 

@@ -86,3 +86,10 @@ def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:
     kinds = ("paper", "nyu-eigen", "kitti-devkit", "eigen", "garg")
     rules = [PROTOCOLS[name].scoring() for name in kinds]
     assert all(a != b for i, a in enumerate(rules) for b in rules[:i])
+
+
+@pytest.mark.parametrize(("least", "missing"), [(None, "min"), (0.5, "min"), (0.0, "skip")])
+def test_empty_predictions_are_skipped_where_no_bound_is_left_to_score_them_as(
+    least: float | None, missing: str
+) -> None:
+    assert choose_protocol("eigen", min_depth=least).missing == missing
