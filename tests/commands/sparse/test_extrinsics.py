@@ -11,12 +11,18 @@ from scipy.spatial import cKDTree
 
 from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scans import camera_of, check_direction, read_scan_points
+from pnpdepth_cli.commands.sparse.scans import (
+    _is_upright,
+    camera_of,
+    check_direction,
+    read_scan_points,
+)
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.extrinsics import inverse
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.sensors import Camera
 from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
 
 TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -79,3 +85,13 @@ def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> 
         assert check_direction(scan, portrait, (1242, 375)) == []
         (warning,) = check_direction(scan, wrong, (375, 1242))
         assert "if they map the camera to the scanner, add --scan inverse-extrinsics" in warning
+
+
+@pytest.mark.parametrize(("turns", "upright"), [(0, True), (1, False), (2, True)])
+def test_a_thin_scan_shows_whether_the_image_is_upright(turns: int, upright: bool) -> None:
+    rays = np.random.default_rng(0).normal(size=(400, 3)) * (1, 1, 0.1)
+    c, s = np.cos(turns * np.pi / 2), np.sin(turns * np.pi / 2)
+    about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    camera = Camera(intrinsics=np.eye(3), rotation=about_z @ TURN)
+    assert _is_upright(rays, camera) is upright
+    assert _is_upright(np.random.default_rng(0).normal(size=(400, 3)), camera) is None

@@ -27,7 +27,7 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.frames import refiner as frame_refiner
-from pnpdepth_cli.io.dataset import Frame
+from pnpdepth_cli.io.dataset import Frame, Protocol
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,
@@ -274,6 +274,18 @@ def test_a_lidar_stands_where_the_camera_is(root: Path, tmp_path: Path) -> None:
     wanted = simulate_lidar(inputs.gt, camera, scanner, 3)
     assert np.array_equal(points.xy.numpy(), wanted.xy)
     assert np.array_equal(points.depth.numpy(), wanted.depth)
+
+
+@pytest.mark.parametrize("cut", [{"halved": True}, {"crop": (20, 30)}], ids=["halved", "cropped"])
+def test_a_lidar_needs_the_image_of_the_calibration(
+    root: Path, tmp_path: Path, cut: dict[str, Any]
+) -> None:
+    calib = tmp_path / "calib.txt"
+    calib.write_text(CALIB)
+    request, inputs = one_frame(root)
+    request = request.with_fields(protocol=Protocol(name="cut", **cut))
+    with pytest.raises(InputError, match=r"but protocol 'cut' crops it; --protocol whole does not"):
+        frame_points(Sampling(sensor="vlp-16"), 0, inputs, request, Frame(name="a", calib=calib))
 
 
 def test_so_many_of_the_frames_own_points_are_among_them(root: Path) -> None:
