@@ -52,6 +52,7 @@ def test_any_setting_of_the_method_fixes_it(settings: Settings, by: str) -> None
         *((field, "foo") for field in ("preset", "loss", "update", "schedule", "align", "mask")),
         *(("mask_fraction", value) for value in (0, 1, 1.5)),
         *(("mask_scale", value) for value in (0, 1.5)),
+        *(("time_budget_s", value) for value in (0, -1, NAN)),
         ("align", ["auto"]),
         ("layer", 3),
         ("seed", -1),

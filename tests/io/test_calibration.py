@@ -241,6 +241,14 @@ def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
         read_calibration(path, 7)
 
 
+def test_the_first_two_intrinsics_of_an_eucm_camera_are_its_lens(tmp_path: Path) -> None:
+    text = KALIBR.replace("camera_model: pinhole", "camera_model: eucm", 1)
+    text = text.replace("[500.5, 501, 320, 240]", "[0.6, 1.1, 500.5, 501, 320, 240]")
+    got = read_calibration(write(tmp_path, text), 0)
+    assert (got.lens, got.distortion) == ("eucm", (0.6, 1.1))
+    assert got.intrinsics.tolist() == [[500.5, 0, 320], [0, 501, 240], [0, 0, 1]]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
