@@ -8,11 +8,12 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from benchmarks.golden.normalise import NUMBER
+
 RELATIVE = 0.002
 """Of numbers that differ no more than this, or by one in the last digit, one is rounded."""
 LEAST_DIGITS = 5
 """One in a later digit is rounded as well."""
-_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 _MESSAGES = re.compile(r"(^|\.)(notes|warnings|message|messages|problem|why)(\.|\[|$)")
 
 
@@ -120,9 +121,9 @@ def _only_rounded(kept: Any, now: Any, numbers: bool) -> bool:
         return False
     if isinstance(kept, int | float):
         return not numbers or _near(repr(kept), repr(now))
-    if not isinstance(kept, str) or _NUMBER.sub("#", kept) != _NUMBER.sub("#", now):
+    if not isinstance(kept, str) or NUMBER.sub("#", kept) != NUMBER.sub("#", now):
         return False
-    pairs = zip(_NUMBER.findall(kept), _NUMBER.findall(now), strict=True)
+    pairs = zip(NUMBER.findall(kept), NUMBER.findall(now), strict=True)
     return not numbers or all(_near(*pair) for pair in pairs)
 
 

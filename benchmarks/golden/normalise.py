@@ -27,7 +27,7 @@ _MEASURED_TEXT = (
     (re.compile(r"\d+(?:\.\d+)? a second\b"), "# a second"),
     (re.compile(r"(pnpdepth,? (?:version )?)\d+\.\d+\.\d+\w*"), r"\1#"),
 )
-_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
+NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 _MEASURED = re.compile(
     r"^(versions?|seconds(_\w+)?|\w+_(ms|mb|seconds)|[cm]time_ns|crc32|run|time_s|frames_per_second|network_busy)$"
 )
@@ -79,10 +79,10 @@ class Normaliser:
         times = next((n for n, line in enumerate(lines) if "where the time went" in line), None)
         if times is not None:
             lines[times:] = [
-                re.sub(r"([ ─━])\1+", r"\1", _NUMBER.sub("#", line)) for line in lines[times:]
+                re.sub(r"([ ─━])\1+", r"\1", NUMBER.sub("#", line)) for line in lines[times:]
             ]
         if not step.figures:
-            lines = [re.sub(r"([ ─━])\1+", r"\1", _NUMBER.sub("#", line)).strip() for line in lines]
+            lines = [re.sub(r"([ ─━])\1+", r"\1", NUMBER.sub("#", line)).strip() for line in lines]
         return sorted(lines) if step.unordered else lines
 
     def data(self, value: Any, step: Step, key: str = "") -> Any:

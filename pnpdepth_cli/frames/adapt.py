@@ -40,7 +40,6 @@ LEAST_FRAMES = 8
 """Of a sequence; fewer teach too little."""
 SIGNIFICANT = 0.05
 """Of the one-sided paired t test over the frames for validation."""
-NEEDS_POINTS = "--adapt needs a network that takes points, such as compact, as the first --model"
 MOST_VALIDATED = 16
 STEPS_A_VISIT = 4
 """Updates on a frame before the next is taken."""
@@ -80,6 +79,11 @@ def too_little(count: int, first: Frame) -> str | None:
     return None
 
 
+def is_significant(p_value: float | None) -> bool:
+    """Returns whether `Adaptation.p_value` says that the weights are better beyond chance."""
+    return p_value is not None and p_value < SIGNIFICANT
+
+
 def learnt(
     network: Network, frames: Sequence[Frame], seed: int
 ) -> tuple[MovingWeights | None, str]:
@@ -106,7 +110,7 @@ def learnt(
     losses = adaptation.run()
     change = losses[adaptation.kept] / losses[0] - 1
     text = f"{change:+.1%} loss at hidden points of {len(adaptation.validation)} frames"
-    if not adaptation.is_significant:
+    if not is_significant(adaptation.p_value()):
         return None, f"{unused} {text} is not beyond chance"
     return adaptation.best, f"adapt: {text}"
 
@@ -186,12 +190,6 @@ class Adaptation:
         if len(ratios) < 2 or not self.kept:
             return None
         return float(ttest_1samp(ratios, 0, alternative="less").pvalue)
-
-    @property
-    def is_significant(self) -> bool:
-        """Whether the best weights are better beyond chance."""
-        p_value = self.p_value()
-        return p_value is not None and p_value < SIGNIFICANT
 
     def _visits(self) -> Iterator[int]:
         """The frames to learn from, shuffled anew when all were visited."""

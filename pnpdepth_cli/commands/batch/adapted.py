@@ -111,11 +111,13 @@ def _learn(
     try:
         adapted = adapt_to(tasks, asked, say, on_step)
     except UsageError as error:
-        raise UsageError(adapt.NEEDS_POINTS) from error
+        raise UsageError(
+            "--adapt needs a network that takes points, such as compact, as the first --model"
+        ) from error
     change = (
         f"{adapted['change']:+.1%} loss at hidden points of {adapted['validation_frames']} frames"
     )
-    if adapted["p_value"] is not None and adapted["p_value"] < adapt.SIGNIFICANT:
+    if adapt.is_significant(adapted["p_value"]):
         say(f"adapt: {change}")
         return None
     for path in (weights, asked.card):
