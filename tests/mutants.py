@@ -1,13 +1,15 @@
-"""Random mutants of the package, and whether the tests notice them.
+"""Random mutants of the package, and whether the first tier of the tests notices them.
 
     python -m tests.mutants --count 40 --seed 0 --only pnpdepth_cli/core --jobs 2
 
 One expression of a file is changed: a comparison, an arithmetic operator, a constant, `and`, a
-returned value, min, any, floor, mean and the like. In a temporary copy of the tree the test files
-that mirror the module or import it run first, then those of the modules that import it and the
-others of its folder, then those of whole commands. A test that fails with the mutant and passes
-without it kills it; so does a run without end. Prints a table by package, and each survivor with
-its place and change.
+returned value, min, any, floor, mean and the like. The tests that run this line are tried in a
+temporary copy of the tree, first one case of each test, the fastest first. A test that fails with
+the mutant and passes without it kills it; so does a run without end. Prints a table by package,
+and each survivor with its place and change.
+
+Which test runs which line is found by running the first tier once under coverage (four minutes on
+two cores). `--lines FILE` keeps it for the next samples.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import random
 import re
 import resource
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -32,11 +35,15 @@ from itertools import accumulate
 from pathlib import Path
 from queue import SimpleQueue
 from typing import NamedTuple
+from xml.etree import ElementTree
 
 import pytest
+from coverage import CoverageData
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("pnpdepth_cli", "model_zoo_defs")
+FIRST = 40
+"""Number of tests that are tried in a process of their own before the others are collected."""
 HANGS_S = 10
 """Seconds of processor time after a mutant's limit at which its tests are ended."""
 
@@ -63,6 +70,7 @@ class Mutant(NamedTuple):
     end: int
     text: bytes
     change: str
+    lines: tuple[int, int] | None
 
 
 def changed(node: ast.AST) -> Iterator[ast.AST]:
@@ -90,16 +98,29 @@ def changed(node: ast.AST) -> Iterator[ast.AST]:
             yield ast.Return(ast.Constant(None))
 
 
-def places(node: ast.AST) -> Iterator[ast.AST]:
-    """Yields the nodes that run: no annotations, texts or imports for types."""
-    yield node
+def places(
+    node: ast.AST, lines: tuple[int, int] | None = None
+) -> Iterator[tuple[ast.AST, tuple[int, int] | None]]:
+    """Yields the nodes that run (no annotations, texts or imports for types) with the lines that
+    a test of them runs: those of the statement, of the function whose default it is, or None
+    for all of the file.
+    """
+    yield node, lines
+    inside = lines is not None or isinstance(node, ast.FunctionDef)
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns", "decorator_list") or isinstance(node, ast.JoinedStr):
             continue
         for child in value if isinstance(value, list) else [value]:
             typing = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test)
-            if isinstance(child, ast.AST) and not typing:
-                yield from places(child)
+            if not isinstance(child, ast.AST) or typing:
+                continue
+            within = lines
+            if isinstance(child, ast.stmt) and inside:
+                last = child.body[0].lineno - 1 if hasattr(child, "body") else child.end_lineno
+                within = child.lineno, max(child.lineno, last or 0)
+            if isinstance(child, ast.arguments) and isinstance(node, ast.FunctionDef):
+                within = node.lineno, node.end_lineno or 0
+            yield from places(child, within)
 
 
 def mutants(only: str) -> list[Mutant]:
@@ -112,7 +133,7 @@ def mutants(only: str) -> list[Mutant]:
                 continue
             content = path.read_bytes()
             starts = [0, *accumulate(len(line) for line in content.splitlines(keepends=True))]
-            for node in places(ast.parse(content)):
+            for node, lines in places(ast.parse(content)):
                 for other in changed(node):
                     assert isinstance(node, ast.expr | ast.stmt)
                     text = ast.unparse(other)
@@ -122,51 +143,73 @@ def mutants(only: str) -> list[Mutant]:
                     end = starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
                     before = " ".join(content[start:end].decode().split())
                     change = f"{file}:{node.lineno}: {before}  ->  {text}"
-                    found.append(Mutant(file, start, end, text.encode(), change))
+                    found.append(Mutant(file, start, end, text.encode(), change, lines))
     return found
 
 
-def matching_tests(file: Path) -> list[list[str]]:
-    """Returns the test files that mirror a module or import it, those that mirror modules which
-    import it with the others of its folder, and those of whole commands.
+class RunLines:
+    """The tests of the first tier that run a line, and their times in seconds."""
+
+    def __init__(self, folder: Path, jobs: int) -> None:
+        """Runs the first tier under coverage, unless `folder` holds its results already."""
+        data, times = folder / "coverage", folder / "times.xml"
+        if not times.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            settings = folder / "settings.ini"
+            settings.write_text(f"[run]\nsource = {','.join(PACKAGES)}\ndata_file = {data}\n")
+            command = [sys.executable, "-m", "pytest", "-n", str(jobs), "--dist", "loadfile"]
+            command += ["--cov", f"--cov-config={settings}", "--cov-context=test"]
+            command += ["--cov-report=", f"--junitxml={times}", "-o", "junit_family=xunit1"]
+            subprocess.run(command, cwd=ROOT, check=True)
+        self._data = CoverageData(str(data))
+        self._data.read()
+        self._times = {
+            f"{case.get('file')}::{case.get('name')}": float(case.get("time", 0))
+            for case in ElementTree.parse(times).iter("testcase")
+        }
+
+    def tests(self, mutant: Mutant, limit: float) -> list[str]:
+        """Returns tests that together take `limit` seconds at most, in the order to try them."""
+        lines = self._data.contexts_by_lineno(str(ROOT / mutant.file))
+        first, last = mutant.lines or (0, sys.maxsize)
+        names = {
+            test.rpartition("|")[0]
+            for line, tests in lines.items()
+            for test in tests
+            if first <= line <= last
+        }
+        cases = Counter[str]()
+        order = list[tuple[int, float, str]]()
+        for time_s, name in sorted((self._times[name], name) for name in names & {*self._times}):
+            test = name.partition("[")[0]
+            order.append((cases[test], time_s, name))
+            cases[test] += 1
+        order.sort()
+        ends = accumulate(time_s for _, time_s, _ in order)
+        chosen = [name for (_, _, name), end in zip(order, ends, strict=True) if end <= limit]
+        return chosen or _mirroring(mutant.file)
+
+
+def _mirroring(file: Path) -> list[str]:
+    """The test files of the module's name, else those of its folder, for lines that only other
+    processes run.
     """
-    folder, first = _mirrored(file)
-    module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
-    parent, _, last = module.rpartition(".")
-    imports = re.compile(rf"{module}\b|from {parent} import [^)\n]*\b{last}\b")
-
-    def importing(root: Path) -> list[Path]:
-        return [path for path in sorted(root.rglob("*.py")) if imports.search(path.read_text())]
-
-    first += [path for path in importing(ROOT / "tests") if path.name.startswith("test_")]
-    near = [
-        test
-        for path in importing(ROOT / PACKAGES[0])
-        for test in _mirrored(path.relative_to(ROOT))[1]
-    ]
-    while not (others := sorted(folder.glob("test_*.py"))):  # such as io/formats, tested in io
-        folder = folder.parent
-    lists = first, near + others, [ROOT / "tests" / "test_golden.py"]
-    chosen = [[path.relative_to(ROOT).as_posix() for path in dict.fromkeys(each)] for each in lists]
-    chosen[1] = [path for path in chosen[1] if path not in chosen[0]]
-    return [paths for paths in chosen if paths]
-
-
-def _mirrored(file: Path) -> tuple[Path, list[Path]]:
-    """The folder of tests of a module's package, and the test files of the module's name there."""
     parts = file.parts[1:-1] if file.parts[0] == "pnpdepth_cli" else file.parts[:1]
     folder = ROOT.joinpath("tests", *parts)
-    return folder, sorted(folder.glob(f"test_{file.stem}*.py"))
+    chosen = sorted(folder.glob(f"test_{file.stem}*.py"))
+    while not (chosen := chosen or sorted(folder.glob("test_*.py"))):
+        folder = folder.parent
+    return [path.relative_to(ROOT).as_posix() for path in chosen]
 
 
 class Trees:
     """Copies of the tree, one a job, in which mutants are tried."""
 
-    def __init__(self, folder: Path, arguments: argparse.Namespace) -> None:
+    def __init__(self, folder: Path, run_lines: RunLines, jobs: int, limit: float) -> None:
         self._free: SimpleQueue[Path] = SimpleQueue()
-        self._arguments, self._sound = arguments, dict[str, bool]()
+        self._run_lines, self._limit, self._sound = run_lines, limit, dict[str, bool]()
         ignored = shutil.ignore_patterns(".*", "__pycache__", "out", "dist", "build", "site")
-        for number in range(arguments.jobs):
+        for number in range(jobs):
             shutil.copytree(ROOT, folder / str(number), ignore=ignored)
             compileall.compile_dir(folder / str(number), quiet=2)  # never of a mutant
             self._free.put(folder / str(number))
@@ -178,9 +221,10 @@ class Trees:
         original = file.read_bytes()
         mutated = original[: mutant.start] + mutant.text + original[mutant.end :]
         try:
-            for tests in matching_tests(mutant.file):
+            chosen = self._run_lines.tests(mutant, self._limit)
+            for tests in (chosen[:FIRST], chosen[FIRST:]):
                 file.write_bytes(mutated)
-                while failed := self._failed(tree, tests, broken):
+                while tests and (failed := self._failed(tree, tests, broken)):
                     if failed == "time" or self._passes_without(failed, tree, file, original):
                         return failed
                     broken.append(failed)
@@ -199,9 +243,9 @@ class Trees:
     def _failed(self, tree: Path, tests: list[str], without: list[str]) -> str:
         """The first test that fails, `time` if it does not end, or an empty text."""
         options = ["-p", "no:cacheprovider", "-p", "tests.mutants", "--assert=plain", "--tb=no"]
-        options += ["-x", "-q", "-rfE", "-m", self._arguments.marked]
+        options += ["-x", "-q", "-rfE"]
         options += [*(f"--deselect={name}" for name in without), *tests]
-        printed, limit = tree / "printed.txt", self._arguments.limit
+        printed, limit = tree / "printed.txt", self._limit
         process = _FORKS.Process(target=_run_tests, args=(printed, limit, options))
         process.start()
         process.join(20 * limit)
@@ -259,7 +303,7 @@ def main() -> None:
         ("--only", "", "a file or folder, from the root of the tree"),
         ("--jobs", 1, "mutants at once"),
         ("--limit", 90.0, "seconds of processor time for a mutant's tests"),
-        ("--marked", "not slow", "pytest's -m"),
+        ("--lines", "", "folder for what the first tier runs; used again if it is there"),
     ):
         parser.add_argument(name, type=type(default), default=default, help=text)
     arguments = parser.parse_args()
@@ -267,7 +311,8 @@ def main() -> None:
     chosen = random.Random(arguments.seed).sample(everything, min(arguments.count, len(everything)))
     tried, killed, lines = Counter[str](), Counter[str](), []
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.jobs) as pool:
-        trees = Trees(Path(folder), arguments)
+        run_lines = RunLines(Path(arguments.lines or f"{folder}/lines"), arguments.jobs)
+        trees = Trees(Path(folder), run_lines, arguments.jobs, arguments.limit)
         for mutant, outcome in zip(chosen, pool.map(trees.outcome, chosen), strict=True):
             package = mutant.file.parts[1] if len(mutant.file.parts) > 2 else mutant.file.parts[0]
             tried[package] += 1
