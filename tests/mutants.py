@@ -4,7 +4,8 @@
 
 One expression of a file is changed: a comparison, an arithmetic operator, a constant, `and`, a
 returned value, min, any, floor, mean and the like. The tests that run this line are tried in a
-temporary copy of the tree, first one case of each test, the fastest first. A test that fails with
+temporary copy of the tree, those that mirror the file and one case of each
+other test first, the fastest first. A test that fails with
 the mutant and passes without it kills it; so does a run without end. Prints a table by package,
 and each survivor with its place and change.
 
@@ -178,16 +179,19 @@ class RunLines:
             for test in tests
             if first <= line <= last
         }
-        cases = Counter[str]()
+        near, cases = _mirroring(mutant.file), Counter[str]()
+        if mutant.lines is None:  # a constant, perhaps without a function that uses it
+            names |= {name for name in self._times if name.partition("::")[0] in near}
         order = list[tuple[int, float, str]]()
         for time_s, name in sorted((self._times[name], name) for name in names & {*self._times}):
             test = name.partition("[")[0]
-            order.append((cases[test], time_s, name))
+            mirrored = name.partition("::")[0] in near
+            order.append((0 if mirrored else cases[test], time_s, name))
             cases[test] += 1
         order.sort()
         ends = accumulate(time_s for _, time_s, _ in order)
         chosen = [name for (_, _, name), end in zip(order, ends, strict=True) if end <= limit]
-        return chosen or _mirroring(mutant.file)
+        return chosen or near
 
 
 def _mirroring(file: Path) -> list[str]:

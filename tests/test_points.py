@@ -111,6 +111,7 @@ def test_a_point_outside_the_frame_is_not_scattered() -> None:
     outside = points([(-0.6, 0), (0, -3), (2.6, 0), (0, 2.7)], (3, 3))
     assert not outside.scatter().any()
     assert points([(-0.5, -0.5), (2.5, 2.5), (2.4999, 0)], (3, 3)).scatter().count_nonzero() == 3
+    assert points([(3.5, 3.5)], (4, 4)).scatter().nonzero().tolist() == [[0, 0, 3, 3]]
 
 
 def test_arrays_become_tensors_without_copy_and_follow_the_same_rules() -> None:

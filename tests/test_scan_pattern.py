@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pnpdepth_cli.scan_pattern import scan_lines, scan_pattern
+from pnpdepth_cli.scan_pattern import _median_gap, scan_lines, scan_pattern
 
 SIZE = (120, 300)
 
@@ -27,6 +27,10 @@ def test_spacings_are_those_to_the_next_point_in_a_row_or_beside_it() -> None:
     turned = scan_pattern(np.column_stack([y.ravel(), x.ravel()]), SIZE[::-1])
     assert (turned.along_px, turned.across_px) == (5.0, 3.0)
     assert not turned.has_scan_lines
+
+
+def test_the_last_column_of_a_row_is_not_the_first_of_the_next() -> None:
+    assert _median_gap(np.array([2, 0, 1]), np.array([0, 1, 1])) == 1
 
 
 @pytest.mark.parametrize("gap", [4, 7])

@@ -243,8 +243,8 @@ def _lay_out(
 
 def _labels(ticks: list[float]) -> list[tuple[float, str]]:
     gaps = [b - a for a, b in pairwise(ticks)]
-    smallest = min([*gaps, *ticks[:1]], default=1.0)
-    decimals = max(0, -math.floor(math.log10(smallest) + 1e-9)) if smallest > 0 else 0
+    smallest = min((each for each in (*gaps, *ticks[:1]) if each > 0), default=1.0)
+    decimals = max(0, -math.floor(math.log10(smallest) + 1e-9))
     return [(tick, f"{tick:,.{decimals}f}") for tick in ticks]
 
 

@@ -45,8 +45,9 @@ def test_idle_threads_sleep_soon_unless_the_user_sets_how_they_wait(
     variables: dict[str, str], spins: str
 ) -> None:
     code = (
-        "import os\nfrom pnpdepth_cli.cli.main import main\n"
-        "try:\n    main(['--version'])\nexcept SystemExit:\n    pass\n"
+        "import os, sys\nfrom pnpdepth_cli.cli.main import main\n"
+        "sys.argv += ['--version']\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
         "print(os.environ.get('GOMP_SPINCOUNT'))\n"
     )
     others = {k: v for k, v in os.environ.items() if k not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy.stats import ttest_rel
 
 import pnpdepth_cli as pnp
 from pnpdepth_cli.frames import adapt
@@ -113,3 +114,6 @@ def test_frames_for_validation_are_looked_at_as_often_as_asked(network: pnp.Netw
     losses = adaptation.run()
     assert sorted(losses) == [0, 8, 12]
     assert losses[adaptation.kept] == min(losses.values())
+    best, first = adaptation._losses[adaptation.kept], adaptation._losses[0]
+    expected = ttest_rel(np.log(best), np.log(first), alternative="less").pvalue
+    assert adaptation.p_value() == pytest.approx(expected, rel=1e-9)

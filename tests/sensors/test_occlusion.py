@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import FORWARD_LEFT_UP, Camera, project_velodyne
-from pnpdepth_cli.sensors.projection import hidden_points
+from pnpdepth_cli.sensors.projection import edge_agreement, hidden_points
 
 K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
 SIZE = (480, 640)
@@ -111,3 +112,16 @@ def test_a_point_is_hidden_by_a_nearer_one_beside_its_beam(
     hidden = hidden_points(xy, depth, (24, 32), focal_px=focal_px, scanner=scanner)
     assert hidden.tolist() == expected.tolist()
     assert 0.1 < expected.mean() < 0.9
+
+
+@pytest.mark.parametrize(("edge", "agreement"), [(50, 0.81), (20, -0.11), (None, 0.0)])
+def test_edges_agree_where_they_are_beside_jumps_of_depth(
+    edge: int | None, agreement: float
+) -> None:
+    y, x = np.mgrid[2:60:4, 2:100:4]
+    xy = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
+    depth = np.where((xy[:, 0] < 50) & (edge is not None), 2, 5).astype(np.float32)
+    rgb = np.zeros((60, 100, 3), np.float32)
+    rgb[:, edge:] = 1
+    got = edge_agreement(SparsePoints(xy=xy, depth=depth, size=(60, 100)), rgb)
+    assert got == pytest.approx(agreement, abs=0.005)

@@ -96,11 +96,9 @@ class Tally:
         for key, values in _measured(row).items():
             sums = self._sums[key]
             for name, value in values.items():
-                total, count = sums.get(name, (0.0, 0))
-                known = value is not None and not math.isnan(value)
-                sums[name] = (
-                    (total + value, count + 1) if known and value else (total, count + known)
-                )
+                total, count = sums.setdefault(name, (0.0, 0))
+                if value is not None and not math.isnan(value):
+                    sums[name] = (total + value, count + 1)
         worse = (row.get("linear") or {}).get("worse")
         self._compared += worse is not None
         self._worse += bool(worse)

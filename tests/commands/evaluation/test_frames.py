@@ -51,14 +51,17 @@ def test_affine_is_the_least_squares_fit_of_marigold_and_midas(scale_by: str) ->
     in_depth = scale_by == "affine"
     target = GT if in_depth else 1 / GT
     predicted = ((target + 0.5) / 3 + RNG.normal(0, 0.01, GT.shape)).astype(np.float32)
-    a = np.stack([predicted[WHERE], np.ones(WHERE.sum())], axis=1).astype(np.float64)
-    (s, t), *_ = np.linalg.lstsq(a, target[WHERE].astype(np.float64), rcond=None)
+    predicted[:3] = 0  # unknown
+    both = WHERE & (predicted > 0)
+    a = np.stack([predicted[both], np.ones(both.sum())], axis=1).astype(np.float64)
+    (s, t), *_ = np.linalg.lstsq(a, target[both].astype(np.float64), rcond=None)
     kind = "depth" if in_depth else "disparity"
     depth, fit = scaled(predicted, np.where(WHERE, GT, 0), kind, scale_by)
     assert fit is not None
     assert (fit.factor, fit.shift) == pytest.approx((s, t), rel=1e-5)
-    fitted = np.maximum(s * predicted + t, 0)
-    assert depth == pytest.approx(fitted if in_depth else 1 / fitted, rel=1e-4, abs=1e-6)
+    assert not depth[:3].any()
+    fitted = np.maximum(s * predicted + t, 0)[3:]
+    assert depth[3:] == pytest.approx(fitted if in_depth else 1 / fitted, rel=1e-4, abs=1e-6)
 
 
 def test_log_leaves_no_mean_error_of_the_logarithm() -> None:

@@ -95,6 +95,7 @@ def test_chamfer_and_f_score_are_those_of_all_pairs() -> None:
     assert errors["chamfer"] == pytest.approx((accuracy.mean() + completeness.mean()) / 2)
     assert errors["f_score"] == pytest.approx(2 * precision * recall / (precision + recall))
     assert values("cloud", replace(FRAME, depth=FRAME.gt)) == {"chamfer": 0, "f_score": 1}
+    assert values("cloud", replace(FRAME, depth=FRAME.gt + 50))["f_score"] == 0
     nothing = replace(FRAME, depth=np.zeros_like(FRAME.gt))
     assert np.isnan(list(values("cloud", nothing).values())).all()
 

@@ -208,6 +208,7 @@ def test_groups_are_clusters_in_the_order_of_the_frames() -> None:
 def test_one_sequence_of_independent_frames_has_a_cluster_for_each() -> None:
     lengths = [block_length(autoregression(0.0, 100, seed)) for seed in range(40)]
     assert np.mean([length == 1 for length in lengths]) >= 0.7  # 84 % in the long run
+    assert block_length(np.random.default_rng(0).random((30, 1)) % 0.1 + [[0], [0.2]] * 15) == 1
     assert find_clusters([""] * 6, np.arange(6.0)[:, None] % 2).describe() == "6 frames"
 
 

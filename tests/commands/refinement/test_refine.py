@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from pnpdepth_cli.commands.refinement.inputs import _scale_warning
+from pnpdepth_cli.commands.refinement.refine import _point_error
 from pnpdepth_cli.errors import (
     InputError,
     LayerError,
@@ -24,6 +25,7 @@ from pnpdepth_cli.errors import (
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.points import SparsePoints
 from tests.commands.frames import FrameOnDisk, run
 
 
@@ -226,3 +228,12 @@ def test_a_mistake_gives_one_clear_line_and_writes_nothing(
         run(frame, **changes)
     assert "\n" not in str(caught.value)
     assert files(frame.folder) == before
+
+
+def test_the_error_at_points_is_of_those_with_a_prediction() -> None:
+    points = SparsePoints(
+        xy=torch.tensor([[0.0, 0], [1, 0], [2, 0]]), depth=torch.tensor([5.0, 2, 6]), size=(1, 3)
+    )
+    errors = _point_error(np.array([[0, 3, 9]], np.float32), points)
+    assert errors == {"points": 2, "mae": 2.0, "rmse": 5**0.5}
+    assert _point_error(np.zeros((1, 3), np.float32), points) is None

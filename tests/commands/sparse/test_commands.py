@@ -78,7 +78,10 @@ def test_the_size_comes_from_image_option_or_calibration(frame: ScanOnDisk) -> N
     by_option = projected(frame, image=None, size=(48, 64))
     frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
     by_file = projected(frame, "other.csv", image=None)
-    assert by_option["points"] == by_file["points"]
+    by_image = projected(frame, "third.csv", size=(48, 64))
+    assert by_option["points"] == by_file["points"] == by_image["points"]
+    target = SparseTarget(output=frame.folder / "fourth.csv")
+    refused(frame, SizeError, "64×48, not of the size given", size=(64, 48), target=target)
 
 
 def refused(frame: ScanOnDisk, error: type[PnpDepthError], message: str, **more: object) -> None:
