@@ -120,6 +120,7 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
         ("a.bin", b"", "empty"),
         ("a.npy", npy_bytes(POINTS)[:-4], "cannot be read"),
         ("a.npy", b"text", "not an NPY file"),
+        ("a.npy", npy_bytes(POINTS * [1, 1e9, 1]), "m is none of a scan"),
         ("a.npy", npy_bytes(POINTS, np.int32), "int32 of shape 37×4"),
         ("a.pcd", b"VERSION 0.7\nPOINTS 3\n", "no header that ends with DATA"),
         ("a.pcd", b"FIELDS x y z\nDATA ascii\n", "has no SIZE"),

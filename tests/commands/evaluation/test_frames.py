@@ -115,6 +115,15 @@ def test_sparsification_is_by_definition() -> None:
     assert (total["ause"], none["ause"]) == pytest.approx((area / error.mean(), 0))
 
 
+def test_a_pixel_without_sigma_or_prediction_is_not_scored() -> None:
+    gt = np.full((1, 4), 10, np.float32)
+    depth, sigma = np.array([[9, 0, 12, 13]], np.float32), np.array([[1, 1, 0, 1]], np.float32)
+    frame = frame_uncertainty(depth, gt, sigma)
+    assert frame is not None
+    assert frame.oracle[0] == frame.sparsification[0] == 2
+    assert frame_uncertainty(depth, gt, np.zeros_like(gt)) is None
+
+
 def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
     for folder in ("out", "gt"):
         (tmp_path / folder).mkdir()
