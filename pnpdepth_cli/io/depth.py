@@ -251,11 +251,8 @@ def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
         return None
     fact = f"median depth {metres(median)} m is implausible, the scale is probably wrong"
     if scale is None:
-        divisor = next((s for s in (1000.0, 100.0) if _is_common(median / s)), None)
-        advice = (
-            f"; divided by {divisor:g} it would be {metres(median / divisor)} m" if divisor else ""
-        )
-        return f"{fact}: a float file must hold metres{advice}"
+        advice = f"; divided by 1000 it would be {metres(median / 1000)} m"
+        return f"{fact}: a float file must hold metres{advice if _is_common(median / 1000) else ''}"
     better = next((s for s in _COMMON_SCALES if _is_common(median * scale / s)), None)
     if better is None:
         return f"{fact}: give codes per metre with --depth-scale (now {scale:g})"

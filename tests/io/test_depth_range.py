@@ -61,3 +61,6 @@ def test_a_float_file_in_millimetres_is_an_error_that_names_metres() -> None:
         "median depth 2,500.0 m is implausible, the scale is probably wrong: "
         "a float file must hold metres; divided by 1000 it would be 2.5 m"
     )
+    warning = implausible(np.full(3, 1e9))
+    assert warning is not None
+    assert warning.endswith(": a float file must hold metres")

@@ -230,6 +230,19 @@ def test_ticks_lie_within_the_scale_and_in_order(low: float, ratio: float) -> No
     assert (positions[0], positions[-1]) == (0, pytest.approx(1))
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [
+        (1.5, 9.5, [2, 3, 4, 5, 6, 7, 8, 9]),
+        (1.5, 62, [2, 3, 5, 7, 10, 20, 30, 50]),
+        (0.6, 60, [1, 2, 5, 10, 20, 50]),
+        (0.6, 600, [1, 10, 100]),
+    ],
+)
+def test_ticks_of_more_decades_have_fewer_digits(low: float, high: float, ticks: Any) -> None:
+    assert DepthScale(low_m=low, high_m=high).ticks() == ticks
+
+
 def test_steps_are_round_and_a_few_wild_depths_do_not_stretch_the_scale() -> None:
     assert round_steps(0.9, 3.1) == [1.0, 1.5, 2.0, 2.5, 3.0]
     assert round_steps(2, 63) == [10, 20, 30, 40, 50, 60]
