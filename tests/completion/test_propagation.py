@@ -104,7 +104,7 @@ def test_an_unknown_prediction_stays_unknown_and_its_points_have_no_effect(kind:
     unknown[0, 30], unknown[0, 31] = torch.inf, torch.nan
     depth = propagate(unknown, points, rgb, kind=kind).depth
     known = unknown.isfinite() & (unknown > 0)
-    assert torch.equal(depth > 0, known)
+    assert torch.equal(depth != 0, known)
     as_it_is = propagate(unknown, points, rgb, kind="none").depth
     assert torch.equal(as_it_is, torch.where(known, unknown, 0))
     beside, inside = torch.tensor([[[19.5, 9.0], [20.0, 9.0]], [[20.5, 9.0], [63.0, 9.0]]])
