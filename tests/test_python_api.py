@@ -175,7 +175,8 @@ def test_every_unambiguous_form_of_an_image_is_read_alike(
     assert torch.equal(given, expected)
     depth = np.zeros((6, 8, 1))
     depth[2, 1] = 3
-    assert torch.equal(frame_of_arrays(rgb, depth).points.xy, torch.tensor([[1.0, 2.0]]))
+    for sparse in (depth, depth[None], depth[None, ..., 0], depth[..., 0]):
+        assert frame_of_arrays(rgb, sparse).points.xy.tolist() == [[1, 2]]
 
 
 @pytest.mark.parametrize(

@@ -181,6 +181,22 @@ def test_with_target_given_the_loss_at_all_points_falls() -> None:
     assert result.kept == settings.iterations
 
 
+def test_points_set_aside_are_looked_at_before_the_steps_and_three_times(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked: list[int] = []
+    of_class = weights_refinement._WeightsRefinement
+    check = of_class._check
+
+    def counted(state: Any) -> None:
+        looked.append(len(state.losses) if hasattr(state, "losses") else 0)
+        check(state)
+
+    monkeypatch.setattr(of_class, "_check", counted)
+    refined(TwoInputs(), replace(SETTINGS, iterations=10))
+    assert looked == [0, 4, 7, 10]
+
+
 def test_a_budget_ends_the_steps() -> None:
     assert len(refined(TwoInputs(), replace(SETTINGS, time_budget_s=1e-9)).losses) == 1
 
