@@ -4,13 +4,12 @@
 
 One expression of a file is changed: a comparison, an arithmetic operator, a constant, `and`, a
 returned value, min, any, floor, mean and the like. The tests that run this line are tried in a
-temporary copy of the tree, those that mirror the file and one case of each
-other test first, the fastest first. A test that fails with
-the mutant and passes without it kills it; so does a run without end. Prints a table by package,
-and each survivor with its place and change.
+temporary copy of the tree: first those that mirror the file and one case of each other test, the
+fastest first. A test that fails with the mutant and passes without it kills it; so does a run
+without end. Prints a table by package, and each survivor with its place and change.
 
-Which test runs which line is found by running the first tier once under coverage (four minutes on
-two cores). `--lines FILE` keeps it for the next samples.
+Which test runs which line is found by running the first tier once under coverage (three minutes on
+two cores). `--lines FOLDER` keeps it for the next samples of the same tree.
 """
 
 from __future__ import annotations
@@ -315,7 +314,7 @@ def main() -> None:
     chosen = random.Random(arguments.seed).sample(everything, min(arguments.count, len(everything)))
     tried, killed, lines = Counter[str](), Counter[str](), []
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.jobs) as pool:
-        run_lines = RunLines(Path(arguments.lines or f"{folder}/lines"), arguments.jobs)
+        run_lines = RunLines(Path(arguments.lines or f"{folder}/lines").resolve(), arguments.jobs)
         trees = Trees(Path(folder), run_lines, arguments.jobs, arguments.limit)
         for mutant, outcome in zip(chosen, pool.map(trees.outcome, chosen), strict=True):
             package = mutant.file.parts[1] if len(mutant.file.parts) > 2 else mutant.file.parts[0]

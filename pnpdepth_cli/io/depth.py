@@ -251,8 +251,9 @@ def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
         return None
     fact = f"median depth {metres(median)} m is implausible, the scale is probably wrong"
     if scale is None:
-        advice = f"; divided by 1000 it would be {metres(median / 1000)} m"
-        return f"{fact}: a float file must hold metres{advice if _is_common(median / 1000) else ''}"
+        divided = median / 1000
+        advice = f"; divided by 1000 it would be {metres(divided)} m" if _is_common(divided) else ""
+        return f"{fact}: a float file must hold metres{advice}"
     better = next((s for s in _COMMON_SCALES if _is_common(median * scale / s)), None)
     if better is None:
         return f"{fact}: give codes per metre with --depth-scale (now {scale:g})"
