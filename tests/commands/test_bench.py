@@ -48,6 +48,19 @@ def test_a_network_without_weights_gets_random_ones_and_a_note(frame: FrameOnDis
     assert any("weights: random" in note for note in result["notes"])
 
 
+def test_only_random_weights_leave_the_output_unaligned(
+    frame: FrameOnDisk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str | None] = []
+    given = bench.resolve_settings
+    monkeypatch.setattr(
+        *(bench, "resolve_settings", lambda d, method: asked.append(method.align) or given(d, method))
+    )
+    measured(frame)
+    measured(frame, checkpoint=None)
+    assert asked == [None, "none"]
+
+
 def test_where_no_layer_is_named_the_cut_is_that_of_refine(
     frame: FrameOnDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:

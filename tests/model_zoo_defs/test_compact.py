@@ -162,6 +162,13 @@ def test_a_prior_that_does_not_explain_the_points_is_unknown_everywhere(useless:
     assert not bool(Prior.of(prior, points, Cloud.of(points, rgb)).valid.any())
 
 
+def test_a_prior_that_is_less_exact_than_the_nearest_point_is_unknown_everywhere() -> None:
+    rgb, sparse = frame(96, 128, 200)
+    sparse[..., 1::2] = sparse[..., ::2]  # pairs of equal depth
+    points, prior = Points(sparse), sparse * torch.exp(0.4 * rgb[:, :1])
+    assert not bool(Prior.of(prior, points, Cloud.of(points, rgb)).valid.any())
+
+
 def test_each_image_of_a_batch_keeps_or_loses_its_own_prior() -> None:
     one, other = frame(64, 96, 90, seed=1), frame(64, 96, 300, seed=2)
     rgb, sparse = (torch.cat(pair) for pair in zip(one, other, strict=True))

@@ -47,6 +47,7 @@ def test_the_motion_between_two_images_is_that_of_the_poses() -> None:
 
 def test_an_image_without_texture_gives_no_motion() -> None:
     blank = keypoints_of(np.full((187, 621, 3), 0.5, np.float32))
+    assert (blank.xy.shape, blank.descriptors.shape) == ((0, 2), (0, 128))
     estimate = motion_of_images(blank, image(1), points_of(1), CAMERA)
     assert estimate.motion is None
     assert estimate.basis.startswith("0 matches")

@@ -43,6 +43,8 @@ def test_from_another_position_every_point_lies_on_the_wall_it_hits(
     np.testing.assert_allclose(elevation, 2 * np.rint(elevation / 2), atol=1e-3)
     assert set(np.rint(elevation).astype(int)) == set(range(-14, 15, 2))
     assert len(got.depth) > 1000
+    nearer = replace(camera, translation=camera.translation / 10)
+    np.testing.assert_allclose(simulate_lidar(depth / 10, nearer, IDEAL, 0).xy, got.xy, atol=1e-3)
 
 
 def test_what_is_behind_an_edge_for_the_scanner_is_not_measured() -> None:
