@@ -54,7 +54,11 @@ def test_only_random_weights_leave_the_output_unaligned(
     asked: list[str | None] = []
     given = bench.resolve_settings
     monkeypatch.setattr(
-        *(bench, "resolve_settings", lambda d, method: asked.append(method.align) or given(d, method))
+        *(
+            bench,
+            "resolve_settings",
+            lambda d, method: asked.append(method.align) or given(d, method),
+        )
     )
     measured(frame)
     measured(frame, checkpoint=None)

@@ -89,7 +89,7 @@ def test_frames_show_together_that_the_image_sees_much_less_or_more(zoom: float)
     found = estimated([evidence_of(seed, there) for seed in range(4)])
     assert isinstance(found, ImageRegistration)
     assert found.zoom == pytest.approx(zoom, abs=0.01)
-    assert (found.right, found.down) == pytest.approx((6.0, -4.0), abs=1.5)
+    assert (found.right, found.down) == pytest.approx((6.0, -4.0), abs=0.5)
 
 
 @pytest.mark.parametrize(("count", "frames"), [(100, 6), (500, 5)])

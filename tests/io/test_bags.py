@@ -1,4 +1,4 @@
-"""Bags that are damaged, or bombs: small files that claim, decompress to or compute gigabytes."""
+"""Images of bags; damaged bags, and bombs: small files that claim or decompress to gigabytes."""
 
 from __future__ import annotations
 
@@ -7,17 +7,39 @@ import sqlite3
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import bags as bounds
 from pnpdepth_cli.io.bags import open_bag
+from pnpdepth_cli.io.bags.messages import image_file
 from tests.bags import write_bag
 
 pytest.importorskip("rosbags")
 
 BOMB = 64 << 20
+
+
+PIXELS = {name: name.rstrip("8") for name in ("rgb8", "bgr8", "rgba8", "bgra8")}
+PIXELS |= {"8UC3": "bgr", "mono8": "g", "8UC1": "g"}
+PIXELS |= {f"bayer_{name}8": name for name in ("rggb", "bggr", "gbrg", "grbg")}
+
+
+@pytest.mark.parametrize("encoding", PIXELS)
+def test_an_image_of_every_encoding_has_its_colour(encoding: str) -> None:
+    pixel = np.array([{"r": 200, "g": 100, "b": 50, "a": 9}[c] for c in PIXELS[encoding]], "u1")
+    rows = np.tile(pixel.reshape(2, 2), (3, 3)) if "bayer" in encoding else np.tile(pixel, (6, 6))
+    sizes = {"height": 6, "width": 6, "step": rows.shape[1]}
+    suffix, content = image_file(
+        SimpleNamespace(encoding=encoding, data=rows.tobytes(), **sizes), "/image"
+    )
+    decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert suffix == ".png"
+    assert decoded.tolist() == [[[100] * 3 if len(pixel) == 1 else [50, 100, 200]] * 6] * 6
 
 
 def read_all(path: Path) -> int:

@@ -196,7 +196,7 @@ def _write_view(path: Path, image: Image | None, inputs: Inputs, frame: Refined)
             "range": [near, far],
             "middle": float(np.median(known)) if len(known) else 1.0,
             "farthest": far,
-            "spacing": stride * float(np.ptp(rays[:, :, 0])) / max(width - 1, 1),
+            "spacing": stride / float(inputs.camera.camera.intrinsics[0, 0]),
             "unit": inputs.unit,
             "rays": {"size": [rays.shape[1], rays.shape[0]], "values": _text(rays, "<f4")},
             "depths": {name: _text(_codes(d, near, far), "<u2") for name, d in depths.items()},

@@ -13,6 +13,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from pnpdepth_cli.commands.refinement.outputs import LARGEST_VIEW, _rays, _stride
+from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.camera import Camera
@@ -47,6 +48,15 @@ def test_depths_are_those_of_the_cloud_to_a_ten_thousandth(
     assert view["depths"]["before"] != view["depths"]["after"]
     assert (view["stride"], view["whole"], view["farthest"]) == (1, view["size"], far)
     assert view["spacing"] == pytest.approx(2 * math.tan(math.radians(30)) / width)
+
+
+def test_points_have_a_spacing_where_the_lens_shows_nothing_in_a_corner(tmp_path: Path) -> None:
+    frame, calib = frame_on_disk(tmp_path), tmp_path / "camera.yaml"
+    calib.write_text(
+        "distortion_model: equidistant\nd: [0, 0, 0, 0]\nk: [20, 0, 30, 0, 20, 22, 0, 0, 1]"
+    )
+    run(frame, view_3d=True, scan=ScanOptions(calib=calib))
+    assert json.loads((tmp_path / "out" / "img_view.json").read_text())["spacing"] == 1 / 20
 
 
 def test_colours_are_those_of_the_image(view: dict[str, Any], tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import LayerError, ModelError, UsageError
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.onnx import graph, limits
+from pnpdepth_cli.models.onnx.network import _as_map
 from pnpdepth_cli.models.onnx.table import OPERATORS
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -62,6 +63,21 @@ def test_a_cut_at_any_node_gives_the_network_bit_for_bit(
         for name, _ in module.named_children():
             with Split(module, name) as split:
                 assert torch.equal(split.rear(split.front(x)), whole), name
+
+
+@pytest.mark.parametrize(
+    ("shape", "as_map"),
+    [
+        ((1, 32, 48, 1), (1, 1, 32, 48)),
+        ((1, 32, 1, 1), (1, 1, 32, 1)),
+        ((1, 2, 48, 1), (1, 1, 2, 48)),
+        *((same, same) for same in ((1, 1, 32, 48), (1, 1, 32, 1), (1, 32, 48), (1, 32, 1))),
+    ],
+)
+def test_an_output_with_channels_last_is_a_map(
+    shape: tuple[int, ...], as_map: tuple[int, ...]
+) -> None:
+    assert _as_map(torch.zeros(shape)).shape == as_map
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 32, 48), ("n", 3, "h", "w"), (1, 3, None, None)])
