@@ -84,8 +84,11 @@ def neighbours(position: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         position: Rows and columns (n, 2), in units that hold about one point.
     """
+    if not len(position):
+        nothing = position.new_zeros((0, NEIGHBOURS), dtype=torch.long)
+        return nothing, nothing > 0
     cells = position.long() + 2
-    down, across = (int(x) + 3 for x in cells.amax(0)) if len(cells) else (5, 5)
+    down, across = (int(x) + 3 for x in cells.amax(0))
     cell = cells[:, 0] * across + cells[:, 1]
     order = torch.argsort(cell, stable=True)
     count = torch.bincount(cell, minlength=down * across)
@@ -107,7 +110,4 @@ def neighbours(position: Tensor) -> tuple[Tensor, Tensor]:
         square, best = square.topk(NEIGHBOURS, largest=False)
         near.append(candidate.gather(1, best))
         found.append(square < math.inf)
-    if not near:
-        nothing = cell.new_zeros((0, NEIGHBOURS))
-        return nothing, nothing > 0
     return torch.cat(near), torch.cat(found)

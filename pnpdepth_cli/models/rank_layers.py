@@ -78,7 +78,7 @@ def best_layer(
     first, end = 0, len(layers)
     while first < end:
         middle = (first + end) // 2
-        layer = _measure(network, layers[middle], arguments, size[0], enough=enough)
+        layer = _measure(network, layers[middle], arguments, size, enough=enough)
         if layer.field_in_output is None:
             del layers[middle]
             end -= 1
@@ -160,7 +160,7 @@ def measure_layers(
         network.depth_of(network.module(*arguments))
     for done, name in enumerate(names, start=1):
         measured.append(
-            _measure(network, name, arguments, size[0], whole_flops=whole.get_total_flops())
+            _measure(network, name, arguments, size, whole_flops=whole.get_total_flops())
         )
         on_layer(done, len(names))
     return measured
@@ -170,7 +170,7 @@ def _measure(
     network: Network,
     name: str,
     arguments: tuple[Tensor, ...],
-    rows: int,
+    size: tuple[int, int],
     *,
     whole_flops: int | None = None,
     enough: float | None = None,
@@ -196,7 +196,7 @@ def _measure(
     return MeasuredLayer(
         name=name,
         shape=tuple(z.shape),
-        stride=rows / z.shape[-2] if z.ndim == 4 else None,
+        stride=size[0] / z.shape[-2] if z.ndim == 4 else None,
         cost_behind=cost,
         seconds_behind=seconds,
         parameters=sum(parameter.numel() for parameter in module.parameters()),

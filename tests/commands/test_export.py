@@ -110,6 +110,11 @@ def test_3dgs_gets_the_inverse_depth_of_the_model(root: Path) -> None:
         assert inverse == pytest.approx(1 / DEPTH, rel=2e-4)
 
 
+def test_results_without_any_known_depth_are_refused_for_3dgs(root: Path) -> None:
+    with pytest.raises(InputError, match="no frame has a pixel with known depth"):
+        export(results(root, np.zeros_like(DEPTH)), "gaussian-splatting", root)
+
+
 def test_no_pixel_is_infinitely_far_in_3dgs_and_masks_mark_what_is_not_known(root: Path) -> None:
     depth = DEPTH.copy()
     depth[:2] = 0  # unknown: taken from the nearest pixel

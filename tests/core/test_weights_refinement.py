@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnpdepth_cli.core import weights_refinement
-from pnpdepth_cli.core.masks import Masks, set_aside
+from pnpdepth_cli.core.masks import MASKS, Masks, set_aside
 from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.weights import MovingWeights, rank_of
@@ -290,6 +290,15 @@ def test_every_point_is_hidden_once_before_any_is_hidden_again(
         hidden = torch.stack([masks.next() for _ in sizes]).int()
         assert hidden.sum(dim=0).tolist() == [1] * 40
         assert sorted(hidden.sum(dim=1).tolist()) == sizes
+
+
+def test_no_block_is_joined_with_another(seeded: torch.Generator) -> None:
+    xy = torch.cartesian_prod(torch.arange(64.0), torch.arange(128.0))
+    at = SparsePoints(xy=xy, depth=torch.ones(len(xy)), size=(128, 64))
+    groups = MASKS["blocks"](at, seeded)
+    for group in groups.unique():
+        block = xy[groups == group]
+        assert bool((block.amax(0) - block.amin(0) < torch.tensor([8, 16])).all())
 
 
 @pytest.mark.parametrize(("kind", "rows", "columns"), [("blocks", 16, 8), ("lines", 2, 64)])

@@ -115,7 +115,7 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
     [
         ("a.png", b"\x89PNG\r\n\x1a\n" + bytes(24), "not a scan; give a file of .bin"),
         ("a.bin", b"\x89PNG\r\n\x1a\n" + bytes(24), "is a PNG file"),
-        ("a.bin", np.full((2, 4), 1e9, "<f4").tobytes(), "1e+09 m is none of a scan"),
+        ("a.bin", np.array([1, 1, -1e9, 1], "<f4").tobytes(), "1e+09 m is none of a scan"),
         ("a.bin", bin_bytes(POINTS)[:-1], "not a multiple of 16"),
         ("a.bin", b"", "empty"),
         ("a.npy", npy_bytes(POINTS)[:-4], "cannot be read"),

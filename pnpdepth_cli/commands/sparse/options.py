@@ -93,7 +93,6 @@ class ColmapOptions:
         "Drop points of a COLMAP model that fewer images observe.",
         within="--colmap",
         metavar="N",
-        least=1,
         show_default=True,
     )
     max_reprojection: float = option(
@@ -107,8 +106,10 @@ class ColmapOptions:
     def __post_init__(self) -> None:
         if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
             raise UsageError(f"unit-scale must be above 0 metres per unit, got {self.unit_scale:g}")
-        if self.min_track < 1 or not self.max_reprojection > 0:
-            raise UsageError("min-track must be >= 1, and max-reprojection above 0")
+        if self.min_track < 1:
+            raise UsageError(f"min-track must be >= 1, got {self.min_track}")
+        if not self.max_reprojection > 0:
+            raise UsageError(f"max-reprojection must be above 0, got {self.max_reprojection:g}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -212,7 +212,7 @@ _GROWING: dict[str, Callable[..., float]] = {
 
 _PRODUCTS: dict[str, Callable[..., int]] = {
     **{f"conv{axes}d": lambda _, weight, *__: weight[0].numel() for axes in (1, 2, 3)},
-    **{f"conv_transpose{axes}d": lambda _, weight, *__: weight[0].numel() for axes in (1, 2, 3)},
+    **{f"conv_transpose{n}d": lambda _, weight, *__: weight[:, :1].numel() for n in (1, 2, 3)},
     **dict.fromkeys(("matmul", "__matmul__"), lambda a, _: a.shape[-1]),
     "einsum": lambda _, *tensors: max(map(torch.numel, tensors)),
 }

@@ -124,7 +124,7 @@ def _unpickled(value: Any, name: str, most: int) -> Tensor:
     data = data.encode("latin-1") if isinstance(data, str) else data  # as Python 2 has it
     if not isinstance(data, bytes):
         raise BrokenFileError(f"{name} holds objects, not numbers")
-    if len(data) > most or min(shape, default=0) < 0:
+    if len(data) > most or any(side < 0 for side in shape):
         raise BrokenFileError("its arrays are larger than the file")
     if not isinstance(code, str) or not isinstance(order, str):
         raise BrokenFileError("an array without a type")

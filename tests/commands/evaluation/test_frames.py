@@ -115,9 +115,10 @@ def test_sparsification_is_by_definition() -> None:
     assert (total["ause"], none["ause"]) == pytest.approx((area / error.mean(), 0))
 
 
-def test_a_pixel_without_sigma_or_prediction_is_not_scored() -> None:
-    gt = np.full((1, 4), 10, np.float32)
-    depth, sigma = np.array([[9, 0, 12, 13]], np.float32), np.array([[1, 1, 0, 1]], np.float32)
+def test_a_pixel_without_sigma_prediction_or_ground_truth_is_not_scored() -> None:
+    gt, depth, sigma = np.array(
+        [[[10, 10, 10, 10, 0]], [[9, 0, 12, 13, 8]], [[1, 1, 0, 1, 1]]], np.float32
+    )
     frame = frame_uncertainty(depth, gt, sigma)
     assert frame is not None
     assert frame.oracle[0] == frame.sparsification[0] == 2

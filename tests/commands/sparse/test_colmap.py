@@ -56,6 +56,15 @@ def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> dict[str, Any]:
     return run(frame, **(files | changes)).record
 
 
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [("min_track", 0), ("max_reprojection", 0.0), ("unit_scale", 0.0), ("unit_scale", np.inf)],
+)
+def test_options_out_of_range_are_refused(name: str, wrong: float) -> None:
+    with pytest.raises(UsageError, match=f"{name.replace('_', '-')} must be"):
+        ColmapOptions(**{name: wrong})  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("orientation", [3, 6])
 def test_a_photo_with_exif_rotation_is_read_as_colmap_reads_it(
     orientation: int, tmp_path: Path, project: Path

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.onnx.limits import _GROWING, SizeLimit
+from pnpdepth_cli.models.onnx.limits import _GROWING, _PRODUCTS, SizeLimit
 from pnpdepth_cli.models.onnx.table import Unsupported
 
 X, W, AT = torch.ones(2, 3, 7, 6), torch.ones(3, 3, 3, 3), torch.zeros(5, dtype=torch.long)
@@ -66,8 +66,23 @@ def test_a_result_is_refused_from_its_bound_on_and_is_no_larger(name: str) -> No
         call()
 
 
+SUMMED = {"conv1d": 9, "conv2d": 27, "conv3d": 27, "matmul": 3, "__matmul__": 1, "einsum": 10}
+SUMMED |= {"conv_transpose1d": 9, "conv_transpose2d": 3 * 12, "conv_transpose3d": 27}
+"""Products that are summed for an element of the result."""
+
+
+@pytest.mark.parametrize("name", SUMMED)
+def test_an_operation_is_refused_from_the_products_that_it_sums_on(name: str) -> None:
+    call, bound = CALLS[name]
+    with SizeLimit(9999, work=SUMMED[name] * bound + 500):  # elements that are read
+        call()
+    with SizeLimit(9999, work=SUMMED[name] * bound), pytest.raises(Unsupported, match="arithmetic"):
+        call()
+
+
 def test_every_growing_function_is_bounded_here() -> None:
     assert _GROWING.keys() <= CALLS.keys()
+    assert _PRODUCTS.keys() == SUMMED.keys()
 
 
 def test_all_results_together_are_bounded_and_views_count_nothing() -> None:

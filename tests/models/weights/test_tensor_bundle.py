@@ -159,6 +159,16 @@ def test_what_claims_more_or_other_than_is_there_is_refused(
     assert message in refused(bundle(tmp_path, entries, b"\0" * 8))
 
 
+@pytest.mark.parametrize("shared_fresh_length", [(0, 90, 0), (0, 1, 90), (1, 0, 0)])
+def test_an_entry_beyond_its_block_is_refused(
+    shared_fresh_length: tuple[int, ...], tmp_path: Path
+) -> None:
+    data = b"".join(map(varint, shared_fresh_length)) + b"a" + struct.pack("<II", 0, 1) + bytes(5)
+    handle = varint(0) + varint(len(data) - 5)
+    (tmp_path / "x.index").write_bytes(index_of_blocks(data, [(b"", handle)]))
+    assert "an entry goes beyond its block" in refused(tmp_path / "x.index")
+
+
 def test_names_that_grow_from_one_another_and_blocks_named_again_take_no_memory(
     tmp_path: Path,
 ) -> None:
