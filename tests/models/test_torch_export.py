@@ -55,7 +55,7 @@ def test_an_exported_program_is_cut_at_its_graphs_nodes_bit_for_bit(tmp_path: Pa
 
 
 class Dynamic(nn.Module):
-    """Sizes that are reckoned, an equation, attention, a constant, and a part without gradients."""
+    """Computed sizes, an equation, attention, constants, and a part without gradients."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -72,7 +72,7 @@ class Dynamic(nn.Module):
         left, right = torch.split(self.out(z), [8, z.shape[3] - 8], dim=3)
         y = torch.cat([left, right.clamp(min=-float("inf"))], dim=3)
         y = nn.functional.interpolate(y, size=(height, width), mode="bilinear")
-        return 1 + torch.sigmoid(y) + mean
+        return torch.ones(1, layout=torch.strided) + torch.sigmoid(y) + mean
 
 
 @pytest.fixture(scope="module")
