@@ -179,6 +179,20 @@ def test_a_divergence_in_one_tile_is_one_of_the_frame(monkeypatch: pytest.Monkey
     assert calls == [(27, 64), *[(64, 64)] * 3]  # the whole frame reduced, and three tiles
 
 
+@pytest.mark.parametrize("unknown", ["before", "after"])
+def test_where_a_tile_has_no_depth_that_of_the_whole_frame_stays(
+    unknown: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_depth(*arguments: Any, **more: Any) -> Refined:
+        refined, is_tile = refine_frame(*arguments, **more), arguments[3].size == (SIDE, SIDE)
+        return replace(refined, **{unknown: 0 * refined.before}) if is_tile else refined
+
+    monkeypatch.setattr(tiles, "refine_frame", without_depth)
+    refined = tiled(OneNumber(), PLAIN, everywhere((64, 150)))
+    for depth in (refined.before, refined.after):  # one number
+        np.testing.assert_allclose(depth, depth[0, 0], rtol=1e-6)
+
+
 def test_propagation_follows_once_over_all_tiles() -> None:
     torch.manual_seed(0)
     module, one = PixelByPixel(), everywhere((64, 150))

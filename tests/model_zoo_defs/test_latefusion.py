@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from model_zoo_defs.latefusion import Encoder, Halved, LateFusion, averaged, definitions
+from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from tests.model_zoo_defs.cuts import built
 
 TINY = definitions["latefusion-tiny"]
@@ -18,6 +19,10 @@ def test_an_encoder_has_as_many_values_as_nasnet_mobile() -> None:
     counted = sum(p.numel() for p in encoder.parameters())
     assert counted == 4_232_978 - 2 * 32 + 32
     assert encoder.channels[-1] == 1056
+
+
+def test_images_are_in_minus_one_to_one() -> None:
+    assert {each.normalisation for each in definitions.values()} == {NORMALISATIONS["symmetric"]}
 
 
 def test_nothing_normalises_behind_the_first_strided_convolution() -> None:

@@ -247,6 +247,20 @@ def test_a_node_may_have_the_name_of_an_attribute_of_modules(tmp_path: Path) -> 
         assert torch.equal(split.rear(split.front(x)), network.module(x))
 
 
+@pytest.mark.parametrize("given", ["depth", "one"])
+def test_a_node_may_give_an_output_without_a_name(tmp_path: Path, given: str) -> None:
+    nodes = (
+        helper.make_node("Dropout", [given], ["same", ""]),
+        helper.make_node("Sub", ["same", given], ["nothing"]),
+        helper.make_node("Add", ["depth", "nothing"], ["out"]),
+    )
+    path = write_network(tmp_path / "net.onnx", nodes=nodes, outputs=("out",))
+    assert (
+        "agrees with onnxruntime"
+        in load_network(str(path), None).verified((image(1, 3, 32, 48),))[0]
+    )
+
+
 def test_an_operator_that_the_output_does_not_need_is_not_looked_at(tmp_path: Path) -> None:
     node = helper.make_node("RandomUniformLike", ["depth"], ["noise"])
     path = write_network(tmp_path / "net.onnx", nodes=(node,))
