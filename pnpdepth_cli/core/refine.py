@@ -221,7 +221,7 @@ class _FrameRefinement:
         self.losses.append(float(loss.detach()))
         if self._first is None:
             self._first = depth
-        if not self._settings.gives_best or self.losses[-1] <= min(self.losses):
+        if not (self._settings.gives_best and self.losses[-1] > min(self.losses)):
             self._kept, self._after = updates, depth
         return loss
 

@@ -322,8 +322,9 @@ def test_a_gradient_that_is_not_finite_stops_with_the_depth_it_came_from() -> No
 
 
 def test_a_bad_prediction_without_updates_is_handed_over_as_it_is() -> None:
-    result = refined(Breaking(1, float("nan")), "cut", Settings(iterations=0))
-    assert bool(result.after.isnan().all())
+    for settings in (Settings(iterations=0), Settings(iterations=0, keep_best=True)):
+        result = refined(Breaking(1, float("nan")), "cut", settings)
+        assert bool(result.after.isnan().all())
 
 
 # ------------------------------------------------------------------ no gradient to z
