@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from onnx import helper, numpy_helper
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import LayerError, ModelError, UsageError
+from pnpdepth_cli.models.definition import Multiple
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.onnx import graph, limits
 from pnpdepth_cli.models.onnx.network import _as_map
@@ -71,7 +73,7 @@ def test_a_cut_at_any_node_gives_the_network_bit_for_bit(
         ((1, 32, 48, 1), (1, 1, 32, 48)),
         ((1, 32, 1, 1), (1, 1, 32, 1)),
         ((1, 2, 48, 1), (1, 1, 2, 48)),
-        *((same, same) for same in ((1, 1, 32, 48), (1, 1, 32, 1), (1, 32, 48), (1, 32, 1))),
+        *((s, s) for s in ((1, 1, 32, 48), (1, 1, 32, 1), (1, 2, 32, 48), (1, 32, 48), (1, 32, 1))),
     ],
 )
 def test_an_output_with_channels_last_is_a_map(
@@ -99,9 +101,35 @@ def test_an_incorrect_conversion_is_refused(
         network.verified((image(1, 3, 32, 48),))
 
 
+@pytest.mark.parametrize(
+    ("kind", "kernel", "strides", "multiple"),
+    [
+        ("Conv", [14, 14], [14, 14], 14),
+        ("Conv", [8, 8], [8, 8], 8),
+        ("Conv", [7, 7], [7, 7], 32),
+        ("Conv", [16, 16], [8, 8], 32),
+        ("MaxPool", [16, 16], [16, 16], 32),
+    ],
+)
+def test_a_free_size_is_a_multiple_of_the_patches_of_a_vision_transformer(
+    tmp_path: Path, kind: str, kernel: list[int], strides: list[int], multiple: int
+) -> None:
+    weight = helper.make_tensor("w", 1, [1, 1, *kernel], [0.0] * math.prod(kernel))
+    inputs = ["depth", "w"] if kind == "Conv" else ["depth"]
+    nodes = (
+        helper.make_node("Constant", [], ["w"], value=weight),
+        helper.make_node(kind, inputs, ["out"], kernel_shape=kernel, strides=strides),
+    )
+    path = write_network(tmp_path / "x.onnx", shape=(1, 3, "h", "w"), nodes=nodes, outputs=("out",))
+    assert load_network(str(path), None).definition.size == Multiple(multiple)
+
+
 def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "net.onnx"
     assert "does not exist" in refused(path)
+    path.touch()
+    os.truncate(path, 2**31 + 1)  # without a byte on the disk
+    assert "larger than 2 GB" in refused(path)
     named = write_network(path).read_bytes()
     contents = {b"not a network": "cannot be read", b"": "holds no graph"}
     contents |= {
@@ -192,6 +220,8 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
     path = write_network(tmp_path / "net.onnx", shape=shape, nodes=nodes, outputs=("out",))
     network = load_network(str(path), None)
     names = [name for name, _ in network.module.named_children()]
+    # in the file's order, though the side's nodes could be run before
+    assert names[-5:] == ["big/up", "side/reshape", "side/pool", "side/mean", "big/add"]
     assert not any(name.startswith("shape/") for name in names)
     for height, width in ((32, 48), (64, 32)):
         x = image(1, 3, height, width)
@@ -273,7 +303,8 @@ def test_graphs_that_are_broken_are_refused_in_one_line(tmp_path: Path) -> None:
         return lambda model: model.graph.node[0].input.__setitem__(0, name)
 
     assert "'nowhere', which nothing gives" in refused(edited(tmp_path / "a.onnx", read("nowhere")))
-    assert "in a circle" in refused(edited(tmp_path / "b.onnx", read("e")))
+    for name in "ae":  # of this node itself, and of a later one
+        assert "in a circle" in refused(edited(tmp_path / f"{name}.onnx", read(name)))
     for dims in ([4], [-1], [2**62, 2**62], [2**62] * 20):
 
         def change(model: Any, dims: list[int] = dims) -> None:
