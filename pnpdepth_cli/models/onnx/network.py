@@ -175,9 +175,8 @@ def _image_input(model: Any, file: Path) -> tuple[str, list[int | str]]:
             " image, can be run"
         )
     ((name, shape),) = inputs.items()
-    channels = shape[-1] if len(shape) == 4 and _channels_last(shape) else shape[1:2] == [3]
-    batch = not shape or not isinstance(shape[0], int) or shape[0] == 1
-    if len(shape) != 4 or not channels or not batch:
+    one_image = len(shape) == 4 and (shape[0] == 1 or isinstance(shape[0], str))
+    if not one_image or 3 not in (shape[1], shape[3]):
         raise ModelError(
             f"ONNX file {file} takes {listed}; one rgb image 1×3×H×W or 1×H×W×3 is expected"
         )

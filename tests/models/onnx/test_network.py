@@ -24,7 +24,7 @@ from pnpdepth_cli.errors import LayerError, ModelError, UsageError
 from pnpdepth_cli.models.definition import Multiple
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.onnx import graph, limits
-from pnpdepth_cli.models.onnx.network import _as_map
+from pnpdepth_cli.models.onnx.network import _as_map, _channels_last, _deviation
 from pnpdepth_cli.models.onnx.table import OPERATORS
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -82,6 +82,11 @@ def test_an_output_with_channels_last_is_a_map(
     assert _as_map(torch.zeros(shape)).shape == as_map
 
 
+def test_an_image_with_channels_last_has_three_in_its_last_axis_alone() -> None:
+    shapes = ((1, 32, 48, 3), (1, 3, 48, 3), (1, 3, 32, 48), (3, 3, 3, 3), (1, 2, 3, 2))
+    assert [_channels_last(shape) for shape in shapes] == [True, False, False, False, False]
+
+
 @pytest.mark.parametrize("shape", [(1, 3, 32, 48), ("n", 3, "h", "w"), (1, 3, None, None)])
 def test_fixed_and_free_input_sizes_agree_with_onnxruntime(
     tmp_path: Path, shape: tuple[object, ...]
@@ -89,6 +94,7 @@ def test_fixed_and_free_input_sizes_agree_with_onnxruntime(
     network = load_network(str(write_network(tmp_path / "net.onnx", shape=shape)), None)
     (note,) = network.verified((image(1, 3, 32, 48),))
     assert "agrees with onnxruntime" in note
+    assert network.verified((image(1, 3, 32, 48),)) == (note,)
 
 
 def test_an_incorrect_conversion_is_refused(
@@ -124,6 +130,21 @@ def test_a_free_size_is_a_multiple_of_the_patches_of_a_vision_transformer(
     assert load_network(str(path), None).definition.size == Multiple(multiple)
 
 
+@pytest.mark.parametrize(
+    ("actual", "expected", "deviation"),
+    [
+        ([5, -1], [4, -2], 0.25),
+        ([1, 0], [0, 0], 1.0),
+        ([], [], 0.0),
+        ([1], [1, 1], math.inf),
+    ],
+)
+def test_a_deviation_is_relative_to_the_largest_expected_value(
+    actual: list[float], expected: list[float], deviation: float
+) -> None:
+    assert _deviation(torch.tensor(actual), torch.tensor(expected)) == deviation
+
+
 def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "net.onnx"
     assert "does not exist" in refused(path)
@@ -143,6 +164,7 @@ def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
     assert "NonZero (1 ×)" in refused(write_network(path, nodes=(node,), outputs=("where",)))
     assert "com.microsoft.Add" in refused(write_network(path, domain="com.microsoft"))
     assert "opset 99" in refused(write_network(path, opset=99))
+    assert "1×4×h×?" in refused(write_network(path, shape=(1, 4, "h", None)))
     for shape in ((1, 4, 32, 48), (2, 3, 32, 48), (1, 3, 32)):
         assert "×".join(map(str, shape)) in refused(write_network(path, shape=shape))
 
@@ -292,8 +314,11 @@ def test_a_node_may_give_an_output_without_a_name(tmp_path: Path, given: str) ->
 
 
 def test_an_operator_that_the_output_does_not_need_is_not_looked_at(tmp_path: Path) -> None:
-    node = helper.make_node("RandomUniformLike", ["depth"], ["noise"])
-    path = write_network(tmp_path / "net.onnx", nodes=(node,))
+    nodes = (
+        helper.make_node("RandomUniformLike", ["depth"], ["noise"]),
+        helper.make_node("Unknown", ["depth"], ["nothing"], domain="nowhere"),
+    )
+    path = write_network(tmp_path / "net.onnx", nodes=nodes)
     network = load_network(str(path), None)
     assert "agrees with onnxruntime" in network.verified((image(1, 3, 32, 48),))[0]
 
