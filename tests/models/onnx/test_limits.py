@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
-from pnpdepth_cli.models.onnx.limits import _GROWING, _PRODUCTS, SizeLimit
+from pnpdepth_cli.models.onnx.limits import _GROWING, _PRODUCTS, SizeLimit, largest_activation
 from pnpdepth_cli.models.onnx.table import Unsupported
 
 X, W, AT = torch.ones(2, 3, 7, 6), torch.ones(3, 3, 3, 3), torch.zeros(5, dtype=torch.long)
@@ -56,14 +58,26 @@ CALLS: dict[str, tuple[Callable[[], Tensor], float]] = {
 }
 
 
+class Counted(TorchFunctionMode):
+    """Counts the functions that are run inside."""
+
+    count = 0
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
 @pytest.mark.parametrize("name", CALLS)
-def test_a_result_is_refused_from_its_bound_on_and_is_no_larger(name: str) -> None:
+def test_a_result_is_refused_from_its_bound_on_before_it_is_computed(name: str) -> None:
     call, bound = CALLS[name]
+    most = math.ceil(bound)
     assert call().numel() <= bound
-    with SizeLimit(math.ceil(bound)):
+    with Counted() as allowed, SizeLimit(most):
         call()
-    with SizeLimit(math.ceil(bound) - 1), pytest.raises(Unsupported, match="a result of"):
+    with Counted() as refused, SizeLimit(most - 1), pytest.raises(Unsupported, match="a result of"):
         call()
+    assert refused.count < allowed.count
 
 
 SUMMED = {"conv1d": 9, "conv2d": 27, "conv3d": 27, "matmul": 3, "__matmul__": 1, "einsum": 10}
@@ -91,4 +105,9 @@ def test_all_results_together_are_bounded_and_views_count_nothing() -> None:
         for _ in range(2):
             (x + 1).reshape(2, 3)
         with pytest.raises(Unsupported):
-            x + 1
+            x[:1] + 1
+
+
+def test_activations_may_grow_in_proportion_to_large_images() -> None:
+    given = 1 << 30
+    assert largest_activation(2 * given) == 2 * largest_activation(given) > 2 * given
