@@ -17,7 +17,7 @@ from pnpdepth_cli.models.onnx.table import Unsupported
 
 X, W, AT = torch.ones(2, 3, 7, 6), torch.ones(3, 3, 3, 3), torch.zeros(5, dtype=torch.long)
 X1, W1, X3, W3 = X[..., 0], W[..., 0], X[:, :, None], W[:, :, None]
-DOUBLES = X.double(), W.double()
+DOUBLES, EMPTY, NONE = (X.double(), W.double()), torch.ones(2, 0), AT[:0]
 CALLS: dict[str, tuple[Callable[[], Tensor], float]] = {
     "conv1d": (lambda: F.conv1d(X1, W1, None, 1, [4], 1, 1), 2 * 3 * 15),
     "conv2d": (lambda: F.conv2d(X, W, None, 1, [1, 2], 1, 1), 2 * 3 * 9 * 10),
@@ -46,6 +46,7 @@ CALLS: dict[str, tuple[Callable[[], Tensor], float]] = {
     "grid_sample": (lambda: F.grid_sample(X, torch.zeros(2, 4, 5, 2), align_corners=False), 480),
     "interpolate": (lambda: F.interpolate(X, (8, 9)), 2 * 3 * 8 * 9),
     "index_select": (lambda: X.index_select(2, AT), 2 * 3 * 6 * 5),
+    "index_select of nothing": (lambda: EMPTY.index_select(1, NONE), 0),
     "__getitem__": (lambda: X[AT[:, None], AT], 5 * 5 * 7 * 6),
     "__getitem__ of a part": (lambda: X[:, 1:], X.numel()),
     "expand": (lambda: torch.ones(3, 1).expand([2, 3, 4]), 24),
@@ -54,7 +55,7 @@ CALLS: dict[str, tuple[Callable[[], Tensor], float]] = {
     "arange": (lambda: torch.arange(2, 9, 3), 7 / 3 + 1),
     "arange from 0": (lambda: torch.arange(5), 6),
     "pad": (lambda: F.pad(torch.ones(2, 3), (1, 2, 0, 4)), 6 * 6),
-    "add": (lambda: torch.ones(3, 1) + torch.ones(2, 1, 4), 24),
+    "add": (lambda: torch.ones(3, 1) + torch.ones(1, 2, 1, 4), 24),
 }
 
 
