@@ -17,7 +17,8 @@ from pnpdepth_cli.models.onnx.table import Unsupported
 
 X, W, AT = torch.ones(2, 3, 7, 6), torch.ones(3, 3, 3, 3), torch.zeros(5, dtype=torch.long)
 X1, W1, X3, W3 = X[..., 0], W[..., 0], X[:, :, None], W[:, :, None]
-DOUBLES, EMPTY, NONE = (X.double(), W.double()), torch.ones(2, 0), AT[:0]
+DOUBLES, VECTORS = (X.double(), W.double()), (torch.ones(4, 3), torch.ones(3))
+EMPTY, NONE = torch.ones(2, 0), AT[:0]
 CALLS: dict[str, tuple[Callable[[], Tensor], float]] = {
     "conv1d": (lambda: F.conv1d(X1, W1, None, 1, [4], 1, 1), 2 * 3 * 15),
     "conv2d": (lambda: F.conv2d(X, W, None, 1, [1, 2], 1, 1), 2 * 3 * 9 * 10),
@@ -36,7 +37,7 @@ CALLS: dict[str, tuple[Callable[[], Tensor], float]] = {
         2 * 3 * (1 + 1) * (7 * 2 + 3) * (6 * 3 + 3),
     ),
     "matmul": (lambda: torch.matmul(torch.ones(5, 1, 2, 3), torch.ones(4, 3, 6)), 5 * 4 * 2 * 6),
-    "matmul of vectors": (lambda: torch.matmul(torch.ones(4, 3), torch.ones(3)), 12),
+    "matmul of vectors": (lambda: torch.matmul(*VECTORS), 12),
     "__matmul__": (lambda: torch.ones(2, 1) @ torch.ones(1, 6), 12),
     "cat": (lambda: torch.cat([torch.ones(2, 3), torch.ones(4, 3)]), 18),
     "stack": (lambda: torch.stack([torch.ones(2, 3)] * 3), 18),
@@ -54,7 +55,7 @@ CALLS: dict[str, tuple[Callable[[], Tensor], float]] = {
     "repeat_interleave": (lambda: torch.ones(4).repeat_interleave(3), 12),
     "arange": (lambda: torch.arange(2, 9, 3), 7 / 3 + 1),
     "arange from 0": (lambda: torch.arange(5), 6),
-    "pad": (lambda: F.pad(torch.ones(2, 3), (1, 2, 0, 4)), 6 * 6),
+    "pad": (lambda: F.pad(torch.ones(2, 3, 1), (1, 2, 5, 4, 1, 0)), 4 * 12 * 3),
     "add": (lambda: torch.ones(3, 1) + torch.ones(1, 2, 1, 4), 24),
 }
 
