@@ -601,7 +601,8 @@ def test_functions_are_written_out_but_neither_recursive_nor_exponential_ones(
     assert torch.equal(load_network(str(chain), None).module(x), plain.module(x))
     ring = with_functions(tmp_path / "b.onnx", lambda n: [f"f{1 - n}"], 2)
     assert "without end" in refused(ring)
-    doubling = lambda n: [f"f{n + 1}"] * 2 if n < 39 else []  # noqa: E731
     with little():
-        for count in (40, 41):
-            assert "written out" in refused(with_functions(tmp_path / "c.onnx", doubling, count))
+        for last in (39, 40):
+            doubling = [*([f"f{n + 1}"] * 2 for n in range(last)), []]
+            path = with_functions(tmp_path / "c.onnx", doubling.__getitem__, last + 1)
+            assert "written out" in refused(path)
