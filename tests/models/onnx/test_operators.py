@@ -165,6 +165,7 @@ CASES = [
     case("DepthToSpace", normal(1, 18, 2, 3), blocksize=3),
     case("CastLike", X, ints(1)),
     case("ConstantOfShape", ints(2, 3), value=numpy_helper.from_array(ints(7))),
+    case("ConstantOfShape", ints(2, 3)),
     case("Range", np.array(2, I64), np.array(9, I64), np.array(3, I64)),
     case("Split", normal(5, 2), opset=11, outputs=1, axis=0),
     case("Split", normal(6, 2), opset=11, outputs=3, axis=0),
