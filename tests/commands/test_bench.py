@@ -12,6 +12,8 @@ import torch
 
 from pnpdepth_cli.commands import bench
 from pnpdepth_cli.commands.bench import FIRST_FRAME, in_turn, run_bench
+from pnpdepth_cli.frames.resolve import resolve_settings
+from pnpdepth_cli.settings import Settings
 from tests.commands.frames import FrameOnDisk, frame_on_disk
 
 
@@ -51,15 +53,13 @@ def test_a_network_without_weights_gets_random_ones_and_a_note(frame: FrameOnDis
 def test_only_random_weights_leave_the_output_unaligned(
     frame: FrameOnDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[str | None] = []
-    given = bench.resolve_settings
-    monkeypatch.setattr(
-        *(
-            bench,
-            "resolve_settings",
-            lambda d, method: asked.append(method.align) or given(d, method),
-        )
-    )
+    asked = list[str | None]()
+
+    def resolved(definition: Any, method: Settings) -> Settings:
+        asked.append(method.align)
+        return resolve_settings(definition, method)
+
+    monkeypatch.setattr(bench, "resolve_settings", resolved)
     measured(frame)
     measured(frame, checkpoint=None)
     assert asked == [None, "none"]
