@@ -3,10 +3,11 @@
     python -m tests.mutants --count 40 --seed 0 --only pnpdepth_cli/core --jobs 2
 
 One expression of a file is changed: a comparison, an arithmetic operator, a constant, `and`, a
-returned value, min, any, floor, mean and the like. The tests that run this line are tried in a
-temporary copy of the tree: first those that mirror the file and one case of each other test, the
-fastest first. A test that fails with the mutant and passes without it kills it; so does a run
-without end. Prints a table by package, and each survivor with its place and change.
+returned value, min, any, floor, mean and the like. The tests that run this line, or a line that
+names the changed constant, are tried in a temporary copy of the tree: first those that mirror the
+file and one case of each other test, the fastest first. A test that fails with the mutant and
+passes without it kills it; so does a run without end. Prints a table by package, and each survivor
+with its place and change.
 
 Which test runs which line is found by running the first tier once under coverage (three minutes on
 two cores). `--lines FOLDER` keeps it for the next samples of the same tree.
@@ -29,12 +30,12 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import accumulate
 from pathlib import Path
 from queue import SimpleQueue
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 from xml.etree import ElementTree
 
 import pytest
@@ -63,7 +64,10 @@ _OPERATORS, _NAMES = _swaps(_ORDER, both=False) | _swaps(_PAIRS), _swaps(_CALLS)
 
 
 class Mutant(NamedTuple):
-    """A file with bytes `start` to `end` changed, and the change in words."""
+    """A file with bytes `start` to `end` changed, and the change in words.
+
+    `constants` are the names that the statement assigns in the module.
+    """
 
     file: Path
     start: int
@@ -71,6 +75,7 @@ class Mutant(NamedTuple):
     text: bytes
     change: str
     lines: tuple[int, int] | None
+    constants: tuple[str, ...]
 
 
 def changed(node: ast.AST) -> Iterator[ast.AST]:
@@ -133,7 +138,14 @@ def mutants(only: str) -> list[Mutant]:
                 continue
             content = path.read_bytes()
             starts = [0, *accumulate(len(line) for line in content.splitlines(keepends=True))]
-            for node, lines in places(ast.parse(content)):
+            tree = ast.parse(content)
+            constants = {
+                line: tuple(name.id for name in ast.walk(each) if _is_assigned(name))
+                for each in tree.body
+                if isinstance(each, ast.Assign | ast.AnnAssign)
+                for line in range(each.lineno, (each.end_lineno or 0) + 1)
+            }
+            for node, lines in places(tree):
                 for other in changed(node):
                     assert isinstance(node, ast.expr | ast.stmt)
                     text = ast.unparse(other)
@@ -143,8 +155,13 @@ def mutants(only: str) -> list[Mutant]:
                     end = starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
                     before = " ".join(content[start:end].decode().split())
                     change = f"{file}:{node.lineno}: {before}  ->  {text}"
-                    found.append(Mutant(file, start, end, text.encode(), change, lines))
+                    names = constants.get(node.lineno, ())
+                    found.append(Mutant(file, start, end, text.encode(), change, lines, names))
     return found
+
+
+def _is_assigned(node: ast.AST) -> TypeGuard[ast.Name]:
+    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
 
 
 class RunLines:
@@ -170,17 +187,12 @@ class RunLines:
 
     def tests(self, mutant: Mutant, limit: float) -> list[str]:
         """Returns tests that together take `limit` seconds at most, in the order to try them."""
-        lines = self._data.contexts_by_lineno(str(ROOT / mutant.file))
         first, last = mutant.lines or (0, sys.maxsize)
-        names = {
-            test.rpartition("|")[0]
-            for line, tests in lines.items()
-            for test in tests
-            if first <= line <= last
-        }
+        names = self._running(ROOT / mutant.file, lambda line: first <= line <= last)
         near, cases = _mirroring(mutant.file), Counter[str]()
         if mutant.lines is None:  # a constant, perhaps without a function that uses it
             names |= {name for name in self._times if name.partition("::")[0] in near}
+            names |= self._naming(mutant.constants)
         order = list[tuple[int, float, str]]()
         for time_s, name in sorted((self._times[name], name) for name in names & {*self._times}):
             test = name.partition("[")[0]
@@ -191,6 +203,23 @@ class RunLines:
         ends = accumulate(time_s for _, time_s, _ in order)
         chosen = [name for (_, _, name), end in zip(order, ends, strict=True) if end <= limit]
         return chosen or near
+
+    def _running(self, file: Path, wanted: Callable[[int], bool]) -> set[str]:
+        """The tests that run a wanted line of a file."""
+        lines = self._data.contexts_by_lineno(str(file))
+        return {
+            test.rpartition("|")[0] for n, tests in lines.items() if wanted(n) for test in tests
+        }
+
+    def _naming(self, constants: tuple[str, ...]) -> set[str]:
+        """The tests that run a line, of any file, that names one of the constants."""
+        named = re.compile(rf"\b({'|'.join(constants) or '(?!)'})\b")
+        found = set[str]()
+        for file in self._data.measured_files():
+            text = Path(file).read_text().splitlines()
+            at = {number for number, line in enumerate(text, start=1) if named.search(line)}
+            found |= self._running(Path(file), at.__contains__)
+        return found
 
 
 def _mirroring(file: Path) -> list[str]:
