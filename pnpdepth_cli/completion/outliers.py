@@ -23,6 +23,9 @@ _AGREEING = 2  # of which so many must agree with it
 _MIN_DISAGREEMENT = 0.005  # of log depth; less is none
 _NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
 
+FAR = 0.2
+"""Error of log depth beyond which a point has no weight for a network that weighs its points."""
+
 _PASSES = 3  # without the worst outliers, others stand out
 _MIN_POINTS = 5  # fewer do not predict each other
 _MAX_EXACT = 256  # points up to which all predict each other, instead of neighbourhoods
@@ -50,6 +53,23 @@ def outliers(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Te
     keys = _coordinate_keys(field.points)
     keys = keys[~torch.isin(keys, _coordinate_keys(without_outliers(field).points))]
     return torch.isin(_coordinate_keys(points.tensors()), keys).to(points.xy.device)
+
+
+def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
+    """Returns (N,) bool: the points whose log depth differs by more than `FAR` from a prediction.
+
+    The points of a wrong track of structure from motion agree with each other, so that only a
+    network that sees the image and weighs its points tells that they are outliers. None are where
+    it were half of the points: such a prediction is of no use.
+
+    Args:
+        prediction: (H, W) metres, 0 = unknown, of a network that weighs its points.
+        points: The points that it was given.
+    """
+    at_points = points.sample(prediction)
+    error = points.depth.log() - at_points.clamp_min(1e-6).log()
+    far = (at_points > 0) & (error.abs() > FAR)
+    return far & (far.sum() < len(points) / 2)
 
 
 def without_outliers(field: ResidualField) -> ResidualField:

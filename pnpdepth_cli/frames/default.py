@@ -16,11 +16,11 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.folds import spatial_folds
 from pnpdepth_cli.completion.interpolation import linear
-from pnpdepth_cli.completion.outliers import inlier_weights
+from pnpdepth_cli.completion.outliers import far_points, inlier_weights
 from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.completion.residual_field import Kernel
 from pnpdepth_cli.errors import PnpDepthError
-from pnpdepth_cli.frames.frame import Check, Frame, Refined
+from pnpdepth_cli.frames.frame import Check, Frame, Refined, is_dense
 from pnpdepth_cli.frames.fuse import Fused, Fusion, Member, weighted_mean
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_lines, scan_pattern
@@ -94,6 +94,9 @@ def refine_default(
     hidden = _hidden(fusion, inliers, torch.from_numpy(user.before), seed)
     rejected = () if hidden is None else hidden.rejected
     fused = fusion.fuse(inliers, user=user, rejected=rejected, until=until)
+    if fused.weighed is not None and not is_dense(inliers.points):
+        far = far_points(fused.weighed, inliers.points)
+        inliers = inliers.without(far) if bool(far.any()) else inliers
     kind = propagation_of(inliers.points)
     propagated = propagate(fused.after, inliers.points, inliers.rgb, kind=kind)
     check, notes = None, tuple[str, ...]()

@@ -83,8 +83,10 @@ class Frame:
         return replace(self, points=points)
 
     def without(self, outliers: Tensor) -> Frame:
-        """Returns the frame with those points, of (N,) bool, left out as outliers."""
+        """Returns the frame with those points, of (N,) bool, left out as outliers too."""
         left_out = self.points.select(outliers)
+        if self.outliers is not None:
+            left_out = self.outliers.joined(left_out)
         return replace(self, points=self.points.select(~outliers), outliers=left_out)
 
 

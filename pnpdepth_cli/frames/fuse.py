@@ -72,6 +72,8 @@ class Fused:
     """What the networks give without another one's prior, the user's first."""
     before: Tensor  # (H, W) metres, 0 = unknown: fused before the updates of z
     after: Tensor  # (H, W) metres, 0 = unknown: fused after the updates of z
+    weighed: Tensor | None
+    """(H, W) metres, 0 = unknown: of the networks that weigh their points, before the updates."""
     steps: Mapping[str, int]  # kept steps by hidden points, by network
 
     @property
@@ -171,16 +173,22 @@ class Fusion:
         guides = [m for m in alone if m not in rejected and _guides(m, alone[m])]
         if not guides or len(frame.points) < FEW_POINTS:
             alone |= tried([m for m in others if m.takes_prior], frame)
-        guided = list[Refined]()
+        guided = list[tuple[Member, Refined]]()
         for guide in guides:
             with_prior = replace(frame, prior=torch.from_numpy(alone[guide].before))
             takers = [m for m in self.members if m.takes_prior]
-            guided += tried(takers, with_prior).values()
-        parts = _weighted(alone, guided)
+            guided += tried(takers, with_prior).items()
+        parts = _weighted(alone, [refined for _, refined in guided])
+        weighed = [
+            (torch.from_numpy(refined.before), 1.0)
+            for member, refined in (*alone.items(), *guided)
+            if member.network.definition.weighs_points
+        ]
         return Fused(
             alone=alone,
             before=weighted_mean([(torch.from_numpy(part.before), w) for part, w in parts]),
             after=weighted_mean([(torch.from_numpy(part.after), w) for part, w in parts]),
+            weighed=weighted_mean(weighed) if weighed else None,
             steps=self._steps,
         )
 

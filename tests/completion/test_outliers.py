@@ -7,7 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pnpdepth_cli.completion.outliers import inlier_mask, inlier_weights, outliers
+from pnpdepth_cli.completion.outliers import (
+    FAR,
+    far_points,
+    inlier_mask,
+    inlier_weights,
+    outliers,
+)
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import random_points, scene
 from tests.completion.test_gaussian_process import field
@@ -57,6 +63,15 @@ def test_outliers_are_marked_in_the_order_of_the_points() -> None:
     assert int(suspected[:150][bad].sum()) > 0.9 * int(bad.sum())
     assert int(suspected.sum()) < 2 * int(bad.sum())
     assert not bool(suspected[150])  # nothing is known there
+
+
+def test_points_far_from_a_prediction_are_those_beyond_the_limit_unless_they_are_half() -> None:
+    prediction = torch.tensor([[2.0, 2.0, 2.0], [2.0, 2.0, 0.0]])
+    factor = torch.tensor([-1.01, -0.99, 0.99, 1.01, 0.0, 9.0]).mul(FAR).exp()
+    xy = torch.tensor([[x, y] for y in (0.0, 1.0) for x in (0.0, 1.0, 2.0)])
+    points = SparsePoints(xy=xy, depth=2 * factor, size=(2, 3))
+    assert far_points(prediction, points).tolist() == [True, False, False, True, False, False]
+    assert far_points(prediction, points.select(torch.arange(6) < 4)).tolist() == [False] * 4
 
 
 def test_a_point_alone_among_its_neighbours_has_no_weight() -> None:

@@ -65,6 +65,20 @@ def test_the_residual_of_scan_lines_is_propagated_by_lines_through_the_nearest_p
     assert np.array_equal(result.stages["propagated"], expected.numpy())
 
 
+@pytest.mark.parametrize("weighs", [True, False])
+def test_a_wrong_track_is_left_out_where_a_network_gave_it_no_weight(weighs: bool) -> None:
+    frame, generator = frame_in_memory(100), torch.Generator().manual_seed(0)
+    noise = 0.26 * torch.rand(SIZE, generator=generator) - 0.13
+    frame = replace(frame, rgb=(depth_of_scene() * noise.exp() - 1).expand(3, -1, -1))
+    track = (frame.points.xy - 60).norm(dim=1) < 20  # points that agree with each other
+    wrong = replace(frame.points, depth=torch.where(track, 1.5, 1.0) * frame.points.depth)
+    blind = member(Brightness, weighs_points=weighs)  # sees the image alone
+    result = refined(frame.with_points(wrong), blind)
+    assert int(track.sum()) > 5
+    assert torch.equal(result.used.xy, wrong.select(~(track & weighs)).xy)
+    assert any("outliers: " in note for note in result.notes) == weighs
+
+
 def test_without_a_check_the_uncertainty_has_the_typical_scale() -> None:
     result = refined(frame_in_memory(MIN_POINTS - 1), member(Brightness))
     got = with_uncertainty(result)
@@ -178,8 +192,11 @@ def compact() -> Member:
     return Member(network=network, layer="decoder.s8", settings=Settings(iterations=0))
 
 
-def test_an_image_that_does_not_belong_to_its_points_is_used_less() -> None:
-    frame = frame_in_memory(400)
+def test_an_image_that_does_not_belong_to_its_points_is_used_less(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("pnpdepth_cli.completion.outliers.FAR", 1.0)
+    frame = frame_in_memory(400)  # used in full with either image
     stripes = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(3)).round()
     wrong = replace(frame, rgb=stripes)
     right, moved = refined(frame, compact()), refined(wrong, compact())
