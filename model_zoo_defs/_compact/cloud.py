@@ -17,6 +17,9 @@ NEIGHBOURS = 12
 CELL_POINTS = 3
 # So many points are searched at a time: bounds the memory.
 CHUNK = 4096
+# A smaller image has the spacing that it would have with this longer side, that of the windows in
+# training: few pixels between the points are no sign of a dense pattern there.
+LEARNT_SIZE = 512
 # The colour of a point is the mean of 5 x 5 pixels.
 AROUND = torch.arange(-2, 3)
 
@@ -57,7 +60,8 @@ class Cloud(NamedTuple):
         y = (rows.unsqueeze(1) + down.flatten().to(rows.device)).clamp(0, rgb.shape[1] - 1)
         x = (columns.unsqueeze(1) + right.flatten().to(rows.device)).clamp(0, rgb.shape[2] - 1)
         colour = rgb.float().flatten(1)[:, y * rgb.shape[2] + x].mean(2).t()
-        log_spacing = torch.full_like(position[:, 0], math.log(spacing))
+        enlarged = max(1.0, LEARNT_SIZE / max(mask.shape))
+        log_spacing = torch.full_like(position[:, 0], math.log(enlarged * spacing))
         return cls(value[mask], colour, position, log_spacing, near, found, (len(rows),))
 
     @classmethod

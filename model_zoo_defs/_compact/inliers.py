@@ -16,10 +16,10 @@ from model_zoo_defs._compact.points import Points
 # over few candidates follows a doubtful point too far. Its half is at log odds of 2: an inlier
 # that is left out costs less than an outlier that is kept.
 STEEPNESS, THRESHOLD = 4.0, 2.0
-# Up to this expected fraction of outliers in an image their log odds gain the margin, which falls
-# to 0 at twice the fraction: isolated points of clean images lie on thin objects.
-CLEAN_FRACTION, CLEAN_MARGIN = 0.03, 7.0
-WIDTH, MESSAGE, ROUNDS, HEADS = 32, 48, 2, 4
+# Up to the first expected fraction of outliers in an image their log odds gain the margin, which
+# falls to 0 at the second: isolated points of clean images lie on thin objects.
+CLEAN_FRACTION, SPOILT_FRACTION, CLEAN_MARGIN = 0.045, 0.075, 7.0
+WIDTH, MESSAGE, ROUNDS, HEADS = 32, 48, 4, 4
 # numbers per pair of points: agreement in depth and in colour, and position
 AGREEMENT, COLOUR, POSITION = 6, 6, 5
 
@@ -62,7 +62,8 @@ class InlierWeights(nn.Module):
     def _margin(logits: Tensor) -> Tensor:
         """Log odds that spare doubtful points of an image with hardly any outlier."""
         outliers = torch.sigmoid(-logits).sum() / max(1, len(logits))
-        return CLEAN_MARGIN * (1.0 - (outliers / CLEAN_FRACTION - 1.0).clamp(0.0, 1.0))
+        spoilt = (outliers - CLEAN_FRACTION) / (SPOILT_FRACTION - CLEAN_FRACTION)
+        return CLEAN_MARGIN * (1.0 - spoilt.clamp(0.0, 1.0))
 
 
 class Messages(nn.Module):

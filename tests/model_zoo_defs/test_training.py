@@ -6,6 +6,7 @@ import csv
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -165,6 +166,25 @@ def test_outliers_change_about_their_fraction_of_the_points_and_nothing_else(
     noisy = patterns.outliers(np.random.default_rng(seed), sparse, fraction)
     assert np.array_equal(noisy > 0, sparse > 0)
     assert np.count_nonzero(noisy != sparse) <= 1000 * fraction + 80
+
+
+@drawn_often
+@given(seed=seeds, fraction=st.floats(0.0, 1.0))
+def test_the_points_of_a_wrong_track_are_neighbours_times_one_factor(
+    seed: int, fraction: float
+) -> None:
+    depth = room(seed)
+    sparse = patterns.keep(depth, patterns.uniform(np.random.default_rng(1), depth, 1000))
+    wrong = patterns.wrong_tracks(np.random.default_rng(seed), sparse, fraction)
+    rows, columns = np.nonzero(wrong != sparse)
+    assert np.array_equal(wrong > 0, sparse > 0)
+    assert len(rows) <= round(1000 * fraction)
+    if len(rows):
+        factors = (wrong[rows, columns] / sparse[rows, columns]).round(3)
+        square = (rows[:, None] - rows) ** 2 + (columns[:, None] - columns) ** 2
+        beside = np.argsort(square, axis=1)[:, 1:13]
+        alike = (factors[beside] == factors[:, None]).any(axis=1)
+        assert alike.mean() > 0.5  # others lie in a track that a later one overwrote
 
 
 def test_a_sample_depends_on_its_number_alone(shards: Path) -> None:
@@ -331,6 +351,30 @@ def stop_at(settings_: train.Settings, step: int) -> None:
         if run.step == step:
             run.save()
             return
+
+
+@pytest.fixture
+def example() -> Any:
+    """40 points on an image of noise."""
+    sparse = torch.zeros(8, 10).index_fill(1, torch.tensor([0, 2, 4, 6, 8]), 2.0)
+    rgb = torch.rand(3, 8, 10, generator=torch.Generator().manual_seed(0))
+    return train_inliers.example(sparse, sparse, rgb, where=0.0)
+
+
+def test_an_image_that_is_moved_gives_each_point_the_colour_of_another(example: Any) -> None:
+    colour = train_inliers.moved(np.random.default_rng(0), example).cloud.colour
+    (by,) = (n for n in range(40) if torch.equal(colour.roll(n, 0), example.cloud.colour))
+    assert min(by, 40 - by) >= 2
+
+
+def test_a_flat_image_keeps_its_mean_and_at_most_a_quarter_of_its_contrast(example: Any) -> None:
+    colour, contrasts = example.cloud.colour, []
+    for seed in range(8):
+        flat = train_inliers.flattened(np.random.default_rng(seed), example).cloud.colour
+        torch.testing.assert_close(flat.mean(0), colour.mean(0))
+        contrasts.append(float((flat - flat.mean(0)).norm() / (colour - colour.mean(0)).norm()))
+    assert 0 < sum(contrast < 1e-5 for contrast in contrasts) < 8
+    assert 0.01 < max(contrasts) <= 0.25
 
 
 def test_inlier_weights_learn_to_detect_outliers(

@@ -227,6 +227,25 @@ def outliers(rng: Generator, sparse: Depth, fraction: float) -> Depth:
     return out
 
 
+def wrong_tracks(rng: Generator, sparse: Depth, fraction: float) -> Depth:
+    """The points with a fraction of outliers in groups of neighbours, each times one factor.
+
+    Such are the points of wrong tracks of structure from motion.
+    """
+    rows, columns = np.nonzero(sparse)
+    out, left = sparse.copy(), round(fraction * len(rows))
+    spread, most = rng.uniform(0.2, 0.8), int(rng.integers(2, 13))
+    while left > 0:
+        size = min(max(int(rng.integers(2, most + 1)), len(rows) // 500), left)
+        one = int(rng.integers(len(rows)))
+        square = (rows - rows[one]) ** 2 + (columns - columns[one]) ** 2
+        near = np.argpartition(square, size - 1)[:size]
+        at = rows[near], columns[near]
+        out[at] = sparse[at] * np.float32(np.exp(rng.normal(0.0, spread)))
+        left -= size
+    return out
+
+
 def _shifted(x: Depth, down: int, right: int) -> Depth:
     height, width = x.shape
     reach = abs(down) + abs(right)

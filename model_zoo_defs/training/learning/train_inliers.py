@@ -1,10 +1,10 @@
-r"""Trains only the inlier weights of `compact`, from scratch, before or between runs of `train`.
+r"""Trains only the inlier weights of `compact`, before or between runs of `train`.
 
     python -m model_zoo_defs.training.learning.train_inliers --data DIR --start WEIGHTS \
         --out WEIGHTS
 
 The trained part sees the points and their colours: the clouds of some thousand samples are drawn
-once, then it is trained on them for a few epochs.
+once, then it is trained on them for a few epochs, from its weights in `--start`.
 """
 
 from __future__ import annotations
@@ -29,15 +29,17 @@ from model_zoo_defs._compact.points import Points
 from model_zoo_defs.compact import Compact
 from model_zoo_defs.training.learning.dataset import Samples
 from model_zoo_defs.training.learning.learner import Schedule, export, follow
-from model_zoo_defs.training.learning.patterns import outliers
+from model_zoo_defs.training.learning.patterns import outliers, wrong_tracks
 from model_zoo_defs.training.learning.train import upgrade
 
-BATCH, RATE, STEPS = 4, 3e-3, 8000
+BATCH, RATE, STEPS = 4, 1.5e-3, 12_000
 WINDOW = (384, 512)
 # a strip of the image with so many points is enough of a sample
 MOST_POINTS = 3000
-LAYER = "inlier_weights."
 OUTLIERS_IN, MOST_OUTLIERS = 0.6, 0.35
+# fractions of the samples: of those with outliers the ones with wrong tracks, and of all the ones
+# whose image is moved away from the points or shows little or nothing
+TRACKS_IN, MOVED_IN, FLAT_IN = 0.25, 0.15, 0.25
 # |error of log depth| below which a point is an inlier, and above which it is an outlier
 INLIER_ERROR, OUTLIER_ERROR = 0.05, 0.2
 
@@ -64,8 +66,11 @@ class Examples(Dataset[Example]):
         sample = self.samples[index]
         sparse = sample.sparse[0].numpy()
         if rng.random() < OUTLIERS_IN:
-            sparse = outliers(rng, sparse, float(rng.uniform(0.0, MOST_OUTLIERS)))
-        return example(torch.from_numpy(sparse), sample.depth[0], sample.rgb, rng.random())
+            spoiled = wrong_tracks if rng.random() < TRACKS_IN else outliers
+            sparse = spoiled(rng, sparse, float(rng.uniform(0.0, MOST_OUTLIERS)))
+        drawn = example(torch.from_numpy(sparse), sample.depth[0], sample.rgb, rng.random())
+        drawn = moved(rng, drawn) if rng.random() < MOVED_IN else drawn
+        return flattened(rng, drawn) if rng.random() < FLAT_IN else drawn
 
 
 def example(sparse: Tensor, ground_truth: Tensor, rgb: Tensor, where: float) -> Example:
@@ -87,6 +92,20 @@ def example(sparse: Tensor, ground_truth: Tensor, rgb: Tensor, where: float) -> 
     at = sparse > 0
     cloud = Cloud.of_image(at, value, rgb)
     return Example(cloud, inlier_targets(sparse[at], ground_truth[at]))
+
+
+def moved(rng: np.random.Generator, of: Example) -> Example:
+    """The example with the colours of points elsewhere: those of a row above or below."""
+    count = len(of.target)
+    by = int(rng.integers(count // 20, count // 2 + 1)) * int(rng.choice((-1, 1)))
+    return of._replace(cloud=of.cloud._replace(colour=of.cloud.colour.roll(by, 0)))
+
+
+def flattened(rng: np.random.Generator, of: Example) -> Example:
+    """The example with at most a quarter of the differences of colour, every second time none."""
+    contrast = float(rng.uniform(0.0, 0.25)) * int(rng.integers(2))
+    mean = of.cloud.colour.mean(0)
+    return of._replace(cloud=of.cloud._replace(colour=mean + contrast * (of.cloud.colour - mean)))
 
 
 def inlier_targets(sparse: Tensor, ground_truth: Tensor) -> Tensor:
@@ -154,15 +173,14 @@ def main() -> None:
     parser.add_argument("--val", type=Path, help="folder of shards kept for validation")
     parser.add_argument("--start", type=Path, required=True, help="weights of the network")
     parser.add_argument("--out", type=Path, required=True, help="file for the weights")
-    parser.add_argument("--samples", type=int, default=16_000)
+    parser.add_argument("--samples", type=int, default=50_000)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=0)
     options = parser.parse_args()
     torch.manual_seed(options.seed)
     network = Compact()
-    start = load_file(options.start)
-    upgrade(network, {name: start[name] for name in start if not name.startswith(LAYER)})
+    upgrade(network, load_file(options.start))
     examples = drawn(tuple(options.data), options.samples, options.seed, options.workers)
     loss = fit(network.inlier_weights, examples, options.steps, options.seed)
     print(f"{len(examples)} samples, cross entropy {loss:.4f}")
