@@ -21,6 +21,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ import torch
 
 from benchmarks.frames import (
     MORE_SETS,
+    OUTLIERS,
     REGISTRATIONS,
     SETS,
     Depth,
@@ -62,6 +64,7 @@ NETWORKS = {
 """By set; nothing was chosen on the last four."""
 STAGES = ("linear", "aligned", "fused", "updated", "propagated", "result")
 MULTIPLES = (1, 2, 3, 4)
+WRONG = 0.2  # fraction of the points, with `--outliers`
 LARGE_ERROR = 0.25  # of the depth
 MASKED = 0.05  # of the ground truth
 HEAD = ("network", "set, runs", "points", *STAGES, "result / linear", "worse", "moved", "CPU s")
@@ -82,11 +85,15 @@ def cases(args: argparse.Namespace) -> Iterator[tuple[str, str, int | None]]:
                     yield network, name, count
 
 
-def measure(network: Network, frame: EvalFrame, count: int | None, seed: int) -> dict[str, Any]:
+def measure(
+    network: Network, frame: EvalFrame, count: int | None, seed: int, outliers: str | None = None
+) -> dict[str, Any]:
     """MAE and RMSE of every column on one frame, the choice, and its time."""
     if count is None:  # as the commands read a projected scan
         frame = without_occluded(frame)
     inputs = drawn_inputs(frame, count, seed)
+    if outliers is not None:
+        inputs = replace(inputs, points=OUTLIERS[outliers](inputs.points, WRONG, seed))
     start = time.process_time()
     refined = by_default(network, inputs, seed)
     seconds = time.process_time() - start
@@ -160,6 +167,7 @@ def main() -> None:
     parser.add_argument("--networks", nargs="+", help="only these")
     parser.add_argument("--sets", nargs="+", help="only these")
     parser.add_argument("--points", nargs="+", type=int, help="only these numbers of points")
+    parser.add_argument("--outliers", choices=OUTLIERS, help="make a fifth of the points wrong")
     parser.add_argument("--registration", choices=REGISTRATIONS, default="frame")
     parser.add_argument("--json", type=Path, help="everything, to this file")
     args = parser.parse_args()
@@ -170,7 +178,7 @@ def main() -> None:
         network = networks.setdefault(name, opened(name, args.data))
         frames = frames_of(set_name, args.data, args.half, args.frames)
         rows = [
-            measure(network, frame, count, seed)
+            measure(network, frame, count, seed, args.outliers)
             for seed in range(args.seeds if count else 1)
             for frame in registered(frames, count, seed, args.registration)
         ]

@@ -220,6 +220,32 @@ def with_outliers(points: SparsePoints, fraction: float, seed: int) -> SparsePoi
     return replace(points, depth=torch.where(outlier, random, points.depth))
 
 
+def with_wrong_factors(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:
+    """So many of the points times exp(0.7 n), n normal."""
+    generator = torch.Generator().manual_seed(seed)
+    outlier = torch.rand(len(points), generator=generator) < fraction
+    factor = torch.exp(0.7 * torch.randn(len(points), generator=generator))
+    return replace(points, depth=torch.where(outlier, points.depth * factor, points.depth))
+
+
+def with_wrong_tracks(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:
+    """So many of the points in groups of up to 6 neighbours, each times exp(0.5 n), n normal."""
+    rng, xy = np.random.default_rng(seed), points.xy.numpy()
+    factor = np.ones(len(xy), np.float32)
+    while (factor != 1).mean() < fraction:
+        near = np.argsort(((xy - xy[rng.integers(len(xy))]) ** 2).sum(axis=1))[:6]
+        factor[near[factor[near] == 1]] = np.exp(0.5 * rng.standard_normal())
+    return replace(points, depth=points.depth * torch.from_numpy(factor))
+
+
+OUTLIERS = {
+    "random": with_outliers,
+    "factors": with_wrong_factors,
+    "tracks": with_wrong_tracks,
+}
+"""Kinds of outliers."""
+
+
 def errors_of(depths: dict[str, torch.Tensor], gt: torch.Tensor) -> dict[str, tuple[float, float]]:
     """(MAE, RMSE) over the pixels with ground truth where all are known."""
     seen = torch.stack([depth > 0 for depth in depths.values()]).all(dim=0)
