@@ -381,6 +381,7 @@ def test_inlier_weights_learn_to_detect_outliers(
     shards: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(train_inliers, "MOST_POINTS", 300)
+    monkeypatch.setattr(train_inliers, "RATE", 3e-3)  # for 150 steps from scratch
     torch.manual_seed(0)
     layer = Compact().inlier_weights
     examples = train_inliers.drawn((shards,), 24, seed=1, workers=0)
