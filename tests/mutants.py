@@ -192,7 +192,7 @@ class RunLines:
         near, cases = _mirroring(mutant.file), Counter[str]()
         if mutant.lines is None:  # a constant, perhaps without a function that uses it
             names |= {name for name in self._times if name.partition("::")[0] in near}
-            names |= self._naming(mutant.constants)
+            names |= {test for name in mutant.constants for test in self._naming(name)}
         order = list[tuple[int, float, str]]()
         for time_s, name in sorted((self._times[name], name) for name in names & {*self._times}):
             test = name.partition("[")[0]
@@ -211,14 +211,13 @@ class RunLines:
             test.rpartition("|")[0] for n, tests in lines.items() if wanted(n) for test in tests
         }
 
-    def _naming(self, constants: tuple[str, ...]) -> set[str]:
-        """The tests that run a line, of any file, that names one of the constants."""
-        named = re.compile(rf"\b({'|'.join(constants) or '(?!)'})\b")
-        found = set[str]()
-        for file in self._data.measured_files():
-            text = Path(file).read_text().splitlines()
-            at = {number for number, line in enumerate(text, start=1) if named.search(line)}
-            found |= self._running(Path(file), at.__contains__)
+    def _naming(self, constant: str) -> set[str]:
+        """The tests that run a line, of any file, that names the constant."""
+        named, found = re.compile(rf"\b{constant}\b"), set[str]()
+        for file in map(Path, self._data.measured_files()):
+            lines = enumerate(file.read_text().splitlines(), start=1)
+            if at := {number for number, line in lines if named.search(line)}:
+                found |= self._running(file, at.__contains__)
         return found
 
 
