@@ -17,8 +17,8 @@ NEIGHBOURS = 12
 CELL_POINTS = 3
 # So many points are searched at a time: bounds the memory.
 CHUNK = 4096
-# A smaller image has the spacing that it would have with this longer side, that of the windows in
-# training: few pixels between the points are no sign of a dense pattern there.
+# The longer side of the windows in training. A smaller image has the spacing that it would have at
+# this size: few pixels between the points are no sign of a dense pattern there.
 LEARNT_SIZE = 512
 # The colour of a point is the mean of 5 x 5 pixels.
 AROUND = torch.arange(-2, 3)
@@ -29,8 +29,9 @@ class Cloud(NamedTuple):
 
     value: log depth minus its median (n,). colour (n, 3): of the normalised image around the point.
     position: rows and columns (n, 2) in spacings, the side of the square that holds one point on
-    average. log_spacing (n,): its log, in pixels. near, found: the neighbours' numbers
-    (n, NEIGHBOURS), nearest first, and whether there is one. counts: points per image.
+    average. log_spacing (n,): its log, in pixels of an image of LEARNT_SIZE at least. near, found:
+    the neighbours' numbers (n, NEIGHBOURS), nearest first, and whether there is one. counts: points
+    per image.
     """
 
     value: Tensor

@@ -17,14 +17,13 @@ from pnpdepth_cli.points import SparsePoints
 
 ALONE = 10.0
 """Disagreement with all neighbours, in robust standard deviations, at which a weight is 0."""
+FAR = 0.2
+"""Difference of log depth beyond which a network that weighs its points contradicts a point."""
 
 _COMPARED = 8  # neighbours that a point is compared with,
 _AGREEING = 2  # of which so many must agree with it
 _MIN_DISAGREEMENT = 0.005  # of log depth; less is none
 _NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
-
-FAR = 0.2
-"""Error of log depth beyond which a point has no weight for a network that weighs its points."""
 
 _PASSES = 3  # without the worst outliers, others stand out
 _MIN_POINTS = 5  # fewer do not predict each other
@@ -59,8 +58,8 @@ def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
     """Returns (N,) bool: the points whose log depth differs by more than `FAR` from a prediction.
 
     The points of a wrong track of structure from motion agree with each other, so that only a
-    network that sees the image and weighs its points tells that they are outliers. None are where
-    it were half of the points: such a prediction is of no use.
+    network that sees the image and weighs its points tells that they are outliers. A prediction far
+    from half of the points or more is of no use: then none is far.
 
     Args:
         prediction: (H, W) metres, 0 = unknown, of a network that weighs its points.

@@ -95,8 +95,7 @@ def refine_default(
     rejected = () if hidden is None else hidden.rejected
     fused = fusion.fuse(inliers, user=user, rejected=rejected, until=until)
     if fused.weighed is not None and not is_dense(inliers.points):
-        far = far_points(fused.weighed, inliers.points)
-        inliers = inliers.without(far) if bool(far.any()) else inliers
+        inliers = inliers.without(far_points(fused.weighed, inliers.points))
     kind = propagation_of(inliers.points)
     propagated = propagate(fused.after, inliers.points, inliers.rgb, kind=kind)
     check, notes = None, tuple[str, ...]()

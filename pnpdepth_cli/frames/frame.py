@@ -83,7 +83,9 @@ class Frame:
         return replace(self, points=points)
 
     def without(self, outliers: Tensor) -> Frame:
-        """Returns the frame with those points, of (N,) bool, left out as outliers too."""
+        """Returns the frame with those points, of (N,) bool, added to the outliers left out."""
+        if not bool(outliers.any()):
+            return self
         left_out = self.points.select(outliers)
         if self.outliers is not None:
             left_out = self.outliers.joined(left_out)

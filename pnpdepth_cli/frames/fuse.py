@@ -135,7 +135,7 @@ class Fusion:
         outlying = outliers(torch.from_numpy(refined.before), points, frame.rgb)
         if len(points) >= FEW_POINTS:
             outlying = outlying | suspected
-        inliers = frame.without(outlying) if bool(outlying.any()) else frame
+        inliers = frame.without(outlying)
         if again or not torch.equal(outlying, suspected):
             refined = self._refined(user, inliers)
         return inliers, refined
