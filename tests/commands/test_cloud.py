@@ -17,7 +17,7 @@ from pnpdepth_cli.budget import budget
 from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
 from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
-from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.camera import Camera
 
@@ -212,7 +212,8 @@ def slanted_frame(folder: Path, name: str, shift: float, distortion: tuple[float
     ray = camera.unproject(xy, np.ones(len(xy)))[:, 0]
     depth = (2 + shift / 2) / (1 - ray / 2)
     path.unlink()
-    write_depth(path.with_suffix(".npy"), depth.reshape(HEIGHT, WIDTH).astype(np.float32))
+    path = path.with_suffix(".npy")
+    write_depth(path, depth.reshape(HEIGHT, WIDTH).astype(np.float32))
     pose = np.column_stack([np.eye(3), [shift, 0, 0]])
     found = FrameCamera(camera=camera, source="test", pose=pose)
     record = json.loads((folder / f"{name}.json").read_text())
@@ -221,7 +222,6 @@ def slanted_frame(folder: Path, name: str, shift: float, distortion: tuple[float
     return path
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("distortion", [(), LENS])
 def test_the_mesh_of_two_views_lies_on_their_surface_in_the_colours_of_the_images(
     tmp_path: Path, distortion: tuple[float, ...]
@@ -245,7 +245,14 @@ def test_the_mesh_of_two_views_lies_on_their_surface_in_the_colours_of_the_image
     )
 
 
-@pytest.mark.slow
+def test_the_voxels_of_a_mesh_have_three_pixels_at_the_median_depth(tmp_path: Path) -> None:
+    pytest.importorskip("open3d")
+    path = slanted_frame(tmp_path / "out", "a", 0, ())
+    voxel = 3 * float(np.median(read_depth(path).values)) / FOCAL
+    record = written(path, tmp_path / "o.ply", fov_deg=None, mesh=True)
+    assert record["mesh"]["voxel"] == pytest.approx(voxel)
+
+
 def test_a_mesh_too_large_for_the_memory_is_refused_and_nothing_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -118,8 +118,8 @@ def _padded_indices(mode: str, size: int, begin: int, end: int) -> Tensor:
         return index.remainder(size)
     if mode != "reflect":
         raise Unsupported(f"mode {mode}")
-    if size == 1:
-        return torch.zeros_like(index)
+    if size == 1:  # as onnxruntime
+        raise Unsupported("mode reflect of 1 element")
     around = index.remainder(2 * size - 2)
     return torch.minimum(around, 2 * size - 2 - around)
 

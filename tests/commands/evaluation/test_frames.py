@@ -117,7 +117,7 @@ def test_sparsification_is_by_definition() -> None:
 
 def test_a_pixel_without_sigma_prediction_or_ground_truth_is_not_scored() -> None:
     gt, depth, sigma = np.array(
-        [[[10, 10, 10, 10, 0]], [[9, 0, 12, 13, 8]], [[1, 1, 0, 1, 1]]], np.float32
+        [[[0.5, 10, 10, 10, 0]], [[1.5, 0, 12, 13, 8]], [[1, 1, 0, 1, 1]]], np.float32
     )
     frame = frame_uncertainty(depth, gt, sigma)
     assert frame is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,17 @@ def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
     assert frames["a"]["values"]["rmse_change"] is not None
     assert set(frames["b"]["values"].values()) == {None}
     assert (frames["a"]["tag"], frames["b"]["tag"]) == ("against ground truth", "at points used")
+
+
+def test_a_frame_without_depth_at_any_point_has_no_figures(root: Path, report: Path) -> None:
+    summary = batch(root).summary
+    written = json.loads((root / "out" / "summary.json").read_text())
+    unknown = dict.fromkeys(("scores", "held_out_error", "sparse_error", "linear"))
+    rows = [row | unknown if row["name"] == "b" else row for row in written["frames"]]
+    request = BatchRequest(source=root, output=root / "out", html=report, refine=refinement(root))
+    report_batch.write_batch_report(request, report, summary, lambda: rows)
+    assert {*frames_of(report)["b"]["values"].values()} == {None}
+    assert None not in frames_of(report)["a"]["values"].values()
 
 
 def test_the_report_may_lie_in_the_results_and_the_results_among_the_frames(root: Path) -> None:

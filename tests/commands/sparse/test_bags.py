@@ -69,12 +69,16 @@ def test_a_batch_takes_a_bag_and_writes_its_frames_once(
     bag, frame = write_bag(tmp_path / "drive.mcap"), frame_on_disk(tmp_path)
     network = ["--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
     command = ["batch", str(bag), "-o", str(tmp_path / "out"), *network, "--iterations", "1"]
+    written_at = dict[Path, int]()
     for text, again in (("wrote 3 frames to", "3 to do"), ("", "all of them done already")):
         assert run(command) == 0
         printed = capsys.readouterr().err
         assert text in printed
         assert again in printed
-    assert len(list((tmp_path / "out_frames" / "rgb").iterdir())) == 3
+        times = {path: path.stat().st_mtime_ns for path in (tmp_path / "out_frames/rgb").iterdir()}
+        assert len(times) == 3
+        assert times == written_at or not written_at
+        written_at = times
 
 
 def test_topics_can_be_named_and_images_without_a_scan_in_time_are_none(tmp_path: Path) -> None:
