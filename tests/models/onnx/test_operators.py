@@ -370,7 +370,7 @@ INDEX = np.array([[0, 1]], I64)
         ("Resize", [X, None, None], 1, {}, "neither scales nor sizes"),
         ("Resize", [X, None, np.full(4, 2, F32)], 1, {"mode": "area"}, "mode area"),
         ("Pad", [X, np.ones(8, I64)], 1, {"mode": "mirror"}, "mode mirror"),
-        ("Pad", [normal(2, 1), np.ones(4, I64)], 1, {"mode": "reflect"}, "mode reflect of 1 element"),
+        ("Pad", [normal(2, 1), np.ones(4, I64)], 1, {"mode": "reflect"}, "reflect of 1 element"),
         ("Cast", [X], 1, {"to": TensorProto.STRING}, "data type 8"),
         ("GatherND", [X, INDEX], 1, {"batch_dims": 1}, "batch_dims"),
         ("ScatterND", [X, INDEX, normal(1, 7, 6)], 1, {"reduction": "mul"}, "reduction mul"),
