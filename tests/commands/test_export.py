@@ -143,6 +143,7 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     assert content["camera_model"] == "OPENCV"
     assert len(content["frames"]) == 3
     entry = content["frames"][1]
+    assert (entry["w"], entry["h"]) == (WIDTH, HEIGHT)
     assert (scene / entry["file_path"]).read_bytes() == (root / "images/b.png").read_bytes()
     depth = cv2.imread(str(scene / entry["depth_file_path"]), cv2.IMREAD_UNCHANGED) * 1e-3
     assert content["enable_depth_loading"]  # Instant-NGP's names

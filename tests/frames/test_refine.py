@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import BatchError, DivergedError, NoPointsError, PnpDepthError
+from pnpdepth_cli.errors import BatchError, DivergedError, ModelError, NoPointsError, PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.refine import refine_frame, refine_frames
 from pnpdepth_cli.models.definition import Fixed
@@ -83,6 +83,14 @@ def test_a_frame_that_fails_does_not_lose_the_others(network: Network) -> None:
     assert isinstance(nothing, NoPointsError)
     with pytest.raises(NoPointsError):
         alone(network, SETTINGS, frames[1])
+
+
+def test_a_frame_whose_prediction_is_not_finite_is_an_error_of_its_own(network: Network) -> None:
+    unknown = replace(frame_of(1), rgb=torch.full((3, 46, 62), float("nan")))
+    good, failed = together(network, SETTINGS, [frame_of(0), unknown])
+    assert isinstance(good, Refined)
+    assert isinstance(failed, ModelError)
+    assert "not finite at 20 of 20 sparse points" in str(failed)
 
 
 def test_a_divergence_comes_with_its_last_good_depth(network: Network) -> None:

@@ -107,9 +107,9 @@ def _close_pairs(root: Path, images: list[Timed], depths: list[Timed]) -> list[l
     image = np.repeat(np.arange(len(images)), count)
     depth = np.arange(len(image)) + np.repeat(last - np.cumsum(count), count)
     gap = np.abs(image_times[image] - depth_times[depth])
-    pairs = np.column_stack([image, depth])[gap <= _LONGEST_GAP_S]
-    order = np.argsort(gap[gap <= _LONGEST_GAP_S], kind="stable")
-    closest: list[list[int]] = pairs[order].tolist()
+    close = gap <= _LONGEST_GAP_S
+    order = np.argsort(gap[close], kind="stable")
+    closest: list[list[int]] = np.column_stack([image, depth])[close][order].tolist()
     return closest
 
 

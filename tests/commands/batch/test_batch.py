@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import threading
+import time
 import weakref
 from pathlib import Path
 from typing import Any
@@ -288,6 +289,16 @@ def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path
     assert float(table[1]["held_out_error_mae_before"]) == row["held_out_error"]["before"]["mae"]
     assert [float(line["baseline_linear_held_out_mae"]) for line in table] == held_out
     assert set(_SCORES) == set(Scores.__dataclass_fields__) - {"pixels"}
+
+
+def test_a_profile_counts_the_frames_and_seconds_of_the_run(root: Path) -> None:
+    start = time.perf_counter()
+    profile = batch(root, profile=True).summary["profile"]
+    elapsed, seconds = time.perf_counter() - start, profile["seconds"]
+    assert profile["frames"] == len(NAMES)
+    assert 0 < seconds["refine"] < seconds["wall"] < elapsed
+    assert profile["frames_per_second"] == pytest.approx(len(NAMES) / seconds["wall"], rel=1e-2)
+    assert profile["network_busy"] == pytest.approx(seconds["refine"] / seconds["wall"], rel=1e-2)
 
 
 def test_a_record_that_lacks_what_the_summary_needs_is_an_error_that_names_it(root: Path) -> None:

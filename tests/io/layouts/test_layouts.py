@@ -211,6 +211,13 @@ def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> Non
     assert [lost.path.name for lost in listing.spare] == ["2.png"]
 
 
+def test_tum_pairs_files_two_hundredths_of_a_second_apart_and_no_further(tmp_path: Path) -> None:
+    tum(tmp_path)
+    (tmp_path / "rgb.txt").write_text("0 rgb/a.png\n1 rgb/b.png\n")
+    (tmp_path / "depth.txt").write_text("0.02 depth/a.png\n0.979 depth/b.png\n")
+    assert [frame.gt for frame in read_frames(tmp_path)] == [tmp_path / "depth/a.png"]
+
+
 @pytest.mark.parametrize(
     "line", ["0 depth/0.png 1.5 rgb/0.png", "1.5 rgb/0.png 1.51 depth/0.png  # TUM's own order"]
 )
