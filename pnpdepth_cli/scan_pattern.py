@@ -44,7 +44,7 @@ def scan_pattern(xy: NDArray[np.floating], size: tuple[int, int]) -> ScanPattern
     import numpy as np
 
     xy = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp)
-    x, y = xy.clip(0, np.array(size)[::-1] - 1).T
+    x, y = np.minimum(xy, np.array(size)[::-1] - 1).T
     return ScanPattern(points=len(xy), along_px=_median_gap(x, y), across_px=_median_gap(y, x))
 
 

@@ -41,6 +41,10 @@ def test_all_options_are_in_the_longer_help(name: str) -> None:
             assert f" {long_name(parameter)}" in shown
 
 
+def test_the_longer_help_is_printed_before_anything_is_checked() -> None:
+    assert help_of("refine", "missing.png", "--iterations", "x", "--help-all").startswith("Usage")
+
+
 @pytest.mark.parametrize("arguments", [("refine",), ("models", "check")])
 def test_the_help_states_that_a_python_file_is_run(arguments: tuple[str, ...]) -> None:
     assert "is Python code and is run" in " ".join(help_of(*arguments, "--help").split())

@@ -237,7 +237,7 @@ def test_the_mesh_of_two_views_lies_on_their_surface_in_the_colours_of_the_image
         "path": str(tmp_path / "o_mesh.ply"), "triangles": len(mesh.triangles), "voxel": 0.05,
     }  # fmt: skip
     assert abs(off.mean()) < 0.002
-    assert np.abs(off).max() < 0.05
+    assert np.abs(off).max() < 0.028
     assert np.ptp(x) > 1.7  # a view alone spans 1.6
     assert np.asarray(mesh.vertex_colors).mean(0) * 255 == pytest.approx([30, 20, 10], abs=1)
     assert np.asarray(mesh.vertex_normals).mean(0)[2] == pytest.approx(

@@ -211,6 +211,7 @@ def photo(path: Path, tags: dict[int, object]) -> Path:
         ),
         ("a.jpg", {}, None),
         ("a.jpg", {0xA405: 0}, None),
+        ("a.jpg", {0xA405: 5}, None),
         ("a.jpg", {0xA405: 5000}, None),
         ("a.jpg", {0x920A: 5.0}, None),
         ("a.jpg", {0x920A: 5.0, 0xA20E: 9.0, 0xA210: 1}, None),
