@@ -92,6 +92,8 @@ def test_equal_depths_have_equal_panels_and_other_depths_other_ones(tmp_path: Pa
     for after, equal in ((depth, True), (depth[::-1].copy(), False)):
         panels = panels_of(previewed(tmp_path, depth, after))
         assert np.array_equal(panels["Depth before"], panels["Depth after"]) == equal
+        top, bottom = (panels["No image"][row].mean() for row in (0, -1))
+        assert (top > bottom) == equal  # what is near after refinement is bright
 
 
 def test_depths_that_are_unknown_or_all_alike_still_make_a_preview(tmp_path: Path) -> None:

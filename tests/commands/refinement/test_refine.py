@@ -232,8 +232,8 @@ def test_a_mistake_gives_one_clear_line_and_writes_nothing(
 
 def test_the_error_at_points_is_of_those_with_a_prediction() -> None:
     points = SparsePoints(
-        xy=torch.tensor([[0.0, 0], [1, 0], [2, 0]]), depth=torch.tensor([5.0, 2, 6]), size=(1, 3)
+        xy=torch.tensor([[0.0, 0], [1, 0], [2, 0]]), depth=torch.tensor([5, 1.5, 6]), size=(1, 3)
     )
-    errors = _point_error(np.array([[0, 3, 9]], np.float32), points)
+    errors = _point_error(np.array([[0, 0.5, 9]], np.float32), points)
     assert errors == {"points": 2, "mae": 2.0, "rmse": 5**0.5}
     assert _point_error(np.zeros((1, 3), np.float32), points) is None
