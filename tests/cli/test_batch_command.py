@@ -163,7 +163,7 @@ def test_on_a_terminal_there_is_a_bar(
         display.frame({"name": "y", "status": "done", "message": None})
     err = capsys.readouterr().err
     assert "failed: x: bad\n" in err
-    assert "2/2" in err
+    assert " 2/2" in err
 
 
 def test_the_choices_are_those_that_there_are() -> None:

@@ -39,7 +39,7 @@ def test_exported_frames_are_counted_and_warnings_go_to_stderr(tmp_path: Path) -
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 0, result.output
     assert result.stdout == f"wrote 3 frames in model units: {tmp_path / 'dense'}\n"
-    assert "3 of 3 images have lens distortion" in result.stderr
+    assert " 3 of 3 images have lens distortion" in result.stderr
     result = CliRunner().invoke(cli, [*arguments, "--overwrite", "--json"])
     record = json.loads(result.stdout)
     assert record == json.loads((tmp_path / "dense" / "export_colmap.json").read_text())

@@ -41,7 +41,7 @@ def test_why_a_frame_failed_is_reported_once(
 ) -> None:
     assert run(arguments("--vary", "points=500", "--vary", "lr=1,2", "--plots", "none")) == 7
     *_, last = lines = capsys.readouterr().err.splitlines()
-    assert "4 of 4 runs failed" in last
+    assert " 4 of 4 runs failed" in last
     assert [line for line in lines if line.startswith("failed")] == [
         f"failed: {name}: 500 points of 60; ask for fewer, or draw them from the ground"
         " truth with --sample 500"
@@ -67,7 +67,7 @@ def test_ctrl_c_prints_how_to_continue_and_exits_130(
     assert run(arguments(*vary)) == 130
     assert "stopped; run the same command to continue" in capsys.readouterr().err
     assert run(arguments(*vary)) == 0
-    assert "4 runs: 1 done already, 3 to do" in capsys.readouterr().err
+    assert " 4 runs: 1 done already, 3 to do" in capsys.readouterr().err
 
 
 def test_the_help_names_all_that_can_be_varied() -> None:

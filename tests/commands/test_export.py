@@ -185,7 +185,7 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
     assert [entry[name] for name in names] == [-0.1, 0.02, 0.001, -0.002, 0]
     for to in ("colmap", "gaussian-splatting"):
         notes = "".join(export(folder, to, tmp_path / to)["notes"])
-        assert "3 of 3 images have lens distortion" in notes
+        assert " 3 of 3 images have lens distortion" in notes
 
 
 def test_a_lens_that_nerfstudio_does_not_know_is_refused_and_nothing_is_written(

@@ -84,7 +84,7 @@ def test_linear_exr_gets_the_srgb_curve_and_what_is_clipped_a_note(tmp_path: Pat
     bright = np.array([[0.5, 4.0], [np.nan, np.inf]], dtype=np.float16)
     write_exr(tmp_path / "b.exr", {"R": bright, "G": bright, "B": bright})
     image = read_rgb(tmp_path / "b.exr")
-    assert "50 % of pixels lay outside 0..1" in str(image.note)
+    assert " 50 % of pixels lay outside 0..1" in str(image.note)
     assert image.values[:, 1].tolist() == [[1, 1, 1], [1, 1, 1]]
     assert image.values[1, 0].tolist() == [0, 0, 0]
 

@@ -110,7 +110,7 @@ def test_other_settings_or_other_code_in_the_same_file_do_all_again(root: Path) 
         listener = RecordingListener()
         batch(root, listener, limit=2, refine=settings)
         assert listener.names == ["a", "b"]
-        assert "2 to do (2 other settings)" in listener.messages[2]
+        assert " 2 to do (2 other settings)" in listener.messages[2]
     for code, old, new in ((root / "net/my_net.py", "2 + 3", "2.5 + 3"), (loss, ".abs()", "**2")):
         code.write_text(code.read_text().replace(old, new))
         assert done(root, limit=2, refine=settings) == ["a", "b"]

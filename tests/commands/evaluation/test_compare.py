@@ -66,7 +66,7 @@ def test_frames_are_paired_by_name_and_the_others_reported(tmp_path: Path) -> No
     assert comparison["frames"] == ["a", "b"]
     assert comparison["runs"][0]["mean"]["mae"] == pytest.approx(3)
     note = comparison["notes"][0]
-    assert "1 frames of" in note
+    assert " 1 frames of" in note
     assert note.endswith("left out: only one")
 
 
@@ -131,7 +131,7 @@ def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path
     assert comparison["runs"][0]["mean"]["flicker"] == pytest.approx(one.mean())
     assert flicker["percent"] == pytest.approx(100 * (1 - two.mean() / one.mean()))
     assert flicker["p_value"] == 2 / 2**8
-    assert any("flicker" in note and "1 lack it" in note for note in comparison["notes"])
+    assert any("flicker" in note and " 1 lack it" in note for note in comparison["notes"])
 
 
 def test_frames_of_one_group_are_swapped_together(tmp_path: Path) -> None:

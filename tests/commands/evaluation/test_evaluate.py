@@ -50,7 +50,7 @@ def test_each_image_counts_alike_or_each_pixel(two: Path) -> None:
     assert pooled.mean["mae"] == pytest.approx(5 / 3)
     assert per_image.frames[0].values == pooled.frames[0].values
     assert [(f.pixels, f.known, f.coverage) for f in pooled.frames] == [(2, 2, 1.0), (1, 2, 0.5)]
-    assert any("1 pixels (25.00%) of the ground truth have no pred" in n for n in pooled.notes)
+    assert any(" 1 pixels (25.00%) of the ground truth have no pred" in n for n in pooled.notes)
 
 
 def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_failed_frame_is_reported_and_the_others_are_scored(
     assert result.mean["rmse"] == 3
     assert message in (result.frames[0].error or "")
     assert any(note.startswith("warning: frame a was not scored") for note in result.notes)
-    assert "1 with a faulty file" in (result.unscored() or "")
+    assert " 1 with a faulty file" in (result.unscored() or "")
 
 
 def test_two_single_files_raise_their_error(two: Path) -> None:
@@ -298,7 +298,7 @@ def test_sparse_input_in_the_ground_truth_causes_a_warning_and_can_be_excluded(
     depth_file(tmp_path / "sparse.npy", points)
     result = scored(tmp_path, sparse=tmp_path / "sparse.npy")
     (warning,) = (n for n in result.notes if "sparse input" in n)
-    assert "4 of the scored pixels (4.04%) have a point of the sparse input" in warning
+    assert " 4 of the scored pixels (4.04%) have a point of the sparse input" in warning
     assert "--exclude-sparse" in warning
     without = scored(tmp_path, sparse=tmp_path / "sparse.npy", exclude_sparse=True)
     assert without.frames[0].known == 92

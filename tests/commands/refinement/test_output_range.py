@@ -66,7 +66,7 @@ def test_depths_beyond_16_bits_are_clipped_and_counted() -> None:
     clipped = within_range(PNG, inputs, frame)
     assert clipped.after.tolist() == [[0.0, 1 / 256, 50.0, 65534 / 256]]
     assert len(clipped.notes) == 2
-    assert "1 of 4 pixels clipped to 256.0 m, the largest" in clipped.notes[0]
+    assert " 1 of 4 pixels clipped to 256.0 m, the largest" in clipped.notes[0]
     assert within_range({"depth": Path("depth.exr")}, inputs, frame) is frame
     plain = replace(frame, after=np.full((1, 4), 50, np.float32))
     assert within_range(PNG, inputs, plain) is plain

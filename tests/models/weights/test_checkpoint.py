@@ -359,7 +359,7 @@ def test_garbage_is_refused(tmp_path: Path) -> None:
 def test_a_zip_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "w.pth", "w") as archive:
         archive.writestr("readme.txt", "hello")
-    assert "0 entries named data.pkl" in refused(tmp_path / "w.pth")
+    assert " 0 entries named data.pkl" in refused(tmp_path / "w.pth")
     torch.jit.save(torch.jit.script(nn.Conv2d(1, 1, 1)), tmp_path / "w.pt")
     assert "state_dict() of its module" in refused(tmp_path / "w.pt")
 
