@@ -12,7 +12,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, srgb_from_linear
+from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, sizes_of, srgb_from_linear
 from tests.exr_files import write_exr
 
 COLOURS = np.random.default_rng(1).integers(0, 256, (7, 11, 3)).astype(np.uint8)
@@ -92,6 +92,7 @@ def test_linear_exr_gets_the_srgb_curve_and_what_is_clipped_a_note(tmp_path: Pat
 def test_grey_exr_and_layered_exr_are_read(tmp_path: Path) -> None:
     write_exr(tmp_path / "y.exr", {"Y": ONES, "A": ONES})
     assert np.array_equal(read_rgb(tmp_path / "y.exr").values, np.ones((2, 3, 3), np.float32))
+    assert sizes_of(tmp_path / "y.exr") == ((2, 3), (2, 3))
     layer = {f"View.Combined.{c}": ONES * k for k, c in enumerate("RGB")}
     write_exr(tmp_path / "l.exr", {**layer, "View.Depth.Z": ONES})
     assert read_rgb(tmp_path / "l.exr").values[0, 0].tolist() == [0, 1, 1]
