@@ -120,6 +120,8 @@ def places(
             if not isinstance(child, ast.AST) or typing:
                 continue
             within = lines
+            if isinstance(child, ast.Lambda):
+                within = child.lineno, child.end_lineno or 0
             if isinstance(child, ast.stmt) and inside:
                 last = child.body[0].lineno - 1 if hasattr(child, "body") else child.end_lineno
                 within = child.lineno, max(child.lineno, last or 0)

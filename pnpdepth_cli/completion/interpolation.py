@@ -72,15 +72,13 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
 def in_hull(points: SparsePoints) -> Tensor:
     """Returns bool (H, W), whether each pixel lies in the convex hull of the points."""
     pixels = _queries(points, None)
-    inside = torch.zeros(len(pixels), dtype=torch.bool)
-    if len(points) >= 3:
-        try:
-            planes = torch.from_numpy(ConvexHull(points.xy.double().cpu().numpy()).equations)
-            inside = torch.ones_like(inside)
-            for x, y, offset in planes.tolist():
-                inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
-        except QhullError:  # all points on one line
-            pass
+    inside = torch.ones(len(pixels), dtype=torch.bool)
+    try:
+        planes = ConvexHull(points.xy.double().cpu().numpy()).equations.tolist()
+    except (QhullError, ValueError):  # fewer than three points, or all on one line
+        inside, planes = ~inside, []
+    for x, y, offset in planes:
+        inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
     return inside.reshape(points.size).to(points.depth.device)
 
 
@@ -222,8 +220,8 @@ def _tree(points: NDArray[np.float64]) -> cKDTree:
 def _triangles(points: NDArray[np.float64]) -> Delaunay | None:
     """The points' triangulation; None if there is no triangle."""
     try:
-        return Delaunay(points) if len(points) >= 3 else None
-    except QhullError:  # all points on one line
+        return Delaunay(points)
+    except QhullError:  # fewer than three points, or all on one line
         return None
 
 

@@ -195,6 +195,15 @@ def test_morphological_lets_what_is_near_grow_over_what_is_far() -> None:
     assert bool((filled[:, :18] > 9.9).all())
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_morphological_of_mirrored_points_is_mirrored(axis: int) -> None:
+    points = scattered(300, on_grid=True)
+    xy = points.xy.clone()
+    xy[:, 1 - axis] = points.size[axis] - 1 - xy[:, 1 - axis]
+    mirrored = morphological(replace(points, xy=xy)).flip(axis)
+    assert torch.allclose(mirrored, morphological(points))
+
+
 def test_morphological_of_few_points_is_that_of_a_smaller_image() -> None:
     xy = [(8.0, 8.0), (24.0, 8.0), (8.0, 24.0), (24.0, 24.0)]
     depth = [2.0, 4.0, 6.0, 8.0]
