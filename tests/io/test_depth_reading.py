@@ -185,6 +185,7 @@ def test_a_palette_a_folder_and_a_zip_of_something_else_are_refused(tmp_path: Pa
     for name, message in (
         ("p.png", "a palette"), ("d.npz", "is not an array"), ("", "is a folder"),
         ("none.png", r"none\.png: no such file; check the path"),
+        ("x" * 300, r"xxx… cannot be read \(file name too long\); check the path"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=message):
             read_depth(tmp_path / name)

@@ -48,6 +48,8 @@ def test_a_crop_that_does_not_fit_the_frame_is_refused() -> None:
     assert crop_window("10,20,30,40", (60, 40)) == (slice(20, 60), slice(10, 40))
     with pytest.raises(SizeError, match=r"--pred-crop 10,20,30,40 does not lie in .* 39×60"):
         crop_window("10,20,30,40", (60, 39), "--pred-crop")
+    with pytest.raises(SizeError, match="kb does not lie in a frame of 1242×351"):
+        crop_window("kb", (351, 1242))
     with pytest.raises(SizeError, match=r"\b640×480 but this one is 304×228; --crop none"):
         crop_window("nyu", (228, 304))
 
