@@ -42,23 +42,24 @@ MEAN = "        rgb = rgb * (0.5 + rgb.mean())\n        return"
 
 
 @pytest.mark.parametrize(
-    ("code", "why"),
+    ("code", "why", "times"),
     [
-        (MEAN, "frames that go together influence each other"),
-        ("        assert len(rgb) == 1\n        return", "one at a time; together:"),
+        (MEAN, "frames that go together influence each other", 1),
+        ("        assert len(rgb) == 1\n        return", "one at a time; together:", 2),
     ],
 )
 def test_a_network_that_does_not_take_frames_together_gets_one_at_a_time(
-    tmp_path: Path, code: str, why: str
+    tmp_path: Path, code: str, why: str, times: int
 ) -> None:
-    root = pairs_on_disk(tmp_path / "drive")
-    add_frame(root, "e", np.full((46, 62, 3), 255, np.uint8))
+    root = pairs_on_disk(tmp_path / "drive", NAMES[:3])
+    for name in "0e":  # the first and the last of two groups
+        add_frame(root, name, np.full((46, 62, 3), 255, np.uint8))
     model = root / "net/my_net.py"
     model.write_text(model.read_text().replace("        return", code, 1))
     batch(root, output=root / "alone")
     listener = RecordingListener()
-    batch(root, listener, batch_size=5)
-    assert any(why in text for text in listener.messages)
+    batch(root, listener, batch_size=3)
+    assert sum(why in text for text in listener.messages) == times
     alone, together = depths(root / "alone"), depths(root / "out")
     assert all(np.array_equal(together[name], depth) for name, depth in alone.items())
 
