@@ -107,8 +107,8 @@ def places(
     node: ast.AST, lines: tuple[int, int] | None = None
 ) -> Iterator[tuple[ast.AST, tuple[int, int] | None]]:
     """Yields the nodes that run (no annotations, texts or imports for types) with the lines that
-    a test of them runs: those of the statement, of the function whose default it is, or None
-    for all of the file.
+    a test of them runs: those of the statement or lambda, of the function whose default it is, or
+    None for all of the file.
     """
     yield node, lines
     inside = lines is not None or isinstance(node, ast.FunctionDef)
