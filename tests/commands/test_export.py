@@ -296,6 +296,17 @@ def test_results_that_cannot_be_exported_are_one_line(
     assert sorted(root.parent.rglob("*")) == before
 
 
+def test_results_need_depth_a_folder_to_go_to_and_masks_of_their_size(root: Path) -> None:
+    folder = results(root)
+    with pytest.raises(InputError, match=r"images has no files NAME_depth\.png"):
+        export(root / "images", "colmap", root / "dense")
+    with pytest.raises(OutputError, match=r"a\.json is a file; name a folder"):
+        export(folder, "colmap", folder / "a.json")
+    cv2.imwrite(str(folder / "a_valid.png"), np.zeros((2, 2), np.uint8))
+    with pytest.raises(SizeError, match=r"a_valid\.png is not of the size of .*a_depth\.exr"):
+        export(folder, "colmap", root / "dense")
+
+
 def test_depth_without_poses_is_no_scene_of_nerfstudio_and_files_are_kept_without_overwrite(
     root: Path,
 ) -> None:
