@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+
 import click
 import pytest
 from click.testing import CliRunner
@@ -48,3 +51,23 @@ def test_the_longer_help_is_printed_before_anything_is_checked() -> None:
 @pytest.mark.parametrize("arguments", [("refine",), ("models", "check")])
 def test_the_help_states_that_a_python_file_is_run(arguments: tuple[str, ...]) -> None:
     assert "is Python code and is run" in " ".join(help_of(*arguments, "--help").split())
+
+
+def commands_of(group: click.Group) -> Iterator[click.Command]:
+    for name in group.list_commands(click.Context(group)):
+        each = group.get_command(click.Context(group), name)
+        assert each is not None
+        yield from commands_of(each) if isinstance(each, click.Group) else [each]
+
+
+def test_every_default_that_is_a_number_or_a_name_is_in_the_help() -> None:
+    silent = [
+        (each.name, option.opts)
+        for each in commands_of(cli)
+        for option in each.params
+        if isinstance(option, click.Option)
+        and isinstance(option.default, str | int | float)
+        and option.default not in (False, math.inf)
+        and not option.show_default
+    ]
+    assert silent == []

@@ -72,6 +72,8 @@ def test_existing_files_are_not_replaced(
     assert adapted(root, "--steps", "1") == 2
     assert "adapted.md exists; --overwrite" in capsys.readouterr().err
     assert (root / "adapted.md").read_text() == "mine"
+    assert adapted(root, "-o", str(root / "w.pt")) == 2
+    assert "name the file of the weights NAME.safetensors" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -94,6 +94,8 @@ def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path
     with pytest.raises(InputError, match=r"b_depth\.png has no pose in its record"):
         written(out, cloud, fov_deg=None)
     (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    with pytest.raises(UsageError, match="--image is for one depth file"):
+        written(out, cloud, image=tmp_path / "a.png")
     with pytest.raises(InputError, match=r"\b3 poses for 2"):
         written(out, cloud, poses=tmp_path / "p.txt")
     cv2.imwrite(str(tmp_path / "big.png"), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))

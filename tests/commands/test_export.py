@@ -137,8 +137,15 @@ def test_no_pixel_is_infinitely_far_in_3dgs_and_masks_mark_what_is_not_known(roo
 def test_transforms_put_every_pixel_where_the_model_has_it(
     root: Path, unit_scale: float | None
 ) -> None:
-    scene = root / "scene"
-    export(results(root, unit_scale=unit_scale), "nerfstudio", scene)
+    scene, far = root / "scene", DEPTH.copy()
+    far[0] = 20
+    folder = results(root, far, unit_scale)
+    change(folder / "c.json", points={"farthest": 2.0})
+    notes = export(folder, "nerfstudio", scene)["notes"]
+    assert notes == ([] if unit_scale else [
+        f"depth: {3 * WIDTH} pixels beyond 8.192 model units are unknown",
+        "unit: poses and depth are × 8, so that depth fits 16 bits",
+    ])  # fmt: skip
     content = json.loads((scene / "transforms.json").read_text())
     assert content["camera_model"] == "OPENCV"
     assert len(content["frames"]) == 3
@@ -158,6 +165,17 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     factor = world[2] / expected[2]
     assert np.log2(factor) == pytest.approx(0 if unit_scale else round(np.log2(factor)), abs=1e-3)
     assert world[:3] == pytest.approx(expected * factor, rel=1e-3)
+
+
+def test_depth_beyond_16_bits_is_unknown_for_nerfstudio_and_said_so(root: Path) -> None:
+    depth = DEPTH.copy()
+    depth[:2] = np.array([[65.534], [65.535]]) / 0.25  # metres, in units of the model
+    record = export(results(root, depth, unit_scale=0.25), "nerfstudio", root)
+    codes = cv2.imread(str(root / "depths/a.png"), cv2.IMREAD_UNCHANGED)
+    assert (codes[0] == 65534).all()
+    assert not codes[1].any()
+    assert codes[2:].all()
+    assert record["notes"] == [f"depth: {3 * WIDTH} pixels beyond 65.53 m are unknown"]
 
 
 def test_a_copy_of_the_project_takes_the_export_and_the_original_is_as_before(root: Path) -> None:
@@ -183,18 +201,33 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
     assert [each["file_path"] for each in frames] == [f"images/{n}.png" for n in NAMES]
     names = ("k1", "k2", "p1", "p2", "k3")
     assert [entry[name] for name in names] == [-0.1, 0.02, 0.001, -0.002, 0]
+    (tmp_path / "images/link").symlink_to(tmp_path)
+    export(folder, "nerfstudio", tmp_path / "images/link", overwrite=True)
+    assert json.loads((tmp_path / "transforms.json").read_text())["frames"] == frames
     for to in ("colmap", "gaussian-splatting"):
         notes = "".join(export(folder, to, tmp_path / to)["notes"])
         assert " 3 of 3 images have lens distortion" in notes
 
 
+@pytest.mark.parametrize(
+    ("lens", "distortion", "message"),
+    [
+        ("fov", [0.9], r"does not know \(fov, 1 coefficients\); undistort the images first"),
+        ("radial-tangential", [0.1] * 8, r"does not know \(radial-tangential, 8 coefficients\)"),
+        ("fisheye", [0.1] * 4, r"of different kinds \(fisheye, radial-tangential\), but Nerf"),
+    ],
+)
 def test_a_lens_that_nerfstudio_does_not_know_is_refused_and_nothing_is_written(
-    tmp_path: Path,
+    root: Path, lens: str, distortion: list[float], message: str
 ) -> None:
-    folder = results(project(tmp_path, "FOV"))
-    with pytest.raises(InputError, match="undistort the images first"):
-        export(folder, "nerfstudio", tmp_path / "scene")
-    assert list((tmp_path / "scene").rglob("*.*")) == []
+    folder = results(root)
+    for name in NAMES if lens == "fov" else "b":
+        camera = json.loads((folder / f"{name}.json").read_text())["camera"]
+        camera |= {"lens": lens, "distortion": distortion}
+        change(folder / f"{name}.json", camera=camera)
+    with pytest.raises(InputError, match=message):
+        export(folder, "nerfstudio", root / "scene")
+    assert list((root / "scene").rglob("*.*")) == []
 
 
 NO_CAMERA: dict[str, Any] = {
@@ -261,6 +294,17 @@ def test_results_that_cannot_be_exported_are_one_line(
         export(folder, "colmap", root / "dense")
     assert "\n" not in str(caught.value)
     assert sorted(root.parent.rglob("*")) == before
+
+
+def test_results_need_depth_a_folder_to_go_to_and_masks_of_their_size(root: Path) -> None:
+    folder = results(root)
+    with pytest.raises(InputError, match=r"images has no files NAME_depth\.png"):
+        export(root / "images", "colmap", root / "dense")
+    with pytest.raises(OutputError, match=r"a\.json is a file; name a folder"):
+        export(folder, "colmap", folder / "a.json")
+    cv2.imwrite(str(folder / "a_valid.png"), np.zeros((2, 2), np.uint8))
+    with pytest.raises(SizeError, match=r"a_valid\.png is not of the size of .*a_depth\.exr"):
+        export(folder, "colmap", root / "dense")
 
 
 def test_depth_without_poses_is_no_scene_of_nerfstudio_and_files_are_kept_without_overwrite(

@@ -8,7 +8,12 @@ from typing import Any
 
 import pytest
 
-from pnpdepth_cli.commands.error_tables import change, format_error, refinement_table
+from pnpdepth_cli.commands.error_tables import (
+    baselines_table,
+    change,
+    format_error,
+    refinement_table,
+)
 from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
 from pnpdepth_cli.commands.tables import Table
 from pnpdepth_cli.core.metrics import MEASURES
@@ -60,6 +65,54 @@ def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> Non
     record["linear"]["check"]["result"] = 0.5
     _, fused, _, result, _ = (row[0] for row in refinement_table(record).rows)
     assert (fused, result) == ("with points, fused", "result")
+
+
+def test_errors_stand_by_what_they_are_measured_on_and_hidden_points_count_only_alone() -> None:
+    after = {"rmse": 1.0, "delta1": 0.75, "pixels": 1200, "coverage": 0.5}
+    record: dict[str, Any] = {
+        "method": {"kind": "fixed"},
+        "model": {"name": "net"},
+        "settings": {"layer": "middle"},
+        "unit": "m",
+        "scores": {"before": {"rmse": 2.0, "delta1": 0.5}, "after": after},
+        "held_out_error": {"before": {"mae": 0.5}, "after": {"mae": 1.0, "points": 1000}},
+        "sparse_error": {"before": {"mae": 0.5}, "after": {"mae": 0.25, "points": 2000}},
+        "linear": {
+            "scores": {"rmse": 4.0, "delta1": 0.75},
+            "held_out_error": None,
+            "check": {"points": 12, "aligned": 4.0, "result": 1.0, "linear": 2.0},
+        },
+    }
+    table = refinement_table(record)
+    scored = "scored on 1,200 pixels of ground truth (50.0% of those known)"
+    assert table.caption == f"net cut at middle; {scored}"
+    at_used = ["error at 2,000 points used, MAE", "0.5000 m", "0.2500 m", "", "–", ""]
+    assert table.rows == [
+        ["RMSE", "2.0000 m", "1.0000 m", "-50.0%", "4.0000 m", "-75.0%"],
+        ["δ1", "50.00%", "75.00%", "+25.00 pt", "75.00%", "+0.00 pt"],
+        ["error at 1,000 held-out points, MAE", "0.5000 m", "1.0000 m", "+100.0%", "–", "–"],
+        at_used,
+    ]
+    table = refinement_table(record | dict.fromkeys(("scores", "held_out_error")))
+    assert table.caption == "net cut at middle"
+    hidden = ["error at 12 hidden points, MAE", "4.0000 m", "1.0000 m", "-75.0%"]
+    assert table.rows == [[*hidden, "2.0000 m", "-50.0%"], at_used]
+
+
+def test_baselines_are_sorted_and_have_ground_truth_where_one_of_them_has() -> None:
+    baselines: dict[str, Any] = {
+        "nearest": {"held_out_mae": 2.0, "scores": {"mae": 3.0, "rmse": 4.0}},
+        "result": {"held_out_mae": 1.0, "scores": None},
+        "linear": {"held_out_mae": None},
+    }
+    table = baselines_table(baselines, "m")
+    assert table.header == ["", "MAE, held-out points", "MAE, ground truth", "RMSE, ground truth"]
+    assert styled(table) == [
+        [("result", "bold"), ("1.0000 m", "bold"), ("–", "bold"), ("–", "bold")],
+        [("nearest", ""), ("2.0000 m", ""), ("3.0000 m", ""), ("4.0000 m", "")],
+    ]
+    unknown = {name: {"held_out_mae": None} for name in ("nearest", "linear")}
+    assert baselines_table(unknown, "m").rows == [["nearest", "–"], ["linear", "–"]]
 
 
 def styled(table: Table) -> list[list[tuple[str, str]]]:

@@ -63,10 +63,10 @@ def with_adapted_weights(
         digest = _digest(settings_of(request.refine, model), tasks)
         record = read_json(file) if file.exists() else {}
         known = record.get("digest") == digest and (record.get("why") or weights.exists())
-        if not known and stopped is None:
-            return request
         if not known:
-            why = _learn(request, tasks, weights, say, stopped or (lambda: False))
+            if stopped is None:
+                return request
+            why = _learn(request, tasks, weights, say, stopped)
             record = {"digest": digest, "why": why}
             make_folder(folder)
             write_json(file, record)

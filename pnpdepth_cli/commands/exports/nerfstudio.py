@@ -94,7 +94,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
 
 def _factor(frames: Sequence[ExportFrame]) -> float:
     """What poses and depths in model units are multiplied by, a power of two; 1 for metres."""
-    if all(frame.result.unit == METRES for frame in frames):
+    if frames[0].result.unit == METRES:
         return 1.0
     farthest = _BEYOND_POINTS * max(frame.farthest for frame in frames)
     return float(2.0 ** math.floor(math.log2(LARGEST_CODE / _CODES_PER_UNIT / farthest)))

@@ -306,7 +306,7 @@ def _scale(axes: Axes, axis: Axis) -> None:
     numbers, labels = axis.numbers(), list(axis.values)
     axes.set_xlabel(axis.title())
     if numbers is not None:
-        if PARAMETERS[axis.name].shown.log and min(numbers) > 0:
+        if PARAMETERS[axis.name].shown.log:  # of values above 0
             axes.set_xscale("log")
         axes.set_xticks(numbers, [label.removesuffix("%") for label in labels])
     else:

@@ -9,7 +9,11 @@ from types import SimpleNamespace
 import pytest
 
 from pnpdepth_cli.cli.main import run
+from pnpdepth_cli.commands.batch.batch import run_batch
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.frames import adapt as adapting
+from tests.commands.batches import RecordingListener
 from tests.commands.drives import drive_on_disk
 
 NETWORK = ("--model", "sparse2dense-tiny", "--iterations", "0")
@@ -32,6 +36,8 @@ def test_better_weights_are_used_for_every_frame_and_found_again(
 ) -> None:
     monkeypatch.setattr(adapting, "ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.01))
     monkeypatch.setattr(adapting.Adaptation, "_validated", falling(adapting.Adaptation._validated))
+    assert batch(drive, "--dry-run") == 0
+    assert not (drive.parent / "out").exists()
     assert batch(drive) == 0
     weights = drive.parent / "out/adapted/drive.safetensors"
     for number in range(8):
@@ -74,6 +80,28 @@ def test_a_network_without_points_cannot_be_adapted(
     command = ["batch", str(drive), "-o", str(drive.parent / "out"), "--adapt"]
     assert run([*command, "--model", "fcrn-tiny"]) == 2
     assert "--adapt needs a network that takes points" in capsys.readouterr().err
+
+
+def test_learning_can_be_stopped(drive: Path) -> None:
+    request = BatchRequest(
+        source=drive,
+        output=drive.parent / "out",
+        refine=RefineRequest.from_fields(model="sparse2dense-tiny", iterations=0),
+        adapt=True,
+    )
+    with pytest.raises(KeyboardInterrupt):
+        run_batch(request, RecordingListener(), lambda: True)
+    assert list((drive.parent / "out/adapted").iterdir()) == []
+
+
+def test_a_frame_that_cannot_be_read_leaves_the_networks_own_weights(
+    drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (drive / "rgb/drive_000.png").write_bytes(b"")
+    assert batch(drive) == 7
+    assert "own weights are used: " in (printed := capsys.readouterr().err)
+    assert "7 of 8 frames done, 1 failed" in printed
+    assert not (drive.parent / "out/adapted").exists()
 
 
 @pytest.mark.parametrize(

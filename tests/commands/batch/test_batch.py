@@ -115,6 +115,10 @@ def test_other_settings_or_other_code_in_the_same_file_do_all_again(root: Path) 
         code.write_text(code.read_text().replace(old, new))
         assert done(root, limit=2, refine=settings) == ["a", "b"]
     assert done(root, limit=2, refine=settings) == []
+    code, named = root / "net/my_net.py", {"model": f"{root}/net/my_net.py:Net", "iterations": 0}
+    for number in "56":
+        code.write_text(code.read_text().replace(f"2.{number} + 3", f"2.{int(number) + 1} + 3"))
+        assert done(root, limit=2, refine=named) == ["a", "b"]
 
 
 def test_a_bad_frame_is_reported_counted_skipped_and_done_when_it_is_mended(root: Path) -> None:
@@ -187,11 +191,32 @@ def test_results_inside_the_input_are_never_taken_as_input(root: Path) -> None:
     assert json.loads((output / "summary.json").read_text())["unmatched"] == []
 
 
-@pytest.mark.parametrize("output", [".", "rgb", ".."])
-def test_an_output_folder_that_holds_the_frames_is_refused(root: Path, output: str) -> None:
-    with pytest.raises(OutputError, match="holds the frames themselves"):
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        *((folder, "holds the frames themselves") for folder in (".", "rgb", "..")),
+        ("rgb/a.png", r"a\.png is a file; name a folder"),
+    ],
+)
+def test_an_output_that_is_a_file_or_holds_the_frames_is_refused(
+    root: Path, output: str, message: str
+) -> None:
+    with pytest.raises(OutputError, match=message):
         batch(root, output=root / output)
     assert not list(root.rglob(".batch*"))
+
+
+def test_a_few_files_in_no_frame_are_named_and_the_others_counted(root: Path) -> None:
+    listener = RecordingListener()
+    for number in range(7):
+        shutil.copy(root / "rgb/a.png", root / f"rgb/x{number}.png")
+        batch(root, listener, limit=1, refine={"iterations": 0})
+    assert [sum(f"rgb/x{n}.png" in text for text in listener.messages) for n in range(7)] == [
+        *range(7, 2, -1), 0, 0,
+    ]  # fmt: skip
+    more = [text for text in listener.messages if "more files are in no frame" in text]
+    assert [text.split()[1] for text in more] == ["1", "2"]
+    assert len(summary(root)["unmatched"]) == 7
 
 
 @pytest.mark.parametrize("name", ["c.json", "c_depth.png", "summary.csv", "summary.json"])
@@ -306,7 +331,8 @@ def test_a_record_that_lacks_what_the_summary_needs_is_an_error_that_names_it(ro
     path = root / "out/c.json"
     record = json.loads(path.read_text())
     lacking = {key: value for key, value in record.items() if key != "scores"}
-    for damaged in (lacking, *(record | {key: 0.5} for key in ("seconds", "points"))):
+    half = record | {"scores": {"before": record["scores"]["before"]}}
+    for damaged in (lacking, half, *(record | {key: 0.5} for key in ("seconds", "points"))):
         path.write_text(json.dumps(damaged))
         with pytest.raises(InputError, match=r"c\.json is damaged; remove it, and run again"):
             batch(root)

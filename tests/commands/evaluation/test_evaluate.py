@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -86,6 +87,9 @@ def test_two_single_files_raise_their_error(two: Path) -> None:
     prediction, gt = two / "out" / "a_depth.npy", two / "gt" / "a.npy"
     result = evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
     assert (result.mean["rmse"], result.interval) == (1, None)
+    depth_file(prediction, [[0, 0]])
+    with pytest.raises(InputError, match=rf"^{re.escape(str(prediction))} holds no valid depth$"):
+        evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
     depth_file(gt, [[0, 0]])
     with pytest.raises(InputError, match=r"a\.npy has no known depth where protocol paper scores"):
         evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
@@ -212,6 +216,31 @@ def test_the_group_of_a_manifest_goes_before_the_name(tmp_path: Path) -> None:
     assert [frame.pair.group for frame in result.frames] == ["a", "b", "a"]
 
 
+@pytest.mark.parametrize(
+    ("prediction", "row", "options", "message"),
+    [
+        ("out/a.npy", "gt/a.npy,", {}, "data set but .* one file; give a folder"),
+        ("out", ",gt/a.npy", {}, "looks like 'manifest', and no frame in it has ground truth"),
+        ("out", "s3://bucket/a.png,", {}, "eval reads local files; copy the frames from the store"),
+        ("out", "gt/a.npy,scan.ply", {"exclude_sparse": True}, "has no sparse depth file to excl"),
+    ],
+)
+def test_a_data_set_that_cannot_be_scored_so_is_refused(
+    tmp_path: Path, prediction: str, row: str, options: dict[str, Any], message: str
+) -> None:
+    for folder in ("out", "gt"):
+        depth_file(tmp_path / folder / "a.npy", [[2]])
+    for name in ("a.png", "scan.ply"):
+        (tmp_path / name).touch()
+    (tmp_path / "list.csv").write_text(f"image,gt,sparse,name\na.png,{row},a")
+    with pytest.raises((InputError, UsageError), match=message):
+        evaluate(
+            EvalRequest(
+                prediction=tmp_path / prediction, ground_truth=tmp_path / "list.csv", **options
+            )
+        )
+
+
 def test_a_mask_of_another_size_or_missing_for_a_frame_is_a_fault(two: Path) -> None:
     depth_file(two / "masks" / "a.npy", [[1, 0, 1]])
     with pytest.raises(InputError, match=r"mask .*a\.npy is 3×1 but the ground truth"):
@@ -308,7 +337,7 @@ def test_sparse_input_in_the_ground_truth_causes_a_warning_and_can_be_excluded(
 
 def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) -> None:
     sparse = depth_file(two / "s.npy", [[1, 0]])
-    record = {"inputs": {"sparse": {"path": str(sparse)}}}
+    record = {"inputs": {"sparse": {"path": str(sparse)}}, "points": {"used": 2}}
     (two / "out" / "a.json").write_text(json.dumps(record))
     result = scored(two)
     assert [f.leaked for f in result.frames] == [1, None]
@@ -318,6 +347,9 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
     sparse.write_bytes(b"spoilt")
     (two / "out" / "a.json").write_text(json.dumps(record))
     assert scored(two).frames[0].leaked is None
+    for options in ({"sparse": sparse}, {"exclude_sparse": True}):
+        with pytest.raises(InputError, match=r"the first: .*s\.npy is not a depth file"):
+            scored(two, **options)
     (two / "out" / "a.json").write_text(json.dumps(sampled))
     with pytest.raises(InputError, match="give it with --sparse; `pnpdepth sample` draws"):
         scored(two, exclude_sparse=True)

@@ -135,3 +135,7 @@ def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
     assert result.uncertainty is not None
     assert result.uncertainty["within_1_sigma"] == pytest.approx(0.683, abs=0.03)
     assert not any("have no ground truth" in note for note in result.notes)
+    write_depth(tmp_path / "out" / "a_sigma.npy", np.ones((2, 2), np.float32))
+    assert evaluate(result.request).uncertainty is None
+    (tmp_path / "out" / "a_sigma.npy").write_bytes(b"no deviation")
+    assert evaluate(result.request).uncertainty is None

@@ -51,6 +51,9 @@ def test_errors_by_area_are_weighted_by_the_squared_depth_and_bands_hold_their_l
     near = [abs(p - g) for *_, p, g in PIXELS if 5 <= g < 10]
     assert errors["mae_5_10"] == pytest.approx(np.mean(near))
     assert math.isnan(errors["mae_40_80"])
+    at_10 = values("area", MeasuredFrame(depth=np.array([[11.0]]), gt=np.array([[10.0]])))
+    assert at_10["mae_10_20"] == 1
+    assert math.isnan(at_10["mae_5_10"])
 
 
 def test_bands_of_distance_are_of_the_nearest_point() -> None:
@@ -117,6 +120,8 @@ def test_a_shifted_step_is_as_far_as_it_is_shifted_up_to_ten_pixels(
     column: int, error: int
 ) -> None:
     assert edge_errors(step(column), step(30)) == pytest.approx((error, error))
+    far = edge_errors(18 + step(column), 18 + step(30))
+    assert far == pytest.approx((error, error))
 
 
 def test_an_extra_edge_costs_completeness_alone_and_holes_make_none() -> None:
@@ -128,6 +133,12 @@ def test_an_extra_edge_costs_completeness_alone_and_holes_make_none() -> None:
     holes = step(30)
     holes[10:20, 5:15] = 0
     assert edge_errors(holes, step(30)) == (0, 0)
+    holes[:, 28:38] = 0  # where the edge was is not known
+    assert edge_errors(holes, step(30)) == (10, 10)
+    assert np.isnan(edge_errors(np.zeros_like(holes), step(30))).all()
+    rough = step(30)
+    rough[:, :20] += np.random.default_rng(0).uniform(0, 0.02, (40, 20)).astype(np.float32)
+    assert edge_errors(rough, step(30)) == (0, 0)
     sparse = np.where(np.random.default_rng(0).random((40, 60)) < 0.1, step(30), 0)
     assert np.isnan(edge_errors(step(30), sparse.astype(np.float32))).all()
     assert np.isnan(edge_errors(step(30), np.full((40, 60), 2, np.float32))).all()
@@ -169,9 +180,11 @@ def test_the_error_of_a_tilted_plane_is_its_tilt(degrees: float) -> None:
     assert measured["plane_angle"] == pytest.approx(degrees, abs=1e-3)
     assert measured["planarity"] == pytest.approx(0, abs=1e-5)
     assert (measured["normal_11"], measured["normal_30"]) == (degrees < 11.25, degrees < 30)
-    frame = MeasuredFrame(depth=plane(degrees), gt=plane(degrees), intrinsics=K)
+    depth = plane(degrees)
+    depth[20, 30] = 0  # it and its four neighbours have no normal
+    frame = MeasuredFrame(depth=depth, gt=plane(degrees), intrinsics=K)
     normals, known = normals_of(frame.points(frame.gt), frame.both)
-    assert known.sum() == 46 * 70
+    assert known.sum() == 46 * 70 - 5
     assert np.abs(normals[known] @ np.array(tilted(degrees))) == pytest.approx(1, abs=1e-6)
 
 
@@ -186,5 +199,6 @@ def test_planarity_is_the_deviation_from_the_least_squares_plane() -> None:
             singular = np.linalg.svd(tile - tile.mean(axis=0), compute_uv=False)
             spreads.append(singular[-1] / np.sqrt(len(tile)))
     assert surface(noisy, gt)["planarity"] == pytest.approx(np.mean(spreads), rel=1e-6)
+    assert math.isnan(surface(gt, noisy)["planarity"])  # of tiles that are no planes
     gt[::2] = gt[:, ::2] = 0  # no pixel has neighbours, no tile is half known
     assert np.isnan(list(surface(plane(0), gt).values())).all()

@@ -22,7 +22,7 @@ from pnpdepth_cli.commands.evaluation.pairing import (
     stack_size,
 )
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.errors import InputError, UsageError
+from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 from tests.models.weights.files import little, npy_of
 
@@ -77,10 +77,10 @@ MATCHED = [
         [],
     ),
     (
-        ["a.png", "x.png", "y.png", ".b.png", ".hidden/c.png"],
+        [*(f"{name}.png" for name in "avwxyz"), ".b.png", ".hidden/c.png"],
         ["a.png", "b.png"],
         {"a": "a.png", "b": None},
-        ["warning: 2 of 3 predictions have no ground truth and are not scored: x, y"],
+        ["warning: 5 of 6 predictions have no ground truth and are not scored: v, w, x, y, z"],
     ),
 ]
 
@@ -101,7 +101,9 @@ def test_files_are_matched_by_name_and_what_is_left_is_reported(
 
 REFUSED = [
     (["a.npy", "a.png"], ["a.png"], "out", "gt", InputError, "are one frame; keep one"),
+    (["a_depth.png", "a.depth.png"], ["a.png"], "out", "gt", InputError, "are one frame; keep"),
     (["a.png"], [], "out", "gt", InputError, "gt holds no depth file"),
+    (["a.png"], ["a.png"], "out/b.png", "gt/a.png", InputError, "b.png: no such file or folder"),
     (["1.png"], ["0001.png"], "out", "gt", InputError,
      "file: predictions are 1; ground truth is 0001"),
     (["a.png"], ["a.png"], "out/a.png", "gt", UsageError, "two files or two folders"),
@@ -197,6 +199,10 @@ def test_images_of_different_sizes_are_objects_and_anything_else_is_not_executed
     np.savez(tmp_path / "gt_depths.npz", data=maps)
     assert stack_size(tmp_path / "gt_depths.npz") == 2
     assert load_stacked(tmp_path / "gt_depths.npz", 1).values.tolist() == maps[1].tolist()
+    maps[0] = np.ones((2, 3, 1), np.float32)
+    np.savez(tmp_path / "deep.npz", data=maps)
+    with pytest.raises(FileFormatError, match=r"deep\.npz: frame 0 is of shape \(2, 3, 1\)"):
+        load_stacked(tmp_path / "deep.npz", 0)
     calls: list[str] = []
     monkeypatch.setattr(os, "system", calls.append)
     maps[0] = _Attack()
@@ -236,10 +242,14 @@ def test_an_archive_that_is_far_larger_than_its_file_is_no_stack(
 
 def test_single_maps_are_no_stack_and_numbers_of_frames_must_agree(tmp_path: Path) -> None:
     sizes = {}
-    for name, shape in (("map", (4, 5)), ("channel", (1, 4, 5)), ("three", (3, 4, 5)),
-                        ("two", (2, 4, 5))):  # fmt: skip
+    for name, shape in (("map", (4, 5)), ("channel", (1, 4, 5)), ("last", (3, 4, 1)),
+                        ("three", (3, 4, 5)), ("two", (2, 4, 5))):  # fmt: skip
         np.save(tmp_path / f"{name}.npy", np.ones(shape, np.float32))
         sizes[name] = stack_size(tmp_path / f"{name}.npy")
-    assert sizes == {"map": None, "channel": None, "three": 3, "two": 2}
+    assert sizes == {"map": None, "channel": None, "last": None, "three": 3, "two": 2}
+    np.savez_compressed(tmp_path / "empty.npz", np.zeros((3, 200, 200), np.float32))
+    assert stack_size(tmp_path / "empty.npz") == 3  # a few hundred bytes
     with pytest.raises(InputError, match=r"holds 3 frames but .* 2 frames"):
         pair_frames(tmp_path / "three.npy", tmp_path / "two.npy")
+    with pytest.raises(InputError, match=r"holds 3 frames but .* no stack of frames"):
+        pair_frames(tmp_path / "three.npy", tmp_path / "map.npy")

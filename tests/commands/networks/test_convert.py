@@ -91,3 +91,5 @@ def test_a_checkpoint_does_not_replace_itself(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is the checkpoint itself"):
         convert_checkpoint(source, source, overwrite=True)
     assert source.read_bytes() == before
+    with pytest.raises(UsageError, match=r"name the converted file \.safetensors"):
+        convert_checkpoint(source, tmp_path / "w.pt")

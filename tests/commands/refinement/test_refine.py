@@ -12,6 +12,7 @@ from PIL import Image
 
 from pnpdepth_cli.commands.refinement.inputs import _scale_warning
 from pnpdepth_cli.commands.refinement.refine import _point_error
+from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.errors import (
     InputError,
     LayerError,
@@ -26,6 +27,7 @@ from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.sensors import SamplePattern
 from tests.commands.frames import FrameOnDisk, run
 
 
@@ -199,6 +201,11 @@ BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"time_budget_s": 5.0}, UsageError, "--propagate makes none"),
     ({"gt": "small.npy"}, SizeError, "ground truth .* is 62×10 but the image is 62×46"),
     ({"gt": "empty.npy"}, InputError, "no pixel with known depth"),
+    ({"sparse": None}, InputError, "has no sparse depth; add it, or sample the ground truth"),
+    ({"sparse": None, "sample": SamplePattern(count=9)}, InputError, "no ground truth to sample"),
+    ({"sparse": ".", "scan": ScanOptions(max_range=9.0)}, UsageError, "of a LiDAR scan do not app"),
+    ({"sparse": "far.csv"}, NoPointsError, "none of its 1 points lies in the image"),
+    ({"sparse": "one.csv", "holdout": 0.5}, UsageError, "at least two sparse points"),
     ({"ply": True}, UsageError, r"--ply needs the camera, .* give --calib or --fov"),
     ({"ply": True, "fov_deg": 180.0}, UsageError, "--fov is 180 degrees"),
     ({"ply": True, "fov_deg": 60.0, "output": Path("a.exr")}, UsageError, "--ply writes a second"),
@@ -221,9 +228,11 @@ def test_a_mistake_gives_one_clear_line_and_writes_nothing(
 ) -> None:
     np.save(frame.folder / "small.npy", frame.depth[:10])
     np.save(frame.folder / "empty.npy", 0 * frame.depth)
+    for name, x in (("one", 5), ("far", 500)):
+        (frame.folder / f"{name}.csv").write_text(f"x,y,depth\n{x},5,2\n")
     before = files(frame.folder)
-    if "gt" in changes:
-        changes = {"gt": frame.folder / changes["gt"]}
+    paths = {part: changes[part] for part in ("gt", "sparse") if changes.get(part)}
+    changes = changes | {part: frame.folder / path for part, path in paths.items()}
     with pytest.raises(error, match=message) as caught:
         run(frame, **changes)
     assert "\n" not in str(caught.value)

@@ -59,6 +59,15 @@ def test_points_have_a_spacing_where_the_lens_shows_nothing_in_a_corner(tmp_path
     assert json.loads((tmp_path / "out" / "img_view.json").read_text())["spacing"] == 1 / 20
 
 
+def test_a_depth_that_is_the_same_everywhere_has_a_range(tmp_path: Path) -> None:
+    frame = frame_on_disk(tmp_path)
+    frame.model.write_text(frame.model.read_text().replace("2 + 3 *", "2 + 0 *"))
+    run(frame, view_3d=True, fov_deg=60.0, iterations=0, align="none")
+    view = json.loads((tmp_path / "out" / "img_view.json").read_text())
+    assert view["range"] == pytest.approx([2, 2.002])
+    assert {*unpacked(view["depths"]["after"], "<u2", (46 * 62,))} == {1}
+
+
 def test_colours_are_those_of_the_image(view: dict[str, Any], tmp_path: Path) -> None:
     width, height = view["size"]
     colours = unpacked(view["colours"], "|u1", (height, width, 3))

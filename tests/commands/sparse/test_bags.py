@@ -69,6 +69,10 @@ def test_a_batch_takes_a_bag_and_writes_its_frames_once(
     bag, frame = write_bag(tmp_path / "drive.mcap"), frame_on_disk(tmp_path)
     network = ["--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
     command = ["batch", str(bag), "-o", str(tmp_path / "out"), *network, "--iterations", "1"]
+    assert run([*command, "--dry-run"]) == 2
+    assert f"--dry-run writes nothing; run `pnpdepth frames {bag}`" in capsys.readouterr().err
+    assert run(["batch", str(tmp_path), "-o", str(tmp_path / "out"), "--topics", "/lidar"]) == 2
+    assert f"{tmp_path} is no bag; leave out --topics" in capsys.readouterr().err
     written_at = dict[Path, int]()
     for text, again in (("wrote 3 frames to", "3 to do"), ("", "all of them done already")):
         assert run(command) == 0
@@ -85,6 +89,8 @@ def test_topics_can_be_named_and_images_without_a_scan_in_time_are_none(tmp_path
     bag = write_bag(tmp_path / "drive.mcap")
     with pytest.raises(PnpDepthError, match=r"within 0\.001 s; check the clocks"):
         written(bag, tmp_path / "none", options=BagOptions(tolerance=0.001))
+    with pytest.raises(UsageError, match="--tolerance must be >= 0, got -1"):
+        BagOptions(tolerance=-1)
     missing = BagOptions(topics="/rear")
     with pytest.raises(UsageError, match=r"no topic /rear .* there are /front/image_raw, /lidar"):
         written(bag, tmp_path / "frames", options=missing)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,13 @@ from pnpdepth_cli.commands.refinement.refine import refine_image
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.commands.sweep.axes import read_axis, studies_of
-from pnpdepth_cli.commands.sweep.outputs import METHODS, SWEPT, across_and_apart, summarise
+from pnpdepth_cli.commands.sweep.outputs import (
+    METHODS,
+    SWEPT,
+    across_and_apart,
+    draw_study,
+    summarise,
+)
 from pnpdepth_cli.commands.sweep.points import Sampling, frame_points, read_sampling
 from pnpdepth_cli.commands.sweep.sweep import SweepRequest, run_sweep
 from pnpdepth_cli.completion.interpolation import linear
@@ -482,6 +488,80 @@ def test_the_cost_stands_beside_the_error_where_it_is_asked_for(root: Path) -> N
     assert [float(row["time_s"]) for row in lines(root, "sweep.csv")] == times
     assert (root / "out" / "sweep_iterations.pdf").read_bytes().startswith(b"%PDF")
     assert "time_s" not in sweep(root, "iterations=0,40")["studies"][0]["cells"][0]
+
+
+@pytest.fixture
+def drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Draws the study of some axes: its cells, of six frames, and the figure that is saved."""
+    figure, figures = pytest.importorskip("matplotlib.figure").Figure, list[Any]()
+    save = figure.savefig
+    monkeypatch.setattr(figure, "savefig", lambda *a, **k: (figures.append(a[0]), save(*a, **k)))
+
+    def draw(*vary: str) -> tuple[list[dict[str, Any]], Any]:
+        (study,) = studies_of([read_axis(text) for text in vary], one_by_one=False)
+        cells = []
+        for number, parameters in enumerate(study.cells()):
+            of_frames = zip("abcdef", (3, 6, 1, 5, 2, 4), strict=True)
+            rows = [row(name, 0, [n, number + 1, 1, 3], plain=n + 1) for name, n in of_frames]
+            cells.append(summarise(rows, 50) | {"parameters": parameters})
+        draw_study(study, cells, tmp_path / "plot.png")
+        return cells, figures[-1]
+
+    return draw
+
+
+@pytest.mark.parametrize(
+    ("vary", "order", "at", "aside", "scale"),
+    [
+        ("lr=4,1,2", [1, 2, 0], [1, 2, 4], 0, "log"),
+        ("seed=4,1,2", [1, 2, 0], [1, 2, 4], 0, "linear"),
+        ("loss=l2,log,l1", [0, 1, 2], [0, 1, 2], 0.1, "linear"),
+    ],
+)
+def test_a_plot_shows_errors_costs_and_gains_with_their_intervals(
+    vary: str, order: list[int], at: list[float], aside: float, scale: str,
+    drawn: Callable[..., Any],
+) -> None:  # fmt: skip
+    cells, figure = drawn(vary)
+    error, gained, cost = figure.axes
+    ordered = [cells[number] for number in order]
+
+    def points(key: str, name: str, shift: float = 0) -> list[tuple[float, float]]:
+        shown = [cell["measures"][key][name] for cell in ordered]
+        return [(x + shift, y) for x, y in zip(at, shown, strict=True)]
+
+    lines = [line.get_xydata().tolist() for line in (*error.get_lines(), *gained.get_lines())]
+    names = ("refined", "plain", "linear")
+    expected = [points("mae", name) for name in names] + [points("mae", "gain")]
+    assert [line for line in lines if len(line) == 3] == [
+        [list(point) for point in line] for line in [*expected, points("rmse", "gain", aside)]
+    ]
+    styles = [line.get_linestyle() for line in gained.get_lines()[:2]]
+    assert styles == (["None"] * 2 if aside else ["-"] * 2)
+    for key, drawing in zip(("mae", "rmse"), gained.collections, strict=True):
+        ends = {y for name in ("gain_low", "gain_high") for _, y in points(key, name)}
+        corners = np.concatenate([path.vertices for path in drawing.get_paths()])
+        assert {*corners[:, 1]} == ends
+    assert not error.collections
+    assert error.get_xscale() == scale
+    legend = {"refined", "plain network", "linear interpolation", "refined, RMSE"}
+    assert {text.get_text() for text in figure.legends[0].get_texts()} == legend
+    ticks = zip(error.get_xticks(), error.get_xticklabels(), strict=True)
+    assert {tick: label.get_text() for tick, label in ticks} == {
+        x: next(iter(cell["parameters"].values())) for x, cell in zip(at, ordered, strict=True)
+    }
+    expected = [(cell["time_s"], cell["measures"]["mae"]["refined"]) for cell in cells]
+    assert [tuple(line.get_xydata()[0]) for line in cost.get_lines()] == expected
+
+
+def test_a_grid_has_a_line_for_each_value_of_the_other_axis(drawn: Callable[..., Any]) -> None:
+    cells, figure = drawn("lr=1,2,4", "loss=l1,log")
+    lines = {line.get_label(): line.get_ydata().tolist() for line in figure.axes[0].get_lines()}
+    for loss in ("l1", "log"):
+        of_loss = [cell for cell in cells if cell["parameters"]["loss"] == loss]
+        assert lines[loss] == [cell["measures"]["mae"]["refined"] for cell in of_loss]
+    legend = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert legend == {"l1", "log", "plain network", "linear interpolation"}
 
 
 @pytest.mark.parametrize(
