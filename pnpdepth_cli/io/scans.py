@@ -194,7 +194,7 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
 def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
     """x y z of the vertices of a PLY, ASCII or binary."""
     header, body = _header(path, data, "PLY", b"end_header")
-    if header[0] != ["ply"] or len(header) < 2 or header[1][0] != "format":
+    if header[0] != ["ply"] or header[1][0] != "format":
         raise damaged(path, "PLY", "does not begin with ply and its format")
     elements = [i for i, words in enumerate(header) if words[0] == "element"]
     if not elements or header[elements[0]][1:2] != ["vertex"] or len(header[elements[0]]) != 3:

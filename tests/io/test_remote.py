@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import pickle
 import socketserver
 import threading
@@ -14,6 +15,7 @@ import pytest
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import InputError, PnpDepthError, StorageError, UsageError
 from pnpdepth_cli.io import remote as stores
+from pnpdepth_cli.io.fingerprint import fingerprint, is_unchanged
 from pnpdepth_cli.io.remote import (
     Listing,
     RemotePath,
@@ -88,6 +90,7 @@ class FakeStore:
     def __init__(self) -> None:
         self.objects: dict[str, bytes] = {}
         self.error: Exception | None = None
+        self.versions = True
         self.calls: list[str] = []
 
     def _called(self, name: str) -> None:
@@ -100,7 +103,8 @@ class FakeStore:
         if path not in self.objects:
             raise self.error or FileNotFoundError(path)
         data = self.objects[path]
-        return {"name": path, "size": len(data), "type": "file", "ETag": str(hash(data))}
+        version = {"ETag": str(hash(data))} if self.versions else {}
+        return {"name": path, "size": len(data), "type": "file", **version}
 
     def ls(self, path: str, *, detail: bool) -> list[dict[str, Any]]:
         self._called("ls")
@@ -179,6 +183,24 @@ def test_copies_have_the_names_of_their_objects_and_end_with_the_block(fake: Fak
         assert [copies[path].name for path in paths[:2]] == ["a.png", "a.png"]
         assert len(copies) == 2
     assert not any(copy.exists() for copy in copies.values())
+
+
+@pytest.mark.parametrize("versions", [True, False])
+def test_an_object_is_known_by_its_version_or_without_one_by_its_content(
+    fake: FakeStore, versions: bool
+) -> None:
+    path, fake.versions, fake.objects = remote("a"), versions, {"s3://b/a": b"one"}
+    with local_files([path]) as copies:
+        known = fingerprint(path, copies[path])
+    assert (known.size, known.sha256) == (3, hashlib.sha256(b"one").hexdigest())
+    assert is_unchanged(path, known, Listing())
+    assert fake.calls.count("get_file") == (1 if versions else 2)
+    fake.objects["s3://b/a"] = b"two"
+    assert not is_unchanged(path, known, Listing())
+    with pytest.raises(InputError, match="is in a store; copy the file first"):
+        fingerprint(path)
+    fake.objects.clear()
+    assert not is_unchanged(path, known, Listing())
 
 
 @pytest.mark.parametrize(
