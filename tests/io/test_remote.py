@@ -22,6 +22,7 @@ from pnpdepth_cli.io.remote import (
     joined,
     local_files,
     path_of,
+    remove,
     status_of,
     upload,
 )
@@ -117,6 +118,9 @@ class FakeStore:
     def put_file(self, file: str, path: str) -> None:
         self._called("put_file")
 
+    def rm_file(self, path: str) -> None:
+        self._called("rm_file")
+
 
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeStore:
@@ -159,9 +163,11 @@ def test_what_a_store_raises_is_one_line(
 def test_what_cannot_be_written_stops_the_batch(
     fake: FakeStore, error: Exception, message: str, tmp_path: Path
 ) -> None:
-    fake.error = error
+    fake.error, fake.objects = error, {"s3://b/x": b"old"}
     with pytest.raises(StorageError, match=message):
         upload(tmp_path / "x", remote("x"))
+    with pytest.raises(StorageError, match=message):
+        remove(remote("x"))
 
 
 def test_a_folder_is_listed_once_in_a_store_and_on_disk(fake: FakeStore, tmp_path: Path) -> None:

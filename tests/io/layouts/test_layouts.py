@@ -342,8 +342,8 @@ def test_all_of_void_is_taken_without_a_list_of_the_test_split(tmp_path: Path) -
 
 def test_ground_truth_is_moved_and_never_interpolated(tmp_path: Path) -> None:
     depth = np.array([[1, 2], [3, 0]], np.float32)
-    larger = moved_to(tmp_path, depth, (4, 4))
-    assert sorted(larger[larger > 0].tolist()) == [1, 2, 3]
+    larger = [[0, 0, 0, 0], [0, 1, 0, 2], [0, 0, 0, 0], [0, 3, 0, 0]]
+    assert moved_to(tmp_path, depth, (4, 4)).tolist() == larger
     assert moved_to(tmp_path, depth, (1, 1)).tolist() == [[1]]
     with pytest.raises(SizeError, match="do not show the same view"):
         moved_to(tmp_path, depth, (4, 9))
