@@ -8,6 +8,7 @@ import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import bags as bounds
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.bags.messages import cloud_points, image_file
+from pnpdepth_cli.io.bags.transforms import camera_info_topic
 from tests.bags import write_bag
 
 pytest.importorskip("rosbags")
@@ -77,6 +79,23 @@ def test_an_organised_cloud_gives_its_finite_points_row_by_row(order: str) -> No
             cloud_points(SimpleNamespace(**(cloud | claim)), "/scan")
     with pytest.raises(FileFormatError, match="without field z"):
         cloud_points(SimpleNamespace(**(cloud | {"fields": fields[:2]})), "/scan")
+
+
+@pytest.mark.parametrize(
+    ("topics", "expected"),
+    [
+        (["/left/camera_info", "/right/camera_info"], "/right/camera_info"),
+        (["/info"], "/info"),
+        (["/left/camera_info", "/info"], None),
+        ([], None),
+    ],
+)
+def test_an_image_has_the_camera_info_beside_it_or_the_only_one(
+    topics: list[str], expected: str | None
+) -> None:
+    bag: Any = SimpleNamespace(topics=lambda kinds: dict.fromkeys(topics, 1))
+    for topic in ("/right/image_raw", "/right/image_raw/compressed"):
+        assert camera_info_topic(bag, topic) == expected
 
 
 def read_all(path: Path) -> int:

@@ -189,7 +189,7 @@ def test_the_preview_shows_the_signed_change_and_zooms_to_where_after_differs_mo
     assert len(set(unchanged.tolist())) == 1
     assert framed() == [[50, 85], [69, 99]]
     assert colours(linear=linear) == [1, 1, 2]
-    after[5:15, 10:20] = 8  # where there are no points
+    after[5:15, 90:100] = after[50:60, 10:20] = 8  # where there are no points
     xy = np.argwhere(np.ones((8, 8)))[:, ::-1] * [8, 5] + [60, 35]
     preview(
         None, xy.astype(np.float32), after[xy[:, 1], xy[:, 0]], before, after, tmp_path / "p.png"
