@@ -18,7 +18,7 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import bags as bounds
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.bags.messages import cloud_points, image_file
-from pnpdepth_cli.io.bags.transforms import camera_info_topic
+from pnpdepth_cli.io.bags.transforms import camera_info_topic, camera_of_bag
 from tests.bags import write_bag
 
 pytest.importorskip("rosbags")
@@ -53,6 +53,7 @@ def test_an_image_of_every_encoding_has_its_colour(encoding: str) -> None:
     [
         *((claim, "the bag is damaged") for claim in ({"height": 0}, {"height": 7}, {"width": 0})),
         *((claim, "the bag is damaged") for claim in ({"width": 7}, {"step": 5}, {"step": 7})),
+        ({"encoding": "rgb8"}, "the bag is damaged"),
         *(({"encoding": name}, "are not read; known are") for name in ("yuv422", "bayer_rgbg8")),
     ],
 )
@@ -74,6 +75,8 @@ def test_an_organised_cloud_gives_its_finite_points_row_by_row(order: str) -> No
     cloud |= {"height": 2, "width": 3, "point_step": 12, "row_step": 41}
     got = cloud_points(SimpleNamespace(**cloud), "/scan")
     assert got.tolist() == [points[k].tolist() for k in ((0, 0), (0, 2), (1, 0), (1, 1), (1, 2))]
+    flat = cloud_points(SimpleNamespace(**(cloud | {"height": 1, "row_step": 0})), "/scan")
+    assert flat.tolist() == got[:2].tolist()
     for claim in ({"height": 3}, {"width": 4}, {"point_step": 11}, {"row_step": 35}):
         with pytest.raises(FileFormatError, match="the bag is damaged"):
             cloud_points(SimpleNamespace(**(cloud | claim)), "/scan")
@@ -96,6 +99,21 @@ def test_an_image_has_the_camera_info_beside_it_or_the_only_one(
     bag: Any = SimpleNamespace(topics=lambda kinds: dict.fromkeys(topics, 1))
     for topic in ("/right/image_raw", "/right/image_raw/compressed"):
         assert camera_info_topic(bag, topic) == expected
+
+
+@pytest.mark.parametrize(("name", "rectified"), [("", ["P"]), ("p", []), ("r", []), ("k", None)])
+def test_a_camera_info_of_a_bag_may_lack_parts(name: str, rectified: list[str] | None) -> None:
+    """P and R with a NaN are ignored; with a K of zeros there is no camera."""
+    k, p = [500, 0, 320, 0, 500, 240, 0, 0, 1], [400, 0, 320, 0, 0, 400, 240, 0, 0, 0, 1, 0]
+    values: dict[str, Any] = {"d": [], "k": k, "p": p, "r": [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+    values |= {name: [0] * 9 if name == "k" else [*values[name][1:], np.nan]} if name else {}
+    header = SimpleNamespace(frame_id="/camera")
+    message = SimpleNamespace(**values, width=640, height=480, header=header)
+    bag: Any = SimpleNamespace(path=Path("a.bag"), messages=lambda _: [("", 0, message)])
+    found = camera_of_bag(bag, "/camera_info")
+    assert (found and (list(found[0].rectified), found[1])) == (
+        None if rectified is None else (rectified, "camera")
+    )
 
 
 def read_all(path: Path) -> int:

@@ -23,6 +23,7 @@ from pnpdepth_cli.io.remote import (
     local_files,
     path_of,
     remove,
+    renamed,
     status_of,
     upload,
 )
@@ -228,6 +229,13 @@ def test_an_object_that_cannot_be_copied_is_an_error(
     finally:
         set_max_pixels(None)
     assert ("get_file" in fake.calls) == (error is not None)
+
+
+def test_names_are_replaced_in_all_texts_of_a_record_and_nothing_else_changes() -> None:
+    record = {"files": ["/tmp/0/a.png", ("read /tmp/0/a.png", 3, True, None)]}
+    assert renamed(record, {"/tmp/0/a.png": "s3://b/a.png"}) == {
+        "files": ["s3://b/a.png", ("read s3://b/a.png", 3, True, None)]
+    }
 
 
 @contextmanager
