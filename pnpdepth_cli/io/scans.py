@@ -131,7 +131,7 @@ def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
     Coordinates are not too far, reflectance is not negative, and a fifth column holds whole numbers
     0…255, the index of a laser.
     """
-    rows = rows[:: -(-len(rows) // _SAMPLE) or 1]
+    rows = rows[:: -(-len(rows) // _SAMPLE)]
     with np.errstate(invalid="ignore"):
         near = (np.abs(rows[:, :3]) <= _FARTHEST_M).all(axis=1) & (rows[:, 3] >= 0)
         laser = rows[:, 4:]

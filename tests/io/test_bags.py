@@ -17,7 +17,7 @@ import pytest
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import bags as bounds
 from pnpdepth_cli.io.bags import open_bag
-from pnpdepth_cli.io.bags.messages import cloud_points, image_file
+from pnpdepth_cli.io.bags.messages import cloud_points, image_file, seconds_of
 from pnpdepth_cli.io.bags.transforms import camera_info_topic, camera_of_bag
 from tests.bags import write_bag
 
@@ -99,6 +99,14 @@ def test_an_image_has_the_camera_info_beside_it_or_the_only_one(
     bag: Any = SimpleNamespace(topics=lambda kinds: dict.fromkeys(topics, 1))
     for topic in ("/right/image_raw", "/right/image_raw/compressed"):
         assert camera_info_topic(bag, topic) == expected
+
+
+@pytest.mark.parametrize(("stamp", "time_s"), [((2, 500_000_000), 2.5), ((0, 0), 7)])
+def test_a_message_without_a_stamp_has_the_time_of_the_log(
+    stamp: tuple[int, int], time_s: float
+) -> None:
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp[0], nanosec=stamp[1]))
+    assert seconds_of(SimpleNamespace(header=header), 7 * 10**9) == time_s
 
 
 @pytest.mark.parametrize(("name", "rectified"), [("", ["P"]), ("p", []), ("r", []), ("k", None)])
