@@ -72,15 +72,13 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
 def in_hull(points: SparsePoints) -> Tensor:
     """Returns bool (H, W), whether each pixel lies in the convex hull of the points."""
     pixels = _queries(points, None)
-    inside = torch.zeros(len(pixels), dtype=torch.bool)
-    if len(points) >= 3:
-        try:
-            planes = torch.from_numpy(ConvexHull(points.xy.double().cpu().numpy()).equations)
-            inside = torch.ones_like(inside)
-            for x, y, offset in planes.tolist():
-                inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
-        except QhullError:  # all points on one line
-            pass
+    inside = torch.ones(len(pixels), dtype=torch.bool)
+    try:
+        planes = ConvexHull(points.xy.double().cpu().numpy()).equations
+    except QhullError:  # all points on one line
+        return torch.zeros(points.size, dtype=torch.bool, device=points.depth.device)
+    for x, y, offset in planes.tolist():
+        inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
     return inside.reshape(points.size).to(points.depth.device)
 
 
@@ -131,8 +129,7 @@ def morphological(points: SparsePoints) -> Tensor:
     kernel = (kernel / kernel.sum()).reshape(1, 1, 1, 5)
     padded = F.pad(smooth[None, None], (2, 2, 2, 2), mode="replicate")
     dense = -F.conv2d(F.conv2d(padded, kernel), kernel.transpose(2, 3))
-    if dense.shape[-2:] != points.size:
-        dense = F.interpolate(dense, points.size, mode="bilinear", align_corners=False)
+    dense = F.interpolate(dense, points.size, mode="bilinear", align_corners=False)
     return dense[0, 0].to(points.depth.device)
 
 
@@ -222,7 +219,7 @@ def _tree(points: NDArray[np.float64]) -> cKDTree:
 def _triangles(points: NDArray[np.float64]) -> Delaunay | None:
     """The points' triangulation; None if there is no triangle."""
     try:
-        return Delaunay(points) if len(points) >= 3 else None
+        return Delaunay(points)
     except QhullError:  # all points on one line
         return None
 

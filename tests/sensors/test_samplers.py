@@ -53,12 +53,19 @@ def test_grid_gives_evenly_spaced_points_of_about_the_number() -> None:
     assert len(got.depth) == 48  # 6 × 8 at a spacing of 10
     assert set(np.diff(np.unique(got.xy[:, 0]))) == {10}
     assert set(np.diff(np.unique(got.xy[:, 1]))) == {10}
+    ones = np.ones((6, 6), np.float32)
+    few = sample_points(ones, SamplePattern(kind="grid", fraction=1 / 16), 0)
+    assert few.xy.tolist() == [[2, 2], [5, 2], [2, 5], [5, 5]]
 
 
 def test_lines_keeps_whole_rows() -> None:
     got = sample_points(DEPTH, SamplePattern(kind="lines", count=4), 0)
     assert np.unique(got.xy[:, 1]).tolist() == [7, 22, 37, 52]
     assert len(got.depth) == 4 * 80
+    every = sample_points(DEPTH, SamplePattern(kind="lines", count=60), 0)
+    assert np.array_equal(every.depth, DEPTH.ravel())
+    with pytest.raises(UsageError, match="61 lines do not fit 60 rows"):
+        sample_points(DEPTH, SamplePattern(kind="lines", count=61), 0)
 
 
 def test_features_lie_at_the_corners_of_the_image() -> None:
