@@ -198,7 +198,7 @@ def _scale(x: Tensor, y: Tensor, space: str) -> tuple[float, float] | None:
 
 
 def _affine(x: Tensor, y: Tensor, space: str) -> tuple[float, float] | None:
-    if len(x) < 2 or float(x.max() - x.min()) <= 1e-9 * float(x.abs().max()):
+    if float(x.max() - x.min()) <= 1e-9 * float(x.abs().max()):
         return None
     return _reweighted(x, y, _least_median(x, y), shifted=True)
 

@@ -74,10 +74,10 @@ def in_hull(points: SparsePoints) -> Tensor:
     pixels = _queries(points, None)
     inside = torch.ones(len(pixels), dtype=torch.bool)
     try:
-        planes = ConvexHull(points.xy.double().cpu().numpy()).equations.tolist()
+        planes = ConvexHull(points.xy.double().cpu().numpy()).equations
     except (QhullError, ValueError):  # fewer than three points, or all on one line
-        inside, planes = ~inside, []
-    for x, y, offset in planes:
+        return torch.zeros(points.size, dtype=torch.bool, device=points.depth.device)
+    for x, y, offset in planes.tolist():
         inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
     return inside.reshape(points.size).to(points.depth.device)
 
@@ -129,8 +129,7 @@ def morphological(points: SparsePoints) -> Tensor:
     kernel = (kernel / kernel.sum()).reshape(1, 1, 1, 5)
     padded = F.pad(smooth[None, None], (2, 2, 2, 2), mode="replicate")
     dense = -F.conv2d(F.conv2d(padded, kernel), kernel.transpose(2, 3))
-    if dense.shape[-2:] != points.size:
-        dense = F.interpolate(dense, points.size, mode="bilinear", align_corners=False)
+    dense = F.interpolate(dense, points.size, mode="bilinear", align_corners=False)
     return dense[0, 0].to(points.depth.device)
 
 

@@ -131,7 +131,7 @@ def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
     Coordinates are not too far, reflectance is not negative, and a fifth column holds whole numbers
     0…255, the index of a laser.
     """
-    rows = rows[:: -(-len(rows) // _SAMPLE) or 1]
+    rows = rows[:: -(-len(rows) // _SAMPLE)]
     with np.errstate(invalid="ignore"):
         near = (np.abs(rows[:, :3]) <= _FARTHEST_M).all(axis=1) & (rows[:, 3] >= 0)
         laser = rows[:, 4:]
@@ -194,7 +194,7 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
 def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
     """x y z of the vertices of a PLY, ASCII or binary."""
     header, body = _header(path, data, "PLY", b"end_header")
-    if header[0] != ["ply"] or len(header) < 2 or header[1][0] != "format":
+    if header[0] != ["ply"] or header[1][0] != "format":
         raise damaged(path, "PLY", "does not begin with ply and its format")
     elements = [i for i, words in enumerate(header) if words[0] == "element"]
     if not elements or header[elements[0]][1:2] != ["vertex"] or len(header[elements[0]]) != 3:

@@ -72,7 +72,7 @@ def cloud_from_depth(
     height, width = depth.shape
     rows = max(1, _PART_PIXELS // width)
     for top in range(0, height, rows):
-        part = slice(top, min(top + rows, height))
+        part = slice(top, top + rows)
         around = slice(max(0, top - 1), part.stop + 1)  # the normals take neighbours
         points = _points(depth[around], known[around], camera, around.start)
         normals = _normals(points, known[around])
@@ -133,9 +133,7 @@ def _normals(points: Floats, known: Mask) -> Floats:
     across = _difference(points, known, 1)
     normals = np.cross(_difference(points, known, 0), across)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
-    normals = np.where(
-        known[..., None] & (length > 0), normals / np.where(length > 0, length, 1), 0
-    )
+    normals = np.where(length > 0, normals / np.where(length > 0, length, 1), 0)
     away = (normals * points).sum(axis=2, keepdims=True) > 0
     return np.where(away, -normals, normals)
 

@@ -8,6 +8,7 @@ import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,8 @@ import pytest
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import bags as bounds
 from pnpdepth_cli.io.bags import open_bag
-from pnpdepth_cli.io.bags.messages import image_file
+from pnpdepth_cli.io.bags.messages import cloud_points, image_file, seconds_of
+from pnpdepth_cli.io.bags.transforms import camera_info_topic, camera_of_bag
 from tests.bags import write_bag
 
 pytest.importorskip("rosbags")
@@ -29,17 +31,97 @@ PIXELS |= {"8UC3": "bgr", "mono8": "g", "8UC1": "g"}
 PIXELS |= {f"bayer_{name}8": name for name in ("rggb", "bggr", "gbrg", "grbg")}
 
 
+def image_message(**others: object) -> SimpleNamespace:
+    """An image of 6×6 grey pixels."""
+    sizes = {"height": 6, "width": 6, "step": 6}
+    return SimpleNamespace(**{"encoding": "mono8", "data": bytes(36), **sizes, **others})
+
+
 @pytest.mark.parametrize("encoding", PIXELS)
 def test_an_image_of_every_encoding_has_its_colour(encoding: str) -> None:
     pixel = np.array([{"r": 200, "g": 100, "b": 50, "a": 9}[c] for c in PIXELS[encoding]], "u1")
     rows = np.tile(pixel.reshape(2, 2), (3, 3)) if "bayer" in encoding else np.tile(pixel, (6, 6))
-    sizes = {"height": 6, "width": 6, "step": rows.shape[1]}
-    suffix, content = image_file(
-        SimpleNamespace(encoding=encoding, data=rows.tobytes(), **sizes), "/image"
-    )
+    message = image_message(encoding=encoding, data=rows.tobytes(), step=rows.shape[1])
+    suffix, content = image_file(message, "/image")
     decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     assert suffix == ".png"
     assert decoded.tolist() == [[[100] * 3 if len(pixel) == 1 else [50, 100, 200]] * 6] * 6
+
+
+@pytest.mark.parametrize(
+    ("claim", "message"),
+    [
+        *((claim, "the bag is damaged") for claim in ({"height": 0}, {"height": 7}, {"width": 0})),
+        *((claim, "the bag is damaged") for claim in ({"width": 7}, {"step": 5}, {"step": 7})),
+        ({"encoding": "rgb8"}, "the bag is damaged"),
+        *(({"encoding": name}, "are not read; known are") for name in ("yuv422", "bayer_rgbg8")),
+    ],
+)
+def test_an_image_of_other_size_than_its_bytes_or_of_another_kind_is_refused(
+    claim: dict[str, object], message: str
+) -> None:
+    with pytest.raises(FileFormatError, match=message):
+        image_file(image_message(**claim), "/image")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_an_organised_cloud_gives_its_finite_points_row_by_row(order: str) -> None:
+    points = np.arange(18, dtype=np.float32).reshape(2, 3, 3)
+    points[0, 1, 2] = np.nan
+    rows = points.astype(f"{order}f4").view(np.uint8).reshape(2, -1)
+    padded = np.pad(rows, ((0, 0), (0, 5)))
+    fields = [SimpleNamespace(name=n, offset=4 * k, datatype=7) for k, n in enumerate("xyz")]
+    cloud = {"fields": fields, "is_bigendian": order == ">", "data": padded.tobytes()}
+    cloud |= {"height": 2, "width": 3, "point_step": 12, "row_step": 41}
+    got = cloud_points(SimpleNamespace(**cloud), "/scan")
+    assert got.tolist() == [points[k].tolist() for k in ((0, 0), (0, 2), (1, 0), (1, 1), (1, 2))]
+    flat = cloud_points(SimpleNamespace(**(cloud | {"height": 1, "row_step": 0})), "/scan")
+    assert flat.tolist() == got[:2].tolist()
+    for claim in ({"height": 3}, {"width": 4}, {"point_step": 11}, {"row_step": 35}):
+        with pytest.raises(FileFormatError, match="the bag is damaged"):
+            cloud_points(SimpleNamespace(**(cloud | claim)), "/scan")
+    with pytest.raises(FileFormatError, match="without field z"):
+        cloud_points(SimpleNamespace(**(cloud | {"fields": fields[:2]})), "/scan")
+
+
+@pytest.mark.parametrize(
+    ("topics", "expected"),
+    [
+        (["/left/camera_info", "/right/camera_info"], "/right/camera_info"),
+        (["/info"], "/info"),
+        (["/left/camera_info", "/info"], None),
+        ([], None),
+    ],
+)
+def test_an_image_has_the_camera_info_beside_it_or_the_only_one(
+    topics: list[str], expected: str | None
+) -> None:
+    bag: Any = SimpleNamespace(topics=lambda kinds: dict.fromkeys(topics, 1))
+    for topic in ("/right/image_raw", "/right/image_raw/compressed"):
+        assert camera_info_topic(bag, topic) == expected
+
+
+@pytest.mark.parametrize(("stamp", "time_s"), [((2, 500_000_000), 2.5), ((0, 0), 7)])
+def test_a_message_without_a_stamp_has_the_time_of_the_log(
+    stamp: tuple[int, int], time_s: float
+) -> None:
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp[0], nanosec=stamp[1]))
+    assert seconds_of(SimpleNamespace(header=header), 7 * 10**9) == time_s
+
+
+@pytest.mark.parametrize(("name", "rectified"), [("", ["P"]), ("p", []), ("r", []), ("k", None)])
+def test_a_camera_info_of_a_bag_may_lack_parts(name: str, rectified: list[str] | None) -> None:
+    """P and R with a NaN are ignored; with a K of zeros there is no camera."""
+    k, p = [500, 0, 320, 0, 500, 240, 0, 0, 1], [400, 0, 320, 0, 0, 400, 240, 0, 0, 0, 1, 0]
+    values: dict[str, Any] = {"d": [], "k": k, "p": p, "r": [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+    values |= {name: [0] * 9 if name == "k" else [*values[name][1:], np.nan]} if name else {}
+    header = SimpleNamespace(frame_id="/camera")
+    message = SimpleNamespace(**values, width=640, height=480, header=header)
+    bag: Any = SimpleNamespace(path=Path("a.bag"), messages=lambda _: [("", 0, message)])
+    found = camera_of_bag(bag, "/camera_info")
+    assert (found and (list(found[0].rectified), found[1])) == (
+        None if rectified is None else (rectified, "camera")
+    )
 
 
 def read_all(path: Path) -> int:

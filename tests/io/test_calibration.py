@@ -189,10 +189,10 @@ def test_a_plain_text_file_and_its_json_are_read_the_same(tmp_path: Path) -> Non
         read_calibration(tmp_path / "calib.txt", 1)
 
 
-def test_an_image_of_one_column_without_distortion_is_read(tmp_path: Path) -> None:
-    text = PLAIN.replace("[1242, 375]", "[1, 375]").replace("[-0.3, 0.1, 0.0, 0.001]", "[]")
+def test_an_image_of_one_pixel_without_distortion_is_read(tmp_path: Path) -> None:
+    text = PLAIN.replace("[1242, 375]", "[1, 1]").replace("[-0.3, 0.1, 0.0, 0.001]", "[]")
     calibration = read_calibration(write(tmp_path, text))
-    assert (calibration.size, calibration.distortion) == ((375, 1), ())
+    assert (calibration.size, calibration.distortion) == ((1, 1), ())
 
 
 def test_nine_numbers_are_intrinsics_alone(tmp_path: Path) -> None:
@@ -217,6 +217,7 @@ NAMED = {
         "radial-tangential",
     ),
     "of ROS, fisheye": (ROS.format(model="equidistant", data=FOUR), FOUR, "fisheye"),
+    "of ROS, without distortion": (ROS.format(model="''", data=[0] * 4), [], "radial-tangential"),
     "of ROS, without a model": (ROS.format(model="''", data=FOUR), FOUR, "radial-tangential"),
     "an echoed topic": (TOPIC, FIVE, "radial-tangential"),
 }
@@ -229,6 +230,49 @@ def test_files_of_opencv_and_ros_are_read(
 ) -> None:
     got = read_calibration(write(tmp_path, text))
     assert facts(got) == (K, (480, 640), lens, tuple(coefficients), False)
+    kind = "ROS camera_info" if "distortion_model" in text else "OpenCV calibration"
+    assert got.source == kind + (f", {lens} lens" if coefficients else "")
+    assert read_calibration(write(tmp_path, text.replace("height:", "rows:"))).size is None
+
+
+@pytest.mark.parametrize(
+    ("p", "r", "cameras"),
+    [
+        ([0] * 12, [], {}),
+        ([9, 0, 3, 0, 0, 0, 2, 0, 0, 0, 1, 0], [], {}),
+        ([9, 0, 3, 0, 0, 8, 2, 0, 0, 0, 1, 0], [0] * 9, {"P": (None, 0)}),
+        ([9, 0, 3, 0, 0, 8, 2, 0, 0, 0, 1, 0], TURN, {"P and R": (TURN, 0), "P": (None, 0)}),
+        (
+            [9, 0, 3, -18, 0, 8, 2, 0, 0, 0, 1, 0],
+            [],
+            {"P with its offset": (None, -2), "P": (None, 0)},
+        ),
+        (
+            [9, 0, 3, -18, 0, 8, 2, 0, 0, 0, 1, 0],
+            TURN,
+            {"P with its offset, and R": (TURN, -2), "P and R": (TURN, 0), "P": (None, 0)},
+        ),
+    ],
+)
+def test_the_cameras_of_rectified_images_follow_p_and_r(
+    p: list[float], r: Any, cameras: dict[str, Any], tmp_path: Path
+) -> None:
+    raw = read_calibration(write(tmp_path, TOPIC.replace("---", f"p: {p}\nr: {r}\n---")))
+    turns = {name: camera.rotation.tolist() for name, camera in raw.rectified.items()}
+    shifts = {name: camera.translation.tolist() for name, camera in raw.rectified.items()}
+    assert list(turns) == list(cameras)
+    assert turns == {name: turn or np.eye(3).tolist() for name, (turn, _) in cameras.items()}
+    assert shifts == {name: [x, 0, 0] for name, (_, x) in cameras.items()}
+    for camera in raw.rectified.values():
+        assert facts(camera)[:4] == ([[9, 0, 3], [0, 8, 2], [0, 0, 1]], (480, 640), raw.lens, ())
+
+
+def test_images_without_distortion_have_no_rectified_camera_but_that_of_k(tmp_path: Path) -> None:
+    text = TOPIC.replace("[-0.1, 0.02, 0.001, -0.002, 0.01]", "[]")
+    p = [500.5, 0, 320, 0, 0, 501, 240, 0, 0, 0, 1, 0]
+    assert not read_calibration(write(tmp_path, text.replace("---", f"p: {p}\n---"))).rectified
+    p[0] = 400
+    assert read_calibration(write(tmp_path, text.replace("---", f"p: {p}\n---"))).rectified
 
 
 def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
@@ -259,6 +303,8 @@ def test_the_first_two_intrinsics_of_an_eucm_camera_are_its_lens(tmp_path: Path)
         (KITTI.replace("velo_to_cam: 0 -1", "velo_to_cam: 0 1"), "scanner is no rotation"),
         (KITTI + KITTI, "P0 occurs twice"),
         ("hello\n" + KITTI, "line 1: 'hello' has no name"),
+        (PLAIN.replace("[700.5, 0,", "[0, 0,"), "intrinsics are not of the form"),
+        (PLAIN.replace("[0, 701,", "[0, 0,"), "intrinsics are not of the form"),
         (PLAIN.replace("K:", "k:"), "'k' is not part of a calibration"),
         (PLAIN.replace("t:", "#t:"), "has R but no t"),
         (PLAIN.replace("[-0.3, 0.1, 0.0, 0.001]", "[-0.3]"), "1 coefficients of radial-tang"),
@@ -269,6 +315,8 @@ def test_the_first_two_intrinsics_of_an_eucm_camera_are_its_lens(tmp_path: Path)
         # its products would overflow
         (PLAIN.replace("700.5", "1e308"), "which no camera has"),
         (PLAIN.replace("[1242, 375]", "[1000000000, 1000000000]"), "pixels, more than"),
+        (KALIBR.replace("pinhole", "eucm"), "is a eucm camera with 4 intrinsics"),
+        (KALIBR.replace("[500.5,", "[0.6, 1, 500.5,"), "is a pinhole camera with 6 intrinsics"),
         (KALIBR.replace("pinhole", "omni"), "only pinhole (4) and eucm (6) are known"),
         (KALIBR.replace("equidistant", "wobbly"), "distortion model 'wobbly' is not known"),
         # YAML that is more than plain texts

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pnpdepth_cli.io.depth import describe_range, implausible
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.depth import DepthKind, describe_range, implausible, scale_warning
 
 PNG = "16-bit PNG ÷ 256"
 OTHER = "if it holds millimetres, --depth-scale 1000 makes it 0.8–3.4 m"
@@ -34,7 +35,8 @@ def test_the_range_has_count_ends_and_what_was_assumed(
 
 @pytest.mark.parametrize("median", [0, 0.02, 0.5, 80, 1000])
 def test_plausible_metres_and_nothing_known_need_no_word(median: float) -> None:
-    assert implausible(np.full(5, median), 256) is None
+    some_far = np.array([median] * 5 + [1e6 * (median > 0)] * 2)
+    assert implausible(some_far, 256) is None
 
 
 @pytest.mark.parametrize(
@@ -64,3 +66,40 @@ def test_a_float_file_in_millimetres_is_an_error_that_names_metres() -> None:
     warning = implausible(np.full(3, 1e9))
     assert warning is not None
     assert warning.endswith(": a float file must hold metres")
+
+
+FLOAT = DepthKind("PFM", None, False)
+BY_256, BY_1000 = (DepthKind("PNG", scale, False) for scale in (256.0, 1000.0))
+OWN_256 = DepthKind("PNG ÷ 256 (from the file)", 256.0, False)
+
+
+@pytest.mark.parametrize("ratio", [np.nan, 0, 1, 2, 3.906 * 1.11, 3.906 / 1.11])
+def test_a_ratio_that_no_wrong_scale_gives_needs_no_word(ratio: float) -> None:
+    assert scale_warning("depths", ratio, {"--scale": BY_256, "--gt-scale": BY_256}) is None
+
+
+@pytest.mark.parametrize(
+    ("ratio", "depth", "truth", "about", "advice"),
+    [
+        ("4.2", BY_256, FLOAT, "3.906", "--scale 1000 (now 256)"),
+        ("0.256", FLOAT, BY_256, "1/3.906", "--gt-scale 1000 (now 256)"),
+        ("0.001", BY_1000, None, "1/1000", "--scale 1 (now 1000)"),
+        ("3.9", OWN_256, BY_1000, "3.906", "--gt-scale 256 (now 1000)"),
+        ("5", OWN_256, OWN_256, "5", "--scale 1280 (now 256) or --gt-scale 51.2 (now 256)"),
+        ("3.9", FLOAT, FLOAT, "3.906", ""),
+    ],
+)
+def test_a_ratio_that_a_wrong_scale_explains_names_the_scale_that_removes_it(
+    ratio: str, depth: DepthKind, truth: DepthKind | None, about: str, advice: str
+) -> None:
+    got = scale_warning("depths", float(ratio), {"--scale": depth, "--gt-scale": truth})
+    assert got == (
+        f"warning: depths are {ratio} times the ground truth (median), about {about}: a scale is"
+        f" probably wrong; {f'{advice} would remove it' if advice else 'float files hold metres'}"
+    )
+
+
+def test_a_wrong_scale_that_was_assumed_is_an_error() -> None:
+    kinds = {"--scale": FLOAT, "--gt-scale": BY_256._replace(assumed=True)}
+    with pytest.raises(InputError, match=r"would remove it, --gt-scale 256 keeps it$"):
+        scale_warning("depths", 3.9, kinds)

@@ -48,18 +48,18 @@ def test_a_broken_row_is_named(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_a_pose_between_two_is_interpolated_unless_they_are_far_apart(tmp_path: Path) -> None:
-    """From 10 s to 10.1 s 1 m along x and a quarter turn about z; rows in any order."""
+    """From 10 s to 10.5 s 1 m along x and a quarter turn about z; rows in any order."""
     path = tmp_path / "groundtruth.txt"
-    path.write_text(f"# t x y z q\n10.1 1 0 0 0 0 {HALF} {HALF}\n10 0 0 0 0 0 0 1\n")
+    path.write_text(f"# t x y z q\n10.5 1 0 0 0 0 {HALF} {HALF}\n10 0 0 0 0 0 0 1\n")
     trajectory = read_trajectory(path)
-    pose = trajectory.at(10.05, 0.2)
+    pose = trajectory.at(10.25, 0.5)
     assert pose is not None
     assert pose[:, 3] == pytest.approx([0.5, 0, 0])
     assert pose[:, 0] == pytest.approx([HALF, HALF, 0])
     at_row = trajectory.at(10.0, 0.0)
     assert at_row is not None
     assert at_row.tolist() == np.eye(4)[:3].tolist()
-    outside = ((9.99, 1.0), (10.11, 1.0), (10.05, 0.05))
+    outside = ((9.99, 1.0), (10.51, 1.0), (10.25, 0.49))
     assert [trajectory.at(*time_and_gap) for time_and_gap in outside] == [None] * 3
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import pickle
 import socketserver
 import threading
@@ -14,12 +15,15 @@ import pytest
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import InputError, PnpDepthError, StorageError, UsageError
 from pnpdepth_cli.io import remote as stores
+from pnpdepth_cli.io.fingerprint import fingerprint, is_unchanged
 from pnpdepth_cli.io.remote import (
     Listing,
     RemotePath,
     joined,
     local_files,
     path_of,
+    remove,
+    renamed,
     status_of,
     upload,
 )
@@ -88,6 +92,7 @@ class FakeStore:
     def __init__(self) -> None:
         self.objects: dict[str, bytes] = {}
         self.error: Exception | None = None
+        self.versions = True
         self.calls: list[str] = []
 
     def _called(self, name: str) -> None:
@@ -100,7 +105,8 @@ class FakeStore:
         if path not in self.objects:
             raise self.error or FileNotFoundError(path)
         data = self.objects[path]
-        return {"name": path, "size": len(data), "type": "file", "ETag": str(hash(data))}
+        version = {"ETag": str(hash(data))} if self.versions else {}
+        return {"name": path, "size": len(data), "type": "file", **version}
 
     def ls(self, path: str, *, detail: bool) -> list[dict[str, Any]]:
         self._called("ls")
@@ -112,6 +118,9 @@ class FakeStore:
 
     def put_file(self, file: str, path: str) -> None:
         self._called("put_file")
+
+    def rm_file(self, path: str) -> None:
+        self._called("rm_file")
 
 
 @pytest.fixture
@@ -155,9 +164,11 @@ def test_what_a_store_raises_is_one_line(
 def test_what_cannot_be_written_stops_the_batch(
     fake: FakeStore, error: Exception, message: str, tmp_path: Path
 ) -> None:
-    fake.error = error
+    fake.error, fake.objects = error, {"s3://b/x": b"old"}
     with pytest.raises(StorageError, match=message):
         upload(tmp_path / "x", remote("x"))
+    with pytest.raises(StorageError, match=message):
+        remove(remote("x"))
 
 
 def test_a_folder_is_listed_once_in_a_store_and_on_disk(fake: FakeStore, tmp_path: Path) -> None:
@@ -181,6 +192,24 @@ def test_copies_have_the_names_of_their_objects_and_end_with_the_block(fake: Fak
     assert not any(copy.exists() for copy in copies.values())
 
 
+@pytest.mark.parametrize("versions", [True, False])
+def test_an_object_is_known_by_its_version_or_without_one_by_its_content(
+    fake: FakeStore, versions: bool
+) -> None:
+    path, fake.versions, fake.objects = remote("a"), versions, {"s3://b/a": b"one"}
+    with local_files([path]) as copies:
+        known = fingerprint(path, copies[path])
+    assert (known.size, known.sha256) == (3, hashlib.sha256(b"one").hexdigest())
+    assert is_unchanged(path, known, Listing())
+    assert fake.calls.count("get_file") == (1 if versions else 2)
+    fake.objects["s3://b/a"] = b"two"
+    assert not is_unchanged(path, known, Listing())
+    with pytest.raises(InputError, match="is in a store; copy the file first"):
+        fingerprint(path)
+    fake.objects.clear()
+    assert not is_unchanged(path, known, Listing())
+
+
 @pytest.mark.parametrize(
     ("data", "error", "message"),
     [
@@ -200,6 +229,13 @@ def test_an_object_that_cannot_be_copied_is_an_error(
     finally:
         set_max_pixels(None)
     assert ("get_file" in fake.calls) == (error is not None)
+
+
+def test_names_are_replaced_in_all_texts_of_a_record_and_nothing_else_changes() -> None:
+    record = {"files": ["/tmp/0/a.png", ("read /tmp/0/a.png", 3, True, None)]}
+    assert renamed(record, {"/tmp/0/a.png": "s3://b/a.png"}) == {
+        "files": ["s3://b/a.png", ("read s3://b/a.png", 3, True, None)]
+    }
 
 
 @contextmanager

@@ -3,6 +3,7 @@ from __future__ import annotations
 import base64
 import errno
 import hashlib
+import json
 import os
 import re
 import tempfile
@@ -21,6 +22,7 @@ from pnpdepth_cli.io.report import (
     check_report_folder,
     image_key,
     link_image,
+    save_view_3d,
     visible,
     write_report,
 )
@@ -120,6 +122,15 @@ def test_a_linked_image_is_the_file_itself_or_on_another_disk_a_copy(
     link_image(source, tmp_path / "copy.png")
     assert (tmp_path / "copy.png").read_bytes() == b"first"
     assert not (tmp_path / "copy.png").samefile(source)
+
+
+@pytest.mark.parametrize(("length", "size_mb"), [(10, 0.1), (1_260_000, 1.3)])
+def test_a_3d_view_becomes_a_script_of_a_known_size(
+    length: int, size_mb: float, tmp_path: Path
+) -> None:
+    (tmp_path / "a.json").write_text(json.dumps({"rgb": "x" * length}))
+    assert save_view_3d(tmp_path / "a.json", tmp_path / "a.js") == size_mb
+    assert (tmp_path / "a.js").read_text() == f'pnpdepthView({{"rgb":"{"x" * length}"}});\n'
 
 
 def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io import rgb
 from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, sizes_of, srgb_from_linear
 from tests.exr_files import write_exr
 
@@ -138,7 +140,8 @@ def test_a_heic_photo_is_read_upright_and_without_the_extra_says_what_to_do(
     values = read_rgb(path).values
     assert values.shape == (32, 64, 3)  # turned by a quarter
     assert values[16, 16, 2] > 0.7 > 0.1 > values[16, 48, 2]
-    monkeypatch.setattr("pnpdepth_cli.io.rgb._reads_heic", lambda: False)
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    monkeypatch.setattr(rgb, "_reads_heic", rgb._reads_heic.__wrapped__)
     with pytest.raises(FileFormatError, match=r"pip install 'pnpdepth\[heic\]'"):
         read_rgb(path)
 

@@ -128,6 +128,8 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
         ("a.pcd", pcd_bytes(POINTS).replace(b"COUNT 1 1", b"COUNT 1"), "another number of fields"),
         ("a.pcd", pcd_bytes(POINTS).replace(b"DATA binary", b"DATA binary_compressed"), "convert"),
         ("a.ply", ply_bytes(POINTS[:0]), "holds no point"),
+        ("a.ply", b"ply\nend_header\n", "does not begin with ply and its format"),
+        ("a.ply", ply_bytes(POINTS)[4:], "does not begin with ply and its format"),
         ("a.ply", b"ply\nformat\nelement vertex 1\nend_header\n", "unknown format ''"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n", "not vertex"),
         ("a.ply", ply_bytes(POINTS).replace(b"uchar red", b"list uchar int red"), "not one number"),

@@ -99,10 +99,13 @@ def test_equal_depths_have_equal_panels_and_other_depths_other_ones(tmp_path: Pa
 def test_depths_that_are_unknown_or_all_alike_still_make_a_preview(tmp_path: Path) -> None:
     none, one = np.zeros((6, 8), np.float32), np.full((6, 8), 3, np.float32)
     nan = np.full((6, 8), np.nan, np.float32)
-    for before, after in [(none, none), (one, one), (nan, one), (one * 1e-4, one * 1e6)]:
+    pairs = [(none, none), (one, one), (nan, one), (none, one), (one, none), (one, one * np.inf)]
+    for before, after in [*pairs, (one * 1e-4, one * 1e6)]:
         panels = panels_of(previewed(tmp_path, before, after))
-        unknown = not (np.isfinite(before) & (before > 0)).any()
-        assert (panels["Depth before"] == UNKNOWN).all() == unknown
+        known, known_after = ((np.isfinite(depth) & (depth > 0)).any() for depth in (before, after))
+        assert (panels["Depth before"] == UNKNOWN).all() == (not known)
+        # where one is unknown nothing has changed, and the map is dark
+        assert (panels["Change"][-9:, -9:] > 100).any() == (known and known_after)
 
 
 def test_parts_of_different_size_or_number_and_a_place_that_is_none_are_refused(
@@ -161,10 +164,19 @@ def test_only_known_ground_truth_counts_and_a_depth_that_becomes_finite_is_bette
 def test_the_preview_shows_the_signed_change_and_zooms_to_where_after_differs_most(
     tmp_path: Path,
 ) -> None:
-    before, linear = np.full((80, 120), 4, np.float32), np.full((80, 120), 4, np.float32)
-    after = before.copy()
+    before = np.full((80, 120), 4, np.float32)
+    before[:10, 60:70] = 80
+    linear, after = before.copy(), before.copy()
     after[60:70, 90:100] = 4.5  # network and linear agree, and the result is another
-    linear[5:15, 10:20] = 4.4
+    after[:10, 60:70] = 80.5  # relative to the depth, less
+    linear[5:15, 10:20] = 8
+
+    def framed() -> list[list[int]]:
+        """The first and the last row and column of the zoom, of the frame around it."""
+        change = panels_of(tmp_path / "p.png")["Change"]
+        frame = np.argwhere((change == [230, 30, 30]).all(axis=2))
+        ends = frame.min(axis=0) + 1, frame.max(axis=0) - 1
+        return [(end // (change.shape[0] // 80)).tolist() for end in ends]
 
     def colours(**others: np.ndarray) -> list[int]:
         zoom = panels_of(previewed(tmp_path, before, after, **others))["Zoom"]
@@ -177,7 +189,14 @@ def test_the_preview_shows_the_signed_change_and_zooms_to_where_after_differs_mo
     farther, unchanged = change[65 * factor, 95 * factor], change[10 * factor, 10 * factor]
     assert farther.tolist() == [1, 102, 94]
     assert len(set(unchanged.tolist())) == 1
+    assert framed() == [[50, 85], [69, 99]]
     assert colours(linear=linear) == [1, 1, 2]
+    after[5:15, 90:100] = after[50:60, 10:20] = 8  # where there are no points
+    xy = np.argwhere(np.ones((8, 8)))[:, ::-1] * [8, 5] + [60, 35]
+    preview(
+        None, xy.astype(np.float32), after[xy[:, 1], xy[:, 0]], before, after, tmp_path / "p.png"
+    )
+    assert framed() == [[50, 85], [69, 99]]
     after[:] = before
     assert colours(linear=linear) == [1, 2, 1]
 

@@ -123,5 +123,6 @@ def test_edges_agree_where_they_are_beside_jumps_of_depth(
     depth = np.where((xy[:, 0] < 50) & (edge is not None), 2, 5).astype(np.float32)
     rgb = np.zeros((60, 100, 3), np.float32)
     rgb[:, edge:] = 1
-    got = edge_agreement(SparsePoints(xy=xy, depth=depth, size=(60, 100)), rgb)
-    assert got == pytest.approx(agreement, abs=0.005)
+    points = SparsePoints(xy=xy, depth=depth, size=(60, 100))
+    assert edge_agreement(points, rgb) == pytest.approx(agreement, abs=0.005)
+    assert edge_agreement(points.select(slice(9, 15)), rgb) == 0  # too few to tell

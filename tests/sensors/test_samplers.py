@@ -53,20 +53,29 @@ def test_grid_gives_evenly_spaced_points_of_about_the_number() -> None:
     assert len(got.depth) == 48  # 6 × 8 at a spacing of 10
     assert set(np.diff(np.unique(got.xy[:, 0]))) == {10}
     assert set(np.diff(np.unique(got.xy[:, 1]))) == {10}
+    ones = np.ones((6, 6), np.float32)
+    for fraction, (a, b) in ((1 / 9, (1, 4)), (1 / 16, (2, 5))):
+        few = sample_points(ones, SamplePattern(kind="grid", fraction=fraction), 0)
+        assert few.xy.tolist() == [[a, a], [b, a], [a, b], [b, b]]
 
 
 def test_lines_keeps_whole_rows() -> None:
     got = sample_points(DEPTH, SamplePattern(kind="lines", count=4), 0)
     assert np.unique(got.xy[:, 1]).tolist() == [7, 22, 37, 52]
     assert len(got.depth) == 4 * 80
+    every = sample_points(DEPTH, SamplePattern(kind="lines", count=60), 0)
+    assert np.array_equal(every.depth, DEPTH.ravel())
+    with pytest.raises(UsageError, match="61 lines do not fit 60 rows"):
+        sample_points(DEPTH, SamplePattern(kind="lines", count=61), 0)
 
 
 def test_features_lie_at_the_corners_of_the_image() -> None:
     image = np.full((160, 200, 3), 0.2, np.float32)
-    image[40:120, 50:150] = 0.9
+    image[40:120, 20:150] = 0.9
+    image[10:30, 170:190] = 0.3  # its corners are weaker
     depth = np.full((160, 200), 3, np.float32)
     got = sample_points(depth, SamplePattern(kind="features", count=8), 0, image=image)
-    corners = np.array([[50, 40], [149, 40], [50, 119], [149, 119]])
+    corners = np.array([[20, 40], [149, 40], [20, 119], [149, 119]])
     away = np.abs(got.xy[:, None] - corners).max(axis=2)
     assert away.min(axis=1).max() <= 6
     assert len(got.depth) == 8
@@ -77,6 +86,9 @@ def test_edges_lie_on_the_edges_of_the_image() -> None:
     got = sample_points(DEPTH, SamplePattern(kind="edges", count=60), 0, image=checkerboard())
     to_line = np.abs(got.xy - 12 * np.rint(got.xy / 12)).min(axis=1)
     assert to_line.max() <= 2
+    every = sample_points(DEPTH, SamplePattern(kind="edges", count=4800), 0, image=checkerboard())
+    assert len(got) < len(every) < 4800
+    assert np.isin(got.depth, every.depth).all()
 
 
 def test_region_keeps_all_of_it_or_a_number_at_random() -> None:
@@ -99,6 +111,8 @@ def test_noise_has_the_requested_size() -> None:
     noisy = sample_points(DEPTH, every, 3, noise=SampleNoise(outliers=0.1))
     assert np.count_nonzero(noisy.depth != clean.depth) == DEPTH.size // 10
     assert clean.depth.min() <= noisy.depth.min() <= noisy.depth.max() <= clean.depth.max()
+    redrawn = noisy.depth[noisy.depth != clean.depth]
+    assert np.ptp(redrawn) > 0.95 * np.ptp(clean.depth)
 
 
 def test_jitter_moves_positions_and_keeps_depths() -> None:

@@ -52,10 +52,10 @@ def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_positio
 
 
 def test_minimum_and_maximum_range_are_distances_from_the_scanner() -> None:
-    scan = np.array([[3.0, 0, 0], [5.0, 0.5, 0], [9.0, 2.0, 0]])
+    scan = np.array([[3.0, 0, 0], [5.0, 0.5, 0], [9.0, 2.0, 0], [4.0, 0, 0], [8.0, 4.0, 1.0]])
     ahead = camera(translation=np.array([0, 0, 1.0]))
     got = project_velodyne(scan, ahead, SIZE, limits=(4, 9), keep_occluded=True)
-    assert got.depth.tolist() == [6]  # the last is 9.2 m away
+    assert got.depth.tolist() == [6, 5, 9]  # the third is 9.2 m away
     assert got.dropped["out of range"] == 2
 
 

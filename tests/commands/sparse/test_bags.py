@@ -146,6 +146,9 @@ def test_each_image_gets_the_nearest_scan_within_the_tolerance() -> None:
     pairs = [(i.message, s and s.message) for i, s in nearest_pairs(stream(), 0.095)]
     assert pairs == [(0.04, 0.0), (0.06, 0.1), (0.2, 0.29)]
     assert [s for _, s in nearest_pairs(stream(), 0.01)] == [None] * 3
+    rest = iter(stream())
+    next(nearest_pairs(rest, 1.0))  # as soon as a scan after the image is known
+    assert next(rest)[1].time_s == 0.2
 
 
 @pytest.mark.slow

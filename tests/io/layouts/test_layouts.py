@@ -200,6 +200,8 @@ def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
 
 def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> None:
     tum(tmp_path)
+    with (tmp_path / "rgb.txt").open("a") as file:
+        file.write("1.04 rgb/1.04.png\n")  # nearest to the depth of 1.033 s
     (tmp_path / "groundtruth.txt").write_text("1 5 0 0 0 0 0 1\n1.02 7 0 0 0 0 0 1\n")
     _, listing = list_frames(tmp_path)
     assert [frame.gt for frame in listing.frames] == [
@@ -208,7 +210,7 @@ def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> Non
     ]
     # 1.033 s is after the last pose
     assert [(f.gt_scale, f.pose) for f in listing.frames] == [(5000, at_x(5)), (5000, None)]
-    assert [lost.path.name for lost in listing.spare] == ["2.png"]
+    assert [lost.path.name for lost in listing.spare] == ["1.04.png", "2.png"]
 
 
 def test_tum_pairs_files_two_hundredths_of_a_second_apart_and_no_further(tmp_path: Path) -> None:
@@ -340,8 +342,8 @@ def test_all_of_void_is_taken_without_a_list_of_the_test_split(tmp_path: Path) -
 
 def test_ground_truth_is_moved_and_never_interpolated(tmp_path: Path) -> None:
     depth = np.array([[1, 2], [3, 0]], np.float32)
-    larger = moved_to(tmp_path, depth, (4, 4))
-    assert sorted(larger[larger > 0].tolist()) == [1, 2, 3]
+    larger = [[0, 0, 0, 0], [0, 1, 0, 2], [0, 0, 0, 0], [0, 3, 0, 0]]
+    assert moved_to(tmp_path, depth, (4, 4)).tolist() == larger
     assert moved_to(tmp_path, depth, (1, 1)).tolist() == [[1]]
     with pytest.raises(SizeError, match="do not show the same view"):
         moved_to(tmp_path, depth, (4, 9))
