@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from benchmarks.frames import kitti_dc
 from model_zoo_defs.nconv import NConv, NormalisedConv, halved
@@ -22,6 +23,13 @@ def test_a_constant_depth_stays_whatever_pixels_are_known() -> None:
     known = torch.rand(1, 1, 12, 14, generator=torch.Generator().manual_seed(0)) < 0.3
     depth, confidence = layer(7.0 * known, known.float())
     assert torch.allclose(depth[confidence > 0], torch.tensor(7.0), atol=1e-5)
+
+
+@pytest.mark.parametrize("network", [NConv, Pncnn])
+def test_a_constant_depth_stays_in_the_whole_network(network: type[nn.Module]) -> None:
+    depth = torch.full((1, 1, 32, 48), 7.0)
+    with torch.no_grad():
+        assert torch.allclose(network().eval()(depth), depth, atol=1e-3)
 
 
 def test_halving_keeps_the_depth_of_the_most_confident_pixel() -> None:

@@ -46,6 +46,7 @@ def test_the_bounds_are_the_published_ones() -> None:
 
 def test_a_crop_that_does_not_fit_the_frame_is_refused() -> None:
     assert crop_window("10,20,30,40", (60, 40)) == (slice(20, 60), slice(10, 40))
+    assert crop_window("0,0,1,1", (60, 40)) == (slice(0, 1), slice(0, 1))
     with pytest.raises(SizeError, match=r"--pred-crop 10,20,30,40 does not lie in .* 39×60"):
         crop_window("10,20,30,40", (60, 39), "--pred-crop")
     with pytest.raises(SizeError, match="kb does not lie in a frame of 1242×351"):
