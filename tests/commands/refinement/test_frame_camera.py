@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,6 +42,8 @@ def test_the_cloud_of_a_field_of_view_has_the_points_of_the_depth(frame: FrameOn
     kept = pixels_kept(frame.folder / "out" / "img_depth.npy")
     assert record["cloud"] == {"points": kept, "frame": "camera"}
     assert len(points_of(path)) == kept > 100
+    focal = 31 / math.tan(math.radians(30))  # of an image of 62×46
+    assert record["camera"]["intrinsics"] == [[focal, 0, 30.5], [0, focal, 22.5], [0, 0, 1]]
     assert any("(--fov 60)" in note for note in record["notes"])
 
 
