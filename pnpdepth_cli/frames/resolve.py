@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import cast
 
 import torch
 
-from pnpdepth_cli.choices import SPACES, Space
+from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.core.weights import rank_of
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
@@ -45,11 +44,19 @@ _OF_MASKS = ("mask", "mask_fraction", "mask_scale")
 
 
 def redefined(network: Network, output_kind: str | None, normalise: str | None) -> Network:
-    """Returns the network with the user's output kind and input range, where they are given."""
+    """Returns the network with the user's output kind and input range, where they are given.
+
+    Raises:
+        UsageError: One of them is not one of the possible values.
+    """
     definition = network.definition
     if output_kind is not None:
-        definition = replace(definition, output_kind=cast("Space", output_kind))
+        if output_kind not in SPACES:
+            raise UsageError(f"output kind {output_kind!r} is not one of {SPACES}")
+        definition = replace(definition, output_kind=output_kind)
     if normalise is not None:
+        if normalise not in NORMALISATIONS:
+            raise UsageError(f"normalise {normalise!r} is none of {list(NORMALISATIONS)}")
         definition = replace(definition, normalisation=NORMALISATIONS[normalise])
     return replace(network, definition=definition)
 

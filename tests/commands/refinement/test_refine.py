@@ -165,7 +165,8 @@ def test_a_point_between_pixels_is_enough_and_points_outside_are_counted(
 def test_a_list_of_points_with_x_and_y_swapped_is_refused(frame: FrameOnDisk) -> None:
     points = frame.folder / "points.csv"
     points.write_text("10,5,2\n20,50,2\n45,61,3\n")  # of an image of 62×46
-    with pytest.raises(SizeError, match=r"\b2 of 3 points are outside .* 46×62: swap x and y"):
+    message = r"\b2 of 3 points are outside .* inside 46×62: swap x and y"
+    with pytest.raises(SizeError, match=message):
         run(frame, sparse=points)
 
 
@@ -205,6 +206,8 @@ BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"sparse": None, "sample": SamplePattern(count=9)}, InputError, "no ground truth to sample"),
     ({"sparse": ".", "scan": ScanOptions(max_range=9.0)}, UsageError, "of a LiDAR scan do not app"),
     ({"sparse": "far.csv"}, NoPointsError, "none of its 1 points lies in the image"),
+    ({"output_kind": "metric"}, UsageError, "output kind 'metric' is not one of"),
+    ({"normalise": "grey"}, UsageError, "normalise 'grey' is none of"),
     ({"sparse": "one.csv", "holdout": 0.5}, UsageError, "at least two sparse points"),
     ({"ply": True}, UsageError, r"--ply needs the camera, .* give --calib or --fov"),
     ({"ply": True, "fov_deg": 180.0}, UsageError, "--fov is 180 degrees"),
