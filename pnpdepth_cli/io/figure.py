@@ -76,7 +76,7 @@ def resized(pixels: NDArray[Any], factor: float, *, smooth: bool = False) -> NDA
 
 def hatched(pixels: Pixels, valid: NDArray[np.bool_] | None) -> Pixels:
     """Returns an image faded and with diagonal lines where its depth, of any size, is not valid."""
-    if valid is None:
+    if valid is None or valid.all():
         return pixels
     height, width = pixels.shape[:2]
     mask = cv2.resize(valid.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) == 0

@@ -59,7 +59,7 @@ class FrameMap:
                 image, self.resized, mode="bilinear", align_corners=False, antialias=True
             )
         bottom, right = (self.network[0] - self.resized[0], self.network[1] - self.resized[1])
-        return F.pad(image, (0, right, 0, bottom), mode="replicate")
+        return F.pad(image, (0, right, 0, bottom), mode="replicate") if bottom or right else image
 
     def prior_to_network(self, depth: Tensor) -> Tensor:
         """Depth (1, 1, H, W), 0 = unknown → (1, 1, h, w); unknown in the padding.
