@@ -75,7 +75,7 @@ def in_hull(points: SparsePoints) -> Tensor:
     inside = torch.ones(len(pixels), dtype=torch.bool)
     try:
         planes = ConvexHull(points.xy.double().cpu().numpy()).equations
-    except (QhullError, ValueError):  # fewer than three points, or all on one line
+    except QhullError:  # fewer than three points, or all on one line
         return torch.zeros(points.size, dtype=torch.bool, device=points.depth.device)
     for x, y, offset in planes.tolist():
         inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
