@@ -1,1 +1,0 @@
-"""Golden output of the command line: see `python -m benchmarks.golden --help`."""
