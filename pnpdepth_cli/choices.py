@@ -232,16 +232,6 @@ NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mea
 PRECISIONS = ("fp32", "bf16", "fp16")  # of the network's convolutions and matrix products
 
 # Files and sensors
-STORES = {
-    "s3": "s3fs",
-    "gs": "gcsfs",
-    "hf": "huggingface_hub",
-    "https": "aiohttp",
-    "http": "aiohttp",
-    "file": "nothing",
-}
-"""Stores of files by the scheme of their addresses, with the package that fsspec needs."""
-
 COLORS = ("blue-orange", "paper")  # of better and worse; the paper's are red and green
 PREVIEWS = ("all", "worst", "none")  # which frames get images; worst: worse than linear
 FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")  # `io.dataset`

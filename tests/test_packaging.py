@@ -53,7 +53,8 @@ def test_the_version_is_that_of_the_citation_and_of_the_changelog() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     (released,) = re.findall(r'^date-released: "?([\d-]+)"?$', citation, re.MULTILINE)
     assert f"\nversion: {pnp.__version__}\n" in citation
-    first = next(line for line in (ROOT / "CHANGELOG.md").open() if line.startswith("## "))
+    sections = [line for line in (ROOT / "CHANGELOG.md").open() if line.startswith("## ")]
+    first = next(line for line in sections if line != "## Unreleased\n")
     assert first == f"## {pnp.__version__} ({released})\n"
 
 

@@ -51,8 +51,8 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
         "Cluster": (ClusterOptions,),
     },
 )
-@click.argument("source", type=options.Address(), metavar="FOLDER|LIST|BAG")
-@click.option("-o", "--output", type=options.Address(), required=True, help="Output folder.")
+@click.argument("source", type=options.FILE, metavar="FOLDER|LIST|BAG")
+@click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @options.sample
 @options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions, BagOptions)
 @click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")

@@ -15,7 +15,6 @@ from pnpdepth_cli.commands.refinement.request import (
     NetworkChoice,
     OutputOptions,
     RefineRequest,
-    parse_file,
 )
 from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
 from pnpdepth_cli.errors import UsageError
@@ -23,15 +22,6 @@ from pnpdepth_cli.settings import LARGEST_SEED, OptionField, Settings, options_o
 
 FILE = click.Path(path_type=Path)
 SEED = click.IntRange(0, LARGEST_SEED)
-
-
-class Address(click.Path):
-    """A local path, or the address of a file or folder in a store."""
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Returns the path."""
-        text = super().convert(value, param, ctx)
-        return parse_file(text) if isinstance(text, str) else text
 
 
 def click_option(declared: OptionField) -> Callable[[Any], Any]:

@@ -9,24 +9,23 @@ import pytest
 
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.fingerprint import fingerprint, is_unchanged
-from pnpdepth_cli.io.remote import Listing
 
 
 def test_a_file_is_known_by_its_digest_whatever_its_times_say(tmp_path: Path) -> None:
-    path, listing = tmp_path / "f", Listing()
+    path = tmp_path / "f"
     path.write_bytes(b"abc")
     os.utime(path, ns=(5, 7))
     known = fingerprint(path)
     assert (known.size, known.mtime_ns) == (3, 7)
     assert known.sha256 == hashlib.sha256(b"abc").hexdigest()
     os.utime(path, ns=(5, 8))
-    assert is_unchanged(path, known, listing)
+    assert is_unchanged(path, known)
     time.sleep(0.02)
     for content in (b"abd", b"abcd"):
         path.write_bytes(content)
         os.utime(path, ns=(5, 7))
-        assert not is_unchanged(path, known, listing)
+        assert not is_unchanged(path, known)
     path.unlink()
-    assert not is_unchanged(path, known, listing)
+    assert not is_unchanged(path, known)
     with pytest.raises(InputError, match="no such file"):
         fingerprint(path)

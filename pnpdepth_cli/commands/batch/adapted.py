@@ -20,7 +20,6 @@ from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.record import read_json, write_json
-from pnpdepth_cli.io.remote import RemotePath
 
 MOST_FRAMES = 64
 """Frames of a sequence that are learnt from, spread over it."""
@@ -48,10 +47,8 @@ def with_adapted_weights(
         stopped: True ends the adaptation by KeyboardInterrupt. None uses only weights that exist.
 
     Raises:
-        UsageError: The network takes no points, or the output folder lies in a store.
+        UsageError: The network takes no points.
     """
-    if isinstance(request.output, RemotePath):
-        raise UsageError("--adapt needs a local output folder; give a local -o")
     name = re.sub(r"[^\w.-]+", "_", sequence) or "frames"
     if name != sequence:
         name += f"-{hashlib.sha256(sequence.encode()).hexdigest()[:8]}"

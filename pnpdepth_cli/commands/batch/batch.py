@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from pnpdepth_cli.commands.batch.frames import Task, find_frames, source_files, task_of
@@ -26,8 +25,6 @@ from pnpdepth_cli.commands.batch.records import (
 from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions, ray_workers_of
 from pnpdepth_cli.commands.batch.sequence import in_windows, note_of_poses, sequences_of
 from pnpdepth_cli.commands.batch.summary import (
-    CSV,
-    JSON,
     TEXT,
     Row,
     Tally,
@@ -41,7 +38,6 @@ from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.io.remote import RemotePath, upload
 
 Result = TypeVar("Result")
 _MAX_LISTED = 5
@@ -91,10 +87,9 @@ def run_batch(
     if not request.refine.outputs.overwrite:
         batch.records.check_new(task_of(request, frame) for frame in batch.found.chosen)
     with ExitStack() as stack:
-        local = batch.opened_output(stack)
+        batch.open_output(stack)
         batch.adapt(stopped)
         to_do = [frame for frame, _ in batch.to_do()]
-        batch.records.mark()
         began, refined, start = 0, 0, time.perf_counter()
         seconds = Counter[str]()
         if to_do:
@@ -105,8 +100,8 @@ def run_batch(
                     refined += row["status"] != "failed"
                     seconds.update(row.get("seconds") or {})
         profile = profile_of(seconds, refined, time.perf_counter() - start)
-        with in_turn(local):  # so the summary of the shard that ends last stays
-            summary = batch.summarise(local, profile)
+        with in_turn(request.output):  # so the summary of the shard that ends last stays
+            summary = batch.summarise(profile)
     for note in summary.get("unsure", ()):
         listener.say(f"warning: {note}")
     return BatchOutcome(summary=summary, stopped=began < len(to_do))
@@ -184,8 +179,6 @@ class _Batch:
         request = self.request
         if request.html is None:
             return
-        if isinstance(request.output, RemotePath) or isinstance(request.html, RemotePath):
-            raise UsageError("--html needs local folders; give a local -o and a local folder")
         from pnpdepth_cli.commands.report.batch import check_batch_report
 
         files = (path for frame in self.found.frames for path in source_files(frame))
@@ -214,11 +207,9 @@ class _Batch:
         if (more := len(unmatched) - _MAX_LISTED) > 0:
             yield f"warning: {more:,} more files are in no frame; summary.json lists them"
 
-    def opened_output(self, stack: ExitStack) -> Path:
-        """Returns the output folder, locked; of one in a store, a local one for the summaries."""
+    def open_output(self, stack: ExitStack) -> None:
+        """Makes the output folder, and locks it until the stack is left."""
         output = self.request.output
-        if isinstance(output, RemotePath):
-            return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pnpdepth-")))
 
         def clean() -> None:
             if leftovers := remove_all_leftovers(output):
@@ -226,7 +217,6 @@ class _Batch:
 
         make_folder(output)
         stack.enter_context(locked_folder(output, self.request.shard, clean))
-        return output
 
     def to_do(self) -> list[tuple[Frame, str]]:
         """Returns the frames that are to be done, and why, and says how many."""
@@ -296,14 +286,14 @@ class _Batch:
                 task = self._task(by_name[each.name])
                 yield replace(task, written=task.name in names)
 
-    def summarise(self, local: Path, profile: dict[str, Any]) -> dict[str, Any]:
+    def summarise(self, profile: dict[str, Any]) -> dict[str, Any]:
         """Writes the summaries and the report; returns the summary without its frames."""
         request, tally = self.request, Tally()
         refused = (failed_row(frame.name, {}, why) for frame, why in self.found.refused)
         known = _read_in_parts(
             lambda frame: self._part(frame).records.row(self._task(frame)), self.found.frames
         )
-        with tempfile.TemporaryFile("w+", dir=local, **TEXT) as file:
+        with tempfile.TemporaryFile("w+", dir=request.output, **TEXT) as file:
             for row in itertools.chain(refused, known):
                 if row is not None:
                     try:
@@ -319,14 +309,11 @@ class _Batch:
                 file.seek(0)
                 return map(json.loads, file)
 
-            write_summaries(local, summary, file, tally.baselines)
+            write_summaries(request.output, summary, file, tally.baselines)
             if request.html is not None:
                 from pnpdepth_cli.commands.report.batch import write_batch_report
 
                 write_batch_report(request, request.html, summary, rows)
-        if isinstance(request.output, RemotePath):
-            for name in (CSV, JSON):
-                upload(local / name, request.output / name)
         return summary
 
     def _head(self, tally: Tally) -> dict[str, Any]:

@@ -35,9 +35,7 @@ from pnpdepth_cli.io.dataset import (
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.io.lock import LOCKS
-from pnpdepth_cli.io.remote import RemotePath
 
-_LISTS = (".csv", ".jsonl")
 _IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"
 
 
@@ -124,13 +122,6 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         OutputError: If the output is a file, or holds the frames.
     """
     source, output, sequence = request.source, request.output, request.sequence
-    if isinstance(source, RemotePath) and source.suffix not in _LISTS:
-        raise UsageError(
-            f"{source}: folders in a store are not searched for frames; give a list of them"
-            f" ({' or '.join(_LISTS)})"
-        )
-    if isinstance(source, RemotePath) and not source.exists():
-        raise InputError(f"{source}: no such object; check the address")
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
     if source.is_dir() and _is_inside(source, output):

@@ -23,7 +23,6 @@ from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.lock import LOCKS
-from pnpdepth_cli.io.remote import RemotePath
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.running import OpenNetwork, References
@@ -132,9 +131,8 @@ def rows_of_workers(
 
     Arguments and errors are as of `refine_tasks`, with ClusterError if the cluster cannot be used.
     """
-    shared = [request.source]
-    if not isinstance(request.output, RemotePath):
-        shared += [path.absolute() for path in request.output.glob(LOCKS)]
+    locks = [path.absolute() for path in request.output.glob(LOCKS)]
+    shared = [request.source, *locks]
     with connected(workers) as (ray, count, resources):
         say(f"Ray workers: starting {count:,}, each with {workers.each}")
         options = {"scheduling_strategy": "SPREAD", "max_restarts": _RESTARTS, **resources}
@@ -150,7 +148,7 @@ def rows_of_workers(
         finally:
             for started in actors:
                 ray.kill(started)
-    if request.shard is None and not isinstance(request.output, RemotePath):
+    if request.shard is None:
         remove_all_leftovers(request.output)  # of workers that died
 
 

@@ -7,13 +7,12 @@ written; or why the frame failed.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, fields
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,10 +24,10 @@ from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
+from pnpdepth_cli.io.file_bytes import cannot_read
 from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
-from pnpdepth_cli.io.remote import Listing, RemotePath, read_object, remove, renamed, upload
 from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
@@ -52,11 +51,11 @@ class Records:
     def __init__(self, output: Path, model: dict[str, Any]) -> None:
         self.output, self.model = output, model
         self._last: tuple[dict[str, Any], str] | None = None
-        self._listing = Listing()
+        self._names_in = functools.lru_cache(maxsize=64)(_names_in)
 
     def check_new(self, tasks: Iterable[Task]) -> None:
         """Raises OutputError if no batch has written to the folder, and a result exists there."""
-        names_in = Listing().names
+        names_in = functools.cache(_names_in)
         names = names_in(self.output)
         if not names or any(fnmatch(name, LOCKS) for name in names):
             return
@@ -70,18 +69,12 @@ class Records:
                     " names another folder"
                 )
 
-    def mark(self) -> None:
-        """Marks a folder in a store as a batch's own; a lock does so on a disk."""
-        if isinstance(self.output, RemotePath):
-            with tempfile.NamedTemporaryFile() as empty:
-                upload(Path(empty.name), self.output / LOCKS.replace("*", ""))
-
     def reason_to_refine(self, task: Task) -> str | None:
         """Returns why a frame is to be refined; None if it is done with its settings and files.
 
         The reason is a word or two, with details after a colon.
         """
-        names, files = self._listing.names(task.record.parent), task.outputs
+        names, files = self._names_in(task.record.parent), task.outputs
         if task.record.name not in names:
             return "interrupted" if any(path.name in names for path in files.values()) else "new"
         entry, digest = _entry(_record(task.record)), self._digest(task)
@@ -93,8 +86,7 @@ class Records:
             if entry["inputs"].keys() != task.inputs.keys():
                 return "other input files"
             for part, path in task.inputs.items():
-                known = Fingerprint(**entry["inputs"][part])
-                if not is_unchanged(path, known, self._listing):
+                if not is_unchanged(path, Fingerprint(**entry["inputs"][part])):
                     return f"input changed: {part}"
             may_lack = IMAGES if task.request.outputs.previews != "all" else ()
             for kind, path in files.items():
@@ -134,33 +126,23 @@ class Records:
             write: Writes all but the record to the paths that it is given.
         """
         planned = task.outputs
-        with _staged(planned, self.output) as staged:
-            _remove(task.record)
-            outcome = write({kind: path for kind, path in staged.items() if kind != "record"})
-            written = [*outcome.outputs, "record"]
-            entry = {
-                "settings": self._digest(task),
-                "inputs": {part: known.as_record() for part, known in inputs.items()},
-                "outputs": {k: planned[k].relative_to(self.output).as_posix() for k in written},
-            }
-            record = {_ENTRY: entry} | outcome.record
-            if isinstance(self.output, RemotePath):
-                record = renamed(record, {str(staged[k]): str(planned[k]) for k in planned})
-                for kind in planned.keys() - written:
-                    _remove(planned[kind])
-            write_json(staged["record"], record)
-            for kind in written:
-                _put(staged[kind], planned[kind])
+        _remove(task.record)
+        outcome = write({kind: path for kind, path in planned.items() if kind != "record"})
+        written = [*outcome.outputs, "record"]
+        entry = {
+            "settings": self._digest(task),
+            "inputs": {part: asdict(known) for part, known in inputs.items()},
+            "outputs": {k: planned[k].relative_to(self.output).as_posix() for k in written},
+        }
+        record = {_ENTRY: entry} | outcome.record
+        write_json(planned["record"], record)
         return _row(task, record, entry)
 
     def fail(self, task: Task, message: str) -> Row:
         """Writes a record that says why a frame failed; returns the summary's row."""
         entry = {"settings": self._digest(task), "failed": message}
-        with _staged(task.outputs, self.output) as staged:
-            file = staged["record"]
-            make_folder(file.parent)
-            write_json(file, {_ENTRY: entry})
-            _put(file, task.record)
+        make_folder(task.record.parent)
+        write_json(task.record, {_ENTRY: entry})
         return _row(task, {}, entry)
 
     def _digest(self, task: Task) -> str:
@@ -271,8 +253,6 @@ def _entry(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _content(path: Path) -> bytes | None:
-    if isinstance(path, RemotePath):
-        return read_object(path)
     try:
         return path.read_bytes()
     except OSError:
@@ -280,25 +260,17 @@ def _content(path: Path) -> bytes | None:
 
 
 def _remove(path: Path) -> None:
-    if isinstance(path, RemotePath):
-        remove(path)
-        return
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
         raise cannot_write(path, error) from error
 
 
-def _put(file: Path, target: Path) -> None:
-    if isinstance(target, RemotePath):
-        upload(file, target)
-
-
-@contextmanager
-def _staged(outputs: Outputs, output: Path) -> Iterator[Outputs]:
-    """Yields where the results of a frame are written: their own paths, or local ones."""
-    if not isinstance(output, RemotePath):
-        yield outputs
-        return
-    with tempfile.TemporaryDirectory(prefix="pnpdepth-") as folder:
-        yield {kind: Path(folder) / path.relative_to(output) for kind, path in outputs.items()}
+def _names_in(folder: Path) -> frozenset[str]:
+    """The names in a folder; none if there is no such folder."""
+    try:
+        return frozenset(entry.name for entry in os.scandir(folder))
+    except FileNotFoundError:
+        return frozenset()
+    except OSError as error:
+        raise cannot_read(folder, error) from error

@@ -9,11 +9,11 @@ from __future__ import annotations
 import functools
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -37,7 +37,6 @@ from pnpdepth_cli.frames.frame import Refined, WarmStart
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
-from pnpdepth_cli.io.remote import RemotePath, local_files, renamed
 
 Item = TypeVar("Item")
 REGISTERING = 16
@@ -47,41 +46,18 @@ _ROUNDING = 1e-3
 
 
 def read_frame(task: Task, known: dict[str, Fingerprint] | None = None) -> Inputs:
-    """Returns the contents of a frame's files, those in a store through local copies.
-
-    Names in records and messages are those of the task, not of copies.
+    """Returns the contents of a frame's files.
 
     Args:
         task: The frame.
         known: Gets the fingerprints of the files, by part.
 
     Raises:
-        PnpDepthError: As of `read_inputs` and `local_files`.
+        PnpDepthError: As of `read_inputs`.
     """
-    with local_files(task.inputs.values()) as copies:
-        if known is not None:
-            known |= {part: fingerprint(p, copies.get(p)) for part, p in task.inputs.items()}
-        if not copies:
-            return read_inputs(task.request)
-        names = {str(copy): str(path) for path, copy in copies.items()}
-        try:
-            inputs = read_inputs(_with_copies(task.request, copies))
-        except PnpDepthError as error:
-            raise type(error)(renamed(str(error), names)) from error
-        texts = {"record": renamed(inputs.record, names), "notes": renamed(inputs.notes, names)}
-        return replace(inputs, **texts)
-
-
-def _with_copies(value: Any, copies: Mapping[Path, Path]) -> Any:
-    """The request with the copies in the positions of the files in a store."""
-    if isinstance(value, RemotePath):
-        return copies.get(value, value)
-    if isinstance(value, tuple):
-        return tuple(_with_copies(item, copies) for item in value)
-    if is_dataclass(value) and not isinstance(value, type):
-        names = [field.name for field in fields(value) if field.init]
-        return replace(value, **{n: _with_copies(getattr(value, n), copies) for n in names})
-    return value
+    if known is not None:
+        known |= {part: fingerprint(path) for part, path in task.inputs.items()}
+    return read_inputs(task.request)
 
 
 class References(NamedTuple):

@@ -23,7 +23,6 @@ from pnpdepth_cli.io.dataset import (
     IMAGE_SUFFIXES,
     Frame,
     Source,
-    file_of,
     find_files,
     find_protocol,
     groups_by_name,
@@ -32,7 +31,6 @@ from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray
 from pnpdepth_cli.io.formats.arrays import COMPRESSIONS, parse_npy
 from pnpdepth_cli.io.layouts import find_layout, list_frames
-from pnpdepth_cli.io.remote import RemotePath
 from pnpdepth_cli.models.weights.numpy_file import read_pickled_arrays
 
 _DEPTH_MARKS = ("_depth", ".depth")
@@ -94,7 +92,6 @@ def pair_frames(
         InputError: For a missing path, or folders without a common name.
     """
     for path in filter(None, (prediction, ground_truth, sparse, mask, calib)):
-        _check_local(path)
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
     try:
@@ -122,10 +119,6 @@ def pair_frames(
     else:
         name = frame_name(prediction.stem)
         frames, predictions = [Frame(name=name, gt=ground_truth)], {name: prediction}
-    for frame in frames:
-        for part in (frame.image, frame.sparse, frame.gt):
-            if part is not None:
-                _check_local(file_of(part))
     if calib is not None:
         frames = [replace(frame, calib=calib) for frame in frames]
     names = {frame.name for frame in frames}
@@ -152,11 +145,6 @@ def pair_frames(
         pairs.append(replace(pair, previous=last.get(pair.group)))
         last[pair.group] = pair
     return pairs, notes
-
-
-def _check_local(path: Path) -> None:
-    if isinstance(path, RemotePath):
-        raise UsageError(f"{path}: eval reads local files; copy the frames from the store first")
 
 
 def _true_frames(

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import choices
 from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.remote import path_of
 from pnpdepth_cli.settings import Settings, option
 
 if TYPE_CHECKING:
@@ -26,11 +25,6 @@ def _whole_frame() -> Protocol:
     from pnpdepth_cli.io.dataset import WHOLE
 
     return WHOLE
-
-
-def parse_file(text: str) -> Path:
-    """Returns the path of a local file, or of one in a store. Raises UsageError as `path_of`."""
-    return path_of(text)
 
 
 def parse_codes_per_metre(text: str) -> float:

@@ -35,7 +35,6 @@ from pnpdepth_cli.io.atomic import make_folder, remove_leftovers
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.lock import locked_folder
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.io.remote import RemotePath, status_of
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.sensors import SamplePattern
 from pnpdepth_cli.settings import Settings
@@ -146,11 +145,8 @@ def _files(task: Task, frame: Frame, sampling: Sampling) -> Iterator[tuple[str, 
         yield "calib", frame.calib
 
 
-def _state(path: Path) -> tuple[int, int | str] | None:
-    """What changes with a file's content: size and time, or the version that a store states."""
-    if isinstance(path, RemotePath):
-        stored = status_of(path)
-        return None if stored is None else (stored.size, stored.version)
+def _state(path: Path) -> tuple[int, int] | None:
+    """What changes with a file's content: size and time."""
     try:
         status = path.stat()
     except OSError:  # the run will say so
@@ -168,8 +164,6 @@ def run_sweep(request: SweepRequest, listener: Listener) -> dict[str, Any]:
         PnpDepthError: For what concerns all frames.
     """
     output = request.output
-    if isinstance(output, RemotePath):
-        raise UsageError(f"{output}: sweep writes to a local folder; name one with -o")
     if request.plots != "none":
         need_matplotlib()
     sampling, frames = _frames(request, listener)

@@ -2,10 +2,9 @@
 
 Columns or keys: image, sparse, gt, calib, mask, camera, sparse_scale, gt_scale, gt_size_ok, name,
 group, protocol; all may be left out or empty but one of image and sparse. Paths are relative to the
-manifest, or addresses of files in a store (`choices.STORES`). Where the mask is 0, the ground truth
-is unknown; with gt_size_ok, it may have another size than the image. A frame without a name is
-called by its image's stem; if stems come twice, by its path below the folder that all of the images
-are in. Frames of one group are of one sequence.
+manifest. Where the mask is 0, the ground truth is unknown; with gt_size_ok, it may have another
+size than the image. A frame without a name is called by its image's stem; if stems come twice, by
+its path below the folder that all of the images are in. Frames of one group are of one sequence.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.dataset import Frame, Unmatched, find_protocol
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout
-from pnpdepth_cli.io.remote import RemotePath, joined, local_files
 
 _PATHS = ("image", "sparse", "gt", "calib", "mask")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
@@ -53,10 +51,8 @@ def _frames(root: Path) -> list[Frame | Unmatched]:
     Raises:
         FileFormatError: A line is invalid, or two frames would share the files of their results.
     """
-    with local_files([root]) as local:
-        data = read_bytes(local.get(root, root))
     try:
-        text = data.decode("utf-8-sig")
+        text = read_bytes(root).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{root} is not a text file; give CSV or JSON lines") from error
     rows = _csv_rows if root.suffix.lower() == ".csv" else _json_rows
@@ -65,8 +61,7 @@ def _frames(root: Path) -> list[Frame | Unmatched]:
     for number, row in rows(root, text):
         files, values = _parts(root.parent, f"{root}, line {number}", row)
         for path in files.values():
-            # files of a store are looked at when they are read
-            if not isinstance(path, RemotePath) and not path.exists():
+            if not path.exists():
                 why = f"does not exist; correct line {number} of {root}"
                 broken.append(Unmatched(path=path, why=why))
         masks = (files.pop("mask"),) if "mask" in files else ()
@@ -119,7 +114,7 @@ def _parts(folder: Path, where: str, row: dict[str, Any]) -> tuple[dict[str, Pat
     if "image" not in texts and "sparse" not in texts:
         raise FileFormatError(f"{where}: has neither image nor sparse; give one")
     try:
-        files = {key: joined(folder, texts[key]) for key in _PATHS if key in texts}
+        files = {key: folder / texts[key] for key in _PATHS if key in texts}
         values = {key: value(texts[key]) for key, value in _VALUES.items() if key in texts}
     except (ValueError, OverflowError, UsageError) as error:
         raise FileFormatError(f"{where}: {one_line(error)}") from error

@@ -221,7 +221,6 @@ def test_the_group_of_a_manifest_goes_before_the_name(tmp_path: Path) -> None:
     [
         ("out/a.npy", "gt/a.npy,", {}, "data set but .* one file; give a folder"),
         ("out", ",gt/a.npy", {}, "looks like 'manifest', and no frame in it has ground truth"),
-        ("out", "s3://bucket/a.png,", {}, "eval reads local files; copy the frames from the store"),
         ("out", "gt/a.npy,scan.ply", {"exclude_sparse": True}, "has no sparse depth file to excl"),
     ],
 )
