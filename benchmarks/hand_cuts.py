@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model_zoo_defs import adnn, fcrn, sfmlearner
+from model_zoo_defs import adnn, eigen, fcrn, sfmlearner
 from model_zoo_defs.adnn import Adnn
 from model_zoo_defs.eigen import Eigen
 from model_zoo_defs.fcrn import FCRN
@@ -57,7 +57,7 @@ def eigen_front(network: Eigen, rgb: Tensor) -> Any:
 def eigen_rear(network: Eigen, z: Tensor, features: Tensor) -> Tensor:
     coarse, fine = network.coarse, network.fine
     x = coarse.fc2(coarse.dropout(F.relu(coarse.fc1(F.relu(z).flatten(1)))))
-    x = torch.cat([features, x.reshape(-1, 1, *coarse.size)], dim=1)
+    x = torch.cat([features, x.reshape(-1, 1, *eigen.OUT)], dim=1)
     return fine.conv3(F.relu(fine.conv2(x)))
 
 
@@ -166,6 +166,6 @@ ZOO = (
     Case("sfmlearner", "conv7", (3,), (128, 416), sfmlearner_front, sfmlearner_rear),
     Case("sparseconv", "sparse_convs.0[0]", (1,), KITTI, sparseconv_front, sparseconv_rear),
     Case("adnn", "solve", (1,), KITTI, adnn_front, adnn_rear),
-    Case("sparse2dense-r18-deconv3", "bn2", (3, 1), NYU, sparse2dense_front, sparse2dense_rear),
+    Case("sparse2dense", "bn2", (3, 1), NYU, sparse2dense_front, sparse2dense_rear),
     Case("latefusion", "decoder.s8", (3, 1), (224, 320), latefusion_front, latefusion_rear),
 )

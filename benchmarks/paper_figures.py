@@ -53,11 +53,9 @@ class PaperRow:
 
     def takes(self, network: str) -> bool:
         """True if a network of this name belongs in the row."""
-        parts = network.split("-")
-        # editions for an image or for depth alone have no row in the paper
-        if parts[0] != self.family or {"selfsup", "rgb", "d"} & set(parts):
+        if network.partition("-")[0] != self.family:
             return False
-        sized = self.family in ("eigen", "sparse2dense")  # these have an edition for each size
+        sized = self.family in ("eigen", "sparse2dense")  # these take images of one size
         return not sized or network.endswith("-kitti") == self.street
 
 
@@ -89,10 +87,7 @@ MAE after of Ma in table I is printed as 0.0087 (+22.7 %), which is 0.0870.
 """
 _ODOMETRY = ("eigen", "sfmlearner", "sparse2dense")
 """Of table II: on frames of KITTI odometry."""
-_MISSING = (
-    "eigen-tiny is fully connected for NYU's size and learnt rooms, so it has no street row; the"
-    " full-size definition is `eigen-kitti`, for weights of your own"
-)
+_MISSING = "eigen-tiny is fully connected for NYU's size and learnt rooms, so it has no street row"
 
 
 def _row(text: str) -> PaperRow:

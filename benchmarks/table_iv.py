@@ -32,7 +32,7 @@ PAPER_TIMES = (
     PaperTime("Zhou", "sfmlearner", "KITTI", (128, 416)),
     PaperTime("Uhrig", "sparseconv", "KITTI", (352, 1216), 0.0311, 0.1614),
     PaperTime("Chodosh", "adnn", "KITTI", (352, 1216), 0.0320, 0.0447),
-    PaperTime("Ma", "sparse2dense-r18-deconv3", "NYU", (228, 304), 0.0046, 0.0233),
+    PaperTime("Ma", "sparse2dense", "NYU", (228, 304), 0.0046, 0.0233),
     PaperTime("Jaritz", "latefusion", "NYU", (224, 320), 0.0484, 0.1593),
 )
 """Wang et al. (ICRA 2019), Table IV, and the three networks that it leaves out."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3)}
+BLOCKS = {18: (2, 2, 2, 2), 50: (3, 4, 6, 3)}
 WIDTH = 64  # channels of the first stage, as published
 
 
@@ -64,7 +64,7 @@ def stages(depth: int, width: int = WIDTH) -> tuple[list[nn.Sequential], int]:
     """Returns the four stages of a ResNet at 1/4, 1/8, 1/16, 1/32, and the last one's channels.
 
     Args:
-        depth: Number of layers of the ResNet, 18, 34 or 50.
+        depth: Number of layers of the ResNet, 18 or 50.
         width: Input channels of the first stage.
     """
     block = Bottleneck if depth >= 50 else BasicBlock

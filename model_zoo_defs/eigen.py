@@ -1,8 +1,8 @@
 """`eigen`, a coarse and a fine network for depth from one image (Eigen et al., NIPS 2014).
 
 The coarse network predicts log depth at about a quarter of the image's size, through two fully
-connected layers; the fine network corrects it with local features. Input: rgb in 0…1, 228×304, or
-172×576 for KITTI. Output: the logarithm of depth in metres, over the whole image.
+connected layers; the fine network corrects it with local features. Input: rgb in 0…1, 228×304.
+Output: the logarithm of depth in metres, over the whole image.
 
 No weights are published. imran3180/depth-map-prediction trains it and writes two files,
 coarse_model_N.pth and fine_model_N.pth: put both into a folder, `--checkpoint FOLDER`.
@@ -30,36 +30,24 @@ from pnpdepth_cli.models.definition import (
     Settings,
 )
 
-NYU = (228, 304)
-KITTI = (172, 576)
-
-
-def out_size(length: int) -> int:
-    """Returns the rows or columns of the output for those of the input: about a quarter."""
-    return (length - 11) // 4 + 1
-
-
-def deep_size(length: int) -> int:
-    """Returns the rows or columns of the coarse network's last feature map: about a 32nd."""
-    return (out_size(length) // 2 // 2 - 3) // 2 + 1
+SIZE = (228, 304)
+OUT = (55, 74)  # rows and columns of the output
+DEEP = (6, 8)  # of the coarse network's last feature map
 
 
 class Coarse(nn.Module):
-    """Log depth (B, 1, h, w), a quarter of the size, from rgb (B, 3, H, W)."""
+    """Log depth (B, 1, 55, 74) from rgb (B, 3, 228, 304)."""
 
-    def __init__(
-        self, size: tuple[int, int], channels: tuple[int, int, int, int, int], hidden: int
-    ) -> None:
+    def __init__(self, channels: tuple[int, int, int, int, int], hidden: int) -> None:
         super().__init__()
         one, two, three, four, five = channels
-        self.size = (out_size(size[0]), out_size(size[1]))
         self.conv1 = nn.Conv2d(3, one, 11, stride=4)
         self.conv2 = nn.Conv2d(one, two, 5, padding=2)
         self.conv3 = nn.Conv2d(two, three, 3, padding=1)
         self.conv4 = nn.Conv2d(three, four, 3, padding=1)
         self.conv5 = nn.Conv2d(four, five, 3, stride=2)
-        self.fc1 = nn.Linear(five * deep_size(size[0]) * deep_size(size[1]), hidden)
-        self.fc2 = nn.Linear(hidden, self.size[0] * self.size[1])
+        self.fc1 = nn.Linear(five * DEEP[0] * DEEP[1], hidden)
+        self.fc2 = nn.Linear(hidden, OUT[0] * OUT[1])
         self.relu, self.pool = nn.ReLU(), nn.MaxPool2d(2)
         self.dropout = nn.Dropout(0.5)
 
@@ -69,7 +57,7 @@ class Coarse(nn.Module):
         x = self.relu(self.conv4(self.relu(self.conv3(x))))
         x = self.relu(self.conv5(x)).flatten(1)
         x = self.fc2(self.dropout(self.relu(self.fc1(x))))
-        y: Tensor = x.reshape(-1, 1, *self.size)
+        y: Tensor = x.reshape(-1, 1, *OUT)
         return y
 
 
@@ -91,18 +79,17 @@ class Fine(nn.Module):
 
 
 class Eigen(nn.Module):
-    """Log depth (B, 1, h, w), a quarter of the size, from rgb (B, 3, H, W) of `size` only."""
+    """Log depth (B, 1, 55, 74) from rgb (B, 3, 228, 304)."""
 
     def __init__(
         self,
-        size: tuple[int, int] = NYU,
         *,
         channels: tuple[int, int, int, int, int] = (96, 256, 384, 384, 256),
         hidden: int = 4096,
         fine: int = 64,
     ) -> None:
         super().__init__()
-        self.coarse = Coarse(size, channels, hidden)
+        self.coarse = Coarse(channels, hidden)
         self.fine = Fine(fine)
 
     def forward(self, rgb: Tensor) -> Tensor:
@@ -146,19 +133,12 @@ _NYU = ModelDefinition(
     paper="Eigen et al., Depth Map Prediction from a Single Image, NIPS 2014",
     licence="no published weights",
     input_kind="rgb",
-    size=Fixed(*NYU),
+    size=Fixed(*SIZE),
     output_kind="log",
     layers=LAYERS,
     defaults=DEFAULTS,
     build=Eigen,
     read_checkpoint=read_two_files,
-)
-_KITTI = replace(
-    _NYU,
-    name="eigen-kitti",
-    summary="the same for the size of KITTI, street scenes",
-    size=Fixed(*KITTI),
-    build=partial(Eigen, KITTI),
 )
 _TINY = replace(
     _NYU,
@@ -171,4 +151,4 @@ _TINY = replace(
     checkpoint=TINY,
     read_checkpoint=None,
 )
-definitions = {one.name: one for one in (_NYU, _KITTI, _TINY)}
+definitions = {one.name: one for one in (_NYU, _TINY)}

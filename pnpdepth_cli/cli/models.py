@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -37,14 +36,12 @@ def models() -> None:
 
 
 @models.command(name="list", short_help="List the networks that --model takes by name.")
-@click.option("--all", "every", is_flag=True, help="List every variant of a network.")
 @options.as_json
-def list_command(every: bool, as_json: bool) -> None:
+def list_command(as_json: bool) -> None:
     """List the networks that --model takes by name, with their inputs, outputs and defaults."""
     from pnpdepth_cli.commands.networks.describe import list_models
 
     listed = list_models()
-    hidden = Counter(model["family"] for model in listed if model["variant"] and not every)
     if as_json:
         print_json(listed)
         return
@@ -65,11 +62,8 @@ def list_command(every: bool, as_json: bool) -> None:
                 f" {model['loss']}, {model['update']}",
             )
             for model in listed
-            if every or not model["variant"]
         ],
     )
-    for family, count in hidden.items():
-        click.echo(f"{family}: {count} more; --all lists them", err=True)
 
 
 @models.command(short_help="Load a network, run it and cut it at its layers.")

@@ -6,7 +6,7 @@ import pytest
 
 from pnpdepth_cli.models import registry
 
-KNOWN = ["eigen-kitti", "sparse2dense-r18-upconv-d", "sparse2dense-r18-upconv-d-kitti"]
+KNOWN = ["eigen", "sparse2dense-tiny", "sparse2dense-tiny-kitti"]
 
 
 @pytest.fixture(autouse=True)

@@ -16,7 +16,6 @@ CUTS = {
     "sparse2dense-tiny": ("bn2", (1, 64, 8, 10)),
     "sparse2dense-tiny-kitti": ("bn2", (1, 64, 8, 29)),
     "sparseconv": ("sparse_convs.0[0]", (1, 16, 64, 96)),
-    "sparseconv-nomask": ("sparse_convs.0[0]", (1, 16, 64, 96)),
 }
 
 

@@ -40,20 +40,15 @@ def list_models() -> list[dict[str, Any]]:
     """Returns every network that can be named, in the order of `registry.names`.
 
     Of each, `ModelDefinition` has most values. family: the file or entry point that defines it.
-    variant: True if the family's name stands for another network and no weights of this one ship.
     """
     listed: dict[str, dict[str, Any]] = {}
     for family, definitions in families().items():
-        default = definitions.get(family)
         for definition in definitions.values():
-            if definition.name not in listed:
-                is_default = default is None or default.name == definition.name
-                variant = not is_default and definition.checkpoint is None
-                listed[definition.name] = _listed(definition, family, variant)
+            listed.setdefault(definition.name, _listed(definition, family))
     return list(listed.values())
 
 
-def _listed(definition: ModelDefinition, family: str, variant: bool) -> dict[str, Any]:
+def _listed(definition: ModelDefinition, family: str) -> dict[str, Any]:
     # On the meta device counting needs no memory.
     with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
@@ -61,7 +56,6 @@ def _listed(definition: ModelDefinition, family: str, variant: bool) -> dict[str
     return {
         "name": definition.name,
         "family": family,
-        "variant": variant,
         "summary": definition.summary,
         "paper": definition.paper,
         "licence": definition.licence,

@@ -34,7 +34,7 @@ LARGE = 100 << 30  # bytes
 @pytest.fixture(autouse=True)
 def few_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Weights that do not fit are compared with three known networks only."""
-    known = ["nconv", "sparse2dense-r18-deconv3", "sparse2dense-r18-deconv3-kitti"]
+    known = ["nconv", "sparse2dense-tiny", "sparse2dense-tiny-kitti"]
     monkeypatch.setattr(registry, "names", lambda: known)
 
 
@@ -256,8 +256,8 @@ def test_weights_of_known_networks_name_them_the_one_with_the_requested_ending_f
     torch.save(registry.find_definition("nconv").build().state_dict(), path)
     with pytest.raises(CheckpointError, match=r"network 'net': this is nconv; use --model nconv$"):
         loaded(path)
-    torch.save(registry.find_definition("sparse2dense-r18-deconv3").build().state_dict(), path)
-    for wanted, first in (("net-kitti", "r18-deconv3-kitti"), ("net", "r18-deconv3")):
+    torch.save(registry.find_definition("sparse2dense-tiny").build().state_dict(), path)
+    for wanted, first in (("net-kitti", "tiny-kitti"), ("net-tiny", "tiny")):
         with pytest.raises(CheckpointError, match=rf"--model sparse2dense-{first}$"):
             load_checkpoint(Net(), replace(definition(), name=wanted), path)
 
