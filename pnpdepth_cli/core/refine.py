@@ -50,8 +50,6 @@ class Refinement:
     losses: tuple[float, ...]  # L(z_0) … L(z_K)
     step: float  # α as a number
     kept: int  # number of updates after which `after` was predicted: K, or those of the lowest loss
-    z: Tensor | None = None  # z_K; None where weights moved
-    warm: bool = False  # whether it began where the frame before ended
 
 
 def refine(
@@ -197,7 +195,6 @@ class _FrameRefinement:
         self._first: Tensor | None = None  # depth of z_0
         self._after: Tensor | None = None  # depth of z_kept
         self._kept = 0
-        self._z = z0
         self.losses: list[float] = []
         self.error: PnpDepthError | None = None
 
@@ -245,8 +242,7 @@ class _FrameRefinement:
             if self._settings.line_search:
                 self._best = z, direction
         alpha = self._step * SCHEDULES[self._settings.schedule](updates / self._settings.iterations)
-        self._z = z - alpha * 0.5**self._halvings * direction
-        return self._z
+        return z - alpha * 0.5**self._halvings * direction
 
     def result(self) -> Refinement:
         """Returns the refinement as far as it has come."""
@@ -258,7 +254,6 @@ class _FrameRefinement:
             losses=tuple(self.losses),
             step=self._step,
             kept=self._kept,
-            z=self._z.detach(),
         )
 
     def _diverged(self, quantity: str, updates: int) -> DivergedError:

@@ -61,7 +61,6 @@ def refine_weights(
     weights: MovingWeights,
     settings: Settings,
     *,
-    carried: MovingWeights | None = None,
     on_iteration: OnIteration = lambda done, loss: None,
 ) -> Refinement:
     """Returns the depth of one frame after moving weights, which are back in place afterwards.
@@ -70,8 +69,6 @@ def refine_weights(
         frame: The frame, and how the network predicts it.
         weights: The weights that move, θ_0.
         settings: What is updated and how.
-        carried: θ* of the frame before, which moves instead where its L is lower than that of θ_0
-            at the points set aside, or without any at all inliers.
         on_iteration: Called after each step; gets the loss before it.
 
     Raises:
@@ -80,8 +77,6 @@ def refine_weights(
         LayerError: The depth depends on no weight behind the cut.
     """
     state = _WeightsRefinement(frame, weights, settings.complete())
-    if carried is not None:
-        state.start_from(carried)
     for _ in range(state.iterations):
         state.step()
         on_iteration(len(state.losses), state.losses[-1])
@@ -106,7 +101,6 @@ class _WeightsRefinement:
         self._errors: dict[int, float] = {}  # loss at the points set aside, by number of steps
         self._checked: dict[int, list[Tensor]] = {}  # weights, by number of steps
         self._started = time.monotonic()
-        self._warm = False
         self.losses: list[float] = []
         self._before = frame.depth_of(frame.output).detach()
         at_points = frame.points.sample(self._before)
@@ -119,17 +113,6 @@ class _WeightsRefinement:
         """Number of steps at most."""
         enough = len(self._frame.inliers) >= MIN_POINTS or not self._settings.masked
         return self._settings.iterations if enough else 0
-
-    def start_from(self, carried: MovingWeights) -> None:
-        """Replaces θ_0 by the weights of another frame, if L is lower with them."""
-        at = self._aside if len(self._aside) else self._frame.inliers
-        plain, cold = self._weights, self._error_at(at)
-        self._weights = carried
-        self._warm = self._error_at(at) < cold
-        if self._warm:
-            self._check()
-        else:
-            self._weights = plain
 
     def step(self) -> None:
         """Moves the weights: θ_{k+1} = θ_k − α·U(∂L/∂θ_k).
@@ -192,11 +175,10 @@ class _WeightsRefinement:
         self._weights.theta = self._checked[kept]
         return Refinement(
             before=self._before,
-            after=self._predicted(self._frame.points) if kept or self._warm else self._before,
+            after=self._predicted(self._frame.points) if kept else self._before,
             losses=tuple(self.losses),
             step=self._steps[0] if self._steps else 0.0,
             kept=kept,
-            warm=self._warm,
         )
 
     def _check(self) -> None:

@@ -15,7 +15,6 @@ from torch import Tensor
 from pnpdepth_cli.completion.alignment import Alignment
 from pnpdepth_cli.completion.image_registration import ImageRegistration, estimated, evidence
 from pnpdepth_cli.core.refine import Refinement
-from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.models.definition import DENSE_SPACING
 from pnpdepth_cli.points import SparsePoints
@@ -93,15 +92,6 @@ class Frame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WarmStart:
-    """What a frame of a window may take over from the frame before; the first has nothing."""
-
-    change: Tensor | None = None  # z_K − z_0 of the frame before
-    alignment: Alignment | None = None  # its alignment of the network's output with the points
-    weights: MovingWeights | None = None  # its weights, where weights move instead of z
-
-
-@dataclass(frozen=True, kw_only=True)
 class Refined:
     """A refined frame, all in the image frame."""
 
@@ -130,10 +120,6 @@ class Refined:
     """Kept steps by hidden points, by network."""
     registration: ImageRegistration | None = None
     """How the image was moved into the frame of the points. None: it was not."""
-    in_window: bool = False
-    """Whether it may have begun where the frame before it in a window ended."""
-    carried: WarmStart | None = None
-    """What the next frame of the window may begin with; dropped once that has begun."""
 
     @property
     def depth(self) -> DepthMap:

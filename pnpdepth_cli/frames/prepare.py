@@ -8,7 +8,6 @@ import numpy as np
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.completion.alignment import Alignment
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.models.aligned import AlignedDepth
@@ -64,17 +63,13 @@ class PreparedFrame:
         arguments = self.network.arguments_of(image, points, prior)
         return replace(self, image=image, points=points, prior=prior, arguments=arguments)
 
-    def depth_reader(self, settings: Settings, alignment: Alignment | None = None) -> AlignedDepth:
+    def depth_reader(self, settings: Settings) -> AlignedDepth:
         """Returns a new reader of the network's output in metres, (1, 1, h, w).
 
         Args:
             settings: How it is aligned with the points.
-            alignment: Of the frame before, in place of the first fit.
         """
-        every = settings.align_every
-        return AlignedDepth(
-            self.network, self.points, settings.align, every=every, alignment=alignment
-        )
+        return AlignedDepth(self.network, self.points, settings.align, every=settings.align_every)
 
     def to_image(self, depth: Tensor) -> DepthMap:
         """Returns depth (1, 1, h, w) of the network's frame as (H, W) of the image frame.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -187,7 +186,7 @@ def to_refined_frame(
         after=with_propagation(prepared.frame, prepared.to_image(result.after), propagation),
         used=used,
         held_out=no_points(used),
-        refinement=replace(result, z=None),  # which would stay in memory until it is written
+        refinement=result,
         diverged=diverged,
         alignment=reader.alignment,
         notes=reader.notes,

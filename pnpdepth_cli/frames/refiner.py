@@ -34,7 +34,6 @@ from pnpdepth_cli.frames.frame import (
     Register,
     Registration,
     Unit,
-    WarmStart,
     frame_of_arrays,
     is_dense,
     no_points,
@@ -45,7 +44,6 @@ from pnpdepth_cli.frames.refine import refine_frames
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
 from pnpdepth_cli.frames.tiles import refine_tiled
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
-from pnpdepth_cli.frames.warm_start import refine_next
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.rank_layers import default_layer
 from pnpdepth_cli.points import SparsePoints
@@ -215,19 +213,6 @@ class Refiner:
                 refined = self._checked(frame, refined)
         if self._uncertainty:
             refined = with_uncertainty(refined)
-        return _finished(refined, frame)
-
-    def refine_next(self, frame: Frame, carried: WarmStart) -> Refined:
-        """Returns one frame of a window, which may begin where the frame before ended.
-
-        Raises:
-            PnpDepthError: The frame cannot be refined.
-        """
-        frame, split = self._begun(frame)
-        assert isinstance(split, Split)
-        refined = refine_next(
-            self.network, split, self.settings, frame, carried, propagation=self.settings.propagate
-        )
         return _finished(refined, frame)
 
     def refine_together(self, group: Sequence[Frame]) -> list[Refined | PnpDepthError]:

@@ -24,23 +24,16 @@ class AlignedDepth:
     """Called with what the network returns, gives depth (1, 1, h, w) in metres.
 
     The alignment is fitted at the first call, which is the plain prediction's, and kept; with
-    `every` it is fitted at each call, the fit itself being a constant to the gradient. An alignment
-    that is given, of the frame before, takes the place of the first fit.
+    `every` it is fitted at each call, the fit itself being a constant to the gradient.
     """
 
     def __init__(
-        self,
-        network: Network,
-        points: SparsePoints,
-        kind: str,
-        *,
-        every: bool = False,
-        alignment: Alignment | None = None,
+        self, network: Network, points: SparsePoints, kind: str, *, every: bool = False
     ) -> None:
         self._network, self._points, self._kind, self._every = network, points, kind, every
         stated = network.definition.output_kind
         self._spaces = (stated,) if stated in SPACES else ("depth", "inverse")
-        self.alignment: Alignment | None = alignment
+        self.alignment: Alignment | None = None
         self.notes: tuple[str, ...] = ()
 
     def __call__(self, output: Any) -> Tensor:

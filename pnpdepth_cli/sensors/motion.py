@@ -3,8 +3,7 @@
 With images: SIFT keypoints of both (Lowe, "Distinctive image features from scale-invariant
 keypoints", 2004) are matched, those of the other frame get depth from its sparse points, and the
 perspective-n-point problem is solved in RANSAC (Fischler and Bolles, 1981). The frame's own depth
-takes no part in it. Without images: generalized ICP of the two scans (Segal et al., 2009), by
-small_gicp. An estimate that few matches or points support is refused.
+takes no part in it. An estimate that few matches support is refused.
 """
 
 from __future__ import annotations
@@ -15,21 +14,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.sparse import Floats, Mask, Points
 
 MIN_INLIERS = 30
 """Matches that agree with the motion; fewer support no estimate."""
 MIN_FRACTION = 0.25
-"""Of the matches, or of the points of a scan, that agree with the motion."""
+"""Of the matches, that agree with the motion."""
 
 _KEYPOINTS = 3000
 _RATIO = 0.8  # Lowe's, of the distances to the nearest and the next descriptor
 _REPROJECTION_PX = 2.0
 _REACH = 1.2  # mean spacings of the points, from a keypoint to the nearest
 _JUMP = 1.1  # ratio of depths of the points around a keypoint
-_VOXEL, _PAIR = 0.015, 0.15  # fractions of the median depth: voxels and farthest pairs of ICP
 
 
 class Keypoints(NamedTuple):
@@ -84,39 +81,6 @@ def motion_of_images(
     turn, shift = cv2.solvePnPRefineLM(xyz, rays[inliers], np.eye(3), None, turn, shift)
     motion = np.column_stack([cv2.Rodrigues(turn)[0], shift])
     return _plausible(motion, float(np.median(points.depth)), basis)
-
-
-def motion_of_scans(here: Points, there: Points, camera: Camera) -> MotionEstimate:
-    """Returns the motion from the other camera's frame to this one's, from the points of both.
-
-    Raises:
-        UsageError: small_gicp is not installed.
-    """
-    try:
-        import small_gicp
-    except ImportError:
-        raise UsageError(
-            "motion between frames without images needs small_gicp: pip install 'pnpdepth[icp]'"
-        ) from None
-    if min(len(here), len(there)) < MIN_INLIERS:
-        return MotionEstimate(
-            None, f"{min(len(here), len(there))} points, at least {MIN_INLIERS} needed"
-        )
-    median = float(np.median(here.depth))
-    clouds = [
-        small_gicp.preprocess_points(
-            camera.unproject(each.xy, each.depth), downsampling_resolution=_VOXEL * median
-        )
-        for each in (here, there)
-    ]
-    (target, tree), (source, _) = clouds
-    result = small_gicp.align(
-        target, source, tree, registration_type="GICP", max_correspondence_distance=_PAIR * median
-    )
-    basis = f"{result.num_inliers} of {source.size()} voxels of the scans"
-    if not result.converged or result.num_inliers < MIN_FRACTION * source.size():
-        return MotionEstimate(None, f"{basis} agree")
-    return _plausible(np.array(result.T_target_source)[:3], median, basis)
 
 
 def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:

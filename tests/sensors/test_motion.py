@@ -1,22 +1,18 @@
-"""Motion between frames without poses, on the rendered drive of `samples/` and on made-up scans."""
+"""Motion between frames without poses, on the rendered drive of `samples/`."""
 
 from __future__ import annotations
 
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors import Camera, Points
-from pnpdepth_cli.sensors.motion import Keypoints, keypoints_of, motion_of_images, motion_of_scans
+from pnpdepth_cli.sensors.motion import Keypoints, keypoints_of, motion_of_images
 from tests.sensors.test_accumulation import CAMERA as ROOM_CAMERA
-from tests.sensors.test_accumulation import from_ahead, room
+from tests.sensors.test_accumulation import room
 
 DRIVE = Path(__file__).parents[2] / "samples/drive"
 CAMERA = Camera(intrinsics=np.array([[360.77, 0, 304.53], [0, 360.77, 86.18], [0, 0, 1]]))
@@ -76,21 +72,3 @@ def test_too_few_points_give_no_motion() -> None:
     points = points_of(1)
     few = points.select(np.arange(len(points)) < 5)
     assert motion_of_images(image(0), image(1), few, CAMERA).motion is None
-    assert motion_of_scans(few, few, CAMERA).motion is None
-
-
-def test_the_motion_between_two_scans_is_found_without_images() -> None:
-    pytest.importorskip("small_gicp")
-    own, ahead = room((0, 0, 0), -1.0, 0), room((0, 0, 0.3), -1.0, 1)
-    estimate = motion_of_scans(own, ahead, ROOM_CAMERA)
-    assert estimate.motion is not None
-    np.testing.assert_allclose(estimate.motion, from_ahead(0.3), atol=0.02)
-    twice = replace(ahead, depth=2 * ahead.depth)  # most of it lies beyond all of the other
-    assert "agree" in motion_of_scans(own, twice, ROOM_CAMERA).basis
-
-
-def test_scans_need_small_gicp_which_the_message_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "small_gicp", None)
-    own = room((0, 0, 0), None, 0)
-    with pytest.raises(UsageError, match=r"pip install 'pnpdepth\[icp\]'"):
-        motion_of_scans(own, own, ROOM_CAMERA)

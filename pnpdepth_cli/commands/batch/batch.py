@@ -23,7 +23,7 @@ from pnpdepth_cli.commands.batch.records import (
     settings_of,
 )
 from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions, ray_workers_of
-from pnpdepth_cli.commands.batch.sequence import in_windows, note_of_poses, sequences_of
+from pnpdepth_cli.commands.batch.sequence import note_of_poses, sequences_of
 from pnpdepth_cli.commands.batch.summary import (
     TEXT,
     Row,
@@ -33,7 +33,6 @@ from pnpdepth_cli.commands.batch.summary import (
     write_summaries,
 )
 from pnpdepth_cli.commands.ordered_pool import in_order
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
@@ -135,11 +134,6 @@ class _Batch:
         self.workers = ray_workers_of(refine.network.device, request.cluster)
         if self.workers is not None:
             refine = refine.with_fields(device=self.workers.device)
-            if request.sequence.warm_start:
-                raise UsageError(
-                    "--warm-start refines frames in order, in one process; give each process a"
-                    " --shard of the windows instead of --ray"
-                )
         if request.html_3d:
             refine = refine.with_fields(view_3d=True)
         self.request = request = replace(request, refine=refine)
@@ -249,7 +243,7 @@ class _Batch:
             references = running.references_of(request, frames)
             if references is None:
                 begin()
-                yield from running.rows_of_unreadable(self._tasks(wanted), records)
+                yield from running.rows_of_unreadable(map(self._task, wanted), records)
             elif self.workers is not None:
                 from pnpdepth_cli.commands.batch.ray_workers import rows_of_workers
 
@@ -262,7 +256,7 @@ class _Batch:
                 with running.opened_network(request, references, listener.say) as network:
                     begin()
                     yield from running.refine_tasks(
-                        self._tasks(wanted), network, records,
+                        map(self._task, wanted), network, records,
                         threads=request.workers, settings_worked=worked, stopped=stopped,
                     )  # fmt: skip
 
@@ -273,18 +267,6 @@ class _Batch:
             part = self._part(frame)
             parts.setdefault(id(part.records), (part, []))[1].append(frame)
         return list(parts.values())
-
-    def _tasks(self, to_do: list[Frame]) -> Iterator[Task]:
-        """The frames to refine in their order, and within windows those that they begin with."""
-        if not self.request.sequence.warm_start:
-            yield from map(self._task, to_do)
-            return
-        by_name = {frame.name: frame for frame in self.found.frames}
-        for wanted in in_windows(to_do):
-            names = {frame.name for frame in wanted}
-            for each in wanted[-1].window:
-                task = self._task(by_name[each.name])
-                yield replace(task, written=task.name in names)
 
     def summarise(self, profile: dict[str, Any]) -> dict[str, Any]:
         """Writes the summaries and the report; returns the summary without its frames."""

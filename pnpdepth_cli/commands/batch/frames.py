@@ -10,12 +10,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
-from pnpdepth_cli.commands.batch.sequence import (
-    check_warm_start,
-    in_windows,
-    with_neighbours,
-    with_windows,
-)
+from pnpdepth_cli.commands.batch.sequence import with_neighbours
 from pnpdepth_cli.commands.batch.summary import CSV, JSON
 from pnpdepth_cli.commands.refinement.output_files import Outputs, outputs_in
 from pnpdepth_cli.commands.refinement.request import FrameFiles, NeighbourFiles, RefineRequest
@@ -62,8 +57,6 @@ class Task:
     inputs: dict[str, Path]
     """The files that are read for it, by their part."""
     outputs: Outputs
-    written: bool = True
-    """False for a frame that is refined only because another begins where it ends."""
 
     @property
     def record(self) -> Path:
@@ -144,25 +137,14 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         )
     if sequence.accumulate:
         frames = with_neighbours(frames, sequence.accumulate, sequence.poses)
-    if sequence.warm_start:
-        check_warm_start(request.refine)
-        frames = with_windows(frames, sequence.warm_start)
+    number, of = request.shard or (1, 1)
     return BatchFrames(
         layout=layout,
         frames=frames,
-        chosen=_chosen(request, frames[: request.limit]),
+        chosen=frames[: request.limit][number - 1 :: of],
         refused=refused,
         unmatched=tuple(unmatched),
     )
-
-
-def _chosen(request: BatchRequest, frames: list[Frame]) -> list[Frame]:
-    """The frames of the shard: every N-th, or every N-th window."""
-    number, of = request.shard or (1, 1)
-    if not request.sequence.warm_start:
-        return frames[number - 1 :: of]
-    windows = in_windows(frames)[number - 1 :: of]
-    return [frame for window in windows for frame in window]
 
 
 def task_of(request: FrameSelection, frame: Frame) -> Task:
@@ -179,18 +161,17 @@ def task_of(request: FrameSelection, frame: Frame) -> Task:
         )
         for each in frame.neighbours
     )
-    window = tuple(each.name for each in frame.window)
-    files = replace(files, neighbours=tuple(neighbours), window=window)
+    files = replace(files, neighbours=tuple(neighbours))
     return Task(
         name=frame.name,
         request=replace(refine, files=files),
-        inputs=dict(_earlier_files(frame)) | dict(_input_files(files)),
+        inputs=dict(_input_files(files)),
         outputs=outputs_in(request.output, frame.name, refine),
     )
 
 
 def _files_of(request: FrameSelection, frame: Frame, *, needs_camera: bool) -> FrameFiles:
-    """The files of a frame, without its neighbours and window."""
+    """The files of a frame, without its neighbours."""
     base = request.refine.files
     sparse = frame.sparse if base.sample is None else None
     protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
@@ -266,15 +247,6 @@ def _input_files(files: FrameFiles) -> Iterator[tuple[str, Path]]:
         yield from ((f"calib {path.name}", path) for path in sorted(calib.glob("calib_*.txt")))
     elif calib is not None:
         yield "calib", calib
-
-
-def _earlier_files(frame: Frame) -> Iterator[tuple[str, Path]]:
-    """The files of the frames before in the window, on which this one's result depends."""
-    for each in frame.window[:-1]:
-        for other in (each, *(neighbour.frame for neighbour in each.neighbours)):
-            for number, path in enumerate(source_files(other)):
-                if path.is_file():
-                    yield f"file {number} of {other.name}", path
 
 
 def _outside(output: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list[Unmatched]]:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _ENTRY = "batch"
 _OWN_SUMMARY = b'{\n  "command": "batch"'
-_ONLY_IF_SET = {"window", "neighbours", "calibration"}
+_ONLY_IF_SET = {"neighbours", "calibration"}
 DAMAGED = (AttributeError, IndexError, KeyError, TypeError)
 """What a record that holds less than it should leads to."""
 

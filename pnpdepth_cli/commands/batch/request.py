@@ -52,7 +52,7 @@ class SequenceOptions:
     accumulate: int = option(
         0,
         "Add the points of the N frames before and after, moved by the camera's poses or, without"
-        " poses, by its motion as estimated from images or scans.",
+        " poses, by its motion as estimated from the images.",
         metavar="N",
         least=0,
     )
@@ -62,15 +62,8 @@ class SequenceOptions:
         " else estimated]",
         metavar="FILE",
     )
-    warm_start: int = option(
-        0,
-        "Refine windows of N frames in order, each frame from where the one before ended.",
-        metavar="N",
-    )
 
     def __post_init__(self) -> None:
-        if self.warm_start < 0 or self.warm_start == 1:
-            raise UsageError(f"--warm-start must be a window of 2 or more, got {self.warm_start}")
         if self.poses is not None and not self.accumulate:
             raise UsageError("--poses is for --accumulate; give --accumulate 2, say")
 

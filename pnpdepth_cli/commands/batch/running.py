@@ -33,7 +33,7 @@ from pnpdepth_cli.errors import (
     StorageError,
     UsageError,
 )
-from pnpdepth_cli.frames.frame import Refined, WarmStart
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
@@ -208,8 +208,7 @@ def refine_tasks(
                 fatal = StorageError if worked else (StorageError, ModelError, UsageError)
                 if isinstance(frame.result, fatal):
                     raise frame.result
-                if frame.task.written:
-                    yield frame
+                yield frame
 
     def written(frame: FrameInMemory) -> Row:
         return _write(frame, network.refiner, records)
@@ -263,7 +262,6 @@ class OpenNetwork:
 
     def __init__(self, refiner: Refiner, batch_size: int, say: Callable[[str], None]) -> None:
         self.refiner, self._say = refiner, say
-        self._carried: dict[str, WarmStart] = {}  # of the last frame, by the first of its window
         fixed = (
             not refiner.is_default
             and not refiner.settings.moves_weights
@@ -276,7 +274,7 @@ class OpenNetwork:
 
     def refine(self, group: Sequence[Inputs]) -> Sequence[Refined | Exception]:
         """Returns the refined frames, all of one size; for one that fails, its error."""
-        if len(group) > 1 and not any(inputs.window for inputs in group):
+        if len(group) > 1:
             try:
                 return self._together(group)
             except PnpDepthError as error:
@@ -304,15 +302,9 @@ class OpenNetwork:
 
     def _alone(self, inputs: Inputs) -> Refined | Exception:
         try:
-            if not inputs.window:
-                return self.refiner.refine_frame(inputs)
-            first, begins = inputs.window[0], len(inputs.window) == 1
-            carried = WarmStart() if begins else self._carried.pop(first, WarmStart())
-            frame = self.refiner.refine_next(inputs, carried)
+            return self.refiner.refine_frame(inputs)
         except Exception as error:  # concerns this frame only
             return error
-        self._carried = {first: frame.carried or WarmStart()}
-        return replace(frame, carried=None)
 
 
 def _read(task: Task) -> FrameInMemory:

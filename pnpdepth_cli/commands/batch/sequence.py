@@ -1,4 +1,4 @@
-"""The sequences that the frames of a data set are of: their poses, neighbours and windows."""
+"""The sequences that the frames of a data set are of: their poses and neighbours."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.dataset import Frame, Neighbour, groups_by_name
 from pnpdepth_cli.io.poses import read_oxts_poses, read_poses
@@ -32,37 +31,6 @@ def sequences_of(frames: Sequence[Frame]) -> dict[str, list[int]]:
     }
 
 
-def with_windows(frames: Sequence[Frame], length: int) -> list[Frame]:
-    """Returns the frames, each with its window: so many frames of its sequence in a row."""
-    result = list(frames)
-    for sequence in sequences_of(frames).values():
-        for number, index in enumerate(sequence):
-            first = number - number % length
-            window = tuple(frames[other] for other in sequence[first : number + 1])
-            result[index] = replace(frames[index], window=window)
-    return result
-
-
-def in_windows(frames: Sequence[Frame]) -> list[list[Frame]]:
-    """Returns the frames by window, in the order of the first frame of each."""
-    windows: dict[str, list[Frame]] = {}
-    for frame in frames:
-        windows.setdefault((*frame.window, frame)[0].name, []).append(frame)
-    return list(windows.values())
-
-
-def check_warm_start(request: RefineRequest) -> None:
-    """Raises UsageError if the method cannot begin where the frame before ended."""
-    checked = request.hold_out.baselines or request.hold_out.uncertainty
-    if checked or not request.method.fixed_by:
-        raise UsageError(
-            "--warm-start goes with a fixed method, not with the default one; give --propagate gp,"
-            " or another option of the method"
-        )
-    if request.method.tile is not None:
-        raise UsageError("--warm-start does not go with --tile")
-
-
 def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> list[Frame]:
     """Returns the frames, each with those at most `reach` before and after it in its sequence.
 
@@ -74,7 +42,8 @@ def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> 
 
     Raises:
         InputError: The file has another number of poses.
-        UsageError: A frame has no points, or its points are those of all images already.
+        UsageError: A frame has no points, or its points are those of all images already;
+            or neither its pose nor its image is known.
     """
     known, result = _poses(frames, poses), list(frames)
     for sequence in sequences_of(frames).values():
@@ -108,8 +77,11 @@ def _neighbour(
             f" {'images alone' if other.sparse is None else 'a COLMAP model'}"
         )
     if pose is None or other_pose is None:
-        kind = "scans" if other.image is None else "images"
-        return Neighbour(frame=other, motion=None, poses=f"estimated from the {kind}", apart=apart)
+        if other.image is None:
+            raise UsageError(
+                f"{other.name}: --accumulate needs the poses of frames without images; give --poses"
+            )
+        return Neighbour(frame=other, motion=None, poses="estimated from the images", apart=apart)
     (matrix, source), (other_matrix, _) = pose, other_pose
     turn = matrix[:, :3].T @ other_matrix[:, :3]
     shift = matrix[:, :3].T @ (other_matrix[:, 3] - matrix[:, 3])

@@ -63,11 +63,6 @@ class Inputs(Frame):
     """The camera in pixels of the image frame. None: unknown."""
     has_neighbours: bool = False
 
-    @property
-    def window(self) -> tuple[str, ...]:
-        """Names of the frames of its window up to this one; empty outside of windows."""
-        return self.request.files.window
-
 
 def read_inputs(request: RefineRequest) -> Inputs:
     """Returns the frame that is asked for.

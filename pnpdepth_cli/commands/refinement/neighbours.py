@@ -16,13 +16,7 @@ from pnpdepth_cli.io.dataset.reading import read_image
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Camera, NeighbourScan, Points, accumulated
-from pnpdepth_cli.sensors.motion import (
-    Keypoints,
-    MotionEstimate,
-    keypoints_of,
-    motion_of_images,
-    motion_of_scans,
-)
+from pnpdepth_cli.sensors.motion import Keypoints, MotionEstimate, keypoints_of, motion_of_images
 
 _IN_MEMORY = 16
 """Images whose keypoints are kept."""
@@ -68,7 +62,7 @@ def read_neighbours(
         assert source is not None
         known = neighbour.motion
         if known is None:
-            estimate = _estimated(files, neighbour.files, own, points, camera.camera)
+            estimate = _estimated(files, neighbour.files, points, camera.camera)
         else:
             estimate = MotionEstimate(motion=np.array(known), basis=neighbour.poses)
         entry: dict[str, Any] = {
@@ -96,10 +90,10 @@ def read_neighbours(
 
 
 def _estimated(
-    here: FrameFiles, there: FrameFiles, used: Points, points: Points, camera: Camera
+    here: FrameFiles, there: FrameFiles, points: Points, camera: Camera
 ) -> MotionEstimate:
-    if here.image is None or there.image is None:
-        return motion_of_scans(used, points, camera)
+    assert here.image is not None
+    assert there.image is not None
     return motion_of_images(
         _keypoints(here.image, here.protocol, fingerprint(file_of(here.image)).sha256),
         _keypoints(there.image, there.protocol, fingerprint(file_of(there.image)).sha256),

@@ -159,7 +159,6 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: Refined) -> dict[str, Any
         },
         "loss": list(frame.losses),
         "kept": frame.refinement.kept,
-        **({"warm_start": frame.refinement.warm} if frame.in_window else {}),
         "sparse_error": _before_after(frame, lambda depth: _point_error(depth, frame.used)),
         "held_out_error": _before_after(frame, lambda depth: _point_error(depth, frame.held_out)),
         "scores": _before_after(frame, lambda depth: _scores(depth, gt)),

@@ -96,8 +96,6 @@ class FrameFiles:
     camera_number: int | None = None
     neighbours: tuple[NeighbourFiles, ...] = ()
     """Other frames of the sequence, whose points are moved into this one."""
-    window: tuple[str, ...] = ()
-    """Names of the frames of its window up to this one. Empty for a frame outside of windows."""
     gt_masks: tuple[Path, ...] = ()
     """Where one of these is 0, the ground truth is unknown."""
     gt_size_ok: bool = False

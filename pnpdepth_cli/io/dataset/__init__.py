@@ -157,8 +157,6 @@ class Frame:
     """x_world = pose · (x, 1) for points in the camera's frame; of KITTI odometry camera 0's."""
     oxts: Path | None = None  # the packet of KITTI's inertial system that gives the pose
     neighbours: tuple[Neighbour, ...] = ()
-    window: tuple[Frame, ...] = ()
-    """The frames of its window up to and with this one; empty outside of windows."""
     masks: tuple[Path, ...] = ()
     """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""
     gt_other_size: bool = False

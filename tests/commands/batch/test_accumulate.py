@@ -108,6 +108,12 @@ def test_a_frame_without_points_cannot_be_accumulated() -> None:
         with_neighbours([frame, frame], 1, None)
 
 
+def test_frames_without_images_need_poses_to_be_accumulated() -> None:
+    frame = Frame(name="a", sparse=Path("s.png"))
+    with pytest.raises(UsageError, match="--poses"):
+        with_neighbours([frame, frame], 1, None)
+
+
 def test_the_note_names_the_poses_that_are_used() -> None:
     own = Frame(name="a_1", image=Path("i.png"), sparse=Path("s.png"), pose=STILL)
     without = replace(own, name="a_2", pose=None)
