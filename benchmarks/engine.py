@@ -15,21 +15,23 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
 import json
 import platform
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from benchmarks.frames import print_row
 from benchmarks.hand_cuts import ZOO, Case
-from pnpdepth_cli.commands.bench import in_turn, peak_mb
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.precision import lower
@@ -179,7 +181,7 @@ def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
         results = [todo[name]() for name in COMPARED]
         for name, result in zip(COMPARED, results, strict=True):
             assert torch.equal(results[0], result), f"{case.name}: {name} differs"
-        spent = in_turn(todo, runs, CPU)
+        spent = in_turn(todo, runs)
     median = {name: statistics.median(times) for name, times in spent.items()}
     limit = (median["front"] + (2 * ITERATIONS + 1) * median["rear"]) / (
         median["front"] + median["rear"]
@@ -207,6 +209,35 @@ def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
     }
 
 
+def in_turn(todo: Mapping[str, Callable[[], object]], runs: int) -> dict[str, list[float]]:
+    """The seconds of every run of each function, after a first round that does not count.
+
+    They run in turn, so that other load on the machine slows all of them alike.
+    """
+    spent: dict[str, list[float]] = {name: [] for name in todo}
+    for number in range(-1, runs):
+        for name, run in todo.items():
+            start = time.perf_counter()
+            run()
+            if number >= 0:
+                spent[name].append(time.perf_counter() - start)
+    return spent
+
+
+def peak_mb(run: Callable[[], object]) -> float:
+    """The peak memory of the process beyond what is in use before, in 10^6 bytes; Linux only."""
+    ctypes.CDLL(None).malloc_trim(0)  # reuse of the C library's free memory would not be measured
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak to what is in use now
+    resident = kilobytes("VmRSS")
+    run()
+    return max(0.0, (kilobytes("VmHWM") - resident) * 1024 / 1e6)
+
+
+def kilobytes(name: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
+
+
 def peak_of(case: Case, variant: str) -> float:
     """What this needs at its peak, in a new process that has done it once, after a forward pass."""
     command = [sys.executable, "-m", "benchmarks.engine", "--peak", case.name, variant]
@@ -217,7 +248,7 @@ def print_peak(name: str, variant: str) -> None:
     with variants(next(case for case in ZOO if case.name == name)) as todo:
         todo["forward"]()
         todo[variant]()
-        print(peak_mb(todo[variant], CPU))
+        print(peak_mb(todo[variant]))
 
 
 def main() -> None:

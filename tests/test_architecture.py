@@ -110,7 +110,7 @@ def imports_nothing_of(heavy: str, code: str, *arguments: str) -> str:
 
 
 def test_help_imports_neither_torch_nor_numpy_nor_rich() -> None:
-    commands = [*COMMANDS, "models check", "models fetch"]
+    commands = [*COMMANDS, "models check"]
     code = (
         "import sys\n"
         "from pnpdepth_cli.cli.main import main\n"

@@ -70,7 +70,6 @@ COMMANDS = {
     "eval": "evaluate:evaluate",
     "compare": "compare:compare",
     "sweep": "sweep:sweep",
-    "bench": "bench:bench",
     "doctor": "doctor:doctor",
 }
 """The subcommands in the order of the help, as `module:function` in `pnpdepth_cli.cli`."""

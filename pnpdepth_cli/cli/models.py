@@ -23,15 +23,13 @@ class _Models(click.Group):
         return super().parse_args(ctx, args if named else ["list", *args])
 
 
-@click.group(short_help="List, check, convert or fetch networks.", cls=_Models)
+@click.group(short_help="List or check networks.", cls=_Models)
 def models() -> None:
-    """List, check, convert or fetch networks; without a subcommand, list them.
+    """List or check networks; without a subcommand, list them.
 
     \b
     pnpdepth models
     pnpdepth models check net.onnx --image img.png
-    pnpdepth models convert model_best.pth.tar weights.safetensors
-    pnpdepth models fetch depth-anything/Depth-Anything-V2-Small-hf
     """
 
 
@@ -84,30 +82,6 @@ def check(
     _print(check_model(network, checkpoint, image, device), as_json)
 
 
-@models.command(short_help="Extract the tensors of a checkpoint.")
-@click.argument("source", type=options.FILE, metavar="IN")
-@click.argument("target", type=options.FILE, metavar="OUT.safetensors")
-@options.overwrite
-@options.as_json
-def convert(source: Path, target: Path, overwrite: bool, as_json: bool) -> None:
-    """Write the tensors of the checkpoint IN to OUT.safetensors. No code in IN is run."""
-    from pnpdepth_cli.commands.networks.weights import convert_checkpoint
-
-    _print(convert_checkpoint(source, target, overwrite=overwrite), as_json)
-
-
-@models.command(short_help="Download a network from Hugging Face.")
-@click.argument("repository", metavar="ORG/NAME")
-@click.option("--revision", metavar="REV", help="Branch, tag or commit.")
-@click.option("-o", "--output", type=options.FILE, help="Output folder.  [default: ./NAME]")
-@options.as_json
-def fetch(repository: str, revision: str | None, output: Path | None, as_json: bool) -> None:
-    """Download a network from Hugging Face. No other command uses the internet."""
-    from pnpdepth_cli.commands.networks.weights import fetch_model
-
-    _print(fetch_model(repository, revision, output), as_json)
-
-
 def _print(record: Mapping[str, Any], as_json: bool) -> None:
     """Prints the record to stdout; as text, its `notes` go to stderr."""
     if as_json:
@@ -134,16 +108,9 @@ def _print(record: Mapping[str, Any], as_json: bool) -> None:
     "--all", "every", is_flag=True, help="List every submodule, not only the definition's."
 )
 @click.option("--size", metavar="HxW", help="Size of the frame to measure with.")
-@click.option(
-    "--sparse",
-    type=options.FILE,
-    help="Rank the layers for the point density of this sparse depth.",
-)
 @options.device
 @options.as_json
-def layers(
-    size: str | None, every: bool, sparse: Path | None, as_json: bool, **values: Any
-) -> None:
+def layers(size: str | None, every: bool, as_json: bool, **values: Any) -> None:
     """List the layers a network can be cut at.
 
     For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
@@ -153,31 +120,29 @@ def layers(
 
     choice = NetworkChoice(**values)
     with progress_bar("layers", "layer") as show:
-        result = list_layers(
+        rows = list_layers(
             choice,
             every=every,
             size=options.height_and_width(size) if size else None,
-            sparse=sparse,
             on_layer=show,
         )
     if as_json:
-        print_json([asdict(row) for row in result.rows])
+        print_json([asdict(row) for row in rows])
         return
     from pnpdepth_cli.cli.tables import print_rows
 
     fields = ("field\nin z", "field\nin depth")
-    spacing = "" if result.spacing is None else f", points {result.spacing:.3g} pixels apart"
     print_rows(
-        f"layers of {choice.model}{spacing}",
-        ("layer", "z", "stride", "params", "cost\nbehind", "time\nbehind", *fields, "rank"),
-        [_cells(asdict(row)) for row in result.rows],
+        f"layers of {choice.model}",
+        ("layer", "z", "stride", "params", "cost\nbehind", "time\nbehind", *fields),
+        [_cells(asdict(row)) for row in rows],
     )
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     if row["problem"]:
         reason = row["problem"].partition(": ")[2] or row["problem"]
-        return (row["name"], "–", *[""] * 5, reason)
+        return (row["name"], "–", *[""] * 4, reason)
     return (
         row["name"],
         "×".join(str(n) for n in row["shape"]),
@@ -187,5 +152,4 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         f"{1000 * row['seconds_behind']:.0f} ms",
         "{}×{}".format(*row["field_in_z"]) if row["field_in_z"] else "–",
         "{}×{}".format(*row["field_in_output"]),
-        str(row["rank"] or ""),
     )

@@ -44,8 +44,8 @@ from pnpdepth_cli.frames.refine import refine_frames
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
 from pnpdepth_cli.frames.tiles import refine_tiled
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
+from pnpdepth_cli.models.measure_layers import default_layer
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.models.rank_layers import default_layer
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
 

@@ -96,15 +96,13 @@ def _resize(depth: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(depth, size, mode="bilinear", align_corners=False)
 
 
-def synthetic_frame(
-    size: tuple[int, int], count: int = _SYNTHETIC_POINTS
-) -> tuple[Tensor, SparsePoints]:
+def synthetic_frame(size: tuple[int, int]) -> tuple[Tensor, SparsePoints]:
     """A smooth random rgb image (1, 3, H, W), and points on a slanted plane; the seed is fixed."""
     height, width = size
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)
     rgb = F.interpolate(coarse, size, mode="bilinear")
-    pixels = torch.randperm(height * width, generator=generator)[:count]
+    pixels = torch.randperm(height * width, generator=generator)[:_SYNTHETIC_POINTS]
     y, x = pixels // width, pixels % width
     points = SparsePoints(
         xy=torch.stack([x, y], dim=1).float(),

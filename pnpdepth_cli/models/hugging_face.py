@@ -200,8 +200,8 @@ def _weights(folder: Path) -> Path:
         return index
     if any((folder / name).is_file() for name in _PICKLED):
         raise CheckpointError(
-            f"{folder} has its weights as a pickle only; convert it: pnpdepth models convert"
-            f" {folder / _PICKLED[0]} {folder / _WEIGHTS[0]}"
+            f"{folder} has its weights as a pickle only; have transformers load it and write"
+            f" {_WEIGHTS[0]} by save_pretrained"
         )
     raise CheckpointError(f"{folder} has no {_WEIGHTS[0]}")
 

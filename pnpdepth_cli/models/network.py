@@ -186,7 +186,6 @@ def load_network(
     device: str = "cpu",
     *,
     precision: str = "fp32",
-    untrained: bool = False,
 ) -> Network:
     """Returns a network, built, with its weights, on its device.
 
@@ -195,7 +194,6 @@ def load_network(
         checkpoint: The weights; None takes those of the definition.
         device: Name of a torch device.
         precision: "fp32", "bf16" or "fp16"; see `pnpdepth_cli.models.precision`.
-        untrained: Whether random weights will do if there are no others, as for measuring times.
 
     Raises:
         ModelError: There is no such network, or it cannot be built.
@@ -226,8 +224,6 @@ def load_network(
             )
     elif path is not None:
         notes = load_checkpoint(module, definition, path)
-    elif untrained:
-        notes = ["weights: random, none are named; times are right, depths are not"]
     elif module.state_dict():
         raise CheckpointError(
             f"network {definition.name!r} comes without weights; name them with --checkpoint, or,"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +16,15 @@ from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
 from pnpdepth_cli.models.frame import synthetic_frame
+from pnpdepth_cli.models.measure_layers import MeasuredLayer, measure_layers
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
-from pnpdepth_cli.models.rank_layers import (
-    MeasuredLayer,
-    measure_layers,
-    point_spacing,
-    rank_layers,
-    wanted_field,
-)
 from pnpdepth_cli.models.registry import families
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import occluded_in_map
 
 DEFAULT_SIZE = (240, 320)
-"""Rows and columns of the synthetic frame where neither a size nor sparse depth is given."""
+"""Rows and columns of the synthetic frame where no size is given."""
 
 
 def list_models() -> list[dict[str, Any]]:
@@ -165,47 +156,28 @@ def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], who
     return "ok" if bool(gradient.isfinite().all()) else "the gradient is not finite"
 
 
-@dataclass(frozen=True, kw_only=True)
-class LayerList:
-    """The layers of a network, in the order of the definition, or of the network's submodules.
-
-    spacing: pixels of the network's frame between sparse points; None without sparse depth.
-    """
-
-    rows: list[MeasuredLayer]
-    spacing: float | None
-    notes: tuple[str, ...]
-
-
 def list_layers(
     choice: NetworkChoice,
     *,
     every: bool,
     size: tuple[int, int] | None = None,
-    sparse: Path | None = None,
     on_layer: Callable[[int, int], None] = lambda done, of: None,
-) -> LayerList:
+) -> list[MeasuredLayer]:
     """Returns the layers that a network can be cut at, measured on a synthetic frame.
+
+    They are in the order of the definition, or of the network's submodules.
 
     Args:
         choice: The network, its weights and device.
         every: Whether all submodules are listed, not only the layers of the definition.
-        size: Rows and columns of the frame; None takes those of `sparse`, or the network's own, or
-            `DEFAULT_SIZE`.
-        sparse: A sparse depth map; the layers are ranked for the spacing of its points.
+        size: Rows and columns of the frame; None takes the network's own, or `DEFAULT_SIZE`.
         on_layer: Called after each layer with the number of layers done and of all.
 
     Raises:
         UsageError: The definition lists no layers.
-        ModelError, CheckpointError, DeviceError, InputError: As in loading and reading.
+        ModelError, CheckpointError, DeviceError: As in loading.
     """
     network = load_network(choice.model, choice.checkpoint, choice.device)
-    own, count = _own_size(network), None
-    if sparse is not None:
-        points = read_sparse(sparse, size=size or own).points
-        hidden = occluded_in_map(points)  # refine drops them
-        count = len(points) if hidden is None else int((~hidden).sum())
-        size = size or points.size
     names = list(network.definition.layers)
     if every:
         names = [name for name, _ in network.module.named_modules() if name]
@@ -214,16 +186,5 @@ def list_layers(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
     with out_of_memory_is_a_device_error(network.device):
-        prepared = prepare(network, _synthetic(size or own))
-        rows = measure_layers(network, names, prepared.arguments, prepared.map.network, on_layer)
-    spacing, notes = None, network.notes
-    if count:
-        spacing = point_spacing(prepared.map.network, count)
-        rows = rank_layers(rows, wanted_field(prepared.map.network, spacing))
-        if network.definition.defaults.layer is not None:
-            notes = (
-                *notes,
-                f"layers: {network.definition.name!r} is cut at {network.definition.defaults.layer}"
-                " by default, as its definition says",
-            )
-    return LayerList(rows=rows, spacing=spacing, notes=notes)
+        prepared = prepare(network, _synthetic(size or _own_size(network)))
+        return measure_layers(network, names, prepared.arguments, prepared.map.network, on_layer)

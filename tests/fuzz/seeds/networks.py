@@ -14,6 +14,21 @@ from torch import nn
 from tests.fuzz.seeds.seed import HEIGHT, WIDTH, Seed
 from tests.models.weights.test_tensor_bundle import written
 
+_ANY_WEIGHTS = """
+import torch
+from torch import nn
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+
+definition = ModelDefinition(
+    name="any-weights",
+    input_kind="rgb",
+    size=Multiple(1),
+    build=lambda: nn.Conv2d(3, 1, 1, bias=False),
+    read_checkpoint=lambda stored: {"weight": torch.ones(1, 3, 1, 1)},
+)
+"""
+"""A network that every checkpoint fits."""
+
 
 def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
     """Returns checkpoints, and networks of the formats whose packages are installed."""
@@ -29,8 +44,9 @@ def _checkpoints(folder: Path, rng: np.random.Generator) -> list[Seed]:
     np.savez(folder / "net.npz", **tensors)
     np.save(folder / "net.npy", np.array(tensors, dtype=object), allow_pickle=True)
     names = ["net.safetensors", "net.pt", "old.pth", "net.npz", "net.npy", written(folder).name]
+    (folder / "any_weights.py").write_text(_ANY_WEIGHTS)
     return [
-        Seed(file=name, command=("models", "convert", name, "out.safetensors", "--overwrite"))
+        Seed(file=name, command=("models", "check", "any_weights.py", "--checkpoint", name))
         for name in names
     ]
 

@@ -20,7 +20,7 @@ class Seed:
     """Arguments of `pnpdepth`."""
     scratch: tuple[str, ...] = field(
         default=(
-            *("out.png", "out.png.json", "out.json", "out.safetensors", "out.ply", "out.ply.json"),
+            *("out.png", "out.png.json", "out.json", "out.ply", "out.ply.json"),
             *("batch", "frames", "refined"),
         )
     )

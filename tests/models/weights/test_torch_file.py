@@ -269,3 +269,24 @@ def test_opcodes_of_extensions_and_of_things_outside_are_refused(
 ) -> None:
     path = archive_of(tmp_path / "x.pt", b"\x80\x05" + opcode + b".")
     assert "cannot be read as a torch file" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("tensor", "kind"),
+    [
+        (torch.eye(3).to_sparse(), "no state dict of plain tensors"),
+        (torch.eye(3).to_sparse_csr(), "no state dict of plain tensors"),
+        (torch.empty(3, device="meta"), "no state dict of plain tensors"),
+        (torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.qint8), "quantised"),
+        (torch.zeros(1).expand(100_000, 100_000), "1e+10 elements"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_tensor_of_an_unusual_kind_or_size_is_refused(
+    tensor: Any, kind: str, tmp_path: Path
+) -> None:
+    state = {"layer.weight": tensor, "layer.bias": torch.ones(1)}
+    torch.save(state, tmp_path / "w.pt")
+    torch.save({"state_dict": state}, tmp_path / "inside.pt")
+    assert kind in refused(tmp_path / "w.pt")
+    assert kind in refused(tmp_path / "inside.pt")

@@ -5,47 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.commands.networks.describe import list_layers
-from pnpdepth_cli.commands.refinement.request import NetworkChoice
-from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.models import rank_layers as rank
-from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.models.rank_layers import (
+from pnpdepth_cli.models import measure_layers as measuring
+from pnpdepth_cli.models.measure_layers import (
     MeasuredLayer,
     best_layer,
     default_layer,
     measure_layers,
     point_spacing,
-    rank_layers,
     wanted_field,
 )
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.settings import Settings
 
 IMAGE = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
-
-
-def layer(name: str, field: int, cost: float) -> MeasuredLayer:
-    return MeasuredLayer(name=name, field_in_output=(field, field + 4), cost_behind=cost)
-
-
-LAYERS = [
-    layer("deep", 90, 0.9),
-    layer("middle", 40, 0.5),
-    layer("late", 9, 0.1),
-    MeasuredLayer(name="never", problem="never runs"),
-]
-
-
-@pytest.mark.parametrize(
-    ("wanted", "ranks"), [(30, [2, 1, 3, None]), (100, [1, 2, 3, None]), (5, [3, 2, 1, None])]
-)
-def test_the_cheapest_layer_whose_field_is_wide_enough_comes_first(
-    wanted: float, ranks: list[int | None]
-) -> None:
-    assert [one.rank for one in rank_layers(LAYERS, wanted)] == ranks
 
 
 def test_a_field_spans_several_gaps_between_points_and_half_the_image() -> None:
@@ -91,7 +66,7 @@ def network(tmp_path: Path) -> Network:
 def test_few_points_want_a_deep_layer_and_many_a_late_one(
     network: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rank, "LEAST_FRACTION", 0.0)
+    monkeypatch.setattr(measuring, "LEAST_FRACTION", 0.0)
     assert best_layer(network, (IMAGE,), (64, 96), 20) == "deep"
     assert best_layer(network, (IMAGE,), (1, 1), 36) == "late"
     assert best_layer(network, (IMAGE,), (64, 96), 0) is None
@@ -109,8 +84,8 @@ def test_the_best_of_eight_layers_is_found_by_measuring_few(
         field = fields[name]
         return MeasuredLayer(name=name, field_in_output=None if field is None else (field, field))
 
-    monkeypatch.setattr(rank, "_measure", measure)
-    monkeypatch.setattr(rank, "LEAST_FRACTION", 0.0)
+    monkeypatch.setattr(measuring, "_measure", measure)
+    monkeypatch.setattr(measuring, "LEAST_FRACTION", 0.0)
     network = replace(network, definition=replace(network.definition, layers=tuple(fields)))
     wanted = min(wanted_field((64, 64), point_spacing((64, 64), count)), 64)
     reaching = [name for name, field in fields.items() if field is not None and field >= wanted]
@@ -120,18 +95,10 @@ def test_the_best_of_eight_layers_is_found_by_measuring_few(
     assert len(measured) <= 5
 
 
-@pytest.mark.parametrize("count", [50, 20_000])
-def test_the_layer_of_the_default_is_the_one_that_layers_ranks_first(
-    tmp_path: Path, network: Network, count: int
-) -> None:
-    size = (160, 192)
-    depth = np.zeros(size[0] * size[1], np.float32)
-    depth[np.random.default_rng(0).permutation(len(depth))[:count]] = 2.0
-    write_depth(tmp_path / "s.npy", depth.reshape(size), scale=1)
-    choice = NetworkChoice(model=str(tmp_path / "net.py"))
-    listed = list_layers(choice, every=False, sparse=tmp_path / "s.npy")
-    (first,) = [row.name for row in listed.rows if row.rank == 1]
-    assert default_layer(network, size, count) == first
+def test_the_default_is_the_definitions_layer_else_the_best_one(network: Network) -> None:
+    assert default_layer(network, (160, 192), 50) == "deep"
+    named = replace(network.definition, defaults=Settings(layer="late"))
+    assert default_layer(replace(network, definition=named), (160, 192), 50) == "late"
 
 
 def test_a_layer_that_cannot_be_cut_at_is_measured_as_a_problem(network: Network) -> None:

@@ -1,4 +1,4 @@
-"""Ranks the layers a network can be cut at by the spacing of the sparse points.
+"""Measures the layers a network can be cut at, and finds the one for the spacing of the points.
 
 The paper's rule of thumb: the influential field of a point should reach the next points, so that
 updates reach all pixels. Of such layers, the one with the least of the network behind it is the
@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -38,8 +38,7 @@ class MeasuredLayer:
     stride: network pixels per element of z; None if z has no two spatial axes. cost_behind:
     fraction of the network's floating-point operations behind the cut, which every update repeats;
     seconds_behind: time of one pass of that part. parameters: weights of the layer itself. Fields:
-    rows and columns that one point influences, see `InfluentialField`. rank: 1 for the layer to cut
-    at for the spacing of the points.
+    rows and columns that one point influences, see `InfluentialField`.
     """
 
     name: str
@@ -50,14 +49,16 @@ class MeasuredLayer:
     parameters: int | None = None
     field_in_z: tuple[int, int] | None = None
     field_in_output: tuple[int, int] | None = None
-    rank: int | None = None
     problem: str | None = None
 
 
 def best_layer(
     network: Network, arguments: tuple[Tensor, ...], size: tuple[int, int], point_count: int
 ) -> str | None:
-    """Returns the layer of the definition that is ranked first for so many points in a frame.
+    """Returns the layer of the definition to cut at for so many points in a frame.
+
+    It is the last one whose influential field in the depth map is wide enough, which is the one of
+    least cost; if there is none, the one with the widest field.
 
     Args:
         network: Its definition's layers are measured.
@@ -72,7 +73,7 @@ def best_layer(
         return None
     # No field is wider than the image, and of equally wide ones the last layer is taken.
     enough = min(wanted_field(size, point_spacing(size, point_count)), *size)
-    layers, measured = list(network.definition.layers), {}
+    layers, widths = list(network.definition.layers), dict[str, int]()
     # The more of the network lies behind a layer, the wider is its field: bisection finds the last
     # layer that reaches far enough, which is the one of least cost.
     first, end = 0, len(layers)
@@ -83,20 +84,21 @@ def best_layer(
             del layers[middle]
             end -= 1
             continue
-        measured[layer.name] = layer
-        if min(layer.field_in_output) >= enough:
+        widths[layer.name] = min(layer.field_in_output)
+        if widths[layer.name] >= enough:
             first = middle + 1
         else:
             end = middle
-    ranked = rank_layers([measured[name] for name in layers if name in measured], enough)
-    return next((layer.name for layer in ranked if layer.rank == 1), None)
+    last_first = [name for name in reversed(layers) if name in widths]
+    wide = [name for name in last_first if widths[name] >= enough]
+    return wide[0] if wide else max(last_first, key=widths.__getitem__, default=None)
 
 
 def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
     """Returns the layer whose output z is updated if no option names one.
 
-    It is the definition's, else the one ranked first for so many points in an image of this size
-    (rows, columns), measured on a synthetic frame. None if the definition has no layers.
+    It is the definition's, else the best one for so many points in an image of this size (rows,
+    columns), measured on a synthetic frame. None if the definition has no layers.
     """
     definition = network.definition
     if definition.defaults.layer is not None or len(definition.layers) < 2:
@@ -115,29 +117,6 @@ def point_spacing(size: tuple[int, int], point_count: int) -> float:
 def wanted_field(size: tuple[int, int], spacing: float) -> float:
     """Returns how wide an influential field should be, in pixels, for a spacing of the points."""
     return max(GAPS * spacing, LEAST_FRACTION * min(size))
-
-
-def rank_layers(layers: Iterable[MeasuredLayer], wanted: float) -> list[MeasuredLayer]:
-    """Returns the layers, in their order, each with its rank for a width of the field.
-
-    Layers whose influential field in the depth map is at least as wide as wanted come first, the
-    one with the least cost behind the cut before the others; of equal ones the last. Then come the
-    others, the one with the widest field before the others. Layers with a problem have no rank.
-
-    Args:
-        wanted: Pixels of the network's frame.
-    """
-
-    def by_preference(layer: MeasuredLayer) -> tuple[bool, float]:
-        assert layer.field_in_output is not None
-        field = min(layer.field_in_output)
-        return (False, layer.cost_behind or 0.0) if field >= wanted else (True, -float(field))
-
-    layers = list(layers)
-    usable = [layer for layer in reversed(layers) if layer.problem is None]
-    usable.sort(key=by_preference)
-    ranks = {layer.name: rank for rank, layer in enumerate(usable, start=1)}
-    return [replace(layer, rank=ranks.get(layer.name)) for layer in layers]
 
 
 def measure_layers(
