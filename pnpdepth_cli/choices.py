@@ -254,4 +254,3 @@ RESIZES = ("nearest", "bilinear")  # of a prediction to the size of the ground t
 MISSING = ("skip", "min", "max", "fail")  # empty predictions: unscored, at a bound, or refused
 SCALINGS = ("none", "median", "affine", "affine-disparity", "log")  # of each image to its truth
 PREDICTION_KINDS = ("depth", "disparity")
-PLOT_FORMATS = ("png", "svg", "pdf")

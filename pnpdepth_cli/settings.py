@@ -1,7 +1,7 @@
 """The settings of refinement, declared once, and how a field becomes an option.
 
-A network's definition, the command line, the Python API, `sweep` and the records have the same
-type, `Settings`. Imports neither numpy nor torch.
+A network's definition, the command line, the Python API and the records have the same type,
+`Settings`. Imports neither numpy nor torch.
 """
 
 from __future__ import annotations
@@ -17,16 +17,6 @@ from pnpdepth_cli.errors import UsageError
 
 LARGEST_SEED = 2**32 - 1
 _KEY = "option"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Axis:
-    """How a sweep shows a field that it can vary."""
-
-    title: str
-    title_percent: str = ""
-    """Title where the values are given in per cent."""
-    log: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +37,6 @@ class Option:
     value_if_bare: str | None = None
     """Value of the option where none follows. None: one has to."""
     show_default: bool = False
-    axis: Axis | None = None
-    """None: a sweep does not vary the field."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,40 +119,31 @@ class Settings:
         "Layer to cut at: the name of a submodule (NAME#2: its second call, NAME[KEY]: one of its"
         " outputs), or a fraction of the network's depth, 0 the shallowest layer.",
         metavar="NAME|0..1",
-        axis=Axis(title="layer cut at (0 first, 1 last)"),
     )
-    iterations: int = option(
-        None, "Number of updates; 0 is no refinement.", metavar="K", axis=Axis(title="updates")
-    )
+    iterations: int = option(None, "Number of updates; 0 is no refinement.", metavar="K")
     lr: float | str = option(
         None,
         "Step size: absolute, or % of the std of z.",
         metavar="NUMBER|P%",
         parse=str,
-        axis=Axis(title="step", title_percent="step (% of the deviation of z)", log=True),
     )
-    loss: str = option(
-        None, "Loss at the sparse points.", choices=choices.LOSSES, axis=Axis(title="loss")
-    )
+    loss: str = option(None, "Loss at the sparse points.", choices=choices.LOSSES)
     update: str = option(
         None,
         "Update rule; another than the network's resets lr, schedule and blur.",
         choices=choices.UPDATES,
-        axis=Axis(title="update rule"),
     )
     schedule: str = option(
         None,
         "Step size over the updates; linear and cosine decay to 0.",
         within="--set",
         choices=choices.SCHEDULES,
-        axis=Axis(title="schedule of the step"),
     )
     blur: float = option(
         None,
         "Blur the gradient over S times the spacing of the points; 0 is off.",
         within="--set",
         metavar="S",
-        axis=Axis(title="blur of the gradient (spacings of the points)"),
     )
     target: str = option(
         "given",
@@ -172,7 +151,6 @@ class Settings:
         " input, others at every step.",
         choices=choices.TARGETS,
         show_default=True,
-        axis=Axis(title="points of the loss"),
     )
     parameters: str = option(
         None,
@@ -181,21 +159,18 @@ class Settings:
         " --target masked]",
         within="--set",
         metavar="|".join((*choices.PARAMETERS, "weights", "lora:R")),
-        axis=Axis(title="what is updated"),
     )
     mask: str = option(
         None,
         "With --target masked: hide single points, blocks of the frame, or scan lines.",
         within="--set",
         choices=choices.MASKS,
-        axis=Axis(title="what is hidden"),
     )
     mask_fraction: float = option(
         None,
         "With --target masked: the fraction of the points hidden at every step.",
         within="--set",
         metavar="F",
-        axis=Axis(title="hidden fraction of the points"),
     )
     mask_scale: float = option(
         None,
@@ -203,14 +178,12 @@ class Settings:
         " 0.5 takes a third of the time.",
         within="--set",
         metavar="F",
-        axis=Axis(title="scale of the image during the updates"),
     )
     proximity: float = option(
         0.0,
         "Add W times the mean squared change of log depth to the loss.",
         within="--set",
         metavar="W",
-        axis=Axis(title="weight of staying near the network"),
     )
     line_search: bool = option(
         False, "Undo updates that raise the loss and halve the step.", within="--set"
@@ -223,7 +196,6 @@ class Settings:
         "Fit the network's output to the points by scale, or scale and shift."
         "  [default: the network's own]",
         choices=choices.ALIGNMENTS,
-        axis=Axis(title="alignment"),
     )
     align_every: bool = option(False, "Repeat the alignment at every update of z.", within="--set")
     propagate: str = option(
@@ -232,7 +204,6 @@ class Settings:
         " the nearest points, or edge-aware diffusion.  [default: none, with other options of the"
         " method]",
         choices=("none", *choices.PROPAGATIONS),
-        axis=Axis(title="propagation of the residual"),
     )
     tile: int | None = option(
         None,

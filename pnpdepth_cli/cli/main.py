@@ -69,7 +69,6 @@ COMMANDS = {
     "export": "export:export",
     "eval": "evaluate:evaluate",
     "compare": "compare:compare",
-    "sweep": "sweep:sweep",
     "doctor": "doctor:doctor",
 }
 """The subcommands in the order of the help, as `module:function` in `pnpdepth_cli.cli`."""

@@ -52,11 +52,10 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
 class BatchProgress:
     """Progress of a run over frames on stderr.
 
-    `done`, `failed` and `to_do` are numbers of frames, or of what `unit` names.
+    `done`, `failed` and `to_do` are numbers of frames.
     """
 
-    def __init__(self, name: str = "batch", unit: str = "frame") -> None:
-        self._name, self._unit = name, unit
+    def __init__(self) -> None:
         self.done = self.to_do = self.failed = 0
         self._said: set[str] = set()
         self._bar: tqdm[Any] | None = None
@@ -81,7 +80,7 @@ class BatchProgress:
         self.to_do = to_do
         self._began = self._printed_at = time.monotonic()
         if sys.stderr.isatty():
-            self._bar = open_bar(self._name, self._unit, total=to_do)
+            self._bar = open_bar("batch", "frame", total=to_do)
 
     def frame(self, row: Mapping[str, Any]) -> None:
         """Counts a frame, and prints why it failed if it did; what was said of it is not again."""
@@ -103,9 +102,8 @@ class BatchProgress:
         rate = self.done / spent_s
         left = _duration((self.to_do - self.done) / rate)
         failed = f", {self.failed:,} failed" if self.failed else ""
-        unit = self._unit
-        pace = f"{1 / rate:.1f} s a {unit}" if rate < 1 else f"{rate:.1f} {unit}s a second"
-        return f"{self.done:,} of {self.to_do:,} {unit}s, {pace}, {left} left{failed}"
+        pace = f"{1 / rate:.1f} s a frame" if rate < 1 else f"{rate:.1f} frames a second"
+        return f"{self.done:,} of {self.to_do:,} frames, {pace}, {left} left{failed}"
 
 
 def _duration(seconds: float) -> str:

@@ -20,7 +20,6 @@ from pnpdepth_cli.sensors.samplers import PATTERNS as PATTERNS
 from pnpdepth_cli.sensors.samplers import SampleNoise as SampleNoise
 from pnpdepth_cli.sensors.samplers import SamplePattern as SamplePattern
 from pnpdepth_cli.sensors.samplers import sample_points as sample_points
-from pnpdepth_cli.sensors.samplers import with_noise as with_noise
 from pnpdepth_cli.sensors.sparse import Points as Points
 from pnpdepth_cli.sensors.sparse import as_depth_image as as_depth_image
 from pnpdepth_cli.sensors.sparse import describe_dropped as describe_dropped

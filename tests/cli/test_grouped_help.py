@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from pnpdepth_cli.cli.grouped_help import GroupedCommand, long_name
 from pnpdepth_cli.cli.main import cli
 
-GROUPED = ("refine", "batch", "sweep", "eval")
+GROUPED = ("refine", "batch", "eval")
 
 
 def help_of(*arguments: str) -> str:

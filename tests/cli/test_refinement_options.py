@@ -11,9 +11,7 @@ import pytest
 from pnpdepth_cli.cli.batch import batch
 from pnpdepth_cli.cli.options import taken
 from pnpdepth_cli.cli.refine import refine
-from pnpdepth_cli.cli.sweep import sweep
 from pnpdepth_cli.commands.refinement.request import RefineRequest
-from pnpdepth_cli.commands.sweep.axes import PARAMETERS
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
@@ -82,10 +80,3 @@ def test_every_field_belongs_to_one_group_and_its_option_is_one_of_refine() -> N
     spelled = {name for option in refine.params for name in option.opts}
     for group in groups:
         assert {each.flag.split()[0] for each in options_of(type(group))} <= spelled
-
-
-def test_a_sweep_varies_or_sets_what_decides_a_depth_and_nothing_else() -> None:
-    names = {option.name for option in sweep.params}
-    own = {each.name_within for each in options_of(Settings)}
-    assert own - PARAMETERS.keys() == {"tile", "time-budget-s"}
-    assert not names & {"holdout", "uncertainty", "format", "overwrite"}

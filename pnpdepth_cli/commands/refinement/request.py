@@ -1,6 +1,6 @@
 """What the user asks of a refinement, in groups. None means the network's own default.
 
-Command line options, sweep axes and batch cache keys are derived from these declarations
+Command line options and batch cache keys are derived from these declarations
 (`pnpdepth_cli.settings`). Imports neither numpy nor torch.
 """
 
@@ -170,7 +170,7 @@ class NetworkChoice:
     )
     device: str = option(
         "cpu",
-        "cpu, cuda, cuda:1, mps, …; batch and sweep also take several, cuda:0,cuda:1, or all.",
+        "cpu, cuda, cuda:1, mps, …; batch also takes several, cuda:0,cuda:1, or all.",
         metavar="NAME",
         show_default=True,
     )

@@ -18,7 +18,7 @@ _NETWORK = ("--model", "fcrn-tiny", "--propagate", "none")
 
 
 def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
-    """Returns results of `eval`, `batch`, `sweep` and `refine`, and poses."""
+    """Returns results of `eval`, `batch` and `refine`, and poses."""
     return [*_scores(folder), *_journals(folder), *_clouds(folder, depth)]
 
 
@@ -30,12 +30,9 @@ def _scores(folder: Path) -> list[Seed]:
 
 
 def _journals(folder: Path) -> list[Seed]:
-    """A finished batch and a finished sweep, which go on where they ended."""
+    """A finished batch, which goes on where it ended."""
     batch = ("batch", "frames.csv", *_NETWORK, "--iterations", "1", "-o", "finished")
-    sweep = ("sweep", "frames.csv", "--model", "fcrn-tiny", "--set", "propagate=none")
-    sweep += ("--vary", "iterations=0,1", "-o", "swept")
     _output_of(batch)
-    _output_of(sweep)
     (record,) = {*Path("finished").glob("*.json")} - {Path("finished/summary.json")}
     return [
         Seed(file=record.as_posix(), command=batch),
@@ -43,7 +40,6 @@ def _journals(folder: Path) -> list[Seed]:
             file="finished/summary.json",
             command=("compare", "finished/summary.json:before", "finished/summary.json"),
         ),
-        Seed(file="swept/sweep.jsonl", command=sweep),
     ]
 
 
