@@ -1,5 +1,5 @@
 """`python -m pnpdepth_cli` is `pnpdepth`, where the script is not on the path."""
 
-from pnpdepth_cli.cli.start import main
+from pnpdepth_cli.cli.main import main
 
 main()

@@ -119,7 +119,7 @@ def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(
     files = [str(sample / "rgb.png"), "--sparse", str(sample / "sparse.png")]
     code = (
         "import pnpdepth_cli; print(pnpdepth_cli.__file__)\n"
-        "from pnpdepth_cli.cli.start import main; main()"
+        "from pnpdepth_cli.cli.main import main; main()"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, "refine", *files, "-o", "out"],

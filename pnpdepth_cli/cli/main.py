@@ -2,41 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import gc
 import importlib
+import io
 import os
 import sys
-from pathlib import Path
 from typing import NoReturn
 
 import click
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.cli.streams import (
-    INTERRUPTED,
-    StdoutError,
-    drop_stdout,
-    guard_streams,
-    printable,
-    shortened,
-)
-from pnpdepth_cli.errors import DeviceError, InputError, ModelError, OutputError, PnpDepthError
+from pnpdepth_cli.cli.streams import INTERRUPTED, printable, say, shortened
+from pnpdepth_cli.errors import DeviceError, InputError, OutputError, PnpDepthError
 
 _EXIT_CODES = """\b
 Exit codes: 0 done · 1 a bug of this program · 2 wrong usage or output · 3 input file · 4 network,
 layer or checkpoint · 5 refinement diverged · 6 device or memory · 7 some frames failed ·
 130 interrupted. Networks in .py files are code and are run."""
-
-_GARBAGE = 50_000
-"""Allocations between garbage collections. With the default of 700, they take 10 % of imports."""
-
-_SPINS = "3000"
-"""Spins of an idle GNU OpenMP thread (which torch uses) before it sleeps. With the default of
-300,000 a frame takes 13 times as long if another program keeps one of two cores busy; with this
-value twice as long, and no longer on an idle machine."""
 
 _COMPLETION = "_PNPDEPTH_COMPLETE"
 """Set by the shell that asks for completions."""
@@ -46,14 +29,8 @@ _MEMORY_MESSAGES = ("allocate memory", "failed to map segment", "bad_alloc")
 
 _NO_MEMORY = "memory is exhausted; use a smaller image, or --tile"
 
-_CODES_OF_OPTIONS = {
-    **dict.fromkeys(
-        ("-o", "--output", "--csv", "--markdown", "--latex", "--html", "--overlay"),
-        OutputError.exit_code,
-    ),
-    **dict.fromkeys(("--model", "--checkpoint", "check"), ModelError.exit_code),
-}
-"""Exit codes of errors of the operating system by the word before the file; any other is 3."""
+_OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+"""What the operating system says of a disk that takes no more; anything else is of an input."""
 
 COMMANDS = {
     "refine": "refine:refine",
@@ -111,20 +88,15 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 def run(arguments: list[str]) -> int:
     """Returns the exit code. Every error but our own bugs becomes one line on stderr."""
-    gc.set_threshold(_GARBAGE)
-    if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when torch is imported
-    guard_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal without σ still shows the rest
     try:
-        code = _run_command(arguments)
-        sys.stdout.flush()
+        return _run_command(arguments)
     except PnpDepthError as error:
         return _end(error, error.exit_code)
-    except StdoutError as error:
-        drop_stdout()
-        if error.reason.errno == errno.EPIPE:  # as in `pnpdepth models | head -1`
-            return 0
-        return _end(error, OutputError.exit_code)
+    except BrokenPipeError:  # as in `pnpdepth models | head -1`
+        sys.stdout = None
+        return 0
     except KeyboardInterrupt:
         return _end("interrupted", INTERRUPTED)
     except MemoryError:
@@ -134,8 +106,8 @@ def run(arguments: list[str]) -> int:
             raise
         return _end(_NO_MEMORY, DeviceError.exit_code)
     except OSError as error:
-        return _end(_describe(error), _exit_code(error, arguments))
-    return code
+        full = error.errno in _OUTPUT_ERRORS
+        return _end(_describe(error), (OutputError if full else InputError).exit_code)
 
 
 def _run_command(arguments: list[str]) -> int:
@@ -156,30 +128,16 @@ def _run_command(arguments: list[str]) -> int:
 
 
 def _end(message: object, code: int) -> int:
-    """Prints the message as one line. Returns the code."""
-    with contextlib.suppress(StdoutError):  # what was printed before comes first
-        sys.stdout.flush()
-    click.echo(f"pnpdepth: {shortened(printable(message))}", err=True)
+    """Prints the message as one line, after what was printed before it. Returns the code."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:  # it is full
+        sys.stdout = None
+    say(f"pnpdepth: {shortened(printable(message))}")
     return code
 
 
 def _describe(error: OSError) -> str:
     reason = error.strerror or str(error)
     return reason if error.filename is None else f"{os.fsdecode(error.filename)}: {reason}"
-
-
-def _exit_code(error: OSError, arguments: list[str]) -> int:
-    """Returns the code for the file at fault: an output, a network, or an input.
-
-    The file is looked for among the arguments. A file that is not there and does not exist was to
-    be written.
-    """
-    if error.filename is None:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
-        return OutputError.exit_code if full else InputError.exit_code
-    path = Path(os.fsdecode(error.filename)).absolute()
-    words = [part for word in arguments for part in word.split("=", 1)]
-    for before, word in zip(["", *words], words, strict=False):
-        if path.is_relative_to(Path(word).absolute()):
-            return _CODES_OF_OPTIONS.get(before, InputError.exit_code)
-    return InputError.exit_code if os.access(path, os.F_OK) else OutputError.exit_code

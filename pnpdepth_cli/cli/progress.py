@@ -8,9 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from pnpdepth_cli.cli.streams import printable
+from pnpdepth_cli.cli.streams import printable, say
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -69,11 +67,10 @@ class BatchProgress:
 
     def say(self, text: str) -> None:
         """Prints a line on stderr, above the bar."""
-        line = printable(text)
         if self._bar is None:
-            click.echo(line, err=True)
+            say(text)
         else:
-            self._bar.write(line, file=sys.stderr)
+            self._bar.write(printable(text), file=sys.stderr)
 
     def begin(self, to_do: int) -> None:
         """Starts counting; `to_do` frames follow."""

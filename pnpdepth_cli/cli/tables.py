@@ -72,9 +72,14 @@ class TableFiles:
         return any(str(path) == "-" for path, _ in targets)
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        raise  # Rich would exit with code 1
+
+
 def print_table(table: Table, *, err: bool = False) -> None:
     """Prints a table on stdout or stderr, as wide as needed unless that is a terminal."""
-    console = Console(stderr=err, highlight=False)
+    console = _Console(stderr=err, highlight=False)
     shown = RichTable(
         title=escape(printable(table.caption)),
         title_justify="left",
@@ -107,7 +112,7 @@ def _markup(cell: str) -> str:
 
 def print_notes(notes: Sequence[str]) -> None:
     """Prints a line for each on stderr, warnings in a colour."""
-    console = Console(stderr=True, highlight=False)
+    console = _Console(stderr=True, highlight=False)
     for note in notes:
         style = "yellow" if note.startswith("warning") else "dim"
         console.print(escape(printable(note)), style=style, soft_wrap=True)
@@ -129,7 +134,7 @@ def print_refinement(record: Mapping[str, Any]) -> None:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
     if record["baselines"] is not None:
         print_table(baselines_table(record["baselines"], record["unit"]), err=True)
-    console = Console(stderr=True, highlight=False)
+    console = _Console(stderr=True, highlight=False)
     if record["improved_fraction"] is not None:
         where = "pixels with ground truth" if record["scores"] else "points"
         console.print(f"improved: {record['improved_fraction']:.1%} of the {where}")
@@ -168,7 +173,7 @@ def print_batch(summary: Mapping[str, Any]) -> None:
     if beside["frames"]:
         worse = f"{beside['worse']:,} of {beside['frames']:,}"
         parts.append(f"{worse} worse than linear interpolation")
-    console = Console(stderr=True, highlight=False)
+    console = _Console(stderr=True, highlight=False)
     console.print(", ".join(parts))
     output = summary["output"]
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
@@ -199,4 +204,4 @@ def print_sparse(record: Mapping[str, Any]) -> None:
         f"wrote {points['count']:,} points, {points['fraction_of_pixels']:.2%} of {width}×{height}"
         " pixels:"
     )
-    _print_written(Console(stderr=True, highlight=False), start, record)
+    _print_written(_Console(stderr=True, highlight=False), start, record)

@@ -37,27 +37,6 @@ def test_a_stdout_that_cannot_show_every_character_shows_the_others(frame: Frame
     assert b"?1 ?  " in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("variables", "spins"),
-    [({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
-)
-def test_idle_threads_sleep_soon_unless_the_user_sets_how_they_wait(
-    variables: dict[str, str], spins: str
-) -> None:
-    code = (
-        "import os, sys\nfrom pnpdepth_cli.cli.main import main\n"
-        "sys.argv += ['--version']\n"
-        "try:\n    main()\nexcept SystemExit:\n    pass\n"
-        "print(os.environ.get('GOMP_SPINCOUNT'))\n"
-    )
-    others = {k: v for k, v in os.environ.items() if k not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=others | variables, capture_output=True, check=True)
-    version, spinning = done.stdout.decode().splitlines()
-    assert version.startswith("pnpdepth")
-    assert spinning == spins
-
-
 def test_several_models_are_the_first_and_more() -> None:
     context = refine_command.make_context(
         "refine", ["a.png", "--sparse", "s.png", "--model", "fcrn-tiny", "--model", "eigen-tiny"]

@@ -54,7 +54,6 @@ class Worker:
         threads = request.cluster.cpus_per_worker
         for name in _THREADS:  # before torch and OpenCV are imported
             os.environ[name] = str(threads)
-        os.environ.setdefault("GOMP_SPINCOUNT", "3000")
         with suppress(OSError):  # `ready` reports what cannot be seen
             os.chdir(folder)  # which relative paths start from
         import cv2
