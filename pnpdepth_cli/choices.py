@@ -176,8 +176,8 @@ LAYOUTS = Table(
     noun="layout",
     names=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
-        *("tum", "7scenes", "synthia", "colmap", "void", "diode", "ibims", "scannet"),
-        *("arkitscenes", "hypersim", "nuscenes", "ddad", "pairs", "image-depth", "nyu-h5"),
+        *("tum", "7scenes", "colmap", "void", "diode", "ibims", "scannet"),
+        *("arkitscenes", "pairs", "image-depth", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -51,11 +49,6 @@ TREES = {
     "7scenes": (
         "seq-0{1,2}/frame-000000.{color,depth}.png",
         ["seq-01_frame-000000", "seq-02_frame-000000"],
-    ),
-    "synthia": (
-        "{RGB,Depth}/Stereo_Left/Omni_F/000000.png {RGB,Depth}/Stereo_Right/Omni_B/000000.png"
-        " CameraParams/intrinsics.txt",
-        ["Stereo_Left_Omni_F_000000", "Stereo_Right_Omni_B_000000"],
     ),
 }
 """Empty files of a layout by its name, and the names of their frames."""
@@ -122,18 +115,6 @@ def arkitscenes(root: Path) -> None:
     codes(video / "highres_depth/41069021_305.244.png", 2000)
 
 
-def hypersim(root: Path) -> None:
-    h5py = pytest.importorskip("h5py")
-    images = root / "ai_001_001" / "images"
-    image(images / "scene_cam_00_final_preview/frame.0000.tonemap.jpg")
-    (images / "scene_cam_00_geometry_hdf5").mkdir()
-    y, x = np.mgrid[:HEIGHT, :WIDTH]
-    ray = np.sqrt((x - 15.5) ** 2 + (y - 11.5) ** 2 + 886.81**2) / 886.81
-    path = images / "scene_cam_00_geometry_hdf5/frame.0000.depth_meters.hdf5"
-    with h5py.File(path, "w") as file:
-        file["dataset"] = (2 * ray).astype(np.float64)
-
-
 def tum(root: Path) -> None:
     root.mkdir(exist_ok=True)
     (root / "rgb.txt").write_text(
@@ -166,90 +147,6 @@ def nyu_mat(root: Path) -> None:
         file["depths"] = np.tile(np.arange(640, dtype=np.float32)[:, None] + 1, (4, 1, 480))
 
 
-FORWARD = [0.5, -0.5, 0.5, -0.5]
-"""w x y z of a camera that looks along the car's x axis."""
-PINHOLE = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5, "skew": 0.0}
-
-
-def nuscenes(root: Path, *, moved: float = 0.5) -> None:
-    """One sample: the car drives `moved` metres from the scan to the image."""
-    ahead = [1.0, 0, 0, 0]
-    intrinsic = [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]
-
-    def pose(token: str, translation: list[float], rotation: list[float], **more: Any) -> Any:
-        return {"token": token, "translation": translation, "rotation": rotation, **more}
-
-    def datum(token: str, filename: str, sensor: str, time: str, *, key: bool = True) -> Any:
-        return {
-            "token": token, "filename": filename, "calibrated_sensor_token": sensor,
-            "ego_pose_token": time, "sample_token": "s", "is_key_frame": key,
-            "height": 48, "width": 64,
-        }  # fmt: skip
-
-    scan = "samples/LIDAR_TOP/a.pcd.bin"
-    tables = {
-        "scene": [{"token": "scene", "name": "scene-0001"}],
-        "sample": [{"token": "s", "scene_token": "scene"}],
-        "sensor": [
-            {"token": "cam", "channel": "CAM_FRONT"},
-            {"token": "lid", "channel": "LIDAR_TOP"},
-        ],
-        "calibrated_sensor": [
-            pose("c", [1.5, 0, 1.5], FORWARD, sensor_token="cam", camera_intrinsic=intrinsic),
-            pose("l", [1.0, 0, 1.8], ahead, sensor_token="lid", camera_intrinsic=[]),
-        ],
-        "ego_pose": [
-            pose("at image", [1000 + moved, 2000, 0], ahead),
-            pose("at scan", [1000, 2000, 0], ahead),
-        ],
-        "sample_data": [
-            datum("1", "samples/CAM_FRONT/a.jpg", "c", "at image"),
-            datum("2", scan, "l", "at scan"),
-            datum("3", "sweeps/x.jpg", "c", "at image", key=False),
-        ],
-    }
-    (root / "v1.0-mini").mkdir(parents=True, exist_ok=True)
-    for name, rows in tables.items():
-        (root / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows))
-    image(root / "samples/CAM_FRONT/a.jpg", 48, 64)
-    (root / scan).parent.mkdir(parents=True, exist_ok=True)
-    points = [[10.5, 0.0, -0.3, 7, 1], [10.5, 2.0, -0.3, 7, 2]]
-    np.array(points, "<f4").tofile(root / scan)
-
-
-def ddad_scene(
-    folder: Path, *, samples: int = 2, intrinsics: dict[str, float] | None = None
-) -> None:
-    """The car drives 0.5 m from sample to sample, and 0.1 m from the scan to the image."""
-    data, rows = [], []
-    for name in ("rgb/CAMERA_01", "point_cloud/LIDAR", "calibration"):
-        (folder / name).mkdir(parents=True)
-    forward = dict(zip(("qw", "qx", "qy", "qz"), FORWARD, strict=True))
-    for number in range(samples):
-        x, scan, photo = (
-            0.5 * number,
-            f"point_cloud/LIDAR/{number}.npz",
-            f"rgb/CAMERA_01/{number}.png",
-        )
-        lidar = {
-            "filename": scan,
-            "pose": {"translation": {"x": x, "y": 0.0}, "rotation": {"qw": 1.0}},
-        }
-        seen = {"translation": {"x": x + 0.1, "y": 0.0, "z": 1.0}, "rotation": forward}
-        camera = {"filename": photo, "pose": seen, "height": 48, "width": 64}
-        data += [
-            {"key": f"l{number}", "id": {"name": "LIDAR"}, "datum": {"point_cloud": lidar}},
-            {"key": f"c{number}", "id": {"name": "CAMERA_01"}, "datum": {"image": camera}},
-        ]
-        rows.append({"calibration_key": "k", "datum_keys": [f"l{number}", f"c{number}"]})
-        image(folder / photo, 48, 64)
-        points = np.array([[10.1 - x, 0, 1, 7], [10.1 - x, 2, 1, 7]], np.float32)
-        np.savez_compressed(folder / scan, data=points)
-    calibration = {"names": ["LIDAR", "CAMERA_01"], "intrinsics": [{}, intrinsics or PINHOLE]}
-    (folder / "calibration/k.json").write_text(json.dumps(calibration))
-    (folder / "scene_0a.json").write_text(json.dumps({"data": data, "samples": rows}))
-
-
 def read_frames(root: Path, name: str | None = None) -> list[Frame]:
     """The frames of a data set, all of which are complete."""
     _, listing = list_frames(root, name)
@@ -273,7 +170,6 @@ BENCHMARKS: dict[str, tuple[Maker, list[str]]] = {
     "ibims": (ibims, ["corridor_01"]),
     "scannet": (scannet, [f"scene000{s}_00/{n}" for s in (0, 1) for n in (0, 2, 10)]),
     "arkitscenes": (arkitscenes, ["41069021/41069021_305.244"]),
-    "hypersim": (hypersim, ["ai_001_001/cam_00_frame.0000"]),
 }
 """Sets with depth of 2 m."""
 MAKERS: dict[str, tuple[Maker, list[str]]] = {
@@ -286,6 +182,4 @@ MAKERS: dict[str, tuple[Maker, list[str]]] = {
     "colmap": (colmap, ["b", "left/a"]),
     "nyu-h5": (nyu_h5, ["official_00001", "official_00009"]),
     "nyu-mat": (nyu_mat, ["0001", "0002", "0003", "0004"]),
-    "nuscenes": (nuscenes, ["scene-0001/a"]),
-    "ddad": (lambda root: ddad_scene(root / "000000"), [f"000000/CAMERA_01_{n}" for n in (0, 1)]),
 }

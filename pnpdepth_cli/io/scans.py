@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, NoPointsError
 from pnpdepth_cli.io.file_bytes import damaged, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.arrays import parse_npy, parse_npz
+from pnpdepth_cli.io.formats.arrays import parse_npy
 
 _FARTHEST_M = 1e5
 _KITTI_FIELDS, _NUSCENES_FIELDS = 4, 5  # x, y, z, reflectance; nuScenes adds the laser's index
@@ -53,8 +53,6 @@ class ScanFile:
 def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
     """Returns the points of a KITTI or nuScenes .bin, .npy (N, 3 or more columns), .pcd or .ply.
 
-    Also of an .npz whose array `data` is as in an .npy, which is how DDAD stores scans.
-
     Args:
         path: The file; its suffix says the format.
         point_fields: Float32 numbers of a point in a .bin; None: recognised from name and content.
@@ -68,7 +66,7 @@ def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
         raise FileFormatError(f"{path} is not a scan; give a file of {', '.join(SCAN_SUFFIXES)}")
     data = read_bytes(path)
     kind = kind_of(data)
-    if kind not in (None, "NPY") and (kind, suffix) != ("NPZ", ".npz"):
+    if kind not in (None, "NPY"):
         raise FileFormatError(f"{path} is a {kind} file, not a scan; check what is given as scan")
     if suffix == ".bin":
         points, source = _parse_bin(path, data, point_fields)
@@ -141,12 +139,9 @@ def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
 
 def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
     """The first columns of (N, 3 or more) floats."""
-    if path.suffix.lower() == ".npz":
-        array, source = parse_npz(path, data, "data")[1], "DDAD scan"
-    elif kind_of(data) == "NPY":
-        array, source = parse_npy(path, data), "NPY scan"
-    else:
+    if kind_of(data) != "NPY":
         raise FileFormatError(f"{path} is not an NPY file; save it with numpy.save")
+    array = parse_npy(path, data)
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind != "f":
         shape = "×".join(str(n) for n in array.shape)
         raise FileFormatError(
@@ -154,7 +149,7 @@ def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
             " x y z in the first columns"
         )
     with np.errstate(over="ignore"):
-        return np.ascontiguousarray(array[:, :3], np.float32), source
+        return np.ascontiguousarray(array[:, :3], np.float32), "NPY scan"
 
 
 Column = tuple[str, str, int]
@@ -285,7 +280,6 @@ def _whole(path: Path, text: str) -> int:
 
 _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
     ".npy": _parse_array,
-    ".npz": _parse_array,
     ".pcd": _parse_pcd,
     ".ply": _parse_ply,
 }

@@ -145,15 +145,6 @@ def test_what_is_no_scan_is_an_error_of_one_line(
     assert "\n" not in str(error.value)
 
 
-def test_the_points_of_an_npz_are_its_array_data(tmp_path: Path) -> None:
-    points = np.array([[1, 2, 3, 9], [4, 5, 6, 9]], np.float32)
-    np.savez_compressed(tmp_path / "a.npz", data=points, other=np.zeros(3))
-    assert read_scan(tmp_path / "a.npz").points.tolist() == points[:, :3].tolist()
-    (tmp_path / "a.npz").rename(tmp_path / "a.bin")
-    with pytest.raises(FileFormatError, match="is a NPZ file, not a scan"):
-        read_scan(tmp_path / "a.bin")
-
-
 def nuscenes_bytes(points: NDArray[np.float32]) -> bytes:
     """x, y, z, intensity 0 to 255, and the index of one of 32 lasers."""
     numbers = np.arange(len(points))

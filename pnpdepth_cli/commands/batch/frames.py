@@ -178,8 +178,6 @@ def _files_of(request: FrameSelection, frame: Frame, *, needs_camera: bool) -> F
     gt = frame.gt
     if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
         gt = frame.sparse  # points are sampled from the projected scan
-    if frame.calibration is not None:
-        base = replace(base, calibration=frame.calibration)
     is_scan = _reads_scan(base, sparse, gt)
     scan = base.scan
     if is_scan:
@@ -204,12 +202,11 @@ def _files_of(request: FrameSelection, frame: Frame, *, needs_camera: bool) -> F
 
 def _reads_scan(files: FrameFiles, sparse: Path | None, gt: Source | None) -> bool:
     """Whether one of them is a scan that is projected, which needs the scanner's pose."""
-    suffix, known = "" if sparse is None else sparse.suffix.lower(), files.calibration
+    suffix = "" if sparse is None else sparse.suffix.lower()
     return (
         _is_scan_file(gt)
         or _is_scan_file(sparse)
         or (suffix == ".npy" and files.scan.calib is not None)
-        or (suffix == ".npz" and known is not None and known.has_pose)
     )
 
 

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 _ENTRY = "batch"
 _OWN_SUMMARY = b'{\n  "command": "batch"'
-_ONLY_IF_SET = {"neighbours", "calibration"}
 DAMAGED = (AttributeError, IndexError, KeyError, TypeError)
 """What a record that holds less than it should leads to."""
 
@@ -148,7 +147,7 @@ class Records:
     def _digest(self, task: Task) -> str:
         """The SHA-256 of the settings that decide the frame's result."""
         files, last = task.request.settings("files"), self._last  # several threads ask
-        arrays = files.get("calibration") is not None or files.get("neighbours")
+        arrays = files.get("neighbours")
         if not arrays and last is not None and last[0] == files:  # as of most consecutive frames
             return last[1]
         text = json.dumps(settings_of(task.request, self.model), sort_keys=True)
@@ -175,7 +174,7 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
     values = {
         name: value
         for name, value in request.settings(*groups).items()
-        if name != "more_models" and (value or name not in _ONLY_IF_SET)
+        if name != "more_models" and (value or name != "neighbours")
     }
     if "neighbours" in values:
         values["neighbours"] = [(other.motion, other.apart) for other in values["neighbours"]]

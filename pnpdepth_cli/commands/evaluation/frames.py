@@ -149,13 +149,11 @@ def _read_sigma(path: Path | None, size: Size, window: Window) -> Depth | None:
 
 def _intrinsics(pair: FramePair, protocol: EvalProtocol, size: tuple[int, int]) -> Floats | None:
     """(3, 3) of the frame as the data set cuts it, if a measure needs them and they are known."""
-    frame, calibration = pair.frame, pair.frame.calibration
-    if all(group.needs != "intrinsics" for group in protocol.measure_groups):
+    frame = pair.frame
+    needed = any(group.needs == "intrinsics" for group in protocol.measure_groups)
+    if frame.calib is None or not needed:
         return None
-    if frame.calib is not None:
-        calibration = read_calibration(frame.calib, frame.camera)
-    if calibration is None:
-        return None
+    calibration = read_calibration(frame.calib, frame.camera)
     return frame.protocol.intrinsics_in_crop(calibration.intrinsics, size)
 
 

@@ -90,8 +90,6 @@ def camera_of_frame(
         known = camera_of_file(files.scan.calib, files.scan.camera, size, image)
     elif files.camera_file is not None:
         known = camera_of_file(files.camera_file, files.camera_number, size, image)
-    elif files.calibration is not None:
-        known = FrameCamera(camera=camera_of(files.calibration), source=files.calibration.source)
     if outputs.fov_deg is not None:
         if known is not None:
             raise UsageError(f"the camera is known ({known.source}); leave out --fov")

@@ -143,7 +143,9 @@ def read_inputs(request: RefineRequest) -> Inputs:
 def _register(request: RefineRequest) -> Register:
     """How the image is to be moved. A calibrated scan and SfM points are registered."""
     files = request.files
-    calibrated = files.sparse is not None and (files.sparse.is_dir() or files.is_scan(files.sparse))
+    calibrated = files.sparse is not None and (
+        files.sparse.is_dir() or files.scan.describes(files.sparse)
+    )
     if calibrated and files.registration == "auto":
         return None
     return registration_to_make(files.registration, request.method)
@@ -190,7 +192,7 @@ def _read_ground_truth(
 ) -> tuple[DepthImage, dict[str, Any], list[str]]:
     """The ground truth of an image (H, W), what a record keeps of it, and lines for a person."""
     if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
-        scan = read_scan_points(source, files.scan, size, files.image_file, files.calibration)
+        scan = read_scan_points(source, files.scan, size, files.image_file)
         truth = DepthImage(values=as_depth_image(scan.points), source="", assumed_scale=False)
         return truth, scan.record, [note.replace("sparse:", "gt:", 1) for note in scan.notes]
     if isinstance(source, Hdf5Array):
@@ -257,8 +259,8 @@ def _read_sparse(
         sparse = read_colmap_points(path, files.colmap, image, size, any_size=files.sparse_size_ok)
     elif files.colmap != ColmapOptions():
         raise UsageError(f"{path} is no COLMAP model, so --colmap does not apply")
-    elif files.is_scan(path):
-        sparse = read_scan_points(path, files.scan, size, image, files.calibration)
+    elif files.scan.describes(path):
+        sparse = read_scan_points(path, files.scan, size, image)
     else:
         keep = files.scan.keep_occluded or request.method.preset is not None
         sparse = _read_points(files, path, size, keep_occluded=keep)

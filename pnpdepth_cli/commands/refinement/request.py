@@ -16,7 +16,6 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import Settings, option
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.io.calibration import Calibration
     from pnpdepth_cli.io.dataset import Pose, Protocol, Source
     from pnpdepth_cli.sensors import SamplePattern
 
@@ -89,8 +88,6 @@ class FrameFiles:
     )
     colmap: ColmapOptions = field(default_factory=ColmapOptions)
     scan: ScanOptions = field(default_factory=ScanOptions)
-    calibration: Calibration | None = None
-    """Of a LiDAR scan, where the data set gives it instead of a file."""
     camera_file: Path | None = None
     """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
     camera_number: int | None = None
@@ -107,15 +104,6 @@ class FrameFiles:
     def image_file(self) -> Path | None:
         """The file of the image; None for none, or for an array of a data set."""
         return self.image if isinstance(self.image, Path) else None
-
-    def is_scan(self, sparse: Path) -> bool:
-        """Returns whether sparse depth is a scan that is projected; see `ScanOptions.describes`.
-
-        An .npz is one where the data set gives the pose of the scanner.
-        """
-        if sparse.suffix.lower() == ".npz" and self.calibration is not None:
-            return self.calibration.has_pose
-        return self.scan.describes(sparse)
 
 
 @dataclass(frozen=True, kw_only=True)

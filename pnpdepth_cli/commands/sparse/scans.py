@@ -29,7 +29,6 @@ _MOST_OUTSIDE = 1 / 3  # of these points; more outside the image give a warning
 _OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
 _CLEARLY_BETTER = 0.03  # in `edge_agreement`, of a camera that replaces the one that is named
 _FEW_INSIDE = 0.5  # of the most points in the image; a camera with fewer is ruled out
-_ONE_DIRECTION = ("KITTI", "nuScenes", "DDAD")  # whose calibrations give one direction of the pose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +55,6 @@ def read_scan_points(
     options: ScanOptions,
     size: tuple[int, int] | None,
     image: Path | None = None,
-    calibration: Calibration | None = None,
 ) -> SparseDepth:
     """Returns the points of a scan that are visible in an image.
 
@@ -65,20 +63,18 @@ def read_scan_points(
         options: Calibration and limits.
         size: (H, W) of the image; None for the calibration's.
         image: Its file; tells whether it is rectified, where the calibration leaves that open.
-        calibration: Of the frame, where the options name no file.
 
     Raises:
         InputError: A file cannot be read.
         SizeError: Calibration and image do not fit together.
         NoPointsError: No point is visible.
     """
-    if options.calib is not None:
-        calibration = read_calibration(options.calib, options.camera)
-    if calibration is None:
+    named = options.calib
+    if named is None:
         raise UsageError(
             f"{path} is a scan, which needs --calib: a calibration file, or KITTI's raw folder"
         )
-    named = options.calib or Path(calibration.source)
+    calibration = read_calibration(named, options.camera)
     if options.extrinsics is not None:
         rotation, translation = read_extrinsics(options.extrinsics)
         calibration = _with_pose(calibration, rotation, translation)
@@ -100,7 +96,7 @@ def read_scan_points(
         calibration, note = chosen_camera(calibration, frames)
         warnings.append(note)
     camera = camera_of(calibration)
-    if not calibration.source.startswith(_ONE_DIRECTION):
+    if not calibration.source.startswith("KITTI"):  # whose pose has one direction
         warnings += check_direction(scan.points, camera, size)
     points = project_velodyne(
         scan.points,

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, SizeError, UsageError
-from pnpdepth_cli.io.calibration import Calibration
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".exr")
 SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
@@ -99,9 +98,6 @@ class Hdf5Array:
 
     path: Path
     name: str
-    focal_px: float | None = None
-    """For depth that is the distance from the camera's centre: the focal length, with the principal
-    point in the middle, to get z. None for z itself."""
     axes: tuple[int, ...]
     """Order of the axes that makes the array, without its indexed axis, (H, W) or (H, W, 3)."""
     index: int | None = None  # which element of the first axis; None for the whole array
@@ -148,8 +144,6 @@ class Frame:
     gt: Source | None = None
     calib: Path | None = None  # the calibration, as `read_calibration` takes it
     camera: int | None = None  # which camera of the calibration
-    calibration: Calibration | None = None
-    """The calibration itself, of a data set that has one for each frame and no file of it."""
     sparse_scale: float | None = None  # codes per metre of integer sparse depth
     gt_scale: float | None = None  # codes per metre of integer ground truth
     protocol: Protocol = WHOLE

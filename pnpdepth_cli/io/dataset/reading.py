@@ -105,13 +105,7 @@ def depth_of(source: Hdf5Array) -> NDArray[np.float32]:
     metres = _read(source)
     if metres.dtype.kind != "f" or metres.ndim != 2:
         raise FileFormatError(f"{source} is {metres.dtype} of shape {metres.shape}, not depth")
-    if source.focal_px is None:
-        return known_metres(metres)
-    height, width = metres.shape
-    y = np.arange(height)[:, None] - (height - 1) / 2
-    x = np.arange(width)[None, :] - (width - 1) / 2
-    along_axis = source.focal_px / np.sqrt(x * x + y * y + source.focal_px**2)
-    return known_metres(metres.astype(np.float64) * along_axis)
+    return known_metres(metres)
 
 
 def _read(source: Hdf5Array) -> NDArray[Any]:

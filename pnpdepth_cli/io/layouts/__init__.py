@@ -16,7 +16,7 @@ from typing import NamedTuple
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.dataset import Frame, Unmatched
-from pnpdepth_cli.io.layouts import driving, indexed, kitti, manifest, nyu, rows
+from pnpdepth_cli.io.layouts import indexed, kitti, manifest, nyu, rows
 from pnpdepth_cli.io.layouts.layout import Layout
 
 __all__ = ["LAYOUTS", "Layout", "Listing", "find_layout", "list_frames"]
@@ -31,8 +31,6 @@ TABLE: dict[str, Layout] = {
     "kitti-raw": kitti.RAW,
     "tum": indexed.TUM,
     "colmap": indexed.COLMAP,
-    "nuscenes": driving.NUSCENES,
-    "ddad": driving.DDAD,
 }
 """The layouts of this package, which `choices.LAYOUTS` lists in the order of guessing."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pnpdepth_cli.io.depth import write_depth
 from tests.colmap_models import write_binary_model, write_text_model
-from tests.data_sets import ddad_scene, hypersim, nuscenes, tum, void
+from tests.data_sets import tum, void
 from tests.fuzz.seeds.seed import DRY_RUN, Seed
 
 _SAMPLED = ("--sample", "20")
@@ -21,7 +21,7 @@ _POSE = "1 0 0 {} 0 1 0 0 0 0 1 0\n"
 def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
     """Returns what a batch reads before its first frame, and the arrays in HDF5 files."""
     image = (folder / "rgb.png").read_bytes()
-    parts = (_manifests, _colmap, _tum, _odometry, _void, _nuscenes, _ddad)
+    parts = (_manifests, _colmap, _tum, _odometry, _void)
     return [
         *(seed for part in parts for seed in part(folder, image)),
         *_with_h5py(folder, image, depth),
@@ -94,17 +94,6 @@ def _void(folder: Path, image: bytes) -> list[Seed]:
     return _indices("void/test_image.txt")
 
 
-def _nuscenes(folder: Path, image: bytes) -> list[Seed]:
-    nuscenes(folder / "nuscenes")
-    tables = sorted((folder / "nuscenes/v1.0-mini").iterdir())
-    return _indices(*(path.relative_to(folder).as_posix() for path in tables))
-
-
-def _ddad(folder: Path, image: bytes) -> list[Seed]:
-    ddad_scene(folder / "ddad/000000")
-    return _indices("ddad/000000/scene_0a.json", "ddad/000000/calibration/k.json")
-
-
 def _with_h5py(folder: Path, image: bytes, depth: np.ndarray) -> list[Seed]:
     """HDF5 as ground truth; none if h5py is not installed."""
     try:
@@ -114,7 +103,6 @@ def _with_h5py(folder: Path, image: bytes, depth: np.ndarray) -> list[Seed]:
     seeds = []
     writers: tuple[tuple[str, str, Callable[[Path], None]], ...] = (
         ("h5", "00001", lambda root: _write_h5(h5py, root / "00001.h5")),
-        ("hypersim", "ai_001_001/cam_00_frame.0000", hypersim),
         ("labeled", "0002", lambda root: _write_labeled(h5py, root)),
     )
     for name, frame, write in writers:
@@ -122,10 +110,9 @@ def _with_h5py(folder: Path, image: bytes, depth: np.ndarray) -> list[Seed]:
         write(folder / name)
         prediction = folder / f"{name}_pred" / f"{frame}.npy"
         prediction.parent.mkdir(parents=True)
-        height, width = (228, 304) if name != "hypersim" else depth.shape
-        write_depth(prediction, np.full((height, width), 2.0, np.float32))
-        (file,) = [p for p in (folder / name).rglob("*") if p.suffix in (".h5", ".hdf5", ".mat")]
-        command = ("eval", prediction.parents[frame.count("/")].name, name)
+        write_depth(prediction, np.full((228, 304), 2.0, np.float32))
+        (file,) = [p for p in (folder / name).iterdir() if p.suffix in (".h5", ".mat")]
+        command = ("eval", prediction.parent.name, name)
         seeds.append(Seed(file=file.relative_to(folder).as_posix(), command=command))
     (folder / "labeled/test.txt").write_text("2\n")
     return [*seeds, *_indices("labeled/test.txt", options=_SAMPLED)]
