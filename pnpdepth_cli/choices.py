@@ -241,10 +241,7 @@ PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "regio
 SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
 """LiDARs by data sheet; `pnpdepth_cli.sensors.LIDARS` has the paper's of each as "paper-<name>"."""
 
-LENSES = (
-    *("radial-tangential", "fisheye", "fov", "thin-prism-fisheye", "rad-tan-thin-prism-fisheye"),
-    *("division", "eucm"),
-)
+LENSES = ("radial-tangential", "fisheye")
 """Lens distortions: `pnpdepth_cli.sensors.camera`."""
 
 # Evaluation

@@ -15,16 +15,9 @@ _COEFFICIENTS = {
     "RADIAL": "-0.1 0.02",
     "OPENCV": "-0.1 0.02 0.001 -0.002",
     "OPENCV_FISHEYE": "-0.02 0.01 -0.003 0.001",
-    "FOV": "0.9",
     "RADIAL_FISHEYE": "-0.03 0.01",
     "FULL_OPENCV": "-0.1 0.02 0.001 -0.002 0.01 0.02 -0.01 0.003",
     "SIMPLE_RADIAL_FISHEYE": "-0.03",
-    "THIN_PRISM_FISHEYE": "-0.02 0.01 0.001 -0.002 -0.003 0.001 0.002 -0.001",
-    "EUCM": "0.6 1.1",
-    "RAD_TAN_THIN_PRISM_FISHEYE": "-0.02 0.01 -0.003 0.001 0.002 -0.001 0.001 -0.002"
-    " 0.002 0.001 -0.001 0.001",
-    "SIMPLE_DIVISION": "-0.15",
-    "DIVISION": "-0.15",
 }
 CAMERAS = {
     name: f"{'50' if model.focals == 1 else '50 52'} 32.5 23 {_COEFFICIENTS.get(name, '')}".strip()

@@ -57,15 +57,12 @@ _LENSES = {
         "radial-tangential",
     ),
     **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "equi"), "fisheye"),
-    "fov": "fov",
 }
 """Distortion models by their names in ROS and Kalibr."""
 
 _COEFFICIENTS = {
     "radial-tangential": (0, 4, 5, 8, 12, 14),
     "fisheye": (0, 4),
-    "fov": (1,),
-    "eucm": (2,),
 }
 _FIELD = re.compile(r"^\s*([A-Za-z_]\w*)\s*:(.*)$")
 _LARGEST = 1e9
@@ -249,13 +246,11 @@ def _kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> Calibration:
     model = str(fields.get("camera_model", "pinhole"))
     values = _numbers(path, fields, "intrinsics")
     lens = str(fields.get("distortion_model", "none"))
-    distortion: Any = fields.get("distortion_coeffs", [])
-    if model == "eucm" and len(values) == 6:
-        lens, distortion, values = "eucm", values[:2], values[2:]
-    elif model != "pinhole" or len(values) != 4:
+    distortion = fields.get("distortion_coeffs", [])
+    if model != "pinhole" or len(values) != 4:
         raise FileFormatError(
             f"{path}: {name} is a {one_line(model)[:20]} camera with {len(values)} intrinsics; only"
-            " pinhole (4) and eucm (6) are known, so calibrate it as one of them"
+            " pinhole (4) is known, so calibrate it as one"
         )
     fx, fy, cx, cy = values
     single = {name: fields[name] for name in _POSES if name in fields}
@@ -291,7 +286,7 @@ def _lens(path: Path, fields: Mapping[str, Any]) -> tuple[str, tuple[float, ...]
     is_fisheye = str(fields.get("fisheye_model", "0")).lower() not in ("0", "false")
     if is_fisheye and "distortion_model" not in fields:  # of OpenCV
         model = "fisheye"
-    lens = "eucm" if model == "eucm" else _LENSES.get(model)
+    lens = _LENSES.get(model)
     if lens is None:
         known = ", ".join(name for name in _LENSES if name)
         raise FileFormatError(

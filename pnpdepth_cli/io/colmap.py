@@ -93,18 +93,12 @@ MODELS = {
     "OPENCV": _CameraModel(4, 2, _RADIAL, 4),
     "OPENCV_FISHEYE": _CameraModel(5, 2, _FISHEYE, 4),
     "FULL_OPENCV": _CameraModel(6, 2, _RADIAL, 8),
-    "FOV": _CameraModel(7, 2, "fov", 1),
     "SIMPLE_RADIAL_FISHEYE": _CameraModel(8, 1, _FISHEYE, 1),
     "RADIAL_FISHEYE": _CameraModel(9, 1, _FISHEYE, 2),
-    "THIN_PRISM_FISHEYE": _CameraModel(10, 2, "thin-prism-fisheye", 8),
-    "RAD_TAN_THIN_PRISM_FISHEYE": _CameraModel(11, 2, "rad-tan-thin-prism-fisheye", 12),
-    "SIMPLE_DIVISION": _CameraModel(12, 1, "division", 1),
-    "DIVISION": _CameraModel(13, 2, "division", 1),
     "SIMPLE_FISHEYE": _CameraModel(14, 1, _FISHEYE, 0),
     "FISHEYE": _CameraModel(15, 2, _FISHEYE, 0),
-    "EUCM": _CameraModel(16, 2, "eucm", 2),
 }
-"""COLMAP 4.2's camera models except EQUIRECTANGULAR, whose images have no z axis."""
+"""COLMAP's camera models whose lenses are in `choices.LENSES`."""
 _NAMES = {model.number: name for name, model in MODELS.items()} | {17: "EQUIRECTANGULAR"}
 _LARGEST = 1e9
 
@@ -225,8 +219,8 @@ def _parameter_count(path: Path, name: str) -> int:
         )
     if name not in MODELS:
         raise FileFormatError(
-            f"{path}: {one_line(name)[:40]!r} is no camera model of COLMAP 4.2; the file is"
-            " damaged, or written by a newer COLMAP"
+            f"{path}: camera model {one_line(name)[:40]!r} is not one of {', '.join(MODELS)};"
+            " `colmap image_undistorter` writes images and a model of pinhole cameras"
         )
     return MODELS[name].parameters
 

@@ -2,8 +2,7 @@
 
 A lens is a name of `choices.LENSES` and its coefficients. It maps the direction of a ray, x / z and
 y / z, to the point on the image plane z = 1 where it is seen, so all lenses here cover less than
-180 degrees. `radial-tangential` and `fisheye` are OpenCV's; all others are as in COLMAP
-(`src/colmap/sensor/models.h`).
+180 degrees. Both are OpenCV's.
 """
 
 from __future__ import annotations
@@ -124,7 +123,7 @@ def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coeffici
 
 
 def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats]:
-    """Radius before and after the lens, without its tangential and prism parts."""
+    """Radius before and after the lens, without its tangential parts."""
     model = LENS_MODELS[lens]
     if model.by_angle:
         radius = np.tan(np.linspace(0, _WIDEST_ANGLE, _SAMPLES))
@@ -169,60 +168,8 @@ def _fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
     return np.asarray(cv2.fisheye.distortPoints(plane[:, None], np.eye(3), padded)[:, 0])
 
 
-def _fov(plane: Floats, coefficients: Coefficients) -> Floats:
-    """One angle omega (Devernay and Faugeras, 2001)."""
-    (omega,) = coefficients
-    radius = np.hypot(plane[:, 0], plane[:, 1])
-    if omega == 0:
-        return plane.copy()
-    wide = 2 * np.tan(omega / 2)
-    factor = np.where(radius > 1e-8, np.arctan(radius * wide) / (radius * omega), wide / omega)
-    return np.asarray(plane * factor[:, None])
-
-
-def _thin_prism_fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
-    """k1 k2 p1 p2 k3 k4 sx1 sy1 on the equidistant plane."""
-    k1, k2, p1, p2, k3, k4, sx1, sy1 = coefficients
-    radial = _fisheye(plane, (k1, k2, k3, k4))
-    angles = _fisheye(plane, ())
-    prism = _square(angles)[:, None] * np.array([sx1, sy1])
-    return np.asarray(radial + _tangential(angles, (p2, p1)) + prism)
-
-
-def _rad_tan_thin_prism_fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
-    """k0 … k5 p0 p1 s0 … s3, as of Project Aria."""
-    k, p, s = coefficients[:6], coefficients[6:8], coefficients[8:]
-    angles = _fisheye(plane, ())
-    seen = angles * np.polynomial.polynomial.polyval(_square(angles), (1.0, *k))[:, None]
-    square = _square(seen)
-    prism = [square * (s[i] + square * s[i + 1]) for i in (0, 2)]
-    return np.asarray(seen + _tangential(seen, p) + np.column_stack(prism))
-
-
-def _tangential(plane: Floats, p: tuple[float, ...]) -> Floats:
-    along, square = plane @ np.array(p), _square(plane)
-    return np.asarray(2 * along[:, None] * plane + square[:, None] * np.array(p))
-
-
-def _division(plane: Floats, coefficients: Coefficients) -> Floats:
-    """One k: direction = seen / (1 + k seen²) (Fitzgibbon, 2001)."""
-    (k,) = coefficients
-    return np.asarray(plane * (2 / (1 + np.sqrt(1 - 4 * k * _square(plane))))[:, None])
-
-
-def _eucm(plane: Floats, coefficients: Coefficients) -> Floats:
-    """Alpha and beta of the enhanced unified camera model (Khomutenko et al., 2016)."""
-    alpha, beta = coefficients
-    return np.asarray(plane / (alpha * np.sqrt(beta * _square(plane) + 1) + 1 - alpha)[:, None])
-
-
 LENS_MODELS = {
     "radial-tangential": LensModel(_radial_tangential, False, (0, 1, 4, 5, 6, 7)),
     "fisheye": LensModel(_fisheye, True),
-    "fov": LensModel(_fov, True),
-    "thin-prism-fisheye": LensModel(_thin_prism_fisheye, True, (0, 1, 4, 5)),
-    "rad-tan-thin-prism-fisheye": LensModel(_rad_tan_thin_prism_fisheye, True, (0, 1, 2, 3, 4, 5)),
-    "division": LensModel(_division, False),
-    "eucm": LensModel(_eucm, True),
 }
 """By name, as in `choices.LENSES`."""

@@ -285,14 +285,6 @@ def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
         read_calibration(path, 7)
 
 
-def test_the_first_two_intrinsics_of_an_eucm_camera_are_its_lens(tmp_path: Path) -> None:
-    text = KALIBR.replace("camera_model: pinhole", "camera_model: eucm", 1)
-    text = text.replace("[500.5, 501, 320, 240]", "[0.6, 1.1, 500.5, 501, 320, 240]")
-    got = read_calibration(write(tmp_path, text), 0)
-    assert (got.lens, got.distortion) == ("eucm", (0.6, 1.1))
-    assert got.intrinsics.tolist() == [[500.5, 0, 320], [0, 501, 240], [0, 0, 1]]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -315,9 +307,8 @@ def test_the_first_two_intrinsics_of_an_eucm_camera_are_its_lens(tmp_path: Path)
         # its products would overflow
         (PLAIN.replace("700.5", "1e308"), "which no camera has"),
         (PLAIN.replace("[1242, 375]", "[1000000000, 1000000000]"), "pixels, more than"),
-        (KALIBR.replace("pinhole", "eucm"), "is a eucm camera with 4 intrinsics"),
         (KALIBR.replace("[500.5,", "[0.6, 1, 500.5,"), "is a pinhole camera with 6 intrinsics"),
-        (KALIBR.replace("pinhole", "omni"), "only pinhole (4) and eucm (6) are known"),
+        (KALIBR.replace("pinhole", "omni"), "is a omni camera with 4 intrinsics"),
         (KALIBR.replace("equidistant", "wobbly"), "distortion model 'wobbly' is not known"),
         # YAML that is more than plain texts
         ("a: &a [1, 1]\ncamera_matrix: *a\n", "has an alias"),

@@ -104,9 +104,9 @@ def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
     """The frame's entry in transforms.json."""
     camera, pose = frame.camera.camera, frame.camera.pose
     assert pose is not None
-    names = _COEFFICIENTS.get(camera.lens, ())
+    names = _COEFFICIENTS[camera.lens]
     values = dict(zip(names, camera.distortion, strict=False))
-    if camera.lens not in _MODELS or any(camera.distortion[len(names) :]):
+    if any(camera.distortion[len(names) :]):
         raise InputError(
             f"{frame.image} has a lens that Nerfstudio does not know ({camera.lens},"
             f" {len(camera.distortion)} coefficients); undistort the images first"
