@@ -1,11 +1,7 @@
-"""A white figure with titled panels and a colour bar: the frame of every PNG for people.
-
-The PNG's text says where its panels are.
-"""
+"""A white figure with titled panels and a colour bar: the frame of every PNG for people."""
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -16,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colours import DepthScale, Pixels, dimmed, signed_bar
 
@@ -34,14 +29,16 @@ _MAX_PANEL_HEIGHT = 1100
 _GAIN_LEGEND = (900, 84)  # width its text needs, height
 _FONT_SIZE = 19
 _SMALL_FONT_SIZE = 17
-_HATCH_SPACING, _HATCH_WIDTH = 12, 3  # pixels of the figure
-_HATCH_FADED, _HATCH_LINE = 0.45, 0.8  # fractions of white
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
 _LINE = (200, 202, 206)
 _UNKNOWN_GAIN = (52, 52, 52)
 _FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
-_CONTENT_KEY = "pnpdepth"  # of the PNG text that describes the figure
+
+Content = dict[str, Any]
+"""What a figure shows, as a report needs it: `size` is (width, height), `panels` has the box (left,
+top, width, height) of each by title. A figure of depth has `scale_m`, the depths at the ends of its
+colours; one of gains has `ends`, `unknown` and `footer`, the texts of its legend."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,20 +71,6 @@ def resized(pixels: NDArray[Any], factor: float, *, smooth: bool = False) -> NDA
     return np.asarray(cv2.resize(pixels, size, interpolation=method))
 
 
-def hatched(pixels: Pixels, valid: NDArray[np.bool_] | None) -> Pixels:
-    """Returns an image faded and with diagonal lines where its depth, of any size, is not valid."""
-    if valid is None or valid.all():
-        return pixels
-    height, width = pixels.shape[:2]
-    mask = cv2.resize(valid.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) == 0
-    y, x = np.ogrid[:height, :width]
-    lines = (x + y) % _HATCH_SPACING < _HATCH_WIDTH
-    white = np.where(lines, _HATCH_LINE, _HATCH_FADED)[mask][:, None]
-    image = pixels.copy()
-    image[mask] = np.rint((1 - white) * pixels[mask] + white * 255).astype(np.uint8)
-    return image
-
-
 def draw_discs(
     grey: NDArray[np.float32],
     xy: NDArray[np.floating],
@@ -116,10 +99,9 @@ def draw_discs(
 
 def save_depth_figure(
     path: Path, panels: list[Panel], scale: DepthScale, unit: str = "m", *, columns: int = 1
-) -> None:
+) -> Content:
     """Writes a PNG of panels, `columns` to a row, beside a bar of depth colours."""
-    figure, draw = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
-    figure.info[_CONTENT_KEY] |= {"low_m": scale.low_m, "high_m": scale.high_m}
+    figure, draw, content = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
     left = figure.width - MARGIN - _LEGEND_WIDTH + GAP
     top, bottom = MARGIN + _TITLE_HEIGHT, figure.height - MARGIN
     draw.text(
@@ -137,6 +119,7 @@ def save_depth_figure(
         draw.line((right, y, right + 6, y), fill=_INK, width=1)
         draw.text((right + 11, y), label, font=_font(_SMALL_FONT_SIZE), fill=_INK, anchor="lm")
     _save(figure, path)
+    return content | {"scale_m": (scale.low_m, scale.high_m)}
 
 
 def save_gain_figure(
@@ -148,18 +131,19 @@ def save_gain_figure(
     noun: str,
     colors: str,
     unknown: str = "",
-) -> float:
-    """Writes a PNG of one map of N gains with a colour bar; returns the fraction above 0.
+) -> tuple[float, Content]:
+    """Writes a PNG of one map of N gains with a colour bar; returns the fraction above 0 first.
 
     `amount` is the gain of full colour, with its unit; `noun` what is counted; `unknown` what the
     dark pixels are, "" where there are none.
     """
-    figure, draw = _lay_out([panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1])
+    figure, draw, content = _lay_out(
+        [panel], 1, least_width=_GAIN_LEGEND[0], legend_height=_GAIN_LEGEND[1]
+    )
     improved = float((gain > 0).mean())
     worse = 100 * float((gain < 0).mean())
     footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {worse:.1f} % worse"
     ends = (f"worse by {amount} or more", f"better by {amount} or more")
-    figure.info[_CONTENT_KEY] |= {"ends": ends, "unknown": unknown or None, "footer": footer}
     bar = np.repeat(signed_bar(colors, 220)[None], 18, axis=0)
     font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
     x, y = float(MARGIN), figure.height - MARGIN - 56
@@ -174,38 +158,12 @@ def save_gain_figure(
         draw.text((x + 28, y), unknown, font=small, fill=_INK, anchor="lm")
     draw.text((MARGIN, y + 40), footer, font=font, fill=_INK, anchor="lm")
     _save(figure, path)
-    return improved
+    return improved, content | {"ends": ends, "unknown": unknown or None, "footer": footer}
 
 
 def _save(figure: PIL.Image.Image, path: Path) -> None:
-    from PIL.PngImagePlugin import PngInfo
-
-    text = PngInfo()
-    text.add_text(_CONTENT_KEY, json.dumps(figure.info[_CONTENT_KEY]))
     with atomic_path(path) as temporary:
-        figure.save(temporary, "PNG", pnginfo=text, compress_level=_FAST)
-
-
-def figure_content(path: Path) -> dict[str, Any]:
-    """Returns what a figure shows; only the first bytes of its file are read.
-
-    `size` is (width, height), `panels` have title and box (left, top, width, height). A figure of
-    depth has low_m and high_m of its colours, one of gains ends, unknown and footer.
-
-    Raises:
-        InputError: There is no such file.
-        FileFormatError: It is another image.
-    """
-    from PIL import Image
-
-    try:
-        with Image.open(path, formats=["PNG"]) as image:
-            return {"size": image.size, **json.loads(image.info[_CONTENT_KEY])}
-    except OSError as error:
-        fact = (error.strerror or "is no PNG").lower()
-        raise InputError(f"{path} cannot be read ({fact}); create it again") from error
-    except (SyntaxError, KeyError, ValueError) as error:
-        raise FileFormatError(f"{path} is no figure of this program; create it again") from error
+        figure.save(temporary, "PNG", compress_level=_FAST)
 
 
 def _lay_out(
@@ -215,7 +173,8 @@ def _lay_out(
     legend_width: int = 0,
     legend_height: int = 0,
     least_width: int = 0,
-) -> tuple[PIL.Image.Image, PIL.ImageDraw.ImageDraw]:
+) -> tuple[PIL.Image.Image, PIL.ImageDraw.ImageDraw, Content]:
+    """A figure with its panels, for a legend beside or below them to be drawn on."""
     from PIL import Image, ImageDraw
 
     height, width = panels[0].pixels.shape[:2]
@@ -226,7 +185,7 @@ def _lay_out(
     height_px = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2) + legend_height
     figure = Image.new("RGB", (width_px, height_px), "white")
     draw = ImageDraw.Draw(figure)
-    placed = []
+    boxes = {}
     for index, panel in enumerate(panels):
         row, column = divmod(index, columns)
         x = MARGIN + column * (width + GAP)
@@ -236,9 +195,8 @@ def _lay_out(
         indent = draw.textlength(panel.title, font=font) + 14
         draw.text((x + indent, y + 5), panel.remark, font=_font(_SMALL_FONT_SIZE), fill=_FAINT_INK)
         _paste(figure, panel.pixels, x, y + _TITLE_HEIGHT)
-        placed.append({"title": panel.title, "box": (x, y + _TITLE_HEIGHT, width, height)})
-    figure.info[_CONTENT_KEY] = {"panels": placed}
-    return figure, draw
+        boxes[panel.title] = (x, y + _TITLE_HEIGHT, width, height)
+    return figure, draw, {"size": figure.size, "panels": boxes}
 
 
 def _labels(ticks: list[float]) -> list[tuple[float, str]]:

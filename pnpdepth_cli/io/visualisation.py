@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +20,9 @@ from pnpdepth_cli.io.colours import (
     paint_signed,
 )
 from pnpdepth_cli.io.figure import (
+    Content,
     Panel,
     draw_discs,
-    hatched,
     magnification,
     resized,
     save_depth_figure,
@@ -35,10 +34,6 @@ Depth = NDArray[np.float32]
 # Wider images than this (KITTI is 3.3 : 1) are stacked; two in a row would be too small.
 _WIDE = 2.0
 _STRONGEST_PERCENTILE = 95.0
-_ZOOM = 4  # the zoom shows this fraction of the image's sides
-_FARTHEST = 1e-3  # weight of the difference to all others in the choice of the zoom
-_FEW = 20  # points
-_FRAME = (230, 30, 30)
 _GAIN = "|before - ground truth| - |after - ground truth|"
 
 
@@ -50,14 +45,10 @@ def preview(
     after: Depth,
     path: Path,
     unit: str = "m",
-    *,
-    valid: NDArray[np.bool_] | None = None,
-    linear: Depth | None = None,
-) -> None:
-    """Writes a PNG of image, sparse depth, depth before and after, and what changed.
+) -> Content:
+    """Writes a PNG of image, sparse depth, depth before and after, and the signed change.
 
-    All depth panels have one colour scale. The last two show the signed change, and a close-up of
-    before, linear if given, and after where the depth after differs most from the others.
+    All depth panels have one colour scale.
 
     Args:
         rgb: (H, W, 3) in 0..1; None for a network without image.
@@ -67,14 +58,12 @@ def preview(
         after: (H, W) after refinement.
         path: The PNG.
         unit: Name in the legend.
-        valid: (H, W); the depth after is hatched where false. None: all is valid.
-        linear: (H, W) linear interpolation of the points; 0 where unknown.
 
     Raises:
         SizeError: Image and depth differ in size.
         OutputError: The file cannot be written.
     """
-    _check_same_size(before, after=after, image=rgb, mask=valid, linear=linear)
+    _check_same_size(before, after=after, image=rgb)
     height, width = before.shape
     columns = 1 if width > _WIDE * height else 2
     factor = magnification(before.shape, columns=columns, legend=True)
@@ -82,8 +71,6 @@ def preview(
     # Without an image, the depth in grey is the ground of the points.
     grey = grey_of(rgb) if rgb is not None else (1 - scale.position(after)).astype(np.float32)
     first = rgb if rgb is not None else np.repeat(0.25 + 0.65 * grey[:, :, None], 3, axis=2)
-    depths = {"before": before} | ({} if linear is None else {"linear": linear}) | {"after": after}
-    zoom = _zoom(depths, _area(sparse_xy))
     panels = [
         Panel(
             title="Image" if rgb is not None else "No image",
@@ -92,11 +79,10 @@ def preview(
         ),
         _points_panel(grey, sparse_xy, sparse_depth, scale, factor),
         Panel(title="Depth before", pixels=resized(scale.paint(before), factor)),
-        _depth_panel("Depth after", after, valid, scale, factor),
-        _change_panel(before, after, grey, factor, zoom),
-        _zoom_panel(depths, scale, zoom, resized(before, factor).shape),
+        Panel(title="Depth after", pixels=resized(scale.paint(after), factor)),
+        _change_panel(before, after, grey, factor),
     ]
-    save_depth_figure(path, panels, scale, unit, columns=columns)
+    return save_depth_figure(path, panels, scale, unit, columns=columns)
 
 
 def overlay(
@@ -112,13 +98,11 @@ def overlay(
     save_depth_figure(path, [panel], scale)
 
 
-def sigma_preview(
-    sigma: Depth, valid: NDArray[np.bool_] | None, path: Path, unit: str = "m"
-) -> None:
-    """Writes a PNG of a standard deviation (H, W) in `unit`, hatched where depth is not valid."""
+def sigma_preview(sigma: Depth, path: Path, unit: str = "m") -> None:
+    """Writes a PNG of a standard deviation (H, W) in `unit`."""
     scale = replace(depth_scale(sigma), warm_is_far=True)
     factor = magnification(sigma.shape, columns=1, legend=True)
-    panel = _depth_panel("Standard deviation", sigma, valid, scale, factor)
+    panel = Panel(title="Standard deviation", pixels=resized(scale.paint(sigma), factor))
     save_depth_figure(path, [panel], scale, unit)
 
 
@@ -161,14 +145,6 @@ def _painted(
     return pixels, strongest
 
 
-def _depth_panel(
-    title: str, depth: Depth, valid: NDArray[np.bool_] | None, scale: DepthScale, factor: float
-) -> Panel:
-    pixels = hatched(resized(scale.paint(depth), factor), valid)
-    remark = "" if valid is None or valid.all() else "hatched: not valid"
-    return Panel(title=title, pixels=pixels, remark=remark)
-
-
 def _points_panel(
     grey: NDArray[np.float32],
     xy: NDArray[np.float32],
@@ -183,84 +159,13 @@ def _points_panel(
     return Panel(title="Sparse depth", pixels=discs, remark=count)
 
 
-def _change_panel(
-    before: Depth,
-    after: Depth,
-    grey: NDArray[np.float32],
-    factor: float,
-    zoom: tuple[int, int, int, int],
-) -> Panel:
-    """The signed change in metres, with a frame around the zoom."""
-    both = _both_known(before, after)
+def _change_panel(before: Depth, after: Depth, grey: NDArray[np.float32], factor: float) -> Panel:
+    """The signed change in metres."""
+    both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
     change = (after[both] - before[both]).astype(np.float64)
     pixels, strongest = _painted(change, both, grey, "change")
-    shown = resized(pixels, factor)
-    top, left, height, width = zoom
-    low = (round(left * factor), round(top * factor))
-    high = (round((left + width) * factor) - 1, round((top + height) * factor) - 1)
-    cv2.rectangle(shown, low, high, _FRAME, 2)
     remark = f"after - before: teal farther, purple nearer, full at {strongest:.3g}"
-    return Panel(title="Change", pixels=shown, remark=remark)
-
-
-def _zoom_panel(
-    depths: dict[str, Depth],
-    scale: DepthScale,
-    zoom: tuple[int, int, int, int],
-    size: tuple[int, ...],
-) -> Panel:
-    """The window of each depth, side by side."""
-    y, x, height, width = zoom
-    area = np.s_[y : y + height, x : x + width]
-    rows, columns = size
-    part = columns // len(depths)
-    pixels, end = np.full((rows, columns, 3), 255, np.uint8), 0
-    starts = np.linspace(0, columns - part, len(depths)).round().astype(int)
-    for start, depth in zip(starts, depths.values(), strict=True) if part else ():
-        shown = cv2.resize(scale.paint(depth[area]), (part, rows), interpolation=cv2.INTER_NEAREST)
-        pixels[:, start : start + part] = shown
-        if end:  # a line to the depth before
-            pixels[:, end - 1 : start + 1] = 255
-        end = start + part
-    most = "where most changed" if "linear" not in depths else "where after differs most"
-    return Panel(title="Zoom", pixels=pixels, remark=f"{' | '.join(depths)}, {most} (frame)")
-
-
-def _both_known(first: Depth, second: Depth) -> NDArray[np.bool_]:
-    return (first > 0) & (second > 0) & np.isfinite(first) & np.isfinite(second)
-
-
-def _area(xy: NDArray[np.float32]) -> tuple[slice, slice]:
-    """Rows and columns with points, without the outermost per cent; all for a few points."""
-    if len(xy) < _FEW:
-        return slice(None), slice(None)
-    (left, top), (right, bottom) = np.percentile(xy, (1, 99), axis=0).astype(int)
-    return slice(max(top, 0), bottom + 1), slice(max(left, 0), right + 1)
-
-
-def _zoom(depths: dict[str, Depth], of_points: tuple[slice, slice]) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the window where the last depth differs most from the others.
-
-    The relative difference to the nearest of the others counts most, where there are points:
-    elsewhere, such as in the sky, the depth has nothing to follow. The window is as many times
-    narrower as there are depths, because they stand side by side.
-    """
-    *others, after = depths.values()
-    rows, columns = after.shape
-    height, width = max(1, rows // _ZOOM), max(1, columns // (len(depths) * _ZOOM))
-    apart = []
-    for other in others:
-        both = _both_known(other, after)
-        difference = np.where(both, np.nan_to_num(after) - np.nan_to_num(other), 0)
-        apart.append(np.abs(difference.astype(np.float64)) / np.where(both, after, 1))
-    relative = np.min(apart, axis=0) + _FARTHEST * np.sum(apart, axis=0)
-    inside = np.zeros_like(relative)
-    inside[of_points] = np.minimum(relative, _strongest(relative[of_points]))[of_points]
-    total = cv2.integral(inside)
-    rows_of = total[height:] - total[:-height]
-    window = rows_of[:, width:] - rows_of[:, :-width]
-    top, left = np.unravel_index(int(window.argmax()), window.shape)
-    return int(top), int(left), height, width
+    return Panel(title="Change", pixels=resized(pixels, factor), remark=remark)
 
 
 def improvement(
@@ -271,14 +176,14 @@ def improvement(
     *,
     rgb: NDArray[np.float32] | None = None,
     colors: str = "blue-orange",
-) -> float:
+) -> tuple[float, Content]:
     """Writes a PNG of where |depth - gt| fell and rose, as figure 4(d) of the paper.
 
     Only pixels with known ground truth count; equal errors are neither better nor worse. All are
     (H, W) in metres; the image, (H, W, 3) in 0..1, is the ground of the map.
 
     Returns:
-        The fraction of pixels whose error fell.
+        The fraction of pixels whose error fell, and what the figure shows.
 
     Raises:
         InputError: No ground truth is known.
@@ -310,7 +215,7 @@ def improvement_at_points(
     path: Path,
     unit: str = "m",
     colors: str = "blue-orange",
-) -> float:
+) -> tuple[float, Content]:
     """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
 
     The image is (H, W, 3) or (H, W) in 0..1, points are (N, 2) pixel coordinates. Depths in `unit`
@@ -318,7 +223,7 @@ def improvement_at_points(
     out of the refinement.
 
     Returns:
-        The fraction of points whose error fell.
+        The fraction of points whose error fell, and what the figure shows.
 
     Raises:
         NoPointsError: There is no point.

@@ -1,4 +1,4 @@
-"""Figures for people, read back panel by panel, and their colours."""
+"""Figures for people, panel by panel, and their colours."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, OutputError, SizeError
+from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, SizeError
 from pnpdepth_cli.io.colours import UNKNOWN, DepthScale, depth_scale, paint_signed, round_steps
-from pnpdepth_cli.io.figure import _labels, draw_discs, figure_content, magnification, resized
+from pnpdepth_cli.io.figure import MARGIN, Content, _labels, draw_discs, magnification, resized
 from pnpdepth_cli.io.visualisation import (
     error_map,
     improvement,
@@ -24,7 +24,7 @@ from pnpdepth_cli.io.visualisation import (
 
 RED, GREEN = [214, 26, 30], [16, 140, 52]
 BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
-TITLES = ["Image", "Sparse depth", "Depth before", "Depth after", "Change", "Zoom"]
+TITLES = ["Image", "Sparse depth", "Depth before", "Depth after", "Change"]
 
 
 def pixels_of(path: Path) -> np.ndarray:
@@ -33,10 +33,9 @@ def pixels_of(path: Path) -> np.ndarray:
         return np.asarray(image)
 
 
-def panels_of(path: Path) -> dict[str, np.ndarray]:
-    """The panels of a figure by title, where it says that they are."""
-    pixels = pixels_of(path)
-    boxes = {panel["title"]: panel["box"] for panel in figure_content(path)["panels"]}
+def panels_of(path: Path, content: Content) -> dict[str, np.ndarray]:
+    """The panels of a figure by title."""
+    pixels, boxes = pixels_of(path), content["panels"]
     return {title: pixels[y : y + h, x : x + w] for title, (x, y, w, h) in boxes.items()}
 
 
@@ -54,11 +53,10 @@ def at(depth: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return depth[rows, columns]
 
 
-def previewed(folder: Path, before: np.ndarray, after: np.ndarray, **others: Any) -> Path:
-    """A preview without image and points."""
-    none = np.zeros(0, np.float32)
-    preview(None, none.reshape(0, 2), none, before, after, folder / "p.png", **others)
-    return folder / "p.png"
+def previewed(folder: Path, before: np.ndarray, after: np.ndarray) -> dict[str, np.ndarray]:
+    """The panels of a preview without image and points."""
+    none, path = np.zeros(0, np.float32), folder / "p.png"
+    return panels_of(path, preview(None, none.reshape(0, 2), none, before, after, path))
 
 
 @pytest.mark.parametrize(
@@ -69,14 +67,14 @@ def test_a_preview_has_its_panels_in_columns_and_the_image_as_it_is(
 ) -> None:
     rgb, depth, xy = scene(height, width)
     path = tmp_path / "p.png"
-    preview(rgb, xy, at(depth, xy), depth * 1.2, depth, path)
-    content, panels, page = figure_content(path), panels_of(path), pixels_of(path)
+    content = preview(rgb, xy, at(depth, xy), depth * 1.2, depth, path)
+    panels, page = panels_of(path, content), pixels_of(path)
     scale = depth_scale(at(depth, xy), depth * 1.2, depth)
     assert page.shape[1] <= 1600
     assert content["size"] == page.shape[1::-1]
-    assert (content["low_m"], content["high_m"]) == (scale.low_m, scale.high_m)
+    assert content["scale_m"] == (scale.low_m, scale.high_m)
     assert list(panels) == TITLES
-    assert len({panel["box"][0] for panel in content["panels"]}) == columns
+    assert len({left for left, *_ in content["panels"].values()}) == columns
     shown, factor = panels["Depth before"], panels["Depth before"].shape[1] // width
     if factor:
         centres = shown[factor // 2 :: factor, factor // 2 :: factor]
@@ -90,7 +88,7 @@ def test_a_preview_has_its_panels_in_columns_and_the_image_as_it_is(
 def test_equal_depths_have_equal_panels_and_other_depths_other_ones(tmp_path: Path) -> None:
     _, depth, _ = scene(48, 64)
     for after, equal in ((depth, True), (depth[::-1].copy(), False)):
-        panels = panels_of(previewed(tmp_path, depth, after))
+        panels = previewed(tmp_path, depth, after)
         assert np.array_equal(panels["Depth before"], panels["Depth after"]) == equal
         top, bottom = (panels["No image"][row].mean() for row in (0, -1))
         assert (top > bottom) == equal  # what is near after refinement is bright
@@ -101,7 +99,7 @@ def test_depths_that_are_unknown_or_all_alike_still_make_a_preview(tmp_path: Pat
     nan = np.full((6, 8), np.nan, np.float32)
     pairs = [(none, none), (one, one), (nan, one), (none, one), (one, none), (one, one * np.inf)]
     for before, after in [*pairs, (one * 1e-4, one * 1e6)]:
-        panels = panels_of(previewed(tmp_path, before, after))
+        panels = previewed(tmp_path, before, after)
         known, known_after = ((np.isfinite(depth) & (depth > 0)).any() for depth in (before, after))
         assert (panels["Depth before"] == UNKNOWN).all() == (not known)
         # where one is unknown nothing has changed, and the map is dark
@@ -128,28 +126,30 @@ def test_parts_of_different_size_or_number_and_a_place_that_is_none_are_refused(
         improvement(depth, depth, depth, path)
 
 
-def improved(folder: Path, gt: list, before: list, after: list, **options: Any) -> tuple[Any, Any]:
-    """The share that `improvement` returns for one row, and a colour per pixel."""
+def improved(
+    folder: Path, gt: list, before: list, after: list, **options: Any
+) -> tuple[float, Any, Content]:
+    """What `improvement` returns for one row, with a colour per pixel in between."""
     rows = (np.array([row], np.float32) for row in (before, after, gt))
-    share = improvement(*rows, folder / "i.png", **options)
-    shown = panels_of(folder / "i.png")["Change of error"]
+    share, content = improvement(*rows, folder / "i.png", **options)
+    shown = panels_of(folder / "i.png", content)["Change of error"]
     factor = shown.shape[1] // len(gt)
-    return share, shown[factor // 2, factor // 2 :: factor].tolist()
+    return share, shown[factor // 2, factor // 2 :: factor].tolist(), content
 
 
 def test_better_worse_equal_and_unknown_have_their_own_colours(tmp_path: Path) -> None:
     # |6 - 5| = |4 - 5|: unchanged
-    share, colours = improved(tmp_path, [5, 5, 5, 0], [6, 5, 6, 6], [5, 6, 4, 5])
+    share, colours, content = improved(tmp_path, [5, 5, 5, 0], [6, 5, 6, 6], [5, 6, 4, 5])
     assert share == 1 / 3
     assert colours[:2] == [BLUE, ORANGE]
     assert len(set(colours[2])) == len(set(colours[3])) == 1
     assert colours[3][0] < 80 < 150 < colours[2][0]
-    content = figure_content(tmp_path / "i.png")
-    assert content["ends"] == ["worse by 1 m or more", "better by 1 m or more"]
+    assert content["ends"] == ("worse by 1 m or more", "better by 1 m or more")
     assert content["footer"] == "33.3 % of 3 pixels improved, 33.3 % worse"
     assert content["unknown"] == "no ground truth"
-    assert improved(tmp_path, [5, 5], [6, 5], [5, 6], colors="paper")[1] == [RED, GREEN]
-    assert figure_content(tmp_path / "i.png")["unknown"] is None
+    _, colours, content = improved(tmp_path, [5, 5], [6, 5], [5, 6], colors="paper")
+    assert colours == [RED, GREEN]
+    assert content["unknown"] is None
 
 
 def test_only_known_ground_truth_counts_and_a_depth_that_becomes_finite_is_better(
@@ -161,57 +161,25 @@ def test_only_known_ground_truth_counts_and_a_depth_that_becomes_finite_is_bette
     assert improved(tmp_path, [4, 4], [np.nan, np.nan], [5, np.nan])[0] == 0.5
 
 
-def test_the_preview_shows_the_signed_change_and_zooms_to_where_after_differs_most(
-    tmp_path: Path,
-) -> None:
+def test_the_preview_shows_the_signed_change(tmp_path: Path) -> None:
     before = np.full((80, 120), 4, np.float32)
-    before[:10, 60:70] = 80
-    linear, after = before.copy(), before.copy()
-    after[60:70, 90:100] = 4.5  # network and linear agree, and the result is another
-    after[:10, 60:70] = 80.5  # relative to the depth, less
-    linear[5:15, 10:20] = 8
-
-    def framed() -> list[list[int]]:
-        """The first and the last row and column of the zoom, of the frame around it."""
-        change = panels_of(tmp_path / "p.png")["Change"]
-        frame = np.argwhere((change == [230, 30, 30]).all(axis=2))
-        ends = frame.min(axis=0) + 1, frame.max(axis=0) - 1
-        return [(end // (change.shape[0] // 80)).tolist() for end in ends]
-
-    def colours(**others: np.ndarray) -> list[int]:
-        zoom = panels_of(previewed(tmp_path, before, after, **others))["Zoom"]
-        parts = np.array_split(zoom, 2 + len(others), axis=1)
-        return [len(np.unique(part[:, 3:-3].reshape(-1, 3), axis=0)) for part in parts]
-
-    assert colours() == [1, 2]
-    change = panels_of(tmp_path / "p.png")["Change"]
+    after = before.copy()
+    after[60:70, 90:100] = 4.5
+    change = previewed(tmp_path, before, after)["Change"]
     factor = change.shape[0] // 80
     farther, unchanged = change[65 * factor, 95 * factor], change[10 * factor, 10 * factor]
     assert farther.tolist() == [1, 102, 94]
     assert len(set(unchanged.tolist())) == 1
-    assert framed() == [[50, 85], [69, 99]]
-    assert colours(linear=linear) == [1, 1, 2]
-    after[5:15, 90:100] = after[50:60, 10:20] = 8  # where there are no points
-    xy = np.argwhere(np.ones((8, 8)))[:, ::-1] * [8, 5] + [60, 35]
-    preview(
-        None, xy.astype(np.float32), after[xy[:, 1], xy[:, 0]], before, after, tmp_path / "p.png"
-    )
-    assert framed() == [[50, 85], [69, 99]]
-    after[:] = before
-    assert colours(linear=linear) == [1, 2, 1]
 
 
-def test_depth_that_is_not_valid_is_hatched(tmp_path: Path) -> None:
-    _, depth, _ = scene(60, 80)
-    valid = np.arange(60)[:, None] >= np.full(80, 20)
-    panels = panels_of(previewed(tmp_path, depth, depth, valid=valid))
-    before, after = panels["Depth before"], panels["Depth after"]
-    factor = before.shape[0] // 60
-    assert np.array_equal(before[20 * factor :], after[20 * factor :])
-    assert (after[: 20 * factor].astype(int) > before[: 20 * factor]).any(axis=2).all()
-    sigma_preview(0.1 * depth, valid, tmp_path / "s.png")
-    shown = panels_of(tmp_path / "s.png")["Standard deviation"].astype(int)
-    assert shown[-1, -1, 0] > shown[-1, -1, 2]  # warm is large
+def test_a_large_standard_deviation_is_warm(tmp_path: Path) -> None:
+    path = tmp_path / "s.png"
+    sigma_preview(np.linspace(0.1, 1, 4800, dtype=np.float32).reshape(60, 80), path)
+    page = pixels_of(path).astype(int)
+    height = page.shape[0] - 2 * MARGIN
+    small, large = page[MARGIN + height // 10, 2 * MARGIN], page[-2 * MARGIN, 2 * MARGIN]
+    assert small[0] < small[2]
+    assert large[0] > large[2]
 
 
 @pytest.mark.parametrize("held_out", [True, False])
@@ -223,13 +191,16 @@ def test_points_are_coloured_discs_where_they_lie(
     xy, truth = np.array([[5, 5], [30, 20]], np.float32), np.array([2, 3], np.float32)
     before, after = (truth + np.array(error, np.float32) for error in ([1, 0], [0, 1]))
     image, path = rgb[:, :, 0] if grey else rgb, tmp_path / "i.png"
-    assert improvement_at_points(image, xy, truth, before, after, held_out, path) == 0.5
+    share, content = improvement_at_points(image, xy, truth, before, after, held_out, path)
+    assert share == 0.5
     factor = int(magnification((30, 40), columns=1, legend=False))
-    colours = panels_of(path)["Change of error"][factor // 2 :: factor, factor // 2 :: factor]
+    colours = panels_of(path, content)["Change of error"][
+        factor // 2 :: factor, factor // 2 :: factor
+    ]
     assert colours[5, 5].tolist() == BLUE
     assert colours[20, 30].tolist() == ORANGE
     assert len(set(colours[12, 17].tolist())) == 1
-    assert ("held-out" in figure_content(path)["footer"]) == held_out
+    assert ("held-out" in content["footer"]) == held_out
 
 
 def test_points_outside_the_image_do_no_harm() -> None:
@@ -300,18 +271,6 @@ def test_the_error_map_has_different_colours_for_too_far_and_too_near() -> None:
     assert right[0] > 150 > 80 > none[0]
     pixels, _ = error_map(truth, truth, np.full((1, 4), 0.5, np.float32))
     assert (pixels == pixels[0, 0, 0]).all()
-
-
-def test_what_is_no_figure_is_an_input_error(tmp_path: Path) -> None:
-    path = tmp_path / "p.png"
-    with pytest.raises(InputError, match="cannot be read"):
-        figure_content(path)
-    path.write_bytes(b"text")
-    with pytest.raises(InputError, match="cannot be read"):
-        figure_content(path)
-    Image.new("RGB", (4, 4)).save(path)
-    with pytest.raises(FileFormatError, match="no figure of this program"):
-        figure_content(path)
 
 
 def test_a_reduced_image_has_means_and_an_enlarged_one_squares() -> None:

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.refinement.output_files import Outputs
-from pnpdepth_cli.completion.interpolation import linear
-from pnpdepth_cli.frames.frame import Refined, is_dense
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.colours import depth_scale
 from pnpdepth_cli.io.depth import metres, write_depth
+from pnpdepth_cli.io.figure import Content
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.visualisation import (
@@ -102,12 +102,12 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str,
     if frame.sigma is not None and "sigma" in outputs:
         _write_sigma(outputs["sigma"], frame.sigma)
     if frame.sigma is not None and "sigma_preview" in outputs:
-        sigma_preview(frame.sigma, frame.valid, outputs["sigma_preview"], inputs.unit)
+        sigma_preview(frame.sigma, outputs["sigma_preview"], inputs.unit)
     if frame.valid is not None and "valid" in outputs:
         write_mask(outputs["valid"], frame.valid)
-    record: dict[str, Any] = {"improved_fraction": None}
+    record: dict[str, Any] = {"improved_fraction": None, "figures": {}}
     if "preview" in outputs:
-        preview(
+        record["figures"]["preview"] = preview(
             image,
             inputs.own.xy.numpy(),
             inputs.own.depth.numpy(),
@@ -115,11 +115,9 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str,
             frame.after,
             outputs["preview"],
             inputs.unit,
-            valid=frame.valid,
-            linear=None if is_dense(frame.used) else linear(frame.used).numpy(),
         )
     if "improvement" in outputs:
-        record["improved_fraction"] = _write_improvement(
+        record["improved_fraction"], record["figures"]["improvement"] = _write_improvement(
             outputs["improvement"], image, inputs, frame
         )
     if "cloud" in outputs:
@@ -146,7 +144,9 @@ def _write_sigma(path: Path, sigma: Image) -> None:
     write_depth(path, sigma, scale=scale)
 
 
-def _write_improvement(path: Path, image: Image | None, inputs: Inputs, frame: Refined) -> float:
+def _write_improvement(
+    path: Path, image: Image | None, inputs: Inputs, frame: Refined
+) -> tuple[float, Content]:
     colors = inputs.request.outputs.colors
     if inputs.gt is not None:
         return improvement(frame.before, frame.after, inputs.gt, path, rgb=image, colors=colors)

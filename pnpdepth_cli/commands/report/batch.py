@@ -1,8 +1,8 @@
 """`pnpdepth batch --html`: each frame before and after refinement, with a map of the change.
 
 Everything is read from the results on disk: scores from the rows of the summary, images from the
-previews and the improvement maps, which the report links as they were written. So a report also has
-the frames of earlier runs.
+previews and the improvement maps, which the report links as they were written. The records say
+where their panels are. So a report also has the frames of earlier runs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pnpdepth_cli.commands.error_tables import (
 from pnpdepth_cli.commands.report.evaluation import frames_text
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.colours import hex_colours, signed_bar
-from pnpdepth_cli.io.figure import figure_content
+from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.report import (
     IMAGES,
     Head,
@@ -141,17 +141,18 @@ def _views(row: Row, request: BatchRequest, folder: Path) -> dict[str, Any]:
     """
     files = {kind: request.output / path for kind, path in row["outputs"].items()}
     key, views = image_key(row["name"]), dict[str, Any]()
+    if not all(kind in files and files[kind].exists() for kind in ("preview", "improvement")):
+        return {"key": None}
     try:
-        figures = {kind: figure_content(files[kind]) for kind in ("preview", "improvement")}
+        figures = read_json(files["record"])["figures"]
     except (KeyError, InputError):
         return {"key": None}
     for kind, figure in figures.items():
         name = f"{IMAGES}/{key}_{kind}.png"
         link_image(files[kind], folder / name)
-        for panel in figure["panels"]:
-            if panel["title"] in _PANELS:
-                place = {"src": name, "box": panel["box"], "size": figure["size"]}
-                views[_PANELS[panel["title"]]] = place
+        for title, box in figure["panels"].items():
+            if title in _PANELS:
+                views[_PANELS[title]] = {"src": name, "box": box, "size": figure["size"]}
     view_mb = None
     if request.html_3d and "view" in files:
         view_mb = save_view_3d(files["view"], folder / IMAGES / f"{key}_view.js")
@@ -159,7 +160,7 @@ def _views(row: Row, request: BatchRequest, folder: Path) -> dict[str, Any]:
         "key": key,
         "views": views,
         "view_mb": view_mb,
-        "scale_m": [figures["preview"][end] for end in ("low_m", "high_m")],
+        "scale_m": figures["preview"]["scale_m"],
         "map": {name: figures["improvement"][name] for name in ("ends", "unknown", "footer")},
     }
 

@@ -18,7 +18,6 @@ from pnpdepth_cli.commands.report import batch as report_batch
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.colours import paint_signed
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.figure import figure_content
 from pnpdepth_cli.io.report import link_image
 from tests.commands.batches import NAMES, batch, done, pairs_on_disk, refinement
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
@@ -34,11 +33,12 @@ def report(tmp_path: Path) -> Path:
     return tmp_path / "report"
 
 
-def test_the_page_links_the_panels_of_a_frames_files_and_shows_their_errors(
+def test_the_page_links_the_panels_that_a_frames_record_names_and_shows_their_errors(
     root: Path, report: Path
 ) -> None:
     batch(root, html=report)
     frame = frames_of(report)["c"]
+    figures = json.loads((root / "out/c.json").read_text())["figures"]
     for view, kind, title in (
         ("first", "preview", "Depth before"),
         ("second", "preview", "Depth after"),
@@ -46,13 +46,12 @@ def test_the_page_links_the_panels_of_a_frames_files_and_shows_their_errors(
         ("map", "improvement", "Change of error"),
     ):
         result = root / f"out/c_{kind}.png"
-        figure, shown = figure_content(result), frame["views"][view]
+        figure, shown = figures[kind], frame["views"][view]
         assert (report / shown["src"]).samefile(result)
-        assert shown["box"] in [p["box"] for p in figure["panels"] if p["title"] == title]
-        assert shown["size"] == list(figure["size"])
-    preview = figure_content(root / "out/c_preview.png")
-    assert frame["scale_m"] == [preview["low_m"], preview["high_m"]]
-    assert frame["map"]["footer"] == figure["footer"]
+        assert shown["box"] == figure["panels"][title]
+        assert shown["size"] == figure["size"] == list(cv2.imread(str(result)).shape[1::-1])
+    assert frame["scale_m"] == figures["preview"]["scale_m"]
+    assert frame["map"]["footer"] == figures["improvement"]["footer"]
 
     batch(root, output=root / "plain", refine={"iterations": 0})
     gt = read_depth(root / "gt/b.png").values
