@@ -235,11 +235,14 @@ PRECISIONS = ("fp32", "bf16", "fp16")  # of the network's convolutions and matri
 COLORS = ("blue-orange", "paper")  # of better and worse; the paper's are red and green
 PREVIEWS = ("all", "worst", "none")  # which frames get images; worst: worse than linear
 FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")  # `io.dataset`
-PATTERNS = ("uniform", "bernoulli", "grid", "lines", "features", "edges", "region")
+PATTERNS = ("uniform", "grid", "lines", "features")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
 
-SENSORS = ("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e")
-"""LiDARs by data sheet; `pnpdepth_cli.sensors.LIDARS` has the paper's of each as "paper-<name>"."""
+SENSORS = (
+    *("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e"),
+    *("paper-vlp-16", "paper-vlp-32c", "paper-hdl-32e", "paper-hdl-64e"),
+)
+"""LiDARs by data sheet, and as the paper has them: `pnpdepth_cli.sensors.LIDARS`."""
 
 LENSES = ("radial-tangential", "fisheye")
 """Lens distortions: `pnpdepth_cli.sensors.camera`."""

@@ -13,6 +13,7 @@ from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.streams import print_json, say
 from pnpdepth_cli.commands.refinement.request import sample_pattern
 from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
+from pnpdepth_cli.errors import UsageError
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
@@ -55,20 +56,30 @@ def project(
 @click.argument("depth", type=options.FILE)
 @click.option(
     "--pattern",
+    type=click.Choice(PATTERNS),
     default="uniform",
     show_default=True,
-    metavar="NAME",
-    help=f"{', '.join(PATTERNS[:-1])}, or region:X,Y,W,H.",
+    help="Which pixels are sampled.",
 )
 @click.option(
     "--count", metavar="N|P%", help="Number of points (of lines for `lines`), or % of known pixels."
 )
-@click.option("--image", type=options.FILE, help="Image for `features` and `edges`.")
+@click.option("--image", type=options.FILE, help="Image for `features`.")
 @options.seed
 @click.option(
     "--noise",
-    metavar="NOISE,...",
-    help="Gaussian noise of the depth, metres or P%; outliers=P% of random depth; jitter=PIXELS.",
+    metavar="M|P%",
+    help="Standard deviation of Gaussian noise of the depth, metres or %.",
+)
+@click.option(
+    "--outliers", metavar="P%", help="Points whose depth is random, between the least and the most."
+)
+@click.option(
+    "--jitter",
+    type=float,
+    default=0.0,
+    metavar="PX",
+    help="Standard deviation of the noise of the pixel coordinates.",
 )
 @options.depth_scale
 @options.sparse_output
@@ -79,6 +90,8 @@ def sample(
     pattern: str,
     count: str | None,
     noise: str | None,
+    outliers: str | None,
+    jitter: float,
     output: Path,
     overwrite: bool,
     as_json: bool,
@@ -88,36 +101,59 @@ def sample(
 
     \b
     pnpdepth sample gt.png --pattern uniform --count 500 --seed 1 -o sparse.png
-    pnpdepth sample gt.png --count 500 --noise 2%,outliers=5% -o noisy.png
+    pnpdepth sample gt.png --count 500 --noise 2% --outliers 5% -o noisy.png
     pnpdepth sample gt.png --pattern features --count 300 --image rgb.png -o sparse.png
 
     \b
     uniform    N random known pixels
-    bernoulli  each known pixel with the same probability; N is the expected number
     grid       square grid with N nodes on a full map
     lines      all known pixels of N evenly spaced rows
     features   the N strongest ORB corners, as in structure from motion
-    edges      N random pixels on image edges
-    region     all known pixels of a rectangle, or N random ones
 
     The settings, with the seed, are stored in the file (PNG, CSV) and in a JSON file beside it.
     """
     from pnpdepth_cli.commands.sparse import make
+    from pnpdepth_cli.sensors import SampleNoise
 
     values["scale"] = values.pop("depth_scale")
     target = make.SparseTarget(output=output, overwrite=overwrite)
-    chosen, added = sample_pattern(pattern, count), make.read_noise(noise)
+    metres, relative = (0.0, 0.0) if noise is None else _metres_or_fraction("--noise", noise)
+    redrawn, part = (0.0, 0.0) if outliers is None else _metres_or_fraction("--outliers", outliers)
+    if redrawn:
+        raise UsageError(f"--outliers {outliers} is not a percentage such as 5%")
+    added = SampleNoise(metres=metres, relative=relative, outliers=part, jitter_px=jitter)
+    chosen = sample_pattern(pattern, count)
     _print(make.sample_depth(depth, target, chosen, noise=added, **values), as_json=as_json)
+
+
+def _metres_or_fraction(option: str, text: str) -> tuple[float, float]:
+    """(metres, fraction) of `0.05` or `5%`; the other is 0."""
+    try:
+        value = float(text.removesuffix("%"))
+    except ValueError:
+        raise UsageError(f"{option} {text!r} is neither a number such as 0.05 nor 5%") from None
+    return (0.0, value / 100) if text.endswith("%") else (value, 0.0)
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
 @click.argument("depth", type=options.FILE)
 @click.option(
     "--sensor",
-    required=True,
-    metavar="NAME|FILE.toml[,KEY=VALUE,...]",
-    help=f"{', '.join(SENSORS)}, the paper's idealised paper-{SENSORS[0]} etc., or a TOML file; and"
-    " changes of its optional keys.",
+    type=click.Choice(SENSORS),
+    help="LiDAR by its data sheet, or as the paper has it.",
+)
+@click.option(
+    "--beams",
+    type=click.IntRange(1, 4096),
+    metavar="N",
+    help="Beams of another LiDAR, evenly spaced, without noise.",
+)
+@click.option(
+    "--vertical-fov",
+    type=float,
+    nargs=2,
+    metavar="TOP BOTTOM",
+    help="Elevations of its uppermost and lowest beam, degrees.",
 )
 @click.option(
     "--calib",
@@ -140,7 +176,9 @@ def sample(
 @options.as_json
 def simulate(
     depth: Path,
-    sensor: str,
+    sensor: str | None,
+    beams: int | None,
+    vertical_fov: tuple[float, float] | None,
     calib: Path,
     output: Path,
     overwrite: bool,
@@ -151,23 +189,18 @@ def simulate(
 
     \b
     pnpdepth simulate gt.exr --sensor hdl-64e --calib intrinsics.txt --seed 1 -o sparse.png
-    pnpdepth simulate gt.png --sensor my_lidar.toml --calib calib.txt --position calib -o sparse.exr
-    pnpdepth simulate gt.png --sensor vlp-16,dropout=0.1 --calib calib.txt -o sparse.exr
-
-    \b
-    A sensor file:  elevations_deg = [10, 5, 0, -5, -10]
-                    azimuth_step_deg = 0.2
-    Optional keys:  max_range = 80             metres
-                    range_noise = 0.02         metres
-                    angle_noise_deg = 0.05     of each beam
-                    rotation_noise_deg = 0.1   of the whole scanner
-                    dropout = 0.05             fraction of lost beams
+    pnpdepth simulate gt.png --sensor vlp-16 --calib calib.txt --position calib -o sparse.exr
+    pnpdepth simulate gt.png --beams 40 --vertical-fov 15 -25 --calib calib.txt -o sparse.exr
     """
     from pnpdepth_cli.commands.sparse.make import SparseTarget, simulate_scan
+    from pnpdepth_cli.sensors import LIDARS, ideal_lidar
 
+    if (sensor is None) == (beams is None) or (beams is None) != (vertical_fov is None):
+        raise UsageError("give --sensor, or --beams and --vertical-fov")
+    scanner = LIDARS[sensor] if sensor else ideal_lidar(beams or 0, *(vertical_fov or (0, 0)))
     values["scale"] = values.pop("depth_scale")
     target = SparseTarget(output=output, overwrite=overwrite)
-    _print(simulate_scan(depth, target, sensor, calib, **values), as_json=as_json)
+    _print(simulate_scan(depth, target, scanner, calib, **values), as_json=as_json)
 
 
 @click.command(short_help="Write the frames of a ROS bag as files.")

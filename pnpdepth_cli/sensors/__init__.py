@@ -12,6 +12,7 @@ from pnpdepth_cli.sensors.camera import Camera as Camera
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP as FORWARD_LEFT_UP
 from pnpdepth_cli.sensors.lidar import LIDARS as LIDARS
 from pnpdepth_cli.sensors.lidar import Lidar as Lidar
+from pnpdepth_cli.sensors.lidar import ideal_lidar as ideal_lidar
 from pnpdepth_cli.sensors.lidar import simulate_lidar as simulate_lidar
 from pnpdepth_cli.sensors.projection import edge_agreement as edge_agreement
 from pnpdepth_cli.sensors.projection import occluded_in_map as occluded_in_map

@@ -1,6 +1,6 @@
 """Rotating LiDARs, and the points that one would measure in a scene of known dense depth.
 
-The paper's four are lists of beams: by data sheet, and as the paper has them.
+The paper's four are there by data sheet, and as the paper has them.
 
 A rotating LiDAR fires all its beams at every azimuth step. Elevations are degrees above the
 horizontal; its frame is x forward, y left, z up.
@@ -8,7 +8,7 @@ horizontal; its frame is x forward, y left, z up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +45,6 @@ class Lidar:
     range_noise: float = 0.0  # metres
     angle_noise_deg: float = 0.0
     """Of the direction of each measurement, in elevation and in azimuth."""
-    rotation_noise_deg: float = 0.0  # of a rotation of the whole scanner about each axis
-    dropout: float = 0.0  # fraction of beams without return
 
     def __post_init__(self) -> None:
         angles, step = np.array(self.elevations_deg, np.float64), self.azimuth_step_deg
@@ -62,10 +60,6 @@ class Lidar:
             ),
             f"max_range must be > 0, got {self.max_range:g}": not self.max_range > 0,
             "noise must be >= 0": not all(0 <= size < np.inf for size in noise),
-            f"rotation_noise_deg must be 0 to 360, got {self.rotation_noise_deg:g}": (
-                not 0 <= self.rotation_noise_deg <= 360
-            ),
-            f"dropout must be >= 0 and < 1, got {self.dropout:g}": not 0 <= self.dropout < 1,
         }
         for fault, holds in faults.items():
             if holds:
@@ -138,7 +132,24 @@ LIDARS = {
     )
     for name, (fov_deg, step_deg, top_deg) in _PAPER_FOV.items()
 }
-"""The scanners that can be named; `choices.SENSORS` lists those by data sheet."""
+"""The scanners that can be named, as `choices.SENSORS` lists them."""
+
+
+def ideal_lidar(beams: int, top_deg: float, bottom_deg: float) -> Lidar:
+    """Returns a scanner without noise and limit of range, with a VLP-16's azimuth step.
+
+    Args:
+        beams: Their number, evenly spaced in elevation.
+        top_deg: Elevation of the uppermost beam.
+        bottom_deg: Elevation of the lowest beam, below the uppermost.
+
+    Raises:
+        UsageError: There is no such scanner.
+    """
+    if not top_deg > bottom_deg and beams > 1:
+        raise UsageError(f"the field of view from {top_deg:g}° down to {bottom_deg:g}° is empty")
+    elevations = evenly_spaced(top_deg, (top_deg - bottom_deg) / max(beams - 1, 1), beams)
+    return Lidar(name=f"{beams} beams", elevations_deg=elevations, azimuth_step_deg=0.2)
 
 
 def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, seed: int) -> Points:
@@ -155,15 +166,13 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     """
     size = (depth.shape[0], depth.shape[1])
     rng = np.random.default_rng(seed)
-    turned = _rotated(camera, sensor.rotation_noise_deg, rng)
-    beams = sensor.directions(rng) @ turned.rotation.T
+    beams = sensor.directions(rng) @ camera.rotation.T
     drops = DropCounter()
-    z = _depth_at_first_hit(np.asarray(depth, np.float64), turned, beams)
+    z = _depth_at_first_hit(np.asarray(depth, np.float64), camera, beams)
     met = drops.keep(np.isfinite(z), "meets nothing that the camera sees")
     distance = (z[met] - camera.translation[2]) / beams[met, 2]
     kept = drops.keep(distance <= sensor.max_range, "out of range")
-    returned = drops.keep(rng.random(np.count_nonzero(kept)) >= sensor.dropout, "dropped out")
-    distance, beams = distance[kept][returned], beams[met][kept][returned]
+    distance, beams = distance[kept], beams[met][kept]
     if sensor.range_noise > 0:
         distance = distance + rng.normal(0, sensor.range_noise, len(distance))
     points = camera.translation + beams * distance[:, None]
@@ -184,16 +193,6 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
         size=size,
         dropped=drops.dropped,
     )
-
-
-def _rotated(camera: Camera, std_deg: float, rng: np.random.Generator) -> Camera:
-    """The camera with the scanner rotated at random about its own origin."""
-    if std_deg == 0:
-        return camera
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_euler("xyz", rng.normal(0, std_deg, 3), degrees=True)
-    return replace(camera, rotation=camera.rotation @ turn.as_matrix())
 
 
 def _depth_at_first_hit(depth: Floats, camera: Camera, directions: Floats) -> Floats:

@@ -23,8 +23,6 @@ class SamplePattern:
     kind: str = "uniform"  # one of `choices.PATTERNS`
     count: int | None = None  # number of points, or of lines for `lines`; None with a fraction
     fraction: float | None = None  # fraction of the known pixels, 0 to 1; None with a count
-    region: tuple[int, int, int, int] | None = None
-    """x, y, width and height in pixels, for `region` alone."""
 
     def __post_init__(self) -> None:
         count, fraction = self.count, self.fraction
@@ -36,16 +34,14 @@ class SamplePattern:
             raise UsageError("give at least one point, or a fraction above 0 and at most 100 %")
         if self.kind == "lines" and count is None:
             raise UsageError("pattern 'lines' needs the number of lines as its count")
-        if self.kind != "region" and count is None and fraction is None:
+        if count is None and fraction is None:
             raise UsageError(f"pattern {self.kind!r} needs a count, N or N %")
-        if (self.region is None) == (self.kind == "region"):
-            raise UsageError("pattern 'region', and only it, has a rectangle: region:X,Y,W,H")
 
     def wanted(self, known: int) -> int:
         """Returns the number of points to sample from `known` pixels."""
-        if self.fraction is not None:
-            return max(1, round(self.fraction * known))
-        return known if self.count is None else self.count
+        if self.count is not None:
+            return self.count
+        return max(1, round((self.fraction or 0) * known))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,21 +77,6 @@ class Scene:
         """The number of points to sample."""
         return self.pattern.wanted(self.known.size)
 
-    @property
-    def grey(self) -> NDArray[np.uint8]:
-        """The image in grey. Raises UsageError if there is none."""
-        if self.image is None:
-            kind = self.pattern.kind
-            raise UsageError(f"pattern {kind!r} needs the image that the depth belongs to")
-        grey = self.image @ np.array([0.299, 0.587, 0.114], np.float32)
-        return np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)
-
-    def chosen(self, pixels: Pixels, count: int) -> Pixels:
-        """Returns a random choice of pixels. Raises UsageError for more than there are."""
-        if count > pixels.size:
-            raise UsageError(f"{count:,} points of {pixels.size:,} known pixels; ask for fewer")
-        return self.rng.choice(pixels, count, replace=False)
-
 
 def sample_points(
     depth: NDArray[np.float32],
@@ -111,7 +92,7 @@ def sample_points(
         depth: (H, W) metres, 0 = unknown.
         pattern: Which pixels are sampled.
         seed: Of the pattern and the noise.
-        image: (H, W, 3) in 0..1 of the same view, for `features` and `edges`.
+        image: (H, W, 3) in 0..1 of the same view, for `features`.
         noise: Added to the points; None for none.
 
     Raises:
@@ -142,13 +123,10 @@ def sample_points(
 
 
 def _uniform(scene: Scene) -> Pixels:
-    return scene.chosen(scene.known, scene.wanted)
-
-
-def _bernoulli(scene: Scene) -> Pixels:
-    """Each known pixel with the same probability; the count is only the expected one."""
-    count = scene.known.size
-    return scene.known[scene.rng.random(count) < scene.wanted / count]
+    count = scene.wanted
+    if count > scene.known.size:
+        raise UsageError(f"{count:,} points of {scene.known.size:,} known pixels; ask for fewer")
+    return scene.rng.choice(scene.known, count, replace=False)
 
 
 def _grid(scene: Scene) -> Pixels:
@@ -178,10 +156,14 @@ def _lines(scene: Scene) -> Pixels:
 
 def _features(scene: Scene) -> Pixels:
     """The strongest ORB corners with known depth, as structure from motion has its points."""
+    if scene.image is None:
+        raise UsageError("pattern 'features' needs the image that the depth belongs to")
+    grey = scene.image @ np.array([0.299, 0.587, 0.114], np.float32)
+    codes = np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)
     # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
     wanted = scene.wanted
     detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
-    corners = sorted(detector.detect(scene.grey), key=lambda corner: -corner.response)
+    corners = sorted(detector.detect(codes), key=lambda corner: -corner.response)
     xy = np.array([corner.pt for corner in corners], np.float64).reshape(-1, 2)
     column, row = np.rint(xy).astype(np.intp).T
     pixels = row * scene.size[1] + column
@@ -191,25 +173,7 @@ def _features(scene: Scene) -> Pixels:
     return kept
 
 
-def _edges(scene: Scene) -> Pixels:
-    """Known pixels on the image's edges (Canny), a random choice of the wanted count."""
-    edges = cv2.Canny(cv2.GaussianBlur(scene.grey, (5, 5), 0), 30, 90)
-    candidates = np.intersect1d(np.flatnonzero(edges), scene.known)
-    return scene.chosen(candidates, min(scene.wanted, candidates.size))
-
-
-def _region(scene: Scene) -> Pixels:
-    """Known pixels of a rectangle: all, or a random choice of the wanted count."""
-    left, top, width, height = scene.pattern.region or (0, 0, 0, 0)
-    row, column = np.divmod(scene.known, scene.size[1])
-    inside = (column >= left) & (column < left + width) & (row >= top) & (row < top + height)
-    if not inside.any():
-        raise NoPointsError(f"no known pixel in the region {left},{top},{width},{height}; check it")
-    pixels = scene.known[inside]
-    return scene.chosen(pixels, scene.pattern.wanted(pixels.size))
-
-
-_FUNCTIONS = (_uniform, _bernoulli, _grid, _lines, _features, _edges, _region)
+_FUNCTIONS = (_uniform, _grid, _lines, _features)
 PATTERNS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
 """The patterns by name, as in `choices.PATTERNS`; each returns row-major indices of pixels."""
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.sensors import LIDARS, Lidar
+from pnpdepth_cli.sensors import LIDARS, Lidar, ideal_lidar
 
 
 @pytest.mark.parametrize(
@@ -49,6 +49,19 @@ def test_the_papers_variant_is_evenly_spaced_over_its_field_of_view(
     assert fov - step < angles[0] - angles[-1] <= fov + 1e-5
 
 
+def test_a_lidar_of_ones_own_has_evenly_spaced_beams_and_no_noise() -> None:
+    own = ideal_lidar(5, 15, -25)
+    assert own == Lidar(
+        name="5 beams", elevations_deg=(15, 5, -5, -15, -25), azimuth_step_deg=0.2, max_range=np.inf
+    )
+    assert ideal_lidar(1, 3, 3).elevations_deg == (3,)
+    for top, bottom in ((-25, 15), (3, 3), (np.nan, 0)):
+        with pytest.raises(UsageError, match="is empty"):
+            ideal_lidar(5, top, bottom)
+    with pytest.raises(UsageError, match="between −90° and 90°"):
+        ideal_lidar(2, 91, 0)
+
+
 def test_directions_are_unit_vectors_at_the_sensors_angles() -> None:
     sensor = Lidar(name="two", elevations_deg=(30, -10), azimuth_step_deg=90, max_range=10)
     beams = sensor.directions(np.random.default_rng(0)).reshape(2, 4, 3)
@@ -70,8 +83,6 @@ def lidar(**values: object) -> Lidar:
         ("max_range", [0.0, -1.0, np.nan], [0.1], "max_range must be > 0"),
         ("range_noise", [-0.1, np.inf, np.nan], [0.0], "noise must be >= 0"),
         ("angle_noise_deg", [-0.1, np.inf], [0.0, 400.0], "noise must be >= 0"),
-        ("rotation_noise_deg", [-0.1, 360.1, np.nan], [0.0, 360.0], "must be 0 to 360"),
-        ("dropout", [-0.1, 1.0, np.nan], [0.0, 0.99], "must be >= 0 and < 1"),
     ],
 )
 def test_a_sensor_that_cannot_be_is_refused_and_one_at_the_bounds_taken(

@@ -17,8 +17,7 @@ def checkerboard() -> np.ndarray:
 
 
 def pattern(kind: str) -> SamplePattern:
-    region = (10, 20, 30, 25) if kind == "region" else None
-    return SamplePattern(kind=kind, count=9 if kind == "lines" else 40, region=region)
+    return SamplePattern(kind=kind, count=9 if kind == "lines" else 40)
 
 
 @pytest.mark.parametrize("kind", PATTERNS)
@@ -37,15 +36,6 @@ def test_uniform_returns_exactly_the_requested_number(count: int) -> None:
     assert len(sample_points(HOLES, SamplePattern(count=count), 1)) == count
     some = sample_points(HOLES, SamplePattern(fraction=count / 4000), 1)
     assert len(some) == round(count / 4000 * known)
-
-
-def test_bernoulli_gives_the_number_on_average_but_not_exactly() -> None:
-    counts = [
-        len(sample_points(HOLES, SamplePattern(kind="bernoulli", count=300), seed).depth)
-        for seed in range(40)
-    ]
-    assert len(set(counts)) > 5
-    assert np.mean(counts) == pytest.approx(300, abs=4 * 300**0.5 / 40**0.5)
 
 
 def test_grid_gives_evenly_spaced_points_of_about_the_number() -> None:
@@ -82,25 +72,6 @@ def test_features_lie_at_the_corners_of_the_image() -> None:
     assert (away.min(axis=0) <= 6).all()
 
 
-def test_edges_lie_on_the_edges_of_the_image() -> None:
-    got = sample_points(DEPTH, SamplePattern(kind="edges", count=60), 0, image=checkerboard())
-    to_line = np.abs(got.xy - 12 * np.rint(got.xy / 12)).min(axis=1)
-    assert to_line.max() <= 2
-    every = sample_points(DEPTH, SamplePattern(kind="edges", count=4800), 0, image=checkerboard())
-    assert len(got) < len(every) < 4800
-    assert np.isin(got.depth, every.depth).all()
-
-
-def test_region_keeps_all_of_it_or_a_number_at_random() -> None:
-    area = (10, 20, 30, 25)
-    everything = sample_points(DEPTH, SamplePattern(kind="region", region=area), 0)
-    assert len(everything.depth) == 30 * 25
-    assert everything.xy.min(axis=0).tolist() == [10, 20]
-    assert everything.xy.max(axis=0).tolist() == [39, 44]
-    some = sample_points(DEPTH, SamplePattern(kind="region", region=area, count=17), 0)
-    assert len(some.depth) == 17
-
-
 def test_noise_has_the_requested_size() -> None:
     every = SamplePattern(count=DEPTH.size)
     clean = sample_points(DEPTH, every, 3)
@@ -135,8 +106,6 @@ def test_jitter_moves_positions_and_keeps_depths() -> None:
         ({"count": 3, "fraction": 0.1}, "not both"),
         ({}, "needs a count"),
         ({"kind": "lines"}, "number of lines"),
-        ({"kind": "region", "count": 3}, "region"),
-        ({"count": 3, "region": (0, 0, 1, 1)}, "region"),
     ],
 )
 def test_a_pattern_that_makes_no_sense_is_refused(options: dict[str, object], message: str) -> None:
@@ -150,12 +119,13 @@ def test_what_the_depth_map_cannot_give_is_refused() -> None:
     plain = np.full((60, 80, 3), 0.5, np.float32)
     with pytest.raises(NoPointsError, match="leaves no point"):
         sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=plain)
-    with pytest.raises(NoPointsError, match=r"\b100,0,5,5"):
-        sample_points(DEPTH, SamplePattern(kind="region", region=(100, 0, 5, 5)), 0)
+    with pytest.raises(UsageError, match="'features' needs the image"):
+        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0)
+    with pytest.raises(UsageError, match="4,801 points of 4,800 known pixels"):
+        sample_points(DEPTH, SamplePattern(count=4801), 0)
+    image = np.zeros((30, 40, 3), np.float32)
     with pytest.raises(SizeError, match=r"\b40×30"):
-        sample_points(
-            DEPTH, SamplePattern(kind="edges", count=3), 0, image=np.zeros((30, 40, 3), np.float32)
-        )
+        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=image)
 
 
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])

@@ -287,25 +287,15 @@ def count_or_fraction(text: str) -> tuple[int | None, float | None]:
 
 
 def sample_pattern(kind: str, text: str | None) -> SamplePattern:
-    """Returns the pattern of `uniform` or `region:X,Y,W,H`, with `500` points or `5%`.
+    """Returns the pattern of this kind, with `500` points or `5%`.
 
     Raises:
-        UsageError: One of the texts is of another form.
+        UsageError: There is no such pattern, or the number is none.
     """
     from pnpdepth_cli.sensors import SamplePattern
 
-    kind, colon, rectangle = kind.partition(":")
     count, fraction = (None, None) if text is None else count_or_fraction(text)
-    region = None
-    if colon:
-        try:
-            left, top, width, height = (int(word) for word in rectangle.split(","))
-        except ValueError:
-            raise UsageError(
-                f"pattern {kind}:{rectangle} is not of the form region:X,Y,W,H"
-            ) from None
-        region = left, top, width, height
-    return SamplePattern(kind=kind, count=count, fraction=fraction, region=region)
+    return SamplePattern(kind=kind, count=count, fraction=fraction)
 
 
 def parse_sample(text: str | None) -> SamplePattern | None:

@@ -19,12 +19,10 @@ from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.sensor_file import OPTIONAL, read_sensor
 from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
 from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
-    LIDARS,
     Camera,
     Lidar,
     Points,
@@ -174,7 +172,7 @@ def sample_depth(
         target: Files to write.
         pattern: Which pixels are sampled.
         noise: Added to the points; None for none.
-        image: For the patterns that need one.
+        image: For `features`.
         seed: Of all random choices.
         **reading: Options of `read_depth`.
     """
@@ -185,7 +183,7 @@ def sample_depth(
     points = sample_points(dense, pattern, seed, image=rgb, noise=noise)
     wanted = pattern.wanted(int(np.count_nonzero(dense)))
     sampled = len(points) + sum(points.dropped.values())
-    if pattern.kind in ("features", "edges") and sampled < wanted:
+    if pattern.kind == "features" and sampled < wanted:
         notes.append(f"warning: the image has {sampled:,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, f'{pattern.kind}, seed {seed}')}")
     settings = {"pattern": asdict(pattern), "noise": asdict(noise), "seed": seed}
@@ -196,7 +194,7 @@ def sample_depth(
 def simulate_scan(
     depth: Path,
     target: SparseTarget,
-    spec: str,
+    sensor: Lidar,
     calib: Path,
     *,
     camera: int | None = None,
@@ -209,7 +207,7 @@ def simulate_scan(
     Args:
         depth: The file of the map.
         target: Files to write.
-        spec: The sensor, as `find_sensor` takes it.
+        sensor: The scanner.
         calib: Calibration of the camera.
         camera: Which camera of it.
         position: Of the scanner: metres right of, below and in front of the camera as X,Y,Z, or
@@ -217,8 +215,7 @@ def simulate_scan(
         seed: Of all noise.
         **reading: Options of `read_depth`.
     """
-    sensor = find_sensor(spec)
-    target.check((depth, calib, Path(spec.partition(",")[0])))
+    target.check((depth, calib))
     dense, notes = _dense(depth, **reading)
     calibration = read_calibration(calib, camera)
     notes += check_size(calib, calibration, (dense.shape[0], dense.shape[1]), depth)
@@ -244,53 +241,6 @@ def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
     )
     unlikely = implausible(dense.values, dense.scale)
     return dense.values, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
-
-
-def read_noise(text: str | None) -> SampleNoise:
-    """Returns the noise of `0.05` metres, `2%` of the depth, `outliers=10%` and `jitter=1` pixel.
-
-    Several are separated by commas. Raises UsageError for any other text.
-    """
-    names = {"outliers": "outliers", "jitter": "jitter_px"}
-    values: dict[str, float] = {}
-    for word in filter(None, (text or "").split(",")):
-        name, equals, number = word.rpartition("=")
-        try:
-            value = float(number.removesuffix("%")) / (100 if number.endswith("%") else 1)
-            key = names[name] if equals else ("relative" if number.endswith("%") else "metres")
-        except (ValueError, KeyError):
-            raise UsageError(
-                f"--noise must be metres, P%, outliers=P% or jitter=PIXELS, got {word!r}"
-            ) from None
-        values[key] = value
-    return SampleNoise(**values)
-
-
-def find_sensor(spec: str) -> Lidar:
-    """Returns the sensor of `NAME` or `FILE.toml`, with `,key=value` of `OPTIONAL` after it.
-
-    Raises:
-        UsageError: There is no sensor of this name, or it is described wrongly.
-        InputError: The file cannot be read.
-    """
-    name, *changes = spec.split(",")
-    if name in LIDARS:
-        sensor = LIDARS[name]
-    elif Path(name).suffix.lower() == ".toml":
-        sensor = Lidar(**read_sensor(Path(name)))
-    else:
-        known = ", ".join(LIDARS)
-        raise UsageError(f"no sensor {name!r}; --sensor is a TOML file or one of: {known}")
-    values: dict[str, Any] = {}
-    for change in changes:
-        key, _, value = change.partition("=")
-        try:
-            values[OPTIONAL[OPTIONAL.index(key)]] = float(value)
-        except ValueError:
-            raise UsageError(
-                f"--sensor {spec}: {change!r} is not NAME=NUMBER with one of {', '.join(OPTIONAL)}"
-            ) from None
-    return replace(sensor, **values)
 
 
 def _placed(path: Path, calibration: Calibration, position: str | None) -> Camera:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,7 @@ from scipy.spatial import cKDTree
 
 from pnpdepth_cli.commands.sparse.make import (
     SparseTarget,
-    find_sensor,
     project_scan,
-    read_noise,
     sample_depth,
     simulate_scan,
 )
@@ -33,7 +30,7 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.sparse_files import read_sparse
-from pnpdepth_cli.sensors import LIDARS, SampleNoise, SamplePattern
+from pnpdepth_cli.sensors import Lidar, SampleNoise, SamplePattern, ideal_lidar
 from tests.commands.scan_frames import ScanOnDisk, scan_on_disk
 
 
@@ -149,48 +146,29 @@ def test_the_seed_is_in_the_png_and_in_the_record_and_decides_every_byte(frame: 
     assert json.loads((frame.folder / "a.json").read_text())["seed"] == 11
 
 
-def test_fewer_edges_than_requested_are_reported(frame: ScanOnDisk) -> None:
+def test_fewer_features_than_requested_are_reported(frame: ScanOnDisk) -> None:
     image = np.zeros((48, 64, 3), np.uint8)
-    image[:, 30:] = 255
+    image[12:36, 16:48] = 255
     cv2.imwrite(str(frame.image), image)
-    record = sampled(frame, "e.png", kind="edges", count=3000, image=frame.image)
+    record = sampled(frame, "e.png", kind="features", count=3000, image=frame.image)
     assert record["points"]["count"] < 3000
     assert any("of the 3,000 points asked for" in note for note in record["notes"])
 
 
-def simulated(frame: ScanOnDisk, output: str, sensor: str, **more: Any) -> dict[str, Any]:
+def simulated(frame: ScanOnDisk, output: str, sensor: Lidar, **more: Any) -> dict[str, Any]:
     target = SparseTarget(output=frame.folder / output)
     return simulate_scan(frame.gt, target, sensor, frame.calib, **more)
 
 
 def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
-    sensor = frame.folder / "mine.toml"
-    sensor.write_text("top_deg = 20\nstep_deg = 2\nbeams = 21\nazimuth_step_deg = 0.5\n")
+    sensor = ideal_lidar(21, 20, -20)
     for output, position in (("camera.csv", {}), ("scanner.csv", {"position": "calib"})):
-        record = simulated(frame, output, str(sensor), **position)
+        record = simulated(frame, output, sensor, **position)
         got = read_sparse(frame.folder / output, size=(60, 100)).points
         np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
-        assert record["sensor"]["name"] == "mine"
+        assert record["sensor"]["name"] == "21 beams"
         assert record["sensor"]["max_range"] is None
         assert len(got.depth) > 500
-
-
-def test_noise_is_read_as_it_is_written() -> None:
-    assert read_noise(None) == SampleNoise()
-    assert read_noise("0.05") == SampleNoise(metres=0.05)
-    several = SampleNoise(relative=0.02, outliers=0.1, jitter_px=1)
-    assert read_noise("2%,outliers=10%,jitter=1") == several
-    for text in ("much", "blur=1", "jitter="):
-        with pytest.raises(UsageError, match="--noise must be metres"):
-            read_noise(text)
-
-
-def test_a_named_sensor_can_be_changed() -> None:
-    sensor = find_sensor("vlp-16,dropout=0.1,max_range=30")
-    assert sensor == replace(LIDARS["vlp-16"], dropout=0.1, max_range=30)
-    for spec in ("vlp-16,beams=3", "vlp-16,dropout", "vlp-16,dropout=x"):
-        with pytest.raises(UsageError, match="is not NAME=NUMBER"):
-            find_sensor(spec)
 
 
 def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(

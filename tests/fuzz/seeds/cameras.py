@@ -1,4 +1,4 @@
-"""Calibrations, extrinsics and sensors."""
+"""Calibrations and extrinsics."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _FISHEYE = "distortion: [-0.02, 0.01, -0.003, 0.001]\nlens: fisheye\n"
 
 
 def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
-    """Returns calibrations of every tool, poses of a scanner in every form, and a sensor."""
-    return [*_calibrations(folder), *_extrinsics(folder), _sensor(folder)]
+    """Returns calibrations of every tool, and poses of a scanner in every form."""
+    return [*_calibrations(folder), *_extrinsics(folder)]
 
 
 def _project(*options: str) -> tuple[str, ...]:
@@ -78,12 +78,3 @@ def _extrinsics(folder: Path) -> list[Seed]:
         options = _project("--calib", "ros.yaml", "--scan", f"extrinsics={name}")
         seeds.append(Seed(file=name, command=options))
     return seeds
-
-
-def _sensor(folder: Path) -> Seed:
-    (folder / "lidar.toml").write_text(
-        "elevations_deg = [10, 5, 0, -5, -10]\nazimuth_step_deg = 0.5\nmax_range = 80\n"
-        "range_noise = 0.02\n"
-    )
-    options = ("--sensor", "lidar.toml", "--calib", "k.txt", *OUT)
-    return Seed(file="lidar.toml", command=("simulate", "gt.npy", *options))
