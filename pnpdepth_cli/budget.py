@@ -7,10 +7,11 @@ for the whole process, all threads included.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.errors import FileFormatError, UsageError
 
 _MOST_PIXELS = 64_000_000  # of the largest common cameras
 _MOST_FILE_BYTES = 1 << 30
@@ -59,16 +60,36 @@ def budget() -> Budget:
     )
 
 
-def size_problem(path: Path, most: int | None = None) -> str | None:
-    """Returns why an existing file of a network or its weights is too large to be read, or None.
+def check_claim(
+    claim: str,
+    size: int,
+    most: int,
+    *,
+    error: Callable[[str], Exception] = FileFormatError,
+    way_out: str = "",
+) -> None:
+    """Raises the error if a file claims more than may be taken, or less than nothing.
 
-    Allowed are `most` bytes; without a number, `max_decoded_bytes`.
+    Every reader calls this with what a file claims, before memory is taken for it.
+
+    Args:
+        claim: What claims how much, as in "a.png has 9 pixels": the beginning of the message.
+        size: Bytes, pixels, values or entries claimed.
+        most: Largest size allowed.
+        error: Makes the error of a message.
+        way_out: End of the message.
     """
-    most = budget().max_decoded_bytes if most is None else most
+    if not 0 <= size <= most:
+        raise error(f"{claim}, more than {most:,}{f'; {way_out}' if way_out else ''}")
+
+
+def check_network_file(path: Path, kind: str, error: Callable[[str], Exception]) -> None:
+    """Raises the error if an existing file of a network, or of its weights, is too large.
+
+    The kind names the file in the message, as in "checkpoint".
+    """
     size = path.stat().st_size
-    if size <= most:
-        return None
-    return f"has {size:,} bytes; at most {most:,} are read on this machine"
+    check_claim(f"{kind} {path} has {size:,} bytes", size, budget().max_decoded_bytes, error=error)
 
 
 def set_max_pixels(max_pixels: int | None) -> None:

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from pnpdepth_cli.budget import budget, set_max_pixels
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.budget import budget, check_claim, set_max_pixels
+from pnpdepth_cli.errors import FileFormatError, ModelError, UsageError
 
 
 @pytest.fixture(autouse=True)
@@ -29,6 +29,15 @@ def test_the_default_is_64_megapixels_or_less_and_files_grow_with_max_pixels() -
     assert budget().max_file_bytes == 1 << 30
     assert budget().max_image_bytes == 8 * budget().max_pixels
     assert budget().max_decoded_bytes > 32 * budget().max_pixels
+
+
+def test_a_claim_is_refused_above_the_most_and_below_nothing() -> None:
+    check_claim("a has 5 bytes", 5, 5)
+    for size in (6, -1):
+        with pytest.raises(FileFormatError, match=r"^a has bytes, more than 5; make it smaller$"):
+            check_claim("a has bytes", size, 5, way_out="make it smaller")
+    with pytest.raises(ModelError):
+        check_claim("a has 6 bytes", 6, 5, error=ModelError)
 
 
 def test_a_small_file_may_hold_an_image_of_one_colour_but_not_any_number_of_values() -> None:

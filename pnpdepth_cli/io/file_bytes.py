@@ -5,8 +5,10 @@ from __future__ import annotations
 import stat
 from pathlib import Path
 
-from pnpdepth_cli.budget import budget
+from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.errors import FileFormatError, InputError
+
+_SMALLER = "make it smaller, or allow more with --max-pixels"
 
 
 def read_bytes(path: Path) -> bytes:
@@ -17,11 +19,7 @@ def read_bytes(path: Path) -> bytes:
         FileFormatError: It is empty, or larger than the budget.
     """
     size, limit = size_of_regular_file(path), budget().max_file_bytes
-    if size > limit:
-        raise FileFormatError(
-            f"{path} has {size:,} bytes, more than {limit:,}; make it smaller, or allow more with"
-            " --max-pixels"
-        )
+    check_claim(f"{path} has {size:,} bytes", size, limit, way_out=_SMALLER)
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -97,15 +95,10 @@ def check_value_count(
 ) -> None:
     """Raises FileFormatError for an array of more values than the budget."""
     what = what or f"{count:,} values"
-    allow = "make it smaller, or allow more with --max-pixels"
     limits, decoded = budget(), count * value_bytes
-    if count > limits.max_pixels:
-        raise FileFormatError(f"{path} has {what}, more than {limits.max_pixels:,}; {allow}")
-    if decoded > limits.max_image_bytes:
-        raise FileFormatError(
-            f"{path} has {what} in {decoded:,} bytes, more than {limits.max_image_bytes:,}; {allow}"
-        )
-    if file_bytes is not None and count > limits.max_values_from(file_bytes):
-        raise FileFormatError(
-            f"{path} claims {what} in {file_bytes:,} bytes, which cannot be true; create it again"
-        )
+    check_claim(f"{path} has {what}", count, limits.max_pixels, way_out=_SMALLER)
+    as_bytes = f"{path} has {what} in {decoded:,} bytes"
+    check_claim(as_bytes, decoded, limits.max_image_bytes, way_out=_SMALLER)
+    if file_bytes is not None:
+        claim = f"{path} claims {what} in {file_bytes:,} bytes"
+        check_claim(claim, count, limits.max_values_from(file_bytes), way_out="create it again")

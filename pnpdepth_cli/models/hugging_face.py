@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from pnpdepth_cli.budget import size_problem
+from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.user_code import describe
@@ -176,8 +176,8 @@ def _json(file: Path, why: str) -> Mapping[str, Any]:
             f"{file.parent} is not a Hugging Face folder: {file.name} is missing, and {why};"
             " take it from the network's page"
         )
-    if problem := size_problem(file, _MOST_JSON_BYTES):
-        raise ModelError(f"{file} {problem}")
+    size = file.stat().st_size
+    check_claim(f"{file} has {size:,} bytes", size, _MOST_JSON_BYTES, error=ModelError)
     try:
         settings = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

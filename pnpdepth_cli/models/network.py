@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.budget import budget
+from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.core.split import InputSplit, Split
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
@@ -253,11 +253,10 @@ def _with_suggested_layers(network: Network) -> Network:
     size = network.definition.size
     if isinstance(size, Fixed):
         height, width = size.height, size.width
-        if height * width > budget().max_pixels:
-            raise ModelError(
-                f"network {network.definition.name!r} takes images of {height}×{width} pixels;"
-                f" at most {budget().max_pixels:,} are allowed; raise --max-pixels"
-            )
+        check_claim(
+            f"network {network.definition.name!r} takes images of {height}×{width} pixels",
+            height * width, budget().max_pixels, error=ModelError, way_out="raise --max-pixels",
+        )  # fmt: skip
     else:
         height = width = -(-_SUGGESTION_SIDE // size.of) * size.of
     with out_of_memory_is_a_device_error(network.device):

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.budget import size_problem
+from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
@@ -155,8 +155,7 @@ def exported_definition(file: Path) -> ModelDefinition:
     """
     if not file.is_file():
         raise ModelError(f"exported program {file} does not exist")
-    if problem := size_problem(file):
-        raise ModelError(f"exported program {file} {problem}")
+    check_network_file(file, "exported program", ModelError)
     try:
         program, tensors = _read(file)
         graph = ExportedGraph(program, tensors)

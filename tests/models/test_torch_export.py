@@ -155,9 +155,9 @@ HOSTILE: dict[str, tuple[str, Change, str]] = {
         )
     },
     "pickled weights": (WEIGHTS, first_weight(use_pickle=True), "is pickled"),
-    "a large weight": (WEIGHTS, first_weight(sizes=HUGE, strides=HUGE), "elements from"),
+    "a large weight": (WEIGHTS, first_weight(sizes=HUGE, strides=HUGE), "elements, more than"),
     "a repeated weight": (
-        WEIGHTS, first_weight(sizes=HUGE, strides=[{"as_int": 0}]), "elements from"
+        WEIGHTS, first_weight(sizes=HUGE, strides=[{"as_int": 0}]), "elements, more than"
     ),
     "a weight outside": (WEIGHTS, first_weight(path_name="../../../etc/hostname"), "KeyError"),
     "a negative offset": (WEIGHTS, first_weight(storage_offset={"as_int": -1}), "offset"),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.budget import budget, size_problem
+from pnpdepth_cli.budget import budget, check_network_file
 from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
@@ -320,7 +320,8 @@ def _stack(path: Path) -> list[NDArray[Any]] | None:
     """
     try:
         if path.suffix.lower() == ".npy":
-            data = b"" if size_problem(path) else path.read_bytes()
+            check_network_file(path, "stack", FileFormatError)
+            data = path.read_bytes()
         else:
             with zipfile.ZipFile(path) as archive:
                 (member,) = archive.infolist()

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten
 
-from pnpdepth_cli.budget import budget
+from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.onnx.table import Unsupported
 
@@ -55,8 +55,9 @@ def load_external(model: Any, folder: Path) -> None:
     sizes = {claim.location: (folder / claim.location).stat().st_size for claim in claims}
     claimed = sum(claim.length or sizes[claim.location] for claim in claims)
     most = min(_SHARED * sum(sizes.values()), budget().max_decoded_bytes)
-    if claimed > most:
-        raise ValueError(f"its tensors claim {claimed:,} bytes of other files, more than {most:,}")
+    check_claim(
+        f"its tensors have {claimed:,} bytes in other files", claimed, most, error=ValueError
+    )
     external.load_external_data_for_model(model, str(folder))
 
 
@@ -79,14 +80,11 @@ def inlined(model: Any, path: Path) -> Any:
         return sum(written_out(call) if call in functions else _NODE_BYTES for call in calls)
 
     try:
-        too_large = size(model.graph) > _MAX_WRITTEN_OUT
+        claimed = size(model.graph)
     except RecursionError:
         raise ModelError(f"ONNX file {path}: its functions call each other without end") from None
-    if too_large:
-        raise ModelError(
-            f"ONNX file {path}: its functions, written out, are more than"
-            f" {_MAX_WRITTEN_OUT / 1e6:,.0f} MB"
-        )
+    claim = f"ONNX file {path}: its functions, written out, are {claimed:,} bytes"
+    check_claim(claim, claimed, _MAX_WRITTEN_OUT, error=ModelError)
     from onnx import inliner
 
     return inliner.inline_local_functions(model)

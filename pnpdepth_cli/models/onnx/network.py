@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
@@ -131,8 +132,8 @@ def _as_map(output: Any) -> Tensor:
 def _read(file: Path) -> Any:
     if not file.is_file():
         raise ModelError(f"ONNX file {file} does not exist")
-    if file.stat().st_size > _MAX_BYTES:
-        raise ModelError(f"ONNX file {file} is larger than 2 GB, which no ONNX file is")
+    size = file.stat().st_size
+    check_claim(f"ONNX file {file} has {size:,} bytes", size, _MAX_BYTES, error=ModelError)
     try:
         import onnx
         import onnxruntime  # noqa: F401

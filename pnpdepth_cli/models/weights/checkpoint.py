@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from pnpdepth_cli.budget import size_problem
+from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
@@ -201,8 +201,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
             f"checkpoint {path} is a Git LFS pointer, not the file it points to; `git lfs pull`"
             " fetches that"
         )
-    if problem := size_problem(path):
-        raise CheckpointError(f"checkpoint {path} {problem}")
+    check_network_file(path, "checkpoint", CheckpointError)
     kind, read = _READERS.get(path.suffix, ("torch file", read_torch_file))
     try:
         content = read(path)

@@ -8,7 +8,7 @@ Memory stays bounded by the size of the file.
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import IO, Any
@@ -19,6 +19,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, StandIn, read_pickle
 
 _RECONSTRUCT = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
@@ -37,9 +38,10 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
         return _read_pickled_dict(path)
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
-    limit = _MAX_INFLATION * path.stat().st_size + _ALWAYS_ALLOWED
-    if sum(info.file_size for info in entries) > limit or len(entries) > _MAX_ENTRIES:
-        raise BrokenFileError("its arrays are far larger than the file")
+    claimed = sum(info.file_size for info in entries)
+    most = _MAX_INFLATION * path.stat().st_size + _ALWAYS_ALLOWED
+    check_claim(f"its arrays have {claimed:,} bytes", claimed, most, error=BrokenFileError)
+    _check_entries(entries)
     if any(i.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for i in entries):
         raise BrokenFileError("it is compressed as numpy never does")
     with np.load(path, allow_pickle=False) as arrays:
@@ -61,8 +63,9 @@ def read_pickled_arrays(content: IO[bytes]) -> list[NDArray[Any]] | None:
     array, _ = read_pickle(content)
     left, made = content.tell(), {}
     objects = _state_of_array(array)[4]
-    if not isinstance(objects, list) or len(objects) > _MAX_ENTRIES:
+    if not isinstance(objects, list):
         raise BrokenFileError("it holds no row of arrays")
+    _check_entries(objects)
     for value in objects:
         if id(value) not in made:
             made[id(value)] = _unpickled(value, "an entry", left).numpy()
@@ -89,9 +92,13 @@ def _read_pickled_dict(path: Path) -> dict[str, Tensor]:
             made[id(value)] = _unpickled(value, name, left)
             left -= made[id(value)].nbytes
         tensors[name] = made[id(value)]
-        if len(tensors) > _MAX_ENTRIES:
-            raise BrokenFileError(f"it has more than {_MAX_ENTRIES:,} arrays")
+        _check_entries(tensors)
     return tensors
+
+
+def _check_entries(entries: Collection[Any]) -> None:
+    count = len(entries)
+    check_claim(f"it has {count:,} arrays", count, _MAX_ENTRIES, error=BrokenFileError)
 
 
 def _state_of_array(value: Any) -> tuple[Any, ...]:
@@ -124,8 +131,9 @@ def _unpickled(value: Any, name: str, most: int) -> Tensor:
     data = data.encode("latin-1") if isinstance(data, str) else data  # as Python 2 has it
     if not isinstance(data, bytes):
         raise BrokenFileError(f"{name} holds objects, not numbers")
-    if len(data) > most or any(side < 0 for side in shape):
-        raise BrokenFileError("its arrays are larger than the file")
+    check_claim(f"{name} has {len(data):,} bytes", len(data), most, error=BrokenFileError)
+    if any(side < 0 for side in shape):
+        raise BrokenFileError(f"{name} has a shape of {shape}")
     if not isinstance(code, str) or not isinstance(order, str):
         raise BrokenFileError("an array without a type")
     number = np.dtype(f"{order[:1]}{code[:8]}")

@@ -20,6 +20,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.budget import check_claim
+
 MAX_STEPS = 3_000_000
 """Opcodes, and entries of dicts; the state dict of 2,000 tensors takes 100,000."""
 
@@ -245,6 +247,6 @@ def view_of(storage: Any, offset: Any, shape: Any, stride: Any) -> Tensor:
     if len(shape) > _MAX_AXES:
         raise BrokenFileError(f"a tensor of more than {_MAX_AXES} axes")
     count = math.prod(shape)
-    if count > max(len(storage), _MAX_EXPANDED):
-        raise BrokenFileError(f"a tensor of {count:.6g} elements from {len(storage):,} stored ones")
+    most = max(len(storage), _MAX_EXPANDED)
+    check_claim(f"a tensor has {count:.6g} elements", count, most, error=BrokenFileError)
     return cast(Tensor, storage.as_strided(shape, stride, int(offset) if count else 0))

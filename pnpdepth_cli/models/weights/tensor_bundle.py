@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.budget import size_problem
+from pnpdepth_cli.budget import check_claim, check_network_file
 from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError
 
 _FOOTER, _MAGIC = 48, 0xDB4775248B80FB57
@@ -54,13 +54,12 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
             path = index.with_name(f"{index.stem}.data-{shard:05d}-of-{_last(header, 1):05d}")
             if not path.is_file():
                 raise BrokenFileError(f"{path.name} is not beside the index")
-            if problem := size_problem(path):
-                raise BrokenFileError(f"{path.name} {problem}")
+            check_network_file(path, "its file", BrokenFileError)
             shards[shard] = path.read_bytes()
             left += len(shards[shard])
-        left -= _last(fields, 5)
-        if left < 0:
-            raise BrokenFileError("its variables are larger than its files")
+        size = _last(fields, 5)
+        check_claim(f"{name} has {size:,} bytes", size, left, error=BrokenFileError)
+        left -= size
         tensors[name.replace("/", ".")] = _tensor(name, fields, shards[shard])
     return tensors
 

@@ -18,6 +18,7 @@ from typing import Any, TypeGuard
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.weights.pickle_reader import (
     MAX_NAME,
@@ -106,8 +107,8 @@ def refuse_inflated(archive: zipfile.ZipFile, path: Path) -> None:
     """Raises BrokenFileError for an archive whose entries are compressed, or overlap."""
     if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
         raise BrokenFileError("it is compressed, which torch never does")
-    if sum(info.file_size for info in archive.infolist()) > path.stat().st_size:
-        raise BrokenFileError("its entries are larger than the file")
+    claimed, most = sum(info.file_size for info in archive.infolist()), path.stat().st_size
+    check_claim(f"its entries have {claimed:,} bytes", claimed, most, error=BrokenFileError)
 
 
 def _read_row_of_pickles(file: mmap) -> tuple[Any, list[str]]:
@@ -127,9 +128,10 @@ def _read_row_of_pickles(file: mmap) -> tuple[Any, list[str]]:
 
     def room_for(key: str, count: int) -> bytearray:
         nonlocal promised
+        check_claim(
+            f"a storage has {count:,} bytes", count, len(file) - promised, error=BrokenFileError
+        )
         promised += count
-        if not 0 <= count <= promised <= len(file):
-            raise BrokenFileError("its storages are larger than the file")
         return bytearray(count)
 
     storages = _Storages(room_for)

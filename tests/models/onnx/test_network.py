@@ -152,7 +152,7 @@ def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
     assert "does not exist" in refused(path)
     path.touch()
     os.truncate(path, 2**31 + 1)  # without a byte on the disk
-    assert "larger than 2 GB" in refused(path)
+    assert "bytes, more than 2,147,483,648" in refused(path)
     named = write_network(path).read_bytes()
     contents = {b"not a network": "cannot be read", b"": "holds no graph"}
     contents |= {

@@ -170,7 +170,7 @@ def test_an_archive_that_inflates_far_beyond_its_size_is_refused(tmp_path: Path)
     np.savez_compressed(tmp_path / "small.npz", a=np.zeros(10**4))  # a layer's zeros
     assert read_numpy_file(tmp_path / "small.npz")["a"].shape == (10**4,)
     np.savez_compressed(tmp_path / "x.npz", a=np.zeros(10**6))
-    assert "far larger than the file" in refused(tmp_path / "x.npz")
+    assert "bytes, more than" in refused(tmp_path / "x.npz")
     header = io.BytesIO()
     claim = {"descr": "<f4", "fortran_order": False, "shape": (10**10,)}
     np.lib.format.write_array_header_1_0(header, claim)
