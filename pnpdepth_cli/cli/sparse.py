@@ -13,7 +13,6 @@ from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.streams import print_json, say
 from pnpdepth_cli.commands.refinement.request import sample_pattern
 from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
-from pnpdepth_cli.errors import UsageError
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
@@ -113,26 +112,11 @@ def sample(
     The settings, with the seed, are stored in the file (PNG, CSV) and in a JSON file beside it.
     """
     from pnpdepth_cli.commands.sparse import make
-    from pnpdepth_cli.sensors import SampleNoise
 
     values["scale"] = values.pop("depth_scale")
     target = make.SparseTarget(output=output, overwrite=overwrite)
-    metres, relative = (0.0, 0.0) if noise is None else _metres_or_fraction("--noise", noise)
-    redrawn, part = (0.0, 0.0) if outliers is None else _metres_or_fraction("--outliers", outliers)
-    if redrawn:
-        raise UsageError(f"--outliers {outliers} is not a percentage such as 5%")
-    added = SampleNoise(metres=metres, relative=relative, outliers=part, jitter_px=jitter)
-    chosen = sample_pattern(pattern, count)
+    added, chosen = make.read_noise(noise, outliers, jitter), sample_pattern(pattern, count)
     _print(make.sample_depth(depth, target, chosen, noise=added, **values), as_json=as_json)
-
-
-def _metres_or_fraction(option: str, text: str) -> tuple[float, float]:
-    """(metres, fraction) of `0.05` or `5%`; the other is 0."""
-    try:
-        value = float(text.removesuffix("%"))
-    except ValueError:
-        raise UsageError(f"{option} {text!r} is neither a number such as 0.05 nor 5%") from None
-    return (0.0, value / 100) if text.endswith("%") else (value, 0.0)
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
@@ -192,12 +176,9 @@ def simulate(
     pnpdepth simulate gt.png --sensor vlp-16 --calib calib.txt --position calib -o sparse.exr
     pnpdepth simulate gt.png --beams 40 --vertical-fov 15 -25 --calib calib.txt -o sparse.exr
     """
-    from pnpdepth_cli.commands.sparse.make import SparseTarget, simulate_scan
-    from pnpdepth_cli.sensors import LIDARS, ideal_lidar
+    from pnpdepth_cli.commands.sparse.make import SparseTarget, find_sensor, simulate_scan
 
-    if (sensor is None) == (beams is None) or (beams is None) != (vertical_fov is None):
-        raise UsageError("give --sensor, or --beams and --vertical-fov")
-    scanner = LIDARS[sensor] if sensor else ideal_lidar(beams or 0, *(vertical_fov or (0, 0)))
+    scanner = find_sensor(sensor, beams, vertical_fov)
     values["scale"] = values.pop("depth_scale")
     target = SparseTarget(output=output, overwrite=overwrite)
     _print(simulate_scan(depth, target, scanner, calib, **values), as_json=as_json)

@@ -23,12 +23,14 @@ from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
 from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
+    LIDARS,
     Camera,
     Lidar,
     Points,
     SampleNoise,
     SamplePattern,
     as_depth_image,
+    ideal_lidar,
     sample_points,
     simulate_lidar,
 )
@@ -241,6 +243,43 @@ def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
     )
     unlikely = implausible(dense.values, dense.scale)
     return dense.values, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
+
+
+def read_noise(noise: str | None, outliers: str | None, jitter_px: float) -> SampleNoise:
+    """Returns the noise of the depth, `0.05` metres or `2%`, of `5%` outliers, and of the pixels.
+
+    Raises:
+        UsageError: One of the texts is of another form.
+    """
+    metres, relative = _metres_or_fraction("--noise", noise or "0")
+    if outliers is not None and not outliers.endswith("%"):
+        raise UsageError(f"--outliers {outliers} is not a percentage such as 5%")
+    _, redrawn = _metres_or_fraction("--outliers", outliers or "0%")
+    return SampleNoise(metres=metres, relative=relative, outliers=redrawn, jitter_px=jitter_px)
+
+
+def _metres_or_fraction(option: str, text: str) -> tuple[float, float]:
+    """(metres, fraction) of `0.05` or `5%`; the other is 0."""
+    try:
+        value = float(text.removesuffix("%"))
+    except ValueError:
+        raise UsageError(f"{option} {text!r} is neither a number such as 0.05 nor 5%") from None
+    return (0.0, value / 100) if text.endswith("%") else (value, 0.0)
+
+
+def find_sensor(
+    name: str | None, beams: int | None, vertical_fov: tuple[float, float] | None
+) -> Lidar:
+    """Returns the sensor of this name, or one of so many beams between two elevations, degrees.
+
+    Raises:
+        UsageError: Both are given, or neither, or there is no such sensor.
+    """
+    if name is not None and beams is None and vertical_fov is None:
+        return LIDARS[name]
+    if name is not None or beams is None or vertical_fov is None:
+        raise UsageError("give --sensor, or --beams and --vertical-fov")
+    return ideal_lidar(beams, *vertical_fov)
 
 
 def _placed(path: Path, calibration: Calibration, position: str | None) -> Camera:
