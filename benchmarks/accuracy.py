@@ -2,9 +2,9 @@
 
 For each network, set and number of points, means over frames and seeds of the MAE and the RMSE in
 metres, CPU seconds, and the fraction of frames whose MAE is above that of linear interpolation: the
-network as it is and aligned with the points, refined at the paper's setting, with the settings of
-its definition and by hidden points, every baseline, and what `refine` gives without options. All
-are scored on the same pixels. Points are drawn from the ground truth; KITTI's are its own LiDAR's.
+network as it is and aligned with the points, refined at the paper's setting and with the settings
+of its definition, every baseline, and what `refine` gives without options. All are scored on the
+same pixels. Points are drawn from the ground truth; KITTI's are its own LiDAR's.
 `--outliers 0.2` gives that fraction of the points random depths. Constants were chosen on even
 frames: `--every 2 --first 1` takes odd ones.
 """
@@ -40,18 +40,15 @@ from benchmarks.frames import (
 )
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.refinement.inputs import Inputs
-from pnpdepth_cli.frames.frame import DepthMap, is_dense
+from pnpdepth_cli.frames.frame import DepthMap
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.settings import PAPER, Settings
 
-MASKED = Settings(target="masked")
 METHODS: Mapping[str, Settings] = {
     "aligned": Settings(iterations=0, align="auto"),
     "paper": PAPER,
     "tuned": Settings(),
-    "masked": MASKED,
-    "masked-40": replace(MASKED, iterations=40),
 }
 """What is refined how; of the paper's setting nothing is the network's own."""
 NETWORKS = ("compact", "fastdepth", "eigen-tiny", "fcrn-tiny", "sparse2dense-tiny")
@@ -66,8 +63,7 @@ def by_method(network: Network, name: str, inputs: Inputs, seed: int) -> tuple[D
         layer, settings = resolve_layer(network.definition, None), replace(method, align=own)
     else:
         layer = resolve_layer(network.definition, method.layer)
-        method, dense = replace(method, seed=seed), is_dense(inputs.points)
-        settings = resolve_settings(network.definition, method, dense=dense)
+        settings = resolve_settings(network.definition, replace(method, seed=seed))
     result = refined(network, layer, settings, inputs)
     return result.before, (result.after if settings.iterations else result.before)
 
@@ -85,11 +81,9 @@ def measure(
         depths[name] = depth()
         seconds[name] = time.process_time() - start
 
-    takes_points = "sparse" in network.definition.input_kind
-    methods = [n for n in args.methods if takes_points or not n.startswith("masked")]
     plain = by_method(network, "tuned", inputs, seed)[0]
     timed("plain", lambda: torch.from_numpy(plain))
-    for name in methods:
+    for name in args.methods:
         timed(name, lambda name=name: torch.from_numpy(by_method(network, name, inputs, seed)[1]))
     for name, baseline in BASELINES.items():
         timed(name, lambda fit=baseline: fit.depth(inputs.points, depths["plain"]))

@@ -127,7 +127,7 @@ UPDATES = Table(
     in_file="update_rule",
     group="updates",
     noun="update rule",
-    names=("sign", "sgd", "normalised", "momentum", "adam", "adam-short", "lbfgs"),
+    names=("sign", "sgd", "normalised", "momentum", "adam", "lbfgs"),
 )
 """U: each entry creates a rule that turns gradients into directions of z."""
 
@@ -202,9 +202,6 @@ MEASURE_GROUPS = Table(
 # The method
 PRESETS = ("paper",)  # methods by one name: `pnpdepth_cli.settings.PAPER`
 SCHEDULES = ("constant", "linear", "cosine")  # of the step size over the updates
-PARAMETERS = ("elements", "channels")  # of z: every element, or scale and shift of each channel
-TARGETS = ("given", "masked")  # points of the loss: given to the network, or hidden from its input
-MASKS = ("points", "blocks", "lines")  # hidden as a whole: points, blocks of the frame, scan lines
 ALIGNMENTS = ("none", "median", "scale", "affine", "auto")  # of the output with the points
 
 # Networks

@@ -85,18 +85,6 @@ def options_of(group: type) -> Iterator[OptionField]:
             )
 
 
-def parse_seconds(text: str) -> float:
-    """Returns the seconds of `5`, `5s` or `500ms`. Raises UsageError for any other text."""
-    number, unit = (text[:-2], 1e-3) if text.endswith("ms") else (text.removesuffix("s"), 1.0)
-    try:
-        seconds = float(number) * unit
-    except ValueError:
-        seconds = -1.0
-    if not 0 < seconds < math.inf:
-        raise UsageError(f"time budget {text!r} is not a duration; give seconds, such as 5s")
-    return seconds
-
-
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """Where a network is cut, what is updated and how, and what follows.
@@ -145,40 +133,6 @@ class Settings:
         within="--set",
         metavar="S",
     )
-    target: str = option(
-        "given",
-        "Take the loss at the points that the network was given, or at points hidden from its"
-        " input, others at every step.",
-        choices=choices.TARGETS,
-        show_default=True,
-    )
-    parameters: str = option(
-        None,
-        "What is updated: elements of z, a scale and a shift of its channels, the weights behind"
-        " the cut, or low-rank additions to them, lora:R.  [default: elements; weights with"
-        " --target masked]",
-        within="--set",
-        metavar="|".join((*choices.PARAMETERS, "weights", "lora:R")),
-    )
-    mask: str = option(
-        None,
-        "With --target masked: hide single points, blocks of the frame, or scan lines.",
-        within="--set",
-        choices=choices.MASKS,
-    )
-    mask_fraction: float = option(
-        None,
-        "With --target masked: the fraction of the points hidden at every step.",
-        within="--set",
-        metavar="F",
-    )
-    mask_scale: float = option(
-        None,
-        "With --target masked: reduce the image to this fraction of its sides during the updates;"
-        " 0.5 takes a third of the time.",
-        within="--set",
-        metavar="F",
-    )
     proximity: float = option(
         0.0,
         "Add W times the mean squared change of log depth to the loss.",
@@ -211,14 +165,6 @@ class Settings:
         metavar="PIXELS",
         least=64,
     )
-    time_budget_s: float | None = option(
-        None,
-        "Time of a frame, such as 30s: networks that take the points make steps by points hidden"
-        " from their input while it lasts. No step begins that would not end in time.",
-        flag="--time-budget",
-        metavar="SECONDS",
-        parse=parse_seconds,
-    )
     seed: int = option(
         0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
     )
@@ -235,16 +181,6 @@ class Settings:
             object.__setattr__(self, "lr", float(self.lr))  # one spelling of a step
 
     @property
-    def moves_weights(self) -> bool:
-        """Whether weights of the network are updated instead of z."""
-        return self.parameters not in (None, *choices.PARAMETERS)
-
-    @property
-    def masked(self) -> bool:
-        """Whether the loss is taken at points hidden from the network's input."""
-        return self.target == "masked"
-
-    @property
     def gives_best(self) -> bool:
         """Whether the result is the depth of the lowest loss; with a line search it always is."""
         return self.keep_best or self.line_search
@@ -256,11 +192,11 @@ class Settings:
         flags = {each.name: each.flag for each in options_of(Settings)}
         if self.preset is not None:
             flags["preset"] += f" {self.preset}"
-        return " ".join(flags[name] for name in given if name not in _NOT_OF_METHOD)
+        return " ".join(flags[name] for name in given if name != "seed")
 
     def with_preset(self) -> Settings:
         """Returns these settings, and those of the preset where these are open."""
-        return self if self.preset is None else self.over(PAPER.opened(*_OF_MASKS))
+        return self if self.preset is None else self.over(PAPER)
 
     def given(self) -> dict[str, Any]:
         """Returns the fields that are not open."""
@@ -305,18 +241,11 @@ _CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
     "iterations": (_is_whole, "a whole number >= 0"),
     "lr": (_is_step, "a step size above 0, or a text such as '3%'"),
     "blur": (_is_weight, ">= 0"),
-    "parameters": (lambda value: isinstance(value, str), "the name of what is updated"),
-    "mask_fraction": (lambda value: _is_number(value) and 0 < value < 1, "between 0 and 1"),
-    "mask_scale": (lambda value: _is_number(value) and 0 < value <= 1, "above 0 and at most 1"),
     "proximity": (_is_weight, ">= 0"),
     "tile": (lambda value: _is_whole(value) and value >= 64, "a whole number >= 64"),
-    "time_budget_s": (lambda value: _is_number(value) and value > 0, "seconds above 0"),
     "seed": (_is_whole, "a whole number >= 0"),
 }
 """Whether a value of the field is valid, and what it must be."""
-
-_NOT_OF_METHOD = ("time_budget_s", "seed")
-_OF_MASKS = ("mask", "mask_fraction", "mask_scale")
 
 _OPEN = {each.name: each.default for each in fields(Settings)}
 
@@ -327,10 +256,6 @@ PAPER = Settings(
     update="sign",
     schedule="constant",
     blur=0.0,
-    parameters="elements",
-    mask="points",
-    mask_fraction=0.5,
-    mask_scale=1.0,
     align="none",
     propagate="none",
 )

@@ -186,7 +186,6 @@ def test_every_unambiguous_form_of_an_image_is_read_alike(
         (lambda: pnp.Refiner("compact"), "must be from load_network"),  # type: ignore[arg-type]
         (lambda: pnp.Refiner([]), "must be from load_network"),
         (lambda: pnp.Settings(tile=7), "tile must be a whole number >= 64"),
-        (lambda: pnp.Settings(time_budget_s=-1), "must be seconds above 0"),
         (lambda: LOSSES["no_such.py"], "loss file no_such.py cannot be run: FileNotFoundError"),
     ],
 )

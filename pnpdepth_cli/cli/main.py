@@ -35,7 +35,6 @@ _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 COMMANDS = {
     "refine": "refine:refine",
     "batch": "batch:batch",
-    "adapt": "adapt:adapt",
     "models": "models:models",
     "layers": "models:layers",
     "project": "sparse:project",

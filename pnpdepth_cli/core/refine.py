@@ -8,8 +8,7 @@ equations 2 and 3:
     depth   = f_rear(z_K)
 
 `refine_from` is that loop. L and D_s are those of `core.losses` and `points`, U one of
-`core.update_rules`, as are α and its schedule. `core.weights_refinement` is the same for weights of
-the network.
+`core.update_rules`, as are α and its schedule.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from pnpdepth_cli.choices import UPDATES
 from pnpdepth_cli.core.losses import checked_loss, proximity_loss
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
-from pnpdepth_cli.core.update_rules import SCHEDULES, Channels, Update, blurred, step_size
+from pnpdepth_cli.core.update_rules import SCHEDULES, Update, blurred, step_size
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import BatchError, DivergedError, LayerError, ModelError, PnpDepthError
 from pnpdepth_cli.points import SparsePoints
@@ -190,7 +189,6 @@ class _FrameRefinement:
         self._step, self._halvings = step_size(settings.lr, z0), 0
         self._loss = checked_loss(settings.loss)
         self._update: Update = UPDATES[settings.update]()
-        self._channels = Channels(z0) if settings.parameters == "channels" else None
         self._best: tuple[Tensor, Tensor] | None = None  # z of the lowest loss and its direction
         self._first: Tensor | None = None  # depth of z_0
         self._after: Tensor | None = None  # depth of z_kept
@@ -234,11 +232,8 @@ class _FrameRefinement:
             z, direction = self._best
         else:
             gradient = blurred(gradient, self._points, self._settings.blur)
-            of_z = gradient if self._channels is None else self._channels.gradient(gradient)
             with wrap_user_errors(f"update rule {self._settings.update!r}"):
-                direction = self._update(of_z).reshape(of_z.shape)
-            if self._channels is not None:
-                direction = self._channels.change_of_z(direction)
+                direction = self._update(gradient).reshape(gradient.shape)
             if self._settings.line_search:
                 self._best = z, direction
         alpha = self._step * SCHEDULES[self._settings.schedule](updates / self._settings.iterations)

@@ -2,8 +2,7 @@
 
 A decorated function makes a new rule. A rule is called with the gradients of one refinement, in
 order, and returns a direction of the same shape; z moves by −α × direction.
-`pnpdepth_cli.choices.UPDATES` lists the names. The gradient may be blurred before, or taken at a
-scale and a shift of every channel.
+`pnpdepth_cli.choices.UPDATES` lists the names. The gradient may be blurred before.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.errors import LayerError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 
 Update = Callable[[Tensor], Tensor]
@@ -104,16 +103,6 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
         return (first / (1 - beta1**step)) / ((second / (1 - beta2**step)).sqrt() + eps)
 
     return update
-
-
-@update_rule("adam-short")
-def adam_short() -> Update:
-    """Returns Adam's rule with β1 = 0.8 and β2 = 0.95.
-
-    Its means reach back about 5 and 20 gradients instead of 10 and 1000. Eight to sixteen steps of
-    weights by hidden points gain more with them; see docs/guides/masked.md.
-    """
-    return adam(beta1=0.8, beta2=0.95)
 
 
 @update_rule("lbfgs")
@@ -221,39 +210,3 @@ def _gaussian(cells: int, sigma: float, like: Tensor) -> Tensor:
     at = torch.arange(cells, device=like.device, dtype=like.dtype)
     weights = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
     return weights / weights.sum(dim=1, keepdim=True)
-
-
-class Channels:
-    """A scale and a shift of every channel of z_0, to be updated instead of the elements of z.
-
-    z = z_0 + scale · (z_0 − mean)/std + shift, per channel. A change of scale or shift by 1 changes
-    z by a root mean square of 1.
-
-    Args:
-        z0: A map (1, C, H, W) or tokens (1, N, C).
-
-    Raises:
-        LayerError: z_0 has another shape.
-    """
-
-    def __init__(self, z0: Tensor) -> None:
-        if z0.ndim < 3:
-            raise LayerError(
-                f"z of shape {tuple(z0.shape)} has no channels to scale and shift; update its"
-                " elements (--set parameters=elements)"
-            )
-        self._dims = (1,) if z0.ndim == 3 else tuple(range(2, z0.ndim))
-        centred = z0 - z0.mean(dim=self._dims, keepdim=True)
-        deviation = centred.square().mean(dim=self._dims, keepdim=True).sqrt()
-        self._standardised = centred / deviation.clamp_min(torch.finfo(z0.dtype).tiny)
-
-    def gradient(self, gradient_at_z: Tensor) -> Tensor:
-        """Returns the gradient at scale and shift, stacked along axis 0, per element of z."""
-        gradients = (gradient_at_z * self._standardised, gradient_at_z)
-        return torch.cat([one.mean(dim=self._dims, keepdim=True) for one in gradients])
-
-    def change_of_z(self, change: Tensor) -> Tensor:
-        """Returns the change of z for a change of scale and shift, stacked along axis 0."""
-        scale, shift = change.tensor_split(2)
-        change_of_z: Tensor = scale * self._standardised + shift
-        return change_of_z

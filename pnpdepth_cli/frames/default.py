@@ -73,18 +73,11 @@ class _Hidden:
     rejected: tuple[Member, ...]
 
 
-def refine_default(
-    fusion: Fusion,
-    frame: Frame,
-    *,
-    seed: int = 0,
-    until: float | None = None,
-) -> Refined:
+def refine_default(fusion: Fusion, frame: Frame, *, seed: int = 0) -> Refined:
     """Returns the frame refined by the default method.
 
     Args:
         seed: Of the hidden points.
-        until: As of `Fusion.fuse`.
 
     Raises:
         PnpDepthError: The user's network gives no depth.
@@ -93,7 +86,7 @@ def refine_default(
     inliers, user = fusion.without_outliers(frame)
     hidden = _hidden(fusion, inliers, torch.from_numpy(user.before), seed)
     rejected = () if hidden is None else hidden.rejected
-    fused = fusion.fuse(inliers, user=user, rejected=rejected, until=until)
+    fused = fusion.fuse(inliers, user=user, rejected=rejected)
     if fused.weighed is not None and not is_dense(inliers.points):
         inliers = inliers.without(far_points(fused.weighed, inliers.points))
     kind = propagation_of(inliers.points)
@@ -111,9 +104,6 @@ def refine_default(
         if not completion:  # hidden lines are gaps that such a network was not trained with
             depth, check, moved = _moved(fusion, inliers, hidden, depth, check)
             notes += moved
-    if fused.steps:
-        steps = ", ".join(f"{count} with {name}" for name, count in fused.steps.items())
-        notes += (f"hidden points: steps made and kept: {steps}",)
     stages = {ALIGNED: user.before, FUSED: fused.before.numpy(), UPDATED: fused.after.numpy()}
     return replace(
         fused.user,
@@ -121,7 +111,6 @@ def refine_default(
         used=inliers.points,
         stages=stages | {PROPAGATED: final.numpy()},
         check=check,
-        steps=fused.steps,
         notes=(*fused.user.notes, *notes),
     )
 

@@ -116,8 +116,6 @@ class Refined:
     """(H, W) metres after each stage of the default method, by its name."""
     check: Check | None = None
     """The method and its stages at hidden points. None for a fixed method, or with few points."""
-    steps: Mapping[str, int] = field(default_factory=dict)
-    """Kept steps by hidden points, by network."""
     registration: ImageRegistration | None = None
     """How the image was moved into the frame of the points. None: it was not."""
 

@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
@@ -50,8 +49,6 @@ class Member:
     network: Network
     layer: str  # layer to cut at
     settings: Settings  # how its output is aligned and z is updated
-    hidden_points: Settings | None = None
-    """How its weights are updated by points hidden from its input, where there is time for it."""
 
     @property
     def takes_points(self) -> bool:
@@ -74,7 +71,6 @@ class Fused:
     after: Tensor  # (H, W) metres, 0 = unknown: fused after the updates of z
     weighed: Tensor | None
     """(H, W) metres, 0 = unknown: of the networks that weigh their points, before the updates."""
-    steps: Mapping[str, int]  # kept steps by hidden points, by network
 
     @property
     def user(self) -> Refined:
@@ -93,7 +89,6 @@ class Fusion:
         self.members = tuple(members)
         self._opened = {member: OpenNetwork(member.network, member.layer) for member in members}
         self._stack = ExitStack()
-        self._steps: dict[str, int] = {}
 
     def __enter__(self) -> Fusion:
         for opened in self._opened.values():
@@ -147,7 +142,6 @@ class Fusion:
         user: Refined | None = None,
         rejected: Collection[Member] = (),
         updates: bool = True,
-        until: float | None = None,
     ) -> Fused:
         """Returns the frame refined by all networks and fused.
 
@@ -158,17 +152,14 @@ class Fusion:
             user: What the user's network gives for it, if that is known.
             rejected: Networks whose depth serves as no prior.
             updates: Whether z is updated.
-            until: Time by `time.monotonic` until which networks that take the points make steps by
-                points hidden from their input. None makes none.
 
         Raises:
             PnpDepthError: The user's network gives no depth.
         """
-        self._steps = {}
         first, *others = self.members
-        if user is None or (until is not None and first.hidden_points is not None):
-            user = self._refined(first, frame, updates=updates, until=until)
-        tried = partial(self._tried, updates=updates, until=until)
+        if user is None:
+            user = self._refined(first, frame, updates=updates)
+        tried = partial(self._tried, updates=updates)
         alone = {first: user} | tried([m for m in others if not m.takes_prior], frame)
         guides = [m for m in alone if m not in rejected and _guides(m, alone[m])]
         if not guides or len(frame.points) < FEW_POINTS:
@@ -189,7 +180,6 @@ class Fusion:
             before=weighted_mean([(torch.from_numpy(part.before), w) for part, w in parts]),
             after=weighted_mean([(torch.from_numpy(part.after), w) for part, w in parts]),
             weighed=weighted_mean(weighed) if weighed else None,
-            steps=self._steps,
         )
 
     def refine_alone(self, member: Member, frame: Frame) -> Refined:
@@ -197,42 +187,20 @@ class Fusion:
         return self._refined(member, frame, updates=False)
 
     def _tried(
-        self, members: Sequence[Member], frame: Frame, *, updates: bool, until: float | None
+        self, members: Sequence[Member], frame: Frame, *, updates: bool
     ) -> dict[Member, Refined]:
         """The frame refined by each of the networks, without those that fail."""
         refined: dict[Member, Refined] = {}
         for member in members:
             with suppress(PnpDepthError):
-                refined[member] = self._refined(member, frame, updates=updates, until=until)
+                refined[member] = self._refined(member, frame, updates=updates)
         return refined
 
-    def _refined(
-        self, member: Member, frame: Frame, *, updates: bool = True, until: float | None = None
-    ) -> Refined:
-        moved = self._by_hidden_points(member, frame, until)
-        if moved is not None:
-            return moved
+    def _refined(self, member: Member, frame: Frame, *, updates: bool = True) -> Refined:
         settings = member.settings
         if not updates or (member.takes_points and not _updates_gain(frame.points)):
             settings = replace(settings, iterations=0)
         return self._opened[member].refine(frame, settings)
-
-    def _by_hidden_points(
-        self, member: Member, frame: Frame, until: float | None
-    ) -> Refined | None:
-        """The frame after steps by hidden points; None where none are to be made or they fail."""
-        left_s = 0.0 if until is None else until - time.monotonic()
-        if member.hidden_points is None or left_s <= 0:
-            return None
-        settings = replace(member.hidden_points, time_budget_s=left_s)
-        try:
-            moved = self._opened[member].refine(frame, settings)
-        except PnpDepthError:
-            return None
-        if moved.diverged is not None:
-            return None
-        self._steps[member.network.definition.name] = moved.refinement.kept
-        return moved
 
 
 def weighted_mean(depths: Sequence[tuple[Tensor, float]]) -> Tensor:

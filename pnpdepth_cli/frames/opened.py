@@ -12,17 +12,16 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import Refinement, refine_from
-from pnpdepth_cli.core.split import InputSplit, Split
-from pnpdepth_cli.core.split.tensors import tensors_in
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
-from pnpdepth_cli.frames.refine import refine_frame_weights, to_refined_frame
+from pnpdepth_cli.frames.refine import to_refined_frame
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.settings import Settings
@@ -53,14 +52,6 @@ class SplitCache:
             self._split = self._open.enter_context(self.network.cut_at(layer))
         return self._split
 
-    def at_points(self) -> InputSplit:
-        """Returns the network cut at its sparse depth, open."""
-        if not isinstance(self._split, InputSplit):
-            self.close()
-            self._split = self._open.enter_context(self.network.cut_at_points())
-        assert isinstance(self._split, InputSplit)
-        return self._split
-
 
 class OpenNetwork:
     """A network that is cut when first refined, as a context manager."""
@@ -71,12 +62,10 @@ class OpenNetwork:
         self._open, self._cut = ExitStack(), SplitCache(network)
         self._z0: Tensor | None = None
         self._output: Any = None
-        self._encoded: dict[tuple[torch.Size, ...], Any] = {}
+        self._encoded: dict[str, Any] = {}
 
     def __enter__(self) -> OpenNetwork:
-        if self.network.definition.image_encoder is not None:
-            encoder = self.network.module.get_submodule(self.network.definition.image_encoder)
-            self._open.enter_context(self._runs_once(encoder))
+        self._open.enter_context(encoding_once(self.network, self._encoded))
         self._open.enter_context(self._cut)
         return self
 
@@ -87,14 +76,14 @@ class OpenNetwork:
     def next_image(self) -> None:
         """Forgets what was computed for the last image."""
         self._z0 = self._output = None
-        self._encoded = {}
+        self._encoded.clear()
 
     def refine(self, frame: Frame, settings: Settings) -> Refined:
         """Returns the frame refined by this network, its residual not propagated.
 
         Args:
             frame: The image, the same in all calls until `next_image`, and the points of this call.
-            settings: How z, or weights, are updated.
+            settings: How z is updated.
 
         Raises:
             PnpDepthError: The refinement fails.
@@ -105,12 +94,7 @@ class OpenNetwork:
             if not len(prepared.points):
                 raise prepared.no_points_error()
             reader = prepared.depth_reader(settings)
-            if settings.moves_weights:
-                self._z0 = None
-                masked = settings.masked
-                split = self._cut.at_points() if masked else self._cut.at(self.layer)
-                result = refine_frame_weights(split, settings, prepared, reader)
-            elif settings.iterations:
+            if settings.iterations:
                 result = self._updated(prepared, reader, settings)
             else:
                 result = self._plain(prepared, reader, settings)
@@ -156,23 +140,32 @@ class OpenNetwork:
         loss = float(checked_loss(settings.loss)(at_points, prepared.points.depth))
         return Refinement(before=depth, after=depth, losses=(loss,), step=0.0, kept=0)
 
-    @contextmanager
-    def _runs_once(self, encoder: nn.Module) -> Iterator[None]:
-        """Inside, the encoder runs once for an image of one size."""
-        run, own = encoder.forward, encoder.__dict__.get("forward")
 
-        def forward(*inputs: Any, **options: Any) -> Any:
-            # steps by hidden points also see the image reduced
-            size = tuple(tensor.shape for _, tensor in tensors_in((inputs, options)))
-            if size not in self._encoded:
-                self._encoded[size] = run(*inputs, **options)
-            return self._encoded[size]
+@contextmanager
+def encoding_once(network: Network, encoded: dict[str, Any]) -> Iterator[None]:
+    """Inside, the image encoder, if the definition names one, runs once; then its output is known.
 
-        encoder.__dict__["forward"] = forward
-        try:
-            yield
-        finally:
-            if own is None:
-                encoder.__dict__.pop("forward", None)
-            else:
-                encoder.__dict__["forward"] = own
+    Args:
+        network: The network.
+        encoded: What is known, by the encoder's name; cleared for another image.
+    """
+    name = network.definition.image_encoder
+    if name is None:
+        yield
+        return
+    encoder = network.module.get_submodule(name)
+    run, own = encoder.forward, encoder.__dict__.get("forward")
+
+    def forward(*inputs: Any, **options: Any) -> Any:
+        if name not in encoded:
+            encoded[name] = run(*inputs, **options)
+        return encoded[name]
+
+    encoder.__dict__["forward"] = forward
+    try:
+        yield
+    finally:
+        if own is None:
+            encoder.__dict__.pop("forward", None)
+        else:
+            encoder.__dict__["forward"] = own

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.models.aligned import AlignedDepth
-from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
@@ -32,36 +30,9 @@ class PreparedFrame:
     prior: Tensor | None = None
     """(1, 1, h, w) metres, 0 = unknown: the dense prior in the network's frame. None without."""
 
-    @property
-    def varying(self) -> tuple[int, ...]:
-        """Positions of the arguments that depend on the points."""
-        pairs = zip(self.arguments, self.arguments_for(self.points), strict=True)
-        return tuple(index for index, (one, other) in enumerate(pairs) if one is not other)
-
     def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
         """Returns the arguments of the network for some of the points; the image is the same."""
         return self.network.arguments_of(self.image, points, self.prior)
-
-    def reduced(self, scale: float) -> PreparedFrame | None:
-        """Returns the frame with sides of about this fraction, in the same field of view.
-
-        None where the network takes one size only, or where the size stays the same.
-        """
-        policy, (height, width) = self.network.definition.size, self.map.network
-        if isinstance(policy, Fixed):
-            return None
-        size = [max(1, round(side * scale / policy.of)) * policy.of for side in (height, width)]
-        if size == [height, width]:
-            return None
-        image = self.image
-        if image is not None:
-            image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
-        points = self.points.resized(*size)
-        prior = self.prior
-        if prior is not None:
-            prior = F.interpolate(prior, size, mode="nearest-exact")
-        arguments = self.network.arguments_of(image, points, prior)
-        return replace(self, image=image, points=points, prior=prior, arguments=arguments)
 
     def depth_reader(self, settings: Settings) -> AlignedDepth:
         """Returns a new reader of the network's output in metres, (1, 1, h, w).

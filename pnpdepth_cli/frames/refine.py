@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.outliers import outliers
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.refine import OnIteration, Refinement, refine_from
-from pnpdepth_cli.core.split import InputSplit, Split
-from pnpdepth_cli.core.weights import MovingWeights
-from pnpdepth_cli.core.weights_refinement import FrameOfPoints, Predict, refine_weights
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import BatchError, DivergedError, PnpDepthError
 from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined, no_points
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
-from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
-
-MIN_POINTS_FOR_OUTLIERS = 50
-"""Of fewer points, one inconsistent with the others may be all that is seen of an object."""
 
 
 def refine_frame(
@@ -78,11 +69,7 @@ def refine_frames(
         seen = [frame for frame in prepared if len(frame.points)]
         readers = [frame.depth_reader(settings) for frame in seen]
         results: list[Refinement | PnpDepthError] = []
-        if seen and settings.moves_weights:
-            if len(seen) > 1:
-                raise BatchError("weights are updated for one frame alone; refine one at a time")
-            results = [refine_frame_weights(split, settings, seen[0], readers[0], on_iteration)]
-        elif seen:
+        if seen:
             with torch.no_grad():
                 z = split.front(*_stacked([frame.arguments for frame in seen]))
             points = [frame.points for frame in seen]
@@ -94,71 +81,6 @@ def refine_frames(
         for each in zip(seen, readers, results, strict=True)
     )
     return [next(refined) if len(each.points) else each.no_points_error() for each in prepared]
-
-
-def refine_frame_weights(
-    split: Split,
-    settings: Settings,
-    frame: PreparedFrame,
-    reader: AlignedDepth,
-    on_iteration: OnIteration = lambda done, loss: None,
-) -> Refinement | PnpDepthError:
-    """Returns the refinement of one frame by updates of weights, or its error.
-
-    The split is at the network's sparse depth, or at a layer. The frame has at least one point.
-    """
-    weights = MovingWeights(frame.network.module, settings.parameters, settings.seed)
-    try:
-        with opened_frame(split, frame, reader, settings.mask_scale) as seen:
-            return refine_weights(seen, weights, settings, on_iteration=on_iteration)
-    except PnpDepthError as error:
-        return error
-
-
-@contextmanager
-def opened_frame(
-    split: Split, frame: PreparedFrame, reader: AlignedDepth, scale: float
-) -> Iterator[FrameOfPoints]:
-    """Yields the frame as the network predicts it from any of its points, after one plain pass.
-
-    A split at a layer stays at z_0. One at the points predicts the steps from a reduced image.
-    """
-    predict: Predict
-    in_steps: Predict
-    with ExitStack() as stack:
-        if isinstance(split, InputSplit):
-            output = split.first(*frame.arguments, varying=frame.varying)
-            predict = in_steps = lambda points: split.again(*frame.arguments_for(points))
-            reduced = frame.reduced(scale)
-            if reduced is not None:
-                small = stack.enter_context(frame.network.cut_at_points())
-                small.first(*reduced.arguments, varying=reduced.varying)
-
-                def reduced_steps(points: SparsePoints, frame: PreparedFrame = reduced) -> Any:
-                    return small.again(*frame.arguments_for(points.resized(*frame.points.size)))
-
-                in_steps = reduced_steps
-        else:
-            with torch.no_grad():
-                z0 = split.front(*frame.arguments)
-                output = split.rear(z0)
-            predict = in_steps = lambda points: split.rear(z0)
-        yield FrameOfPoints(
-            points=frame.points,
-            inliers=_inliers(frame.points),
-            output=output,
-            predict=predict,
-            predict_in_steps=in_steps,
-            depth_of=reader,
-        )
-
-
-def _inliers(points: SparsePoints) -> SparsePoints:
-    """The points without those inconsistent with the others; of a few, none is."""
-    if len(points) < MIN_POINTS_FOR_OUTLIERS:
-        return points
-    on_cpu = points.tensors()
-    return points.select(~outliers(torch.ones(points.size), on_cpu, None).to(points.xy.device))
 
 
 def to_refined_frame(

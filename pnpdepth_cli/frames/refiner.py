@@ -7,7 +7,6 @@ it.
 from __future__ import annotations
 
 import copy
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -23,9 +22,8 @@ from pnpdepth_cli.completion.image_registration import (
 )
 from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.weights import MovingWeights
 from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
-from pnpdepth_cli.frames.adapt import learnt
+from pnpdepth_cli.frames.adapt import Weights, learn, too_little, weights_in_place
 from pnpdepth_cli.frames.default import check_fixed, refine_default, split_hidden
 from pnpdepth_cli.frames.frame import (
     METRES,
@@ -35,7 +33,6 @@ from pnpdepth_cli.frames.frame import (
     Registration,
     Unit,
     frame_of_arrays,
-    is_dense,
     no_points,
     registration_to_make,
 )
@@ -53,8 +50,6 @@ COMPANION = "compact"
 """The network that is fused with the user's, where there is an image."""
 UPDATES = 5
 """Most updates of z in the default method. More fit what propagation fits anyway."""
-HIDDEN_POINT_STEPS = 40
-"""Most steps by hidden points; of dense points the network's own number."""
 _TRIED = 3
 """After so many frames that say nothing of the registration, no more are read."""
 
@@ -103,24 +98,14 @@ class Refiner:
         self._uncertainty, self._check = uncertainty, check or uncertainty
         self._register = registration_to_make(registration, self.asked)
         self._adapt = [frame_of_arrays(*pair, self._register, None) for pair in adapt]
-        self._learnt: MovingWeights | None = None
+        self._weights: Weights | None = None  # learnt ones, where they are better
         self.members: tuple[Member, ...] = ()
         self.registrations: Mapping[tuple[int, int], Register] = MappingProxyType({})
         self._stack = ExitStack()
         self._opened: Split | Fusion | None = None
-        of_weights = self.asked.masked or self.asked.moves_weights
-        if self.asked.time_budget_s is not None and not (self.is_default or of_weights):
-            raise UsageError(
-                f"--time-budget caps steps by hidden points, but {self.asked.fixed_by} makes none"
-            )
         if len(self._networks) > 1 and not self.is_default:
             raise UsageError(
                 f"several --model are fused, but {self.asked.fixed_by} fixes one network"
-            )
-        if self._check and of_weights:
-            raise UsageError(
-                "--baselines and --uncertainty go with updates of z; leave out --target and"
-                " --set parameters"
             )
 
     def __enter__(self) -> Refiner:
@@ -191,9 +176,7 @@ class Refiner:
         """
         frame, opened = self._begun(frame)
         if isinstance(opened, Fusion):
-            seconds, seed = self.asked.time_budget_s, self.asked.seed
-            until = None if seconds is None else time.monotonic() + seconds
-            refined = refine_default(opened, frame, seed=seed, until=until)
+            refined = refine_default(opened, frame, seed=self.asked.seed)
         else:
             settings, propagation = self.settings, self.settings.propagate
             if settings.tile is None:
@@ -249,8 +232,7 @@ class Refiner:
             for network in self._networks
         ]
         if self._adapt:
-            self._learnt, note = learnt(networks[0], self._adapt, self.asked.seed)
-            networks[0] = replace(networks[0], notes=(*networks[0].notes, note))
+            networks[0] = self._adapted(networks[0])
         named = {network.definition.name for network in networks}
         if self.is_default and first.rgb is not None and COMPANION not in named:
             device, precision = str(networks[0].device), networks[0].precision
@@ -261,6 +243,17 @@ class Refiner:
             for number, network in enumerate(networks)
         )
         return self
+
+    def _adapted(self, network: Network) -> Network:
+        """The network, with a note of what its weights learnt from the frames of `adapt`."""
+        why = too_little(len(self._adapt), self._adapt[0])
+        if why is None:
+            named = ((f"frame {number}", frame) for number, frame in enumerate(self._adapt))
+            learnt = learn(network, named, seed=self.asked.seed)
+            self._weights = learnt.weights if learnt.is_better else None
+            why = str(learnt)
+        own = "" if self._weights is not None else "the network's own weights are used: "
+        return replace(network, notes=(*network.notes, f"adapt: {own}{why}"))
 
     def share_registration(self, frames: Iterable[Frame]) -> None:
         """Decides the registration that images of one size share, by all these frames together.
@@ -284,48 +277,38 @@ class Refiner:
         if frame.register == "auto" and frame.size in self.registrations:
             frame = replace(frame, register=self.registrations[frame.size])
         if self._opened is None:
-            if self._learnt is not None:
-                self._stack.enter_context(self._learnt.in_place())
-            network: Split | Fusion
-            if self.is_default:
-                network = Fusion(self.members)
-            elif self.settings.masked:
-                network = self.network.cut_at_points()
-            else:
-                network = self.network.cut_at(self.layer)
+            if self._weights is not None:
+                self._stack.enter_context(weights_in_place(self.network, self._weights))
+            network: Split | Fusion = (
+                Fusion(self.members) if self.is_default else self.network.cut_at(self.layer)
+            )
             self._stack.enter_context(network)
             self._opened = network
         return frame.registered(), self._opened
 
     def _member(self, network: Network, frame: Frame, asked: Settings) -> Member:
         """A network, where it is cut, and its settings."""
-        definition, layer, dense = network.definition, asked.layer, is_dense(frame.points)
-        if layer is None and asked.preset is None and not asked.masked:
+        definition, layer = network.definition, asked.layer
+        if layer is None and asked.preset is None:
             layer = default_layer(network, frame.size, len(frame.points))
         layer = resolve_layer(definition, layer)
-        settings = resolve_settings(definition, asked, metric=frame.unit == METRES, dense=dense)
+        settings = resolve_settings(definition, asked, metric=frame.unit == METRES)
         member = Member(network=network, layer=layer, settings=replace(settings, layer=layer))
-        return self._of_default(member, dense) if self.is_default else member
+        return self._of_default(member) if self.is_default else member
 
-    def _of_default(self, member: Member, dense: bool) -> Member:
+    def _of_default(self, member: Member) -> Member:
         """The network as the default method refines it.
 
         A network whose output is metric is aligned too, where the points say that it should be. Of
         networks that take the points, only those made for fusion, with a prior, are updated.
         """
-        definition, settings = member.network.definition, member.settings
+        settings = member.settings
         iterations = min(settings.iterations, UPDATES)
         if not member.takes_points and settings.align == "none":
             settings = replace(settings, align="auto")
         if member.takes_points and not member.takes_prior:
             iterations = 0
-        hidden_points = None
-        if self.asked.time_budget_s is not None and member.takes_points:
-            hidden_points = resolve_settings(definition, Settings(target="masked"), dense=dense)
-            if not dense:
-                hidden_points = replace(hidden_points, iterations=HIDDEN_POINT_STEPS)
-        settings = replace(settings, iterations=iterations)
-        return replace(member, settings=settings, hidden_points=hidden_points)
+        return replace(member, settings=replace(settings, iterations=iterations))
 
     def _checked(self, frame: Frame, refined: Refined) -> Refined:
         """The refined frame with the fixed method's check, for which it is run again.

@@ -9,17 +9,12 @@ import torch
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import align
-from pnpdepth_cli.core.weights import rank_of
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
     IMAGENET_STD,
-    MASKED_DEFAULTS,
-    MASKED_DENSE_DEFAULTS,
-    WEIGHTS_DEFAULTS,
-    WEIGHTS_DENSE_DEFAULTS,
     ModelDefinition,
     Normalisation,
 )
@@ -39,8 +34,6 @@ _CLEARLY_BETTER = 0.6
 
 FastDepth, whose range is 0…1, has ratios down to 0.61 in 13 frames of 7-Scenes and ICL-NUIM.
 """
-_OF_Z = ("blur", "proximity", "line_search", "keep_best", "align_every")
-_OF_MASKS = ("mask", "mask_fraction", "mask_scale")
 
 
 def redefined(network: Network, output_kind: str | None, normalise: str | None) -> Network:
@@ -117,7 +110,7 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
 
 
 def resolve_settings(
-    definition: ModelDefinition, settings: Settings, *, metric: bool = True, dense: bool = False
+    definition: ModelDefinition, settings: Settings, *, metric: bool = True
 ) -> Settings:
     """Returns settings with nothing open: the user's, else the network's defaults.
 
@@ -127,27 +120,11 @@ def resolve_settings(
 
     Args:
         metric: Whether the points are in metres.
-        dense: Whether the points lie as close as a LiDAR's; see `is_dense`.
 
     Raises:
         UsageError: The settings contradict each other.
     """
-    given = settings.given()
-    if misplaced := [name for name in _OF_MASKS if name in given and not settings.masked]:
-        raise UsageError(
-            f"{_spelled(misplaced[0])} is for points hidden from the input; add --target masked"
-        )
-    of_weights = settings.masked or settings.moves_weights
-    if of_weights and settings.preset is not None:
-        raise UsageError(
-            f"--preset {settings.preset} updates z; it goes with neither --target masked nor"
-            " weights"
-        )
     defaults = definition.defaults
-    if settings.masked:
-        defaults = MASKED_DENSE_DEFAULTS if dense else MASKED_DEFAULTS
-    elif of_weights:
-        defaults = WEIGHTS_DENSE_DEFAULTS if dense else WEIGHTS_DEFAULTS
     settings = settings.with_preset()
     if settings.update not in (None, defaults.complete().update):
         defaults = defaults.opened("lr", "schedule", "blur")
@@ -156,36 +133,7 @@ def resolve_settings(
         alignment = "scale"
     closed = settings.over(replace(defaults, align=alignment)).complete()
     layer = settings.layer or definition.default_layer
-    closed = replace(closed, layer=None if layer is None else resolve_layer(definition, layer))
-    if not of_weights:
-        return replace(closed, time_budget_s=None)
-    _check_weights(definition, settings, closed)
-    return closed
-
-
-def _check_weights(definition: ModelDefinition, settings: Settings, closed: Settings) -> None:
-    """Raises UsageError where weights move and a setting concerns z."""
-    if not closed.moves_weights:
-        raise UsageError(
-            f"--target masked updates weights, not {closed.parameters} of z; take --set"
-            " parameters=weights or lora:8"
-        )
-    rank_of(closed.parameters)
-    if settings.masked and "sparse" not in definition.input_kind:
-        raise UsageError(
-            f"network {definition.name!r} takes no sparse depth, so no points can be hidden from"
-            " it; take --target given"
-        )
-    if settings.masked and settings.layer is not None:
-        raise UsageError(
-            "--layer is where z is; with --target masked the network is cut at its sparse depth"
-        )
-    if wrong := [name for name in _OF_Z if getattr(settings, name)]:
-        raise UsageError(f"{_spelled(wrong[0])} is for updates of z; weights are updated here")
-
-
-def _spelled(name: str) -> str:
-    return f"--set {name.replace('_', '-')}"
+    return replace(closed, layer=None if layer is None else resolve_layer(definition, layer))
 
 
 def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[Network, str]:

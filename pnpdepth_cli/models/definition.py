@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,29 +120,8 @@ UNTUNED_DEFAULTS = Settings(
 Chosen with FastDepth on rendered rooms; Adam with steps of 3 % left a quarter more of the error.
 """
 
-WEIGHTS_DEFAULTS = Settings(
-    iterations=16,
-    lr=5e-4,
-    loss="log",
-    update="adam",
-    schedule="cosine",
-    parameters="weights",
-)
-"""For updates of weights by the points that the network is given."""
-
-MASKED_DEFAULTS = replace(
-    WEIGHTS_DEFAULTS, iterations=20, lr=3.5e-4, update="adam-short", schedule="linear"
-)
-"""For updates of weights by points hidden from the input."""
-
 DENSE_SPACING = 10.0
 """Mean spacing of the points in pixels below which they are dense, as those of a LiDAR are."""
-
-WEIGHTS_DENSE_DEFAULTS = replace(WEIGHTS_DEFAULTS, iterations=8, lr=2e-4)
-"""The same for dense points, whose noise more steps would follow."""
-
-MASKED_DENSE_DEFAULTS = replace(MASKED_DEFAULTS, iterations=6, lr=3e-4, mask_scale=0.5)
-"""The same for dense points hidden from the input."""
 
 
 @dataclass(frozen=True, kw_only=True)

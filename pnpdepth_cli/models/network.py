@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.budget import budget, check_claim
-from pnpdepth_cli.core.split import InputSplit, Split
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
@@ -56,19 +56,6 @@ class Network:
             LayerError: The network has no such layer.
         """
         return Split(self.module, layer, static_graph=self.definition.static_graph)
-
-    def cut_at_points(self) -> InputSplit:
-        """Returns the network cut at its sparse depth, to be opened by `with`.
-
-        Raises:
-            UsageError: The network takes no sparse depth.
-        """
-        if "sparse" not in self.definition.input_kind:
-            raise UsageError(
-                f"network {self.definition.name!r} takes no sparse depth, so no points can be"
-                " hidden from it; take --target given"
-            )
-        return InputSplit(self.module, static_graph=self.definition.static_graph)
 
     def image_of(self, frame: FrameMap, rgb: Tensor | None) -> Tensor | None:
         """Returns the image as the network takes it, (1, 3, h, w); None if it takes none.

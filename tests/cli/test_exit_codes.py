@@ -13,7 +13,6 @@ NETWORK = "--model drive/net/my_net.py --checkpoint drive/net/my_net.safetensors
 COMMANDS = {
     "refine": f"drive/rgb/a.png --sparse drive/sparse/a.png -o out {NETWORK}",
     "batch": f"drive -o out {NETWORK}",
-    "adapt": "drive -o w.safetensors --model sparse2dense-tiny",
     "sample": "drive/gt/a.png -o sparse.png",
     "simulate": "drive/gt/a.png --calib calib.txt --sensor vlp-16 -o sparse.png",
     "project": "img.bin --calib calib.txt -o sparse.png",
@@ -37,9 +36,6 @@ COMMANDS = {
         ("batch", "--accumulate -1", 2, "-1 is not in the range x>=0"),
         ("batch", "--adapt --shard 1/2", 2, "--adapt does not go with --shard"),
         ("batch", "--device cuda:9", 6, "--device cpu"),
-        ("adapt", "--steps 0", 2, "'--steps': 0 is not in the range"),
-        ("adapt", "--limit 1", 3, "gives 1 frame; an adaptation needs 2 or more"),
-        ("adapt drive -o w.safetensors --model fcrn-tiny", "", 2, "takes no sparse depth"),
         ("sample", "--count many", 2, "neither a number such as 500 nor 5%"),
         ("sample", "--noise much", 2, "--noise 'much' is neither a number"),
         ("sample", "--outliers 0.1", 2, "--outliers 0.1 is not a percentage"),

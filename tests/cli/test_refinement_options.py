@@ -39,7 +39,7 @@ def test_the_users_options_override_the_definition_and_another_update_its_step()
         assert getattr(settings, name) == getattr(UNTUNED_DEFAULTS, name)
     asked = replace(
         METHOD, update="adam", lr="2%", schedule="linear", blur=0.0, keep_best=True,
-        iterations=3, parameters="channels", proximity=0.5, line_search=True,
+        iterations=3, proximity=0.5, line_search=True,
     )  # fmt: skip
     settings = resolve_settings(STRANGER, asked)
     assert {name: getattr(settings, name) for name in asked.given()} == asked.given()
@@ -47,14 +47,14 @@ def test_the_users_options_override_the_definition_and_another_update_its_step()
 
 @pytest.mark.parametrize("command", [refine, batch])
 def test_names_and_values_reach_the_settings(command: click.Command) -> None:
-    arguments = ["a", "-o", "b", "--set", "blur=2,keep-best,mask-scale=0.5"]
+    arguments = ["a", "-o", "b", "--set", "blur=2,keep-best"]
     arguments += ["--set", "precision=bf16"]
     arguments += ["--sparse", "s", "--scan", "extrinsics=pose.txt"] if command is refine else []
     params = dict(command.make_context("command", arguments).params)
     values = taken(Settings, params)
     assert params["precision"] == "bf16"
     assert params.get("extrinsics") == (Path("pose.txt") if command is refine else None)
-    assert (values["blur"], values["keep_best"], values["mask_scale"]) == (2.0, True, 0.5)
+    assert (values["blur"], values["keep_best"]) == (2.0, True)
     assert "line_search" not in values
 
 
@@ -64,7 +64,7 @@ def test_names_and_values_reach_the_settings(command: click.Command) -> None:
         ("lr=1", "choose from sparse-size-ok, .*, schedule, blur"),
         ("blur", "--set blur must be blur=S"),
         ("keep-best=1", "must be keep-best"),
-        ("mask=all", "'all' is not one of"),
+        ("schedule=all", "'all' is not one of"),
         ("blur=x", "'x' is not a valid float"),
     ],
 )

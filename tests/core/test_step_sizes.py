@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from pnpdepth_cli.core.update_rules import SCHEDULES, Channels, blurred, step_size
-from pnpdepth_cli.errors import LayerError, UsageError
+from pnpdepth_cli.core.update_rules import SCHEDULES, blurred, step_size
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 
 
@@ -66,32 +66,3 @@ def test_the_reach_is_a_gaussian_of_so_many_spacings_of_the_points() -> None:
     for row, column in ((5, 20), (4, 20), (9, 23), (0, 0), (7, 39)):
         expected = weight(row, 10, 5, down) * weight(column, 40, 20, across)
         assert float(result[row, column]) == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize(("shape", "inside"), [((1, 3, 4, 5), (2, 3)), ((1, 7, 3), (1,))])
-def test_channels_move_by_a_scale_and_a_shift_each(
-    shape: tuple[int, ...], inside: tuple[int, ...]
-) -> None:
-    torch.manual_seed(0)
-    z0 = torch.randn(shape).double() * 4 + 1
-    channels = Channels(z0)
-    change = torch.randn_like(channels.gradient(z0))
-    assert change.numel() == 2 * 3
-    scale, shift = change.tensor_split(2)
-    flat = (z0 - z0.mean(inside, keepdim=True)) / z0.std(inside, correction=0, keepdim=True)
-    torch.testing.assert_close(channels.change_of_z(change), scale * flat + shift)
-    # what `of` gives is the slope of the loss in these numbers, over the elements of a channel
-    slope, count = torch.randn_like(z0), z0.numel() // 3
-    along = (slope * channels.change_of_z(change)).sum()
-    torch.testing.assert_close((channels.gradient(slope) * change).sum() * count, along)
-
-
-def test_a_channel_that_is_the_same_everywhere_is_shifted_only() -> None:
-    channels = Channels(torch.ones(1, 1, 2, 2))
-    moved = channels.change_of_z(torch.tensor([5.0, 2.0]).view(2, 1, 1, 1))
-    assert moved.flatten().tolist() == [2.0] * 4
-
-
-def test_a_z_without_channels_is_refused() -> None:
-    with pytest.raises(LayerError, match="--set parameters=elements"):
-        Channels(torch.zeros(1, 8))

@@ -13,7 +13,6 @@ from pnpdepth_cli.core import update_rules
 from pnpdepth_cli.core.update_rules import (
     Update,
     adam,
-    adam_short,
     lbfgs,
     momentum,
     normalised,
@@ -50,7 +49,6 @@ def optimised(make: Callable[[list[Tensor]], torch.optim.Optimizer], steps: int 
         (momentum, lambda p: torch.optim.SGD(p, lr=0.1, momentum=0.9)),
         (adam, lambda p: torch.optim.Adam(p, lr=0.1, eps=1e-12)),
         (lambda: adam(0.5, 0.9, 1e-8), lambda p: torch.optim.Adam(p, 0.1, (0.5, 0.9), 1e-8)),
-        (adam_short, lambda p: torch.optim.Adam(p, 0.1, (0.8, 0.95), 1e-12)),
     ],
 )
 def test_an_update_is_that_of_torch_optim(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +15,8 @@ from scipy.stats import ttest_rel
 
 import pnpdepth_cli as pnp
 from pnpdepth_cli.frames import adapt
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import prepare
 from tests.frames.scenes import frame_in_memory
 
 SETTINGS = pnp.Settings(iterations=0)
@@ -25,13 +29,16 @@ def pair(seed: int, count: int = 60) -> Pair:
     return np.ascontiguousarray(frame.rgb.permute(1, 2, 0).numpy()), frame.points
 
 
+def named(seeds: Iterable[int]) -> Iterator[tuple[str, Frame]]:
+    return ((str(seed), frame_in_memory(seed=seed)) for seed in seeds)
+
+
 FRAMES = [pair(seed) for seed in range(8)]
 
 
 @pytest.fixture
 def network(monkeypatch: pytest.MonkeyPatch) -> pnp.Network:
-    steps = adapt.adaptation_settings.__kwdefaults__
-    monkeypatch.setitem(steps, "steps", 12)
+    monkeypatch.setattr(adapt, "STEPS", 12)
     return pnp.load_network("sparse2dense-tiny")
 
 
@@ -47,9 +54,8 @@ def test_learnt_weights_are_used_while_the_refiner_is_open(
     assert any("% loss at hidden points of 4 frames" in note for note in learnt.notes)
     assert np.array_equal(learnt.depth, again.depth)
     frame = frame_in_memory(seed=0)
-    expected, _ = adapt.learnt(refiner.network, [frame_in_memory(seed=n) for n in range(8)], 0)
-    assert expected is not None
-    with expected.in_place(), torch.no_grad():
+    expected = adapt.learn(refiner.network, named(range(8)))
+    with adapt.weights_in_place(network, expected.weights):
         by_hand = pnp.refine(network, *FRAMES[0], SETTINGS)
     assert np.array_equal(learnt.depth, by_hand.depth)
     residuals = [(frame.points.sample(torch.from_numpy(depth.depth)) - frame.points.depth).abs()
@@ -99,21 +105,71 @@ def test_a_frame_to_learn_from_needs_two_points(network: pnp.Network) -> None:
         refiner.refine(*FRAMES[0])
 
 
-def test_frames_for_validation_are_looked_at_as_often_as_asked(network: pnp.Network) -> None:
-    frames = [frame_in_memory(seed=seed) for seed in range(5)]
-    with pnp.Refiner(network) as refiner:
-        resolved = refiner.decide(frames[0]).network
-    adaptation = adapt.Adaptation(
-        resolved,
-        adapt.adaptation_settings(resolved, frames[0]),
-        {str(number): lambda frame=frame: frame for number, frame in enumerate(frames)},  # type: ignore[misc]
-        validated=2,
-        checks=2,
+def test_an_update_is_adams_on_the_loss_at_points_hidden_from_the_input(
+    network: pnp.Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adapt, "STEPS", 1)
+    learnt = adapt.learn(network, named(range(8)), seed=3)
+    # frames 1, 3, 5 and 7 are for validation
+    generator = torch.Generator().manual_seed(3)
+    number = (0, 2, 4, 6)[torch.randperm(4, generator=generator)[0]]
+    prepared = prepare(network, frame_in_memory(seed=number))
+    points = prepared.points
+    hidden = torch.randperm(len(points), generator=generator) % 2 == 0
+    module = copy.deepcopy(network.module).requires_grad_()
+    output = network.depth_of(module(*prepared.arguments_for(points.select(~hidden))))
+    asked = points.select(hidden)
+    (asked.sample(output).log() - asked.depth.log()).abs().mean().backward()
+    for name, parameter in module.named_parameters():
+        gradient = parameter.grad
+        step = 0 if gradient is None else gradient / (gradient.abs() + adapt.EPSILON)
+        expected = parameter.detach() - adapt.LR * step
+        torch.testing.assert_close(learnt.weights[name], expected, rtol=1e-4, atol=1e-6)
+
+
+def test_the_loss_of_each_validation_frame_is_compared_and_has_to_fall_beyond_chance() -> None:
+    before, after = np.array([1.0, 2.0, 3.0, 2.0]), np.array([0.8, 1.7, 2.7, 1.5])
+    fallen, risen = (
+        adapt.Learnt(weights={}, before=first, after=second)
+        for first, second in ((before, after), (after, before))
     )
-    assert (adaptation.training, adaptation.validation) == ([0, 2, 4], [1, 3])
-    losses = adaptation.run()
-    assert sorted(losses) == [0, 8, 12]
-    assert losses[adaptation.kept] == min(losses.values())
-    best, first = adaptation._losses[adaptation.kept], adaptation._losses[0]
-    expected = ttest_rel(np.log(best), np.log(first), alternative="less").pvalue
-    assert adaptation.p_value() == pytest.approx(expected, rel=1e-9)
+    chance = adapt.Learnt(weights={}, before=before, after=after[::-1])
+    assert ttest_rel(np.log(after), np.log(before), alternative="less").pvalue < adapt.SIGNIFICANT
+    assert [each.is_better for each in (fallen, risen, chance)] == [True, False, False]
+
+
+def test_every_point_is_hidden_once_before_one_is_hidden_again() -> None:
+    halves = adapt._halves(9, torch.Generator().manual_seed(0))
+    first, second, third, fourth = (next(halves) for _ in range(4))
+    assert torch.equal(first, ~second)
+    assert torch.equal(third, ~fourth)
+    assert not torch.equal(first, third)
+    assert int(first.sum()) in (4, 5)
+
+
+def test_the_image_encoder_does_not_learn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adapt, "STEPS", 1)
+    network = pnp.load_network("compact")
+    own = dict(network.module.named_parameters())
+    learnt = adapt.learn(network, named(range(4)))
+    moved = {name for name, value in learnt.weights.items() if not torch.equal(value, own[name])}
+    assert moved
+    assert own.keys() - learnt.weights.keys() == {n for n in own if n.startswith("encoder.")}
+
+
+def test_the_networks_own_weights_come_back_whatever_happens(network: pnp.Network) -> None:
+    before = copy.deepcopy(network.module.state_dict())
+    learnt = {name: value + 1 for name, value in network.module.named_parameters()}
+    with adapt.weights_in_place(network, learnt):
+        assert all(torch.equal(v, learnt[n]) for n, v in network.module.named_parameters())
+    with suppress(KeyError), adapt.weights_in_place(network, learnt):
+        raise KeyError
+    assert all(torch.equal(network.module.state_dict()[name], before[name]) for name in before)
+
+
+def test_a_loss_that_is_not_finite_ends_the_learning(
+    network: pnp.Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adapt, "LR", 1e30)
+    with pytest.raises(pnp.DivergedError, match="not finite after"):
+        adapt.learn(network, named(range(8)))

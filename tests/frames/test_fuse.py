@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -22,9 +21,6 @@ from tests.frames.scenes import SIZE, Brightness, Nearest, TwicePrior, frame_in_
 
 UPDATES = Settings(iterations=3, lr="5%", update="sign", align="none")
 ALIGNED = Settings(iterations=0, align="affine")
-HIDDEN = Settings(
-    iterations=2, lr=1e-4, loss="log", update="adam", parameters="weights", target="masked"
-)
 
 
 def test_the_weighted_mean_is_geometric_and_skips_unknown_depth() -> None:
@@ -177,38 +173,6 @@ def test_outliers_among_few_points_are_those_beside_the_network_and_else_those_o
     expected = frame.points.select(~(bad & (beside or count >= FEW_POINTS)))
     assert torch.equal(inliers.points.xy, expected.xy)
     assert torch.equal(user.used.xy, expected.xy)
-
-
-def test_steps_by_hidden_points_are_made_while_there_is_time() -> None:
-    network = load_network("compact", None)
-    settings = Settings(iterations=0)
-    compact = fuse.Member(
-        network=network, layer="decoder.s8", settings=settings, hidden_points=HIDDEN
-    )
-    frame = frame_in_memory(60)
-    with network.cut_at_points() as split:
-        alone = refine_frame(network, split, HIDDEN, frame)
-    with Fusion([compact]) as fusion:
-        plain, late = fusion.fuse(frame), fusion.fuse(frame, until=time.monotonic() - 1)
-        moved = fusion.fuse(frame, until=time.monotonic() + 1e6)
-    assert torch.equal(moved.after, torch.from_numpy(alone.after))
-    assert (moved.steps, plain.steps, late.steps) == ({"compact": 2}, {}, {})
-    assert torch.equal(late.after, plain.after)
-    assert not torch.equal(moved.after, plain.after)
-
-
-def test_steps_that_fail_leave_the_networks_own_depth() -> None:
-    network = load_network("compact", None)
-    wild = replace(HIDDEN, lr=1e30, iterations=5)
-    compact = fuse.Member(
-        network=network, layer="decoder.s8", settings=Settings(iterations=0), hidden_points=wild
-    )
-    frame = frame_in_memory(60)
-    with Fusion([compact]) as fusion:
-        plain = fusion.fuse(frame)
-        failed = fusion.fuse(frame, until=time.monotonic() + 1e6)
-    assert torch.equal(failed.after, plain.after)
-    assert failed.user.diverged is None
 
 
 def test_a_network_that_explains_nothing_at_the_points_has_no_say() -> None:

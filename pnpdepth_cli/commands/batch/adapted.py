@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,10 +16,15 @@ from pnpdepth_cli.commands.batch.frames import Task, task_of
 from pnpdepth_cli.commands.batch.records import settings_of
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.errors import DivergedError, InputError, UsageError
-from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.record import read_json, write_json
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.frames.adapt import Learnt
+    from pnpdepth_cli.frames.frame import Frame as FrameInMemory
+    from pnpdepth_cli.models.network import Network
 
 MOST_FRAMES = 64
 """Frames of a sequence that are learnt from, spread over it."""
@@ -84,42 +89,51 @@ def _learn(
     stopped: Callable[[], bool],
 ) -> str | None:
     """Writes adapted weights if they are better beyond chance; returns why they are not."""
-    from pnpdepth_cli.commands.adapt import adapt_to  # these import torch
-    from pnpdepth_cli.commands.batch.request import AdaptRequest
-    from pnpdepth_cli.commands.refinement.inputs import read_inputs
-    from pnpdepth_cli.frames import adapt
+    from pnpdepth_cli.commands.refinement.inputs import read_inputs  # these import torch
+    from pnpdepth_cli.frames.adapt import learn, too_little
+    from pnpdepth_cli.frames.resolve import resolve_definition
+    from pnpdepth_cli.models.network import load_network
 
-    if why := adapt.too_little(len(tasks), read_inputs(tasks[0].request)):
-        return why
-
-    def on_step(done: int, of: int, text: str) -> None:
+    def check() -> None:
         if stopped():
             raise KeyboardInterrupt
 
-    make_folder(weights.parent)
-    asked = AdaptRequest(
-        source=request.source,
-        output=weights,
-        refine=request.refine.with_fields(overwrite=True),
-        steps=adapt.STEPS,
-        validated=adapt.validated_of(len(tasks)),
-        checks=1,
-    )
+    def frames() -> Iterator[tuple[str, FrameInMemory]]:
+        for task in tasks:
+            check()
+            yield task.name, read_inputs(task.request)
+
+    first = read_inputs(tasks[0].request)
+    if why := too_little(len(tasks), first):
+        return why
+    choice = request.refine.network
+    network = load_network(choice.model, choice.checkpoint, choice.device)
+    network = resolve_definition(network, first.registered())
     try:
-        adapted = adapt_to(tasks, asked, say, on_step)
+        learnt = learn(network, frames(), seed=request.refine.method.seed, on_step=check)
     except UsageError as error:
         raise UsageError(
             "--adapt needs a network that takes points, such as compact, as the first --model"
         ) from error
-    change = (
-        f"{adapted['change']:+.1%} loss at hidden points of {adapted['validation_frames']} frames"
-    )
-    if adapt.is_significant(adapted["p_value"]):
-        say(f"adapt: {change}")
-        return None
-    for path in (weights, asked.card):
-        path.unlink()
-    return f"{change} is not beyond chance"
+    if not learnt.is_better:
+        return str(learnt)
+    say(f"adapt: {learnt}")
+    _write(weights, network, learnt)
+    return None
+
+
+def _write(path: Path, network: Network, learnt: Learnt) -> None:
+    """Writes all tensors of the network, those that learnt among them."""
+    from safetensors.torch import save_file
+
+    from pnpdepth_cli.frames.adapt import weights_in_place
+
+    with weights_in_place(network, learnt.weights):
+        state = network.module.state_dict()
+        copies = {name: value.detach().cpu().clone().contiguous() for name, value in state.items()}
+    make_folder(path.parent)
+    with atomic_path(path) as file:
+        save_file(copies, file)
 
 
 def _digest(settings: dict[str, Any], tasks: Sequence[Task]) -> str:

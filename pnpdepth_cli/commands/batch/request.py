@@ -1,4 +1,4 @@
-"""What the user asks of a batch, and of an adaptation. Imports neither numpy nor torch."""
+"""What the user asks of a batch. Imports neither numpy nor torch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
 from pnpdepth_cli.commands.refinement.request import RefineRequest
-from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import option
 
 LOCAL = "local"
@@ -154,32 +154,6 @@ class BatchRequest(FrameSelection):
             raise UsageError("--adapt does not go with --shard; weights are learnt in one process")
         if self.html_3d and self.html is None:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
-
-
-@dataclass(frozen=True, kw_only=True)
-class AdaptRequest(FrameSelection):
-    """Which frames a network learns from, and how. `output` is the file of its weights."""
-
-    steps: int = option(
-        200, "Number of updates of the weights.", metavar="N", least=1, show_default=True
-    )
-    lr: float = option(4e-4, "Step size at the start.", metavar="NUMBER", show_default=True)
-    validated: int = 10
-    """One frame in this many is for validation; of fewer frames, the last."""
-    checks: int = 5
-    """How often the validation frames are looked at, besides before the first update."""
-
-    def __post_init__(self) -> None:
-        if self.output.suffix != ".safetensors":
-            raise UsageError(f"{self.output}: name the file of the weights NAME.safetensors")
-        for path in (self.output, self.card):
-            if path.exists() and not self.refine.outputs.overwrite:
-                raise OutputError(f"{path} exists; --overwrite replaces it, -o names another file")
-
-    @property
-    def card(self) -> Path:
-        """The file that describes the weights."""
-        return self.output.with_suffix(".md")
 
 
 class RayWorkers(NamedTuple):

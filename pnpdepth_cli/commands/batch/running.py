@@ -262,11 +262,7 @@ class OpenNetwork:
 
     def __init__(self, refiner: Refiner, batch_size: int, say: Callable[[str], None]) -> None:
         self.refiner, self._say = refiner, say
-        fixed = (
-            not refiner.is_default
-            and not refiner.settings.moves_weights
-            and refiner.settings.tile is None
-        )
+        fixed = not refiner.is_default and refiner.settings.tile is None
         if batch_size > 1 and not fixed:
             say("batch size: 1; only frames of a fixed network without tiles go together")
         self.batch_size = batch_size if fixed else 1

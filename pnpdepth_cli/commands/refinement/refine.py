@@ -166,7 +166,6 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: Refined) -> dict[str, Any
         "stages": [{"stage": n, "scores": _scores(d, gt)} for n, d in stages.items()]
         if stages
         else None,
-        "hidden_point_steps": dict(frame.steps) or None,
         "baselines": _baseline_scores(frame, gt) if request.hold_out.baselines else None,
         "diverged": str(frame.diverged) if frame.diverged else None,
         "notes": [note for note in (*inputs.notes, *of_networks, *frame.notes) if note],

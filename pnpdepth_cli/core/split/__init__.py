@@ -1,4 +1,4 @@
-"""Cutting any network at any layer or at its arguments: f = f_rear ∘ f_front, without rewriting.
+"""Cutting any network at any layer: f = f_rear ∘ f_front, without rewriting.
 
 The front runs the network's own forward up to the cut and stops there. It saves the output of every
 *outermost* submodule that has finished: what ran before z existed cannot depend on z. The rear runs
@@ -18,7 +18,7 @@ reached Python, where the network could branch on it. Then further frames are on
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -26,8 +26,8 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
 from pnpdepth_cli.core.split.recorder import Recorder
-from pnpdepth_cli.core.split.replay import CutReached, Interception, Recording, Replay
-from pnpdepth_cli.core.split.tensors import NetworkState, tensors_in
+from pnpdepth_cli.core.split.replay import CutReached, Interception, Replay
+from pnpdepth_cli.core.split.tensors import NetworkState
 from pnpdepth_cli.core.split.watch import Watch
 from pnpdepth_cli.core.user_code import wrap_user_errors
 
@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 _LOW_PRECISION = (torch.float16, torch.bfloat16)
-
-_BEFORE_ALL_CALLS = -1
-"""Position of the cut among the recorded calls."""
 
 
 class Split:
@@ -63,13 +60,10 @@ class Split:
     def __init__(self, network: nn.Module, layer: str, *, static_graph: bool = False) -> None:
         self.layer = layer
         self._network, self._promised_static = network, static_graph
-        self._cut = self._find_cut()
+        self._cut = CutPoint.find(network, layer)
         self._uncacheable: set[nn.Module] = set()
         self._interception: Interception | None = None
         self._replay: Replay | None = None
-
-    def _find_cut(self) -> CutPoint:
-        return CutPoint.find(self._network, self.layer)
 
     def __enter__(self) -> Self:
         self._state = NetworkState(self._network)
@@ -154,14 +148,11 @@ class Split:
                 return replay
             raise self._cut.never_ran(recorder.ran, replay.calls[self._cut.module])
 
-    def _record_rear(self, replay: Replay, varying: Sequence[Tensor] = ()) -> Any:
-        """A watched pass; what depends on z, or on these tensors, is not cached."""
+    def _record_rear(self, replay: Replay) -> Any:
         assert self._interception is not None
         saved = [output for output in replay.outputs if output is not None]
         tensors = (replay.arguments, *saved, *self._state.tensors)
         watch = Watch(tensors, reads=True, escapes=not self._promised_static)
-        for tensor in varying:
-            watch.touch(tensor)
         recorder = Recorder(self._cut, watch, replay, self._uncacheable)
         try:
             output = self._run(replay, recorder)
@@ -190,63 +181,6 @@ class Split:
                     return self._network(*arguments.fresh())
         finally:
             replay.recorder = None
-
-
-class InputSplit(Split):
-    """A network cut at some of its arguments, as a context manager.
-
-    with InputSplit(network) as split:
-        output = split.first(rgb, sparse, varying={1})     # once for each frame
-        output = split.again(rgb, fewer_points)            # many times
-
-    In `again`, submodules that do not depend on a varying argument return what they gave in
-    `first`, as the image encoder of a network that takes image and sparse depth. A network that
-    branches on values of its arguments runs as a whole, unless `static_graph` promises otherwise.
-
-    Args:
-        static_graph: As of `Split`.
-    """
-
-    def __init__(self, network: nn.Module, *, static_graph: bool = False) -> None:
-        super().__init__(network, "", static_graph=static_graph)
-        self._varying: frozenset[int] = frozenset()
-
-    def _find_cut(self) -> CutPoint:
-        return CutPoint.at_arguments(self._network)
-
-    def first(self, *arguments: Any, varying: Collection[int]) -> Any:
-        """Returns what the network returns, without gradients, and remembers what is fixed.
-
-        Args:
-            *arguments: Of the network's forward.
-            varying: Positions of the arguments that `again` may change.
-        """
-        replay = self._replay
-        with torch.no_grad():
-            if (
-                replay is not None
-                and self._varying == frozenset(varying)
-                and replay.recording.holds_for(arguments)
-            ):
-                replay.next_frame(arguments)
-                return self._run(replay)
-            assert self._interception is not None
-            self._varying, self._replay = frozenset(varying), None  # frees the last frame's tensors
-            self._interception.only(None)
-            self._replay = replay = Replay(self._cut, arguments)
-            replay.recording = Recording(cut=_BEFORE_ALL_CALLS, static_graph=True)
-            value = replay.arguments.value
-            return self._record_rear(
-                replay, [t for index in sorted(varying) for _, t in tensors_in(value[index])]
-            )
-
-    def again(self, *arguments: Any) -> Any:
-        """Returns what the network returns for other values of the varying arguments."""
-        replay = self._replay
-        if replay is None:
-            raise RuntimeError("again() needs first() first")
-        replay.change_arguments(arguments)
-        return self._run(replay)
 
 
 def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:

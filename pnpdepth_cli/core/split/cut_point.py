@@ -73,19 +73,6 @@ class CutPoint:
             around_hooks=_around_hooks(modules),
         )
 
-    @classmethod
-    def at_arguments(cls, network: nn.Module) -> CutPoint:
-        """Returns the cut in front of the whole network: z is what it is called with."""
-        modules = dict(network.named_modules(remove_duplicate=False))
-        return cls(
-            layer="",
-            name=LayerName(""),
-            module=nn.Identity(),  # never called
-            modules=modules,
-            containers=frozenset(),
-            around_hooks=_around_hooks(modules),
-        )
-
     def choose(self, output: Any) -> tuple[tuple[str, ...], Tensor]:
         """Returns the path and the tensor of z in the layer's output.
 

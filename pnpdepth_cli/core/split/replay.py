@@ -162,12 +162,8 @@ class Replay:
 
     def next_frame(self, arguments: Sequence[Any]) -> None:
         """Forgets the frame at hand; `arguments` are those of the next one."""
-        self.change_arguments(arguments)
-        self.outputs, self.z0, self.z = [None] * len(self.recording.calls), None, None
-
-    def change_arguments(self, arguments: Sequence[Any]) -> None:
-        """Replaces the arguments of the frame at hand; saved outputs stay."""
         self.arguments = SavedTensors(_copies(arguments), self.arguments.copied)
+        self.outputs, self.z0, self.z = [None] * len(self.recording.calls), None, None
 
     def handle(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
         """Returns the output of a call in a pass: saved, with z in it, or of the submodule."""

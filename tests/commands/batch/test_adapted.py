@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -34,8 +33,7 @@ def batch(drive: Path, *more: str) -> int:
 def test_better_weights_are_used_for_every_frame_and_found_again(
     drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(adapting, "ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.01))
-    monkeypatch.setattr(adapting.Adaptation, "_validated", falling(adapting.Adaptation._validated))
+    monkeypatch.setattr(adapting.Learnt, "is_better", True)
     assert batch(drive, "--dry-run") == 0
     assert not (drive.parent / "out").exists()
     assert batch(drive) == 0
@@ -52,21 +50,10 @@ def test_better_weights_are_used_for_every_frame_and_found_again(
     assert weights.stat().st_mtime_ns == before
 
 
-def falling(validated):  # type: ignore[no-untyped-def]
-    """The validation loss, halved after the first look."""
-
-    def halved(self, split, updates):  # type: ignore[no-untyped-def]
-        loss = validated(self, split, updates)
-        self._losses[updates] /= 1 + 99 * bool(updates)
-        return loss / (1 + 99 * bool(updates))
-
-    return halved
-
-
 def test_weights_that_are_not_better_are_neither_kept_nor_used(
     drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(adapting, "ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.2))
+    monkeypatch.setattr(adapting.Learnt, "is_better", False)
     assert batch(drive) == 0
     assert "the network's own weights are used: " in capsys.readouterr().err
     assert [path.name for path in (drive.parent / "out/adapted").iterdir()] == ["drive.json"]
@@ -91,7 +78,7 @@ def test_learning_can_be_stopped(drive: Path) -> None:
     )
     with pytest.raises(KeyboardInterrupt):
         run_batch(request, RecordingListener(), lambda: True)
-    assert list((drive.parent / "out/adapted").iterdir()) == []
+    assert not (drive.parent / "out/adapted").exists()
 
 
 def test_a_frame_that_cannot_be_read_leaves_the_networks_own_weights(

@@ -64,12 +64,9 @@ def test_a_network_that_does_not_take_frames_together_gets_one_at_a_time(
     assert all(np.array_equal(together[name], depth) for name, depth in alone.items())
 
 
-@pytest.mark.parametrize("refine", [{"tile": 64}, {"parameters": "weights"}])
-def test_methods_that_take_one_frame_at_a_time_say_so(
-    tmp_path: Path, refine: dict[str, Any]
-) -> None:
+def test_tiles_take_one_frame_at_a_time_and_say_so(tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive", NAMES[:2])
     listener = RecordingListener()
-    batch(root, listener, batch_size=2, refine={"iterations": 1, **refine})
+    batch(root, listener, batch_size=2, refine={"iterations": 1, "tile": 64})
     assert {row["status"] for row in listener.rows} == {"done"}
     assert any(text.startswith("batch size: 1; only frames of a") for text in listener.messages)

@@ -12,7 +12,6 @@ from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.commands.refinement.refine import load_refiner
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.frames.refiner import HIDDEN_POINT_STEPS
 from pnpdepth_cli.io.depth import read_depth
 from tests.commands.frames import FrameOnDisk, run
 
@@ -69,14 +68,6 @@ def test_the_standard_deviation_is_positive_and_rounded_in_a_png(frame: FrameOnD
     assert np.abs(exact - sigma).max() < 0.00051
 
 
-def test_a_time_budget_is_spent_on_steps_by_hidden_points(frame: FrameOnDisk) -> None:
-    record = run(frame, propagate=None, time_budget_s=1e-9).record
-    assert record["hidden_point_steps"] is None
-    record = run(frame, propagate=None, time_budget_s=1e6, overwrite=True).record
-    assert record["hidden_point_steps"].keys() == {"compact"}
-    assert 0 <= record["hidden_point_steps"]["compact"] <= HIDDEN_POINT_STEPS
-
-
 def test_networks_of_the_default_method_are_aligned_and_updated_a_few_times(
     frame: FrameOnDisk,
 ) -> None:
@@ -85,11 +76,7 @@ def test_networks_of_the_default_method_are_aligned_and_updated_a_few_times(
         sparse=frame.sparse,
         model=str(frame.model),
         checkpoint=frame.checkpoint,
-        time_budget_s=5.0,
     )
     user, compact = load_refiner(request, read_inputs(request)).members
     assert (user.settings.align, user.settings.iterations) == ("auto", 5)
-    assert user.hidden_points is None
     assert (compact.settings.align, compact.settings.iterations) == ("none", 2)
-    assert compact.hidden_points is not None
-    assert compact.hidden_points.masked

@@ -187,7 +187,6 @@ def test_the_networks_crop_leaves_the_rest_unknown_and_refuses_points_only_there
         run(frame, model=str(model), sparse=left)
 
 
-MASKED = {"model": "compact", "checkpoint": None, "target": "masked"}
 BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"holdout": 1.0}, UsageError, "--holdout must be a fraction"),
     ({"layer": "1.5"}, UsageError, "between 0 and 1"),
@@ -199,7 +198,6 @@ BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"device": "tpu"}, PnpDepthError, "--device cpu"),
     ({"format": "jpg"}, UsageError, "not one of"),
     ({"depth_scale": -1.0}, UsageError, "scale"),
-    ({"time_budget_s": 5.0}, UsageError, "--propagate makes none"),
     ({"gt": "small.npy"}, SizeError, "ground truth .* is 62×10 but the image is 62×46"),
     ({"gt": "empty.npy"}, InputError, "no pixel with known depth"),
     ({"sparse": None}, InputError, "has no sparse depth; add it, or sample the ground truth"),
@@ -213,15 +211,6 @@ BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"ply": True, "fov_deg": 180.0}, UsageError, "--fov is 180 degrees"),
     ({"ply": True, "fov_deg": 60.0, "output": Path("a.exr")}, UsageError, "--ply writes a second"),
     ({"uncertainty": True, "output": Path("a.exr")}, UsageError, "--uncertainty writes a second"),
-    (MASKED | {"parameters": "channels"}, UsageError, "--target masked updates weights"),
-    (MASKED | {"parameters": "lora:0"}, UsageError, "none of elements, channels, weights"),
-    (MASKED | {"layer": "decoder.s8"}, UsageError, "--layer is where z is"),
-    (MASKED | {"preset": "paper"}, UsageError, "--preset paper updates z"),
-    (MASKED | {"line_search": True}, UsageError, "--set line-search is for updates of z"),
-    (MASKED | {"mask_fraction": 1.0}, UsageError, "mask-fraction must be between 0 and 1, got"),
-    (MASKED | {"mask_scale": 1.5}, UsageError, "mask-scale must be above 0 and at most 1"),
-    (MASKED | {"target": "given", "mask": "lines"}, UsageError, "--set mask is for points hidden"),
-    (MASKED | {"model": "eigen-tiny"}, UsageError, "takes no sparse depth"),
 ]
 
 
