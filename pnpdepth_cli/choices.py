@@ -195,7 +195,7 @@ MEASURE_GROUPS = Table(
     "commands/evaluation/measures",
     group="measures",
     noun="group of measures",
-    names=("area", "cloud", "distance", "edges", "flicker", "normals"),
+    names=("edges",),
 )
 """Measures that `eval` computes only on request."""
 

@@ -91,7 +91,6 @@ class Evaluation:
     def as_record(self) -> dict[str, Any]:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
         request, protocol = self.request, self.protocol
-        of_request = {name: getattr(request, name) for name in ("sparse", "calib")}
         bounds = None
         if self.interval is not None:
             bounds = {
@@ -109,7 +108,7 @@ class Evaluation:
             "inputs": {
                 "prediction": request.prediction,
                 "truth": request.ground_truth,
-                **of_request,
+                "sparse": request.sparse,
                 "layout_protocol": request.layout_protocol,
                 "scales": {
                     "prediction": request.pred_scale,
@@ -189,7 +188,6 @@ def evaluate(
         sparse=request.sparse,
         mask=protocol.mask,
         layout_protocol=request.layout_protocol,
-        calib=request.calib,
     )
     single = request.prediction.is_file() and len(pairs) == 1
 

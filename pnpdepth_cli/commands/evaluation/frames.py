@@ -12,12 +12,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from pnpdepth_cli.commands.evaluation.measures import Depth, Floats, Mask, MeasuredFrame
+from pnpdepth_cli.commands.evaluation.measures import Depth, Mask, MeasuredFrame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, load_stacked
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, crop_window
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.errors import InputError, SizeError
-from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image, read_mask
 from pnpdepth_cli.io.depth import (
@@ -48,6 +47,8 @@ class LoadedFrame(MeasuredFrame):
 
     kinds: dict[str, DepthKind]
     """Of the files by "prediction", "gt" and "sparse"."""
+    sparse: Depth | None = None
+    """(H, W) metres of the network's sparse input, 0 elsewhere; None if it is not known."""
     predicted: Mask | None = None
     """(H, W) true where the file has a prediction; None without a file."""
     fit: Fit | None = None
@@ -93,7 +94,6 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
         depth=np.zeros_like(gt),
         gt=np.where(mask, gt, np.float32(0)),
         sparse=sparse,
-        intrinsics=_intrinsics(pair, protocol, (whole.values.shape[0], whole.values.shape[1])),
         kinds=kinds,
     )
     return loaded if pair.prediction is None else _with_prediction(loaded, pair, protocol, request)
@@ -145,16 +145,6 @@ def _read_sigma(path: Path | None, size: Size, window: Window) -> Depth | None:
         return None
     placed[window] = values
     return placed
-
-
-def _intrinsics(pair: FramePair, protocol: EvalProtocol, size: tuple[int, int]) -> Floats | None:
-    """(3, 3) of the frame as the data set cuts it, if a measure needs them and they are known."""
-    frame = pair.frame
-    needed = any(group.needs == "intrinsics" for group in protocol.measure_groups)
-    if frame.calib is None or not needed:
-        return None
-    calibration = read_calibration(frame.calib, frame.camera)
-    return frame.protocol.intrinsics_in_crop(calibration.intrinsics, size)
 
 
 def _read(

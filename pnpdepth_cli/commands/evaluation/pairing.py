@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import io
 import re
-import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.budget import budget, check_network_file
+from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
@@ -29,17 +27,14 @@ from pnpdepth_cli.io.dataset import (
 )
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray
-from pnpdepth_cli.io.formats.arrays import COMPRESSIONS, parse_npy
+from pnpdepth_cli.io.formats.arrays import parse_npy
 from pnpdepth_cli.io.layouts import find_layout, list_frames
-from pnpdepth_cli.models.weights.numpy_file import read_pickled_arrays
 
 _DEPTH_MARKS = ("_depth", ".depth")
 _COMPANIONS = ("_sigma_preview", "_preview", "_improvement", "_sigma", "_valid")
 # KITTI's selection names the kind of file in the middle.
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5
-_MOST_COMPRESSED = 100
-"""How many bytes of depth one compressed byte may stand for; for sparse depth of LiDAR it is 20."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +54,6 @@ class FramePair:
     sigma: Path | None = None
     index: int | None = None
     """Of the frame, in files of several frames."""
-    previous: FramePair | None = None
     sampled: int = 0
     """Points of the ground truth that were the sparse input, by the run's record."""
     unit: str = METRES
@@ -74,9 +68,8 @@ def pair_frames(
     sparse: Path | None = None,
     mask: Path | None = None,
     layout_protocol: str | None = None,
-    calib: Path | None = None,
 ) -> tuple[list[FramePair], list[str]]:
-    """Returns the frames of the ground truth in its order, each with the one before; and notes.
+    """Returns the frames of the ground truth in its order, and notes.
 
     Args:
         prediction: A depth file, or a folder of them.
@@ -85,13 +78,12 @@ def pair_frames(
         mask: A file, or a folder with the same names.
         layout_protocol: One of choices.FRAME_PROTOCOLS, by which the frames of a data set are cut;
             None for the layout's own.
-        calib: Calibration of all frames; None for the data set's own.
 
     Raises:
         UsageError: For a file and a folder, or a layout protocol without a data set.
         InputError: For a missing path, or folders without a common name.
     """
-    for path in filter(None, (prediction, ground_truth, sparse, mask, calib)):
+    for path in filter(None, (prediction, ground_truth, sparse, mask)):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
     try:
@@ -119,8 +111,6 @@ def pair_frames(
     else:
         name = frame_name(prediction.stem)
         frames, predictions = [Frame(name=name, gt=ground_truth)], {name: prediction}
-    if calib is not None:
-        frames = [replace(frame, calib=calib) for frame in frames]
     names = {frame.name for frame in frames}
     if names.isdisjoint(predictions):
         raise InputError(
@@ -134,17 +124,15 @@ def pair_frames(
         )
     points = _by_frame(sparse, (*DEPTH_SUFFIXES, ".csv", ".txt"), names)
     masks = _by_frame(mask, (*DEPTH_SUFFIXES, *IMAGE_SUFFIXES), names)
-    pairs: list[FramePair] = []
-    last: dict[str, FramePair] = {}
-    for frame, group in zip(frames, groups_by_name([f.name for f in frames]), strict=True):
-        pair = replace(
+    groups = groups_by_name([frame.name for frame in frames])
+    return [
+        replace(
             _pair(frame, predictions.get(frame.name), points.get(frame.name)),
             group=group if frame.group is None else frame.group,
             mask=masks.get(frame.name),
         )
-        pairs.append(replace(pair, previous=last.get(pair.group)))
-        last[pair.group] = pair
-    return pairs, notes
+        for frame, group in zip(frames, groups, strict=True)
+    ], notes
 
 
 def _true_frames(
@@ -291,12 +279,7 @@ def _stacked_pairs(
 
 
 def stack_size(path: Path) -> int | None:
-    """Returns how many frames a file stacks; None for a single depth map or an unreadable file.
-
-    Stacks are `(N, H, W)` NPY, or NPZ as monodepth2's `gt_depths`.
-    """
-    if path.suffix.lower() not in (".npy", ".npz"):
-        return None
+    """Returns how many frames a `(N, H, W)` NPY file stacks; None for anything else."""
     stack = _stack(path)
     return None if stack is None else len(stack)
 
@@ -306,37 +289,17 @@ def load_stacked(path: Path, index: int) -> StoredArray:
     stack = _stack(path)
     assert stack is not None
     values = np.asarray(stack[index])
-    if values.ndim != 2:
-        raise FileFormatError(f"{path}: frame {index} is of shape {values.shape}, not (H, W)")
-    kind = path.suffix.removeprefix(".").upper()
-    return StoredArray(values=values, description=f"{values.dtype} {kind} of {len(stack):,} frames")
+    return StoredArray(values=values, description=f"{values.dtype} NPY of {len(stack):,} frames")
 
 
 @functools.lru_cache(maxsize=4)
-def _stack(path: Path) -> list[NDArray[Any]] | None:
-    """The stack in a file; None for anything else, which the reader of single maps reports.
-
-    monodepth2 stores images of different sizes as objects, a pickle.
-    """
-    try:
-        if path.suffix.lower() == ".npy":
-            check_network_file(path, "stack", FileFormatError)
-            data = path.read_bytes()
-        else:
-            with zipfile.ZipFile(path) as archive:
-                (member,) = archive.infolist()
-                data = archive.read(member) if _can_be_true(path, member) else b""
-        arrays = read_pickled_arrays(io.BytesIO(data))
-        if arrays is None:
-            array = parse_npy(path, data)
-            return [*array] if array.ndim == 3 and 1 not in (len(array), array.shape[2]) else None
-    except Exception:  # NumPy evaluates the header, which raises many kinds where it is damaged
+def _stack(path: Path) -> NDArray[Any] | None:
+    """The stack in a file; None for anything else, which the reader of single maps reports."""
+    if path.suffix.lower() != ".npy":
         return None
-    return arrays
-
-
-def _can_be_true(path: Path, member: zipfile.ZipInfo) -> bool:
-    """Whether an array in an archive may have the size that it claims."""
-    most = max(budget().max_image_bytes, _MOST_COMPRESSED * path.stat().st_size)
-    size_ok = member.file_size <= min(most, budget().max_decoded_bytes)
-    return size_ok and member.compress_type in COMPRESSIONS
+    try:
+        check_network_file(path, "stack", FileFormatError)
+        array = parse_npy(path, path.read_bytes())
+    except (FileFormatError, OSError):
+        return None
+    return array if array.ndim == 3 and 1 not in (len(array), array.shape[2]) else None

@@ -120,11 +120,6 @@ class EvalRequest(ScoringRules):
     channel: str | None = option(
         None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
     )
-    calib: Path | None = option(
-        None,
-        "Calibration or K of all frames, for --measures normals and cloud.  [default: the data"
-        " set's]",
-    )
     layout_protocol: str | None = option(
         None,
         "Crop of the frames of a data set GT, as in batch.  [default: the layout's own]",

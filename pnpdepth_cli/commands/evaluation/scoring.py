@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from pnpdepth_cli.commands.evaluation.frames import Fit, LoadedFrame, load_frame
+from pnpdepth_cli.commands.evaluation.frames import Fit, load_frame
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
 from pnpdepth_cli.commands.evaluation.measures import Depth, Floats
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
@@ -127,7 +127,9 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
     else:
         keys = (measure.key for measure in MEASURES)
         values = dict(zip(keys, measures_of(sums).tolist(), strict=True))
-        values |= _additional(frame, pair, protocol, request)
+        for group in protocol.measure_groups:  # NaN where the frame lacks a measure
+            own = (measure.key for measure in group.measures)
+            values |= zip(own, group.values(frame), strict=True)
     leaked, sparse_ratio = min(pair.sampled, pixels) or None, math.nan
     if frame.sparse is not None:
         equal = np.abs(frame.sparse - gt) <= frame.tolerance + 1e-6 * gt
@@ -147,28 +149,6 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
 def _median_ratio(depth: Depth, gt: Depth) -> float:
     both = (depth > 0) & (gt > 0)
     return float(np.median(depth[both] / gt[both])) if both.any() else math.nan
-
-
-def _additional(
-    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, request: EvalRequest
-) -> dict[str, float]:
-    """The measures of the protocol's additional groups."""
-    values: dict[str, float] = {}
-    for name, group in zip(protocol.groups, protocol.measure_groups, strict=True):
-        if group.needs == "intrinsics" and frame.intrinsics is None:
-            raise InputError(
-                f"--measures {name} needs the intrinsics of frame {pair.name}; give --calib"
-            )
-        if group.needs == "sparse" and frame.sparse is None:
-            raise InputError(
-                f"--measures {name} needs the sparse depth of frame {pair.name}; give --sparse"
-            )
-        previous = None
-        if group.in_sequences and pair.previous is not None and pair.previous.prediction:
-            previous = load_frame(pair.previous, protocol, request)
-        found = group.values(replace(frame, previous=previous))
-        values |= zip((measure.key for measure in group.measures), found, strict=True)
-    return values
 
 
 def filled(depth: Depth) -> Depth:

@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,30 +47,6 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
     with np.load(path, allow_pickle=False) as arrays:
         # TensorFlow writes the number of an operation's output behind its name.
         return {name.removesuffix(":0"): _tensor(arrays[name], name) for name in arrays.files}
-
-
-def read_pickled_arrays(content: IO[bytes]) -> list[NDArray[Any]] | None:
-    """Returns the arrays in a .npy of objects; None if it holds numbers.
-
-    A broken file raises whatever its parts do.
-
-    Args:
-        content: In memory, at its beginning.
-    """
-    version = npy.read_magic(content)
-    if version != (1, 0) or not npy.read_array_header_1_0(content)[2].hasobject:
-        return None
-    array, _ = read_pickle(content)
-    left, made = content.tell(), {}
-    objects = _state_of_array(array)[4]
-    if not isinstance(objects, list):
-        raise BrokenFileError("it holds no row of arrays")
-    _check_entries(objects)
-    for value in objects:
-        if id(value) not in made:
-            made[id(value)] = _unpickled(value, "an entry", left).numpy()
-            left -= made[id(value)].nbytes
-    return [made[id(value)] for value in objects]
 
 
 def _read_pickled_dict(path: Path) -> dict[str, Tensor]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,10 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
-from pnpdepth_cli.commands.evaluation.frames import load_frame
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.scoring import filled
 from pnpdepth_cli.commands.evaluation.tables import worst
 from pnpdepth_cli.errors import InputError, UsageError
-from pnpdepth_cli.io.dataset import Protocol
 from pnpdepth_cli.io.depth import write_depth
 
 
@@ -446,8 +443,8 @@ REFUSED = [
     ({"gt_scale": 0.0}, "--gt-scale"),
     ({"pred_scale": math.nan}, "--pred-scale"),
     ({"groups": ("edge",)}, "unknown group of measures 'edge'; did you mean 'edges'"),
-    ({"groups": ("area",), "average": "pooled"}, "--average pooled does not apply"),
-    ({"groups": ("area",), "protocol": "kitti-devkit"}, "--measures does not apply to kitti-"),
+    ({"groups": ("edges",), "average": "pooled"}, "--average pooled does not apply"),
+    ({"groups": ("edges",), "protocol": "kitti-devkit"}, "--measures does not apply to kitti-"),
 ]
 
 
@@ -466,40 +463,16 @@ def test_the_worst_frames_come_first_in_either_direction(two: Path) -> None:
     assert not [note for note in result.notes if "scale is probably wrong" in note]
 
 
-@pytest.fixture
-def sequences(tmp_path: Path) -> Path:
-    """Two sequences of two frames, and the intrinsics."""
+def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    for name in ("a/0", "a/1", "b/0", "b/1"):
-        gt = rng.uniform(2, 9, (20, 30))
+    for name in ("a", "b", "c"):
+        gt = rng.uniform(2, 9, (20, 30)) if name != "b" else np.full((20, 30), 2.0)
         depth_file(tmp_path / "gt" / f"{name}.npy", gt)
         depth_file(tmp_path / "out" / f"{name}.npy", gt * rng.uniform(0.9, 1.1, gt.shape))
-    (tmp_path / "K.txt").write_text("K: 50 0 15 0 50 10 0 0 1\n")
-    return tmp_path
-
-
-def test_additional_measures_follow_the_default_ones(sequences: Path) -> None:
-    default, more = scored(sequences), scored(sequences, groups=("area", "flicker"))
+    default, more = scored(tmp_path), scored(tmp_path, groups=("edges",))
     assert list(more.mean)[: len(default.mean)] == list(default.mean)
     assert default.mean.items() <= more.mean.items()
     assert more.protocol.scoring() == default.protocol.scoring()
-    first, second, third, fourth = (frame.values["flicker"] for frame in more.frames)
-    assert math.isnan(first)
-    assert math.isnan(third)
-    assert more.mean["flicker"] == pytest.approx((second + fourth) / 2)  # over those that have it
-    assert math.isnan(more.mean["mae_40_80"])
-
-
-def test_measures_of_the_scene_need_intrinsics(sequences: Path) -> None:
-    with pytest.raises(InputError, match="--measures cloud needs the intrinsics of frame a/0"):
-        scored(sequences, groups=("cloud",))
-    result = scored(sequences, groups=("cloud", "normals"), calib=sequences / "K.txt")
-    assert 0 < result.mean["f_score"] < 1
-    assert 0 < result.mean["normal_angle"] < 90
-    pair = result.frames[0].pair
-    cut = replace(pair.frame, protocol=Protocol(name="cut", crop=(4, 6)))
-    cut_out = load_frame(replace(pair, prediction=None, frame=cut), result.protocol, result.request)
-    assert cut_out.intrinsics is not None
-    assert cut_out.intrinsics.tolist() == [[50, 0, 15 - 12], [0, 50, 10 - 8], [0, 0, 1]]
-    with pytest.raises(InputError, match="--measures distance needs the sparse depth of frame"):
-        scored(sequences, groups=("distance",))
+    first, second, third = (frame.values["dbe_completeness"] for frame in more.frames)
+    assert math.isnan(second)  # a wall has no edges
+    assert more.mean["dbe_completeness"] == pytest.approx((first + third) / 2)

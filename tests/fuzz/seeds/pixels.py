@@ -25,7 +25,6 @@ def _depths(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[S
     np.savetxt(folder / "points.csv", points, delimiter=",", header="x,y,depth", comments="")
     np.save(folder / "points.npy", points)
     np.save(folder / "stack.npy", np.stack([depth, depth]))
-    np.savez(folder / "gt_depths.npz", data=np.stack([depth, depth]))
     return [
         *(
             Seed(file=name, command=("sample", name, "--count", "20", *OUT))
@@ -36,7 +35,6 @@ def _depths(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[S
             for name in ("points.csv", "points.npy")
         ),
         Seed(file="stack.npy", command=("eval", "stack.npy", "stack.npy")),
-        Seed(file="gt_depths.npz", command=("eval", "stack.npy", "gt_depths.npz")),
     ]
 
 
