@@ -26,6 +26,23 @@ SLOW_FIXTURES = {"chrome", "shared_data"}
 """A test that uses one of them belongs to the second tier."""
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Adds --rounding."""
+    parser.addoption(
+        "--rounding",
+        action="store_true",
+        help="change the results of torch's products as another processor could",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Enters the mode of --rounding for the whole session."""
+    if config.getoption("--rounding"):
+        from tests.rounding import enter_in_every_thread
+
+        enter_in_every_thread()
+
+
 @pytest.fixture
 def shared_data() -> Path:
     """The folder with real frames and weights, named by PNPDEPTH_TEST_DATA; skips without it."""

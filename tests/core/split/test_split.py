@@ -104,10 +104,13 @@ def test_torch_transformer_layers_with_their_fast_path_come_out_the_same(
     network = nn.Sequential(nn.Linear(4, 8), nn.TransformerEncoder(layer, 2), nn.Linear(8, 1))
     frames = [torch.rand(1, 6, 4) * scale for scale in (1, 3, 1)]
     wholes = [plain(network, frame) for frame in frames]
+    # The mode that sees what a forward of one's own reads turns torch's fast path off in it.
+    tolerance = 1e-5 if kind is LooksAtValues else 0
     for name in ("0", "1", "1.layers.0", "1.layers.1"):
         with Split(network, name) as split, torch.no_grad():
             for frame, whole in zip(frames, wholes, strict=True):
-                assert torch.equal(split.rear(split.front(frame)), whole)
+                depth = split.rear(split.front(frame))
+                torch.testing.assert_close(depth, whole, rtol=tolerance, atol=tolerance)
             assert split.static_graph == (kind is not LooksAtValues)
 
 
