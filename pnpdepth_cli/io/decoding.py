@@ -179,7 +179,8 @@ def _state_for_silence() -> Iterator[None]:
     from PIL import Image
 
     stdout, limit = sys.stdout, Image.MAX_IMAGE_PIXELS
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    log: Any = getattr(cv2.utils, "logging", cv2)  # cv2 itself before OpenCV 4.13
+    level = log.setLogLevel(0)
     ours: Any = _OthersOnly(stdout)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -190,7 +191,7 @@ def _state_for_silence() -> Iterator[None]:
             Image.MAX_IMAGE_PIXELS = limit
             if sys.stdout is ours:
                 sys.stdout = stdout
-            cv2.utils.logging.setLogLevel(level)
+            log.setLogLevel(level)
 
 
 class _OthersOnly:
