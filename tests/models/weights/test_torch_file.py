@@ -154,7 +154,7 @@ def tensor_pickle(elements: int, shape: tuple[Any, ...], stride: tuple[int, ...]
 
 def nested_tuples(depth: int) -> bytes:
     """Opcodes of a tuple that holds the one inside it twice, and that 1 twice, and so on."""
-    return b"K\x01" + b"2\x86" * depth
+    return b"K\x01" + b"q\x00h\x00\x86" * depth
 
 
 NESTED = nested_tuples(200)
@@ -200,7 +200,7 @@ LONG_BOMBS = {
 @pytest.mark.parametrize("kind", BOMBS)
 def test_a_small_pickle_takes_no_time_and_no_memory(kind: str, tmp_path: Path) -> None:
     path = archive_of(tmp_path / "bomb.pt", BOMBS[kind], b"\0" * 4)
-    assert path.stat().st_size < 2500
+    assert path.stat().st_size < 5000
     (tmp_path / "alone.pt").write_bytes(BOMBS[kind])
     with little(megabytes=50):
         refused(path)
