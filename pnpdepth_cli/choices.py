@@ -201,7 +201,7 @@ MEASURE_GROUPS = Table(
 
 # The method
 PRESETS = ("paper",)  # methods by one name: `pnpdepth_cli.settings.PAPER`
-SCHEDULES = ("constant", "linear", "cosine")  # of the step size over the updates
+SCHEDULES = ("constant", "linear")  # of the step size over the updates
 ALIGNMENTS = ("none", "median", "scale", "affine", "auto")  # of the output with the points
 
 # Networks

@@ -118,40 +118,20 @@ class Settings:
     loss: str = option(None, "Loss at the sparse points.", choices=choices.LOSSES)
     update: str = option(
         None,
-        "Update rule; another than the network's resets lr, schedule and blur.",
+        "Update rule; another than the network's resets --lr.",
         choices=choices.UPDATES,
     )
-    schedule: str = option(
-        None,
-        "Step size over the updates; linear and cosine decay to 0.",
-        within="--set",
-        choices=choices.SCHEDULES,
-    )
-    blur: float = option(
-        None,
-        "Blur the gradient over S times the spacing of the points; 0 is off.",
-        within="--set",
-        metavar="S",
-    )
-    proximity: float = option(
-        0.0,
-        "Add W times the mean squared change of log depth to the loss.",
-        within="--set",
-        metavar="W",
-    )
-    line_search: bool = option(
-        False, "Undo updates that raise the loss and halve the step.", within="--set"
-    )
-    keep_best: bool = option(
-        False, "Return the depth with the lowest loss, not the last.", within="--set"
-    )
+    schedule: str = None  # type: ignore[assignment]
+    """Step size over the updates, "constant" or "linear" to 0. It has no option."""
+    blur: float = None  # type: ignore[assignment]
+    """Standard deviation of the blur of the gradient in spacings of the points; 0 is off. It has no
+    option."""
     align: str = option(
         None,
         "Fit the network's output to the points by scale, or scale and shift."
         "  [default: the network's own]",
         choices=choices.ALIGNMENTS,
     )
-    align_every: bool = option(False, "Repeat the alignment at every update of z.", within="--set")
     propagate: str = option(
         None,
         "Propagate the residuals at the points to all pixels: by a Gaussian process, lines through"
@@ -181,15 +161,11 @@ class Settings:
             object.__setattr__(self, "lr", float(self.lr))  # one spelling of a step
 
     @property
-    def gives_best(self) -> bool:
-        """Whether the result is the depth of the lowest loss; with a line search it always is."""
-        return self.keep_best or self.line_search
-
-    @property
     def fixed_by(self) -> str:
-        """The options that fix the method, as the user gives them; empty for the default one."""
+        """What fixes the method, as the user gives it; empty for the default one."""
         given = self.given()
-        flags = {each.name: each.flag for each in options_of(Settings)}
+        flags = {each.name: each.name for each in fields(self)}
+        flags |= {each.name: each.flag for each in options_of(Settings)}
         if self.preset is not None:
             flags["preset"] += f" {self.preset}"
         return " ".join(flags[name] for name in given if name != "seed")
@@ -224,10 +200,6 @@ def _is_whole(value: Any) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
 
 
-def _is_weight(value: Any) -> bool:
-    return _is_number(value) and value >= 0
-
-
 def _is_step(value: object) -> bool:
     try:
         return 0 < float(str(value).strip().removesuffix("%")) < math.inf
@@ -235,13 +207,16 @@ def _is_step(value: object) -> bool:
         return False
 
 
-_NAMES = {o.name: o.option.choices for o in options_of(Settings) if o.option.choices is not None}
+_NAMES: Mapping[str, Collection[str]] = {"schedule": choices.SCHEDULES} | {
+    each.name: each.option.choices
+    for each in options_of(Settings)
+    if each.option.choices is not None
+}
 _CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
     "layer": (lambda value: isinstance(value, str), "the name of a layer, or a fraction as text"),
     "iterations": (_is_whole, "a whole number >= 0"),
     "lr": (_is_step, "a step size above 0, or a text such as '3%'"),
-    "blur": (_is_weight, ">= 0"),
-    "proximity": (_is_weight, ">= 0"),
+    "blur": (lambda value: _is_number(value) and value >= 0, ">= 0"),
     "tile": (lambda value: _is_whole(value) and value >= 64, "a whole number >= 64"),
     "seed": (_is_whole, "a whole number >= 0"),
 }

@@ -34,7 +34,7 @@ def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
     [
         (Settings(), ""),
         (Settings(seed=3), ""),
-        (Settings(iterations=2, keep_best=True), "--iterations --set keep-best"),
+        (Settings(iterations=2, blur=1.0), "--iterations blur"),
         (Settings(tile=128), "--tile"),
         (Settings(preset="paper", iterations=2), "--preset paper --iterations"),
     ],
@@ -48,7 +48,7 @@ def test_any_setting_of_the_method_fixes_it(settings: Settings, by: str) -> None
     [
         *(("iterations", value) for value in ("5", -1, 2.0)),
         *(("lr", value) for value in ("x%", "", 0, -1, NAN, INF, "inf")),
-        *((field, value) for field in ("blur", "proximity") for value in (-1, NAN, INF, "1")),
+        *(("blur", value) for value in (-1, NAN, INF, "1")),
         *((field, "foo") for field in ("preset", "loss", "update", "schedule", "align")),
         ("align", ["auto"]),
         ("layer", 3),

@@ -46,14 +46,14 @@ def click_option(declared: OptionField) -> Callable[[Any], Any]:
 _ASSIGNED = "_assigned"
 """Ending of the parameters of options that take several fields."""
 _HELP_OF_GROUPS = {
-    "--set": "Less common options, as in blur=1,keep-best.",
+    "--set": "Less common options, as in precision=bf16,sparse-size-ok.",
     "--scan": "How a LiDAR scan is read.",
     "--colmap": "Which points of a COLMAP model are used, and their unit.",
 }
 
 
 def _assigning(flag: str, members: Sequence[OptionField]) -> Callable[[Any], Any]:
-    """The click option that takes values of these fields, as in `blur=1,keep-best`."""
+    """The click option that takes values of these fields, as in `precision=bf16,sparse-size-ok`."""
     by_name = {member.name_within: member for member in members}
     forms = {name: _form(member) for name, member in by_name.items()}
 

@@ -104,14 +104,3 @@ def cauchy(predicted: Tensor, true: Tensor) -> Tensor:
     error = predicted.clamp_min(MIN_DEPTH).log() - true.log()
     c = (MAD_TO_STD * error.detach().abs().median()).clamp_min(MIN_CAUCHY_SCALE)
     return (c * (error / c).square().log1p()).mean()
-
-
-def proximity_loss(depth: Tensor, prediction: Tensor) -> Tensor:
-    """Mean (log d − log d_0)² over the image: an optional term of L that keeps d near d_0.
-
-    Args:
-        depth: (1, 1, h, w) metres, of the current z; differentiable.
-        prediction: (1, 1, h, w) metres, of z_0.
-    """
-    change = depth.clamp_min(MIN_DEPTH).log() - prediction.clamp_min(MIN_DEPTH).log()
-    return change.square().mean()

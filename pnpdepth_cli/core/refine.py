@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import UPDATES
-from pnpdepth_cli.core.losses import checked_loss, proximity_loss
+from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
 from pnpdepth_cli.core.update_rules import SCHEDULES, Update, blurred, step_size
@@ -45,10 +45,9 @@ class Refinement:
     """The result of a refinement."""
 
     before: Tensor  # depth (1, 1, h, w) in metres of z_0
-    after: Tensor  # depth (1, 1, h, w) in metres of z_kept
+    after: Tensor  # depth (1, 1, h, w) in metres of z_K
     losses: tuple[float, ...]  # L(z_0) … L(z_K)
     step: float  # α as a number
-    kept: int  # number of updates after which `after` was predicted: K, or those of the lowest loss
 
 
 def refine(
@@ -186,13 +185,11 @@ class _FrameRefinement:
         depth_of: DepthOf,
     ) -> None:
         self._settings, self._points, self._depth_of = settings, points, depth_of
-        self._step, self._halvings = step_size(settings.lr, z0), 0
+        self._step = step_size(settings.lr, z0)
         self._loss = checked_loss(settings.loss)
         self._update: Update = UPDATES[settings.update]()
-        self._best: tuple[Tensor, Tensor] | None = None  # z of the lowest loss and its direction
         self._first: Tensor | None = None  # depth of z_0
-        self._after: Tensor | None = None  # depth of z_kept
-        self._kept = 0
+        self._last: Tensor | None = None  # depth of z_k
         self.losses: list[float] = []
         self.error: PnpDepthError | None = None
 
@@ -205,19 +202,15 @@ class _FrameRefinement:
             return None
         at_points = self._points.sample(depth)
         loss = self._loss(at_points, self._points.depth)
-        if self._settings.proximity and self._first is not None:
-            loss = loss + self._settings.proximity * proximity_loss(depth, self._first)
         if self._settings.iterations and not bool(loss.isfinite()):
             self.error = self._diverged("loss", len(self.losses))
             if not self.losses and not bool(at_points.isfinite().all()):
                 self.error = bad_prediction(at_points)
             return None
-        updates, depth = len(self.losses), depth.detach()
         self.losses.append(float(loss.detach()))
+        self._last = depth.detach()
         if self._first is None:
-            self._first = depth
-        if not (self._settings.gives_best and self.losses[-1] > min(self.losses)):
-            self._kept, self._after = updates, depth
+            self._first = self._last
         return loss
 
     def updated(self, z: Tensor, gradient: Tensor) -> Tensor:
@@ -227,28 +220,21 @@ class _FrameRefinement:
             self.error = self._diverged("gradient", updates)
         if self.error is not None:
             return z
-        if self._best is not None and self._kept < updates:  # the last update raised the loss
-            self._halvings += 1
-            z, direction = self._best
-        else:
-            gradient = blurred(gradient, self._points, self._settings.blur)
-            with wrap_user_errors(f"update rule {self._settings.update!r}"):
-                direction = self._update(gradient).reshape(gradient.shape)
-            if self._settings.line_search:
-                self._best = z, direction
+        gradient = blurred(gradient, self._points, self._settings.blur)
+        with wrap_user_errors(f"update rule {self._settings.update!r}"):
+            direction = self._update(gradient).reshape(gradient.shape)
         alpha = self._step * SCHEDULES[self._settings.schedule](updates / self._settings.iterations)
-        return z - alpha * 0.5**self._halvings * direction
+        return z - alpha * direction
 
     def result(self) -> Refinement:
         """Returns the refinement as far as it has come."""
         assert self._first is not None
-        assert self._after is not None
+        assert self._last is not None
         return Refinement(
             before=self._first,
-            after=self._after,
+            after=self._last,
             losses=tuple(self.losses),
             step=self._step,
-            kept=self._kept,
         )
 
     def _diverged(self, quantity: str, updates: int) -> DivergedError:

@@ -7,7 +7,6 @@ order, and returns a direction of the same shape; z moves by −α × direction.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable
 from typing import TypeVar
@@ -157,7 +156,6 @@ def _two_loops(gradient: Tensor, pairs: deque[tuple[Tensor, Tensor]]) -> Tensor:
 SCHEDULES: dict[str, Callable[[float], float]] = {
     "constant": lambda done: 1.0,
     "linear": lambda done: 1.0 - done,
-    "cosine": lambda done: 0.5 * (1.0 + math.cos(math.pi * done)),
 }
 """Factor of α at each update, from the fraction 0 ≤ done < 1 of the updates already made."""
 

@@ -33,7 +33,6 @@ from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
 
 STEPS = 100
 """Updates on the frames of one sequence."""
@@ -183,7 +182,7 @@ class _Lesson:
         divided anew: halves that complement each other make steps that agree more.
         """
         network = self.frame.network
-        reader = self.frame.depth_reader(Settings(align=network.definition.default_alignment))
+        reader = self.frame.depth_reader(network.definition.default_alignment)
         halves = _halves(len(self.points), generator)
         with encoding_once(network, {}):
             yield lambda weights: self._loss(weights, next(halves), reader)

@@ -27,50 +27,25 @@ from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.settings import Settings
 
 
-class SplitCache:
-    """Keeps a network cut while the layer stays the same, as a context manager."""
-
-    def __init__(self, network: Network) -> None:
-        self.network, self._open = network, ExitStack()
-        self._split: Split | None = None
-
-    def __enter__(self) -> SplitCache:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Restores the whole network until it is cut again."""
-        self._open.close()
-        self._split = None
-
-    def at(self, layer: str) -> Split:
-        """Returns the network cut at the layer, open."""
-        if self._split is None or self._split.layer != layer:
-            self.close()
-            self._split = self._open.enter_context(self.network.cut_at(layer))
-        return self._split
-
-
 class OpenNetwork:
     """A network that is cut when first refined, as a context manager."""
 
     def __init__(self, network: Network, layer: str) -> None:
         self.network, self.layer = network, layer
         self._of_image_only = network.definition.input_kind == "rgb"
-        self._open, self._cut = ExitStack(), SplitCache(network)
+        self._open = ExitStack()
+        self._split: Split | None = None
         self._z0: Tensor | None = None
         self._output: Any = None
         self._encoded: dict[str, Any] = {}
 
     def __enter__(self) -> OpenNetwork:
         self._open.enter_context(encoding_once(self.network, self._encoded))
-        self._open.enter_context(self._cut)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._open.close()
+        self._split = None
         self.next_image()
 
     def next_image(self) -> None:
@@ -93,7 +68,7 @@ class OpenNetwork:
             prepared = prepare(self.network, frame)
             if not len(prepared.points):
                 raise prepared.no_points_error()
-            reader = prepared.depth_reader(settings)
+            reader = prepared.depth_reader(settings.align)
             if settings.iterations:
                 result = self._updated(prepared, reader, settings)
             else:
@@ -103,10 +78,16 @@ class OpenNetwork:
             raise refined
         return refined
 
+    def _cut(self) -> Split:
+        """The network cut at the layer, open."""
+        if self._split is None:
+            self._split = self._open.enter_context(self.network.cut_at(self.layer))
+        return self._split
+
     def _updated(
         self, prepared: PreparedFrame, reader: AlignedDepth, settings: Settings
     ) -> Refinement | PnpDepthError:
-        split, z0 = self._cut.at(self.layer), self._z0
+        split, z0 = self._cut(), self._z0
         if z0 is None:
             with torch.no_grad():
                 z0 = split.front(*prepared.arguments)
@@ -129,7 +110,7 @@ class OpenNetwork:
         output = self._output
         if output is None and self._z0 is not None:
             with torch.no_grad():
-                output = self._cut.at(self.layer).rear(self._z0)
+                output = self._cut().rear(self._z0)
         elif output is None:
             with torch.no_grad(), wrap_user_errors("the network's forward"):
                 output = self.network.module(*prepared.arguments)
@@ -138,7 +119,7 @@ class OpenNetwork:
         depth = reader(output).detach()
         at_points = prepared.points.sample(depth)
         loss = float(checked_loss(settings.loss)(at_points, prepared.points.depth))
-        return Refinement(before=depth, after=depth, losses=(loss,), step=0.0, kept=0)
+        return Refinement(before=depth, after=depth, losses=(loss,), step=0.0)
 
 
 @contextmanager

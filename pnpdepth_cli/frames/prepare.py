@@ -13,7 +13,6 @@ from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.frame import FrameMap
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,13 +33,13 @@ class PreparedFrame:
         """Returns the arguments of the network for some of the points; the image is the same."""
         return self.network.arguments_of(self.image, points, self.prior)
 
-    def depth_reader(self, settings: Settings) -> AlignedDepth:
+    def depth_reader(self, align: str) -> AlignedDepth:
         """Returns a new reader of the network's output in metres, (1, 1, h, w).
 
         Args:
-            settings: How it is aligned with the points.
+            align: How it is aligned with the points, one of `choices.ALIGNMENTS`.
         """
-        return AlignedDepth(self.network, self.points, settings.align, every=settings.align_every)
+        return AlignedDepth(self.network, self.points, align)
 
     def to_image(self, depth: Tensor) -> DepthMap:
         """Returns depth (1, 1, h, w) of the network's frame as (H, W) of the image frame.

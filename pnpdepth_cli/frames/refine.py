@@ -67,7 +67,7 @@ def refine_frames(
     with out_of_memory_is_a_device_error(network.device):
         prepared = [prepare(network, frame) for frame in frames]
         seen = [frame for frame in prepared if len(frame.points)]
-        readers = [frame.depth_reader(settings) for frame in seen]
+        readers = [frame.depth_reader(settings.align) for frame in seen]
         results: list[Refinement | PnpDepthError] = []
         if seen:
             with torch.no_grad():

@@ -23,14 +23,11 @@ _ENOUGH = 20
 class AlignedDepth:
     """Called with what the network returns, gives depth (1, 1, h, w) in metres.
 
-    The alignment is fitted at the first call, which is the plain prediction's, and kept; with
-    `every` it is fitted at each call, the fit itself being a constant to the gradient.
+    The alignment is fitted at the first call, which is the plain prediction's, and kept.
     """
 
-    def __init__(
-        self, network: Network, points: SparsePoints, kind: str, *, every: bool = False
-    ) -> None:
-        self._network, self._points, self._kind, self._every = network, points, kind, every
+    def __init__(self, network: Network, points: SparsePoints, kind: str) -> None:
+        self._network, self._points, self._kind = network, points, kind
         stated = network.definition.output_kind
         self._spaces = (stated,) if stated in SPACES else ("depth", "inverse")
         self.alignment: Alignment | None = None
@@ -43,14 +40,10 @@ class AlignedDepth:
             self.notes = self.notes or self._plain_notes(depth)
             return depth
         raw = self._network.raw_of(output)
-        if self.alignment is None or self._every:
-            first = self.alignment is None
-            spaces = (self.alignment.space,) if self.alignment else self._spaces
-            kind = self.alignment.kind if self.alignment else self._kind
+        if self.alignment is None:
             at_points = self._points.sample(raw.detach())
-            self.alignment = align(at_points, self._points, spaces, kind)
-            if first:
-                self.notes = self._notes(self.alignment, raw.detach())
+            self.alignment = align(at_points, self._points, self._spaces, self._kind)
+            self.notes = self._notes(self.alignment, raw.detach())
         return self.alignment.depth(raw)
 
     def _notes(self, fit: Alignment, raw: Tensor) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import pytest
 from pnpdepth_cli.cli.batch import batch
 from pnpdepth_cli.cli.options import taken
 from pnpdepth_cli.cli.refine import refine
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.request import FrameFiles, OutputOptions, RefineRequest
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
@@ -38,8 +38,7 @@ def test_the_users_options_override_the_definition_and_another_update_its_step()
     for name in ("iterations", "loss"):
         assert getattr(settings, name) == getattr(UNTUNED_DEFAULTS, name)
     asked = replace(
-        METHOD, update="adam", lr="2%", schedule="linear", blur=0.0, keep_best=True,
-        iterations=3, proximity=0.5, line_search=True,
+        METHOD, update="adam", lr="2%", schedule="linear", blur=0.0, iterations=3
     )  # fmt: skip
     settings = resolve_settings(STRANGER, asked)
     assert {name: getattr(settings, name) for name in asked.given()} == asked.given()
@@ -47,25 +46,24 @@ def test_the_users_options_override_the_definition_and_another_update_its_step()
 
 @pytest.mark.parametrize("command", [refine, batch])
 def test_names_and_values_reach_the_settings(command: click.Command) -> None:
-    arguments = ["a", "-o", "b", "--set", "blur=2,keep-best"]
+    arguments = ["a", "-o", "b", "--set", "output-scale=2,sparse-size-ok"]
     arguments += ["--set", "precision=bf16"]
     arguments += ["--sparse", "s", "--scan", "extrinsics=pose.txt"] if command is refine else []
     params = dict(command.make_context("command", arguments).params)
-    values = taken(Settings, params)
+    values = taken(FrameFiles, params) | taken(OutputOptions, params)
     assert params["precision"] == "bf16"
     assert params.get("extrinsics") == (Path("pose.txt") if command is refine else None)
-    assert (values["blur"], values["keep_best"]) == (2.0, True)
-    assert "line_search" not in values
+    assert (values["output_scale"], values["sparse_size_ok"]) == (2.0, True)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("lr=1", "choose from sparse-size-ok, .*, schedule, blur"),
-        ("blur", "--set blur must be blur=S"),
-        ("keep-best=1", "must be keep-best"),
-        ("schedule=all", "'all' is not one of"),
-        ("blur=x", "'x' is not a valid float"),
+        ("lr=1", "choose from sparse-size-ok, "),
+        ("output-scale", "--set output-scale must be output-scale="),
+        ("sparse-size-ok=1", "must be sparse-size-ok"),
+        ("precision=all", "'all' is not one of"),
+        ("output-scale=x", "output-scale 'x' is neither"),
     ],
 )
 def test_what_is_no_name_or_no_value_is_refused(text: str, message: str) -> None:

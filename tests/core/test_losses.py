@@ -14,7 +14,6 @@ from pnpdepth_cli.core.losses import (
     MIN_DEPTH,
     cauchy,
     checked_loss,
-    proximity_loss,
 )
 from pnpdepth_cli.errors import ModelError
 
@@ -88,11 +87,3 @@ def test_cauchy_feels_a_gross_error_less_than_a_middling_one_and_a_small_one_as_
     expected = MIN_CAUCHY_SCALE * log(1 + (log(2) / MIN_CAUCHY_SCALE) ** 2) / 4
     off = torch.tensor([2.0, 2.0, 2.0, 4.0])
     assert float(cauchy(off, true[:4])) == pytest.approx(expected, rel=1e-4)
-
-
-def test_proximity_is_the_mean_squared_change_of_log_depth() -> None:
-    loss = proximity_loss(torch.tensor([2.0, 3.0, 8.0]), torch.tensor([1.0, 3.0, 2.0]))
-    assert float(loss) == pytest.approx((log(2) ** 2 + log(4) ** 2) / 3)
-    # depth that is not positive is read as the least depth
-    loss = proximity_loss(torch.tensor([-1.0, 0.0]), torch.tensor([MIN_DEPTH, MIN_DEPTH / 2]))
-    assert float(loss) == 0

@@ -192,46 +192,6 @@ class Doubling(nn.Module):
         return self.cut(x[:, :1]) * 2
 
 
-@pytest.mark.parametrize("name", ["resnet", "unet", "midas"])
-@pytest.mark.parametrize("lr", [0.02, 1.0])
-def test_the_kept_iterate_has_the_lowest_loss_of_the_trajectory(name: str, lr: float) -> None:
-    settings = Settings(iterations=6, lr=lr, update="sign")
-    last, best = (
-        refined(build(name), CUTS[name][0], replace(settings, keep_best=keep))
-        for keep in (False, True)
-    )
-    assert best.losses == last.losses
-    assert (last.kept, best.kept) == (6, best.losses.index(min(best.losses)))
-    at_best = refined(build(name), CUTS[name][0], replace(settings, iterations=best.kept))
-    assert torch.equal(best.after, at_best.after)
-    assert torch.equal(best.before, last.before)
-
-
-# ------------------------------------------------------------------ what is updated, and how far
-
-
-def test_a_proximity_weight_adds_the_squared_change_of_log_depth_and_holds_it_back() -> None:
-    def change(result: Refinement) -> float:
-        return float((result.after.log() - result.before.log()).square().mean())
-
-    settings = Settings(iterations=8, lr=0.05, update="normalised")
-    free, held = (
-        refined(build("unet"), "bottleneck", replace(settings, proximity=proximity))
-        for proximity in (0.0, 10.0)
-    )
-    assert free.losses[0] == held.losses[0]
-    assert change(held) < change(free)
-    at_points = (POINTS.sample(held.after) - POINTS.depth).abs().mean()
-    assert held.losses[-1] == pytest.approx(float(at_points) + 10 * change(held), rel=1e-5)
-
-
-def test_a_line_search_takes_back_what_raises_the_loss_and_goes_half_as_far() -> None:
-    result = doubled(1, [7.0], Settings(iterations=4, lr=2.0, line_search=True))
-    # 6 → 10, back and half as far: 8, which is no worse than 6; on from there to 6; again 7
-    assert result.losses == (1.0, 3.0, 1.0, 1.0, 1.0)
-    assert result.kept == 4
-
-
 # ------------------------------------------------------------------ divergence
 
 
@@ -298,9 +258,8 @@ def test_a_gradient_that_is_not_finite_stops_with_the_depth_it_came_from() -> No
 
 
 def test_a_bad_prediction_without_updates_is_handed_over_as_it_is() -> None:
-    for settings in (Settings(iterations=0), Settings(iterations=0, keep_best=True)):
-        result = refined(Breaking(1, float("nan")), "cut", settings)
-        assert bool(result.after.isnan().all())
+    result = refined(Breaking(1, float("nan")), "cut", Settings(iterations=0))
+    assert bool(result.after.isnan().all())
 
 
 # ------------------------------------------------------------------ no gradient to z
@@ -434,7 +393,7 @@ class PerPixel(nn.Module):
     [
         *(Settings(lr="5%", update=update, schedule="linear", blur=0.7) for update in UPDATES),
         Settings(iterations=0),
-        Settings(lr="20%", loss="cauchy", update="normalised", keep_best=True),
+        Settings(lr="20%", loss="cauchy", update="normalised"),
     ],
 )
 def test_at_once_is_alone_bit_for_bit_where_the_network_is(settings: Settings) -> None:
@@ -445,7 +404,6 @@ def test_at_once_is_alone_bit_for_bit_where_the_network_is(settings: Settings) -
         assert torch.equal(together.before, alone.before)
         assert torch.equal(together.after, alone.after)
         assert (together.losses, together.step) == (alone.losses, alone.step)
-        assert together.kept == alone.kept
 
 
 def test_a_frame_that_diverges_does_not_touch_the_others() -> None:

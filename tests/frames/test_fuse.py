@@ -12,7 +12,7 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.frames import fuse
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.fuse import FEW_POINTS, IMAGE_WEIGHT, PRIOR_WEIGHT, Fusion, weighted_mean
-from pnpdepth_cli.frames.opened import OpenNetwork, SplitCache
+from pnpdepth_cli.frames.opened import OpenNetwork
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.settings import Settings
@@ -129,15 +129,6 @@ def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stay
     assert (shared.after == alone.after).all()
     assert (plain.after == alone.before).all()
     assert same(before, state_of(network.module))
-
-
-def test_a_cut_stays_as_long_as_the_layer_stays_the_same() -> None:
-    network = load_network("compact", None)
-    with SplitCache(network) as cache:
-        first = cache.at("decoder.s8")
-        assert cache.at("decoder.s8") is first
-        assert cache.at("decoder.s4") is not first
-    assert not any("forward" in module.__dict__ for module in network.module.modules())
 
 
 def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:

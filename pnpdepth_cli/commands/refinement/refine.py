@@ -158,7 +158,6 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: Refined) -> dict[str, Any
             **moved,
         },
         "loss": list(frame.losses),
-        "kept": frame.refinement.kept,
         "sparse_error": _before_after(frame, lambda depth: _point_error(depth, frame.used)),
         "held_out_error": _before_after(frame, lambda depth: _point_error(depth, frame.held_out)),
         "scores": _before_after(frame, lambda depth: _scores(depth, gt)),
