@@ -229,7 +229,8 @@ class _Machine:
 
 
 def _key(key: Any) -> Any:
-    return key if isinstance(key, str | int | float | None) else type(key).__name__
+    small = isinstance(key, int) and abs(key) < 1 << 63
+    return key if small or isinstance(key, str | float | None) else type(key).__name__
 
 
 def view_of(storage: Any, offset: Any, shape: Any, stride: Any) -> Tensor:
