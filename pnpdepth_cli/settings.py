@@ -51,7 +51,7 @@ class OptionField:
 
     @property
     def flag(self) -> str:
-        """Spelling on the command line, such as `--lr` or `--set blur`."""
+        """Spelling on the command line, such as `--lr` or `--set precision`."""
         if self.option.within is not None:
             return f"{self.option.within} {self.name_within}"
         return self.option.flag or f"--{self.name_within}"

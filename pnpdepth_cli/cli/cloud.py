@@ -59,12 +59,9 @@ from pnpdepth_cli.cli import options
     "--voxel",
     type=float,
     metavar="M",
-    help="Merge the points in cubes of this side; also the voxels of --mesh.",
+    help="Merge the points in cubes of this side.",
 )
-@click.option(
-    "--mesh", is_flag=True, help="Also write a triangle mesh, NAME_mesh.ply (extra mesh)."
-)
-@click.option("-o", "--output", type=options.FILE, required=True, help="PLY, GLB or LAZ file.")
+@click.option("-o", "--output", type=options.FILE, required=True, help="PLY file.")
 @options.overwrite
 @options.as_json
 def cloud(as_json: bool, **values: Any) -> None:
@@ -73,8 +70,7 @@ def cloud(as_json: bool, **values: Any) -> None:
     \b
     pnpdepth cloud out/img_depth.png -o img.ply
     pnpdepth cloud out/ --calib calib.txt --poses poses.txt --min-views 2 -o drive.ply
-    pnpdepth cloud depth.exr --image img.png --fov 60 -o img.glb
-    pnpdepth cloud out/ --min-views 2 --mesh -o room.ply
+    pnpdepth cloud depth.exr --image img.png --fov 60 -o img.ply
 
     The cloud is in the camera's frame (x right, y down, z forward), with poses in the world's.
     Pixels that NAME_valid.png beside NAME_depth excludes are left out.
@@ -89,7 +85,3 @@ def cloud(as_json: bool, **values: Any) -> None:
         click.echo(note, err=True)
     colours = "coloured" if record["coloured"] else "without colours (no image is known)"
     click.echo(f"wrote {record['points']:,} points, {colours}: {record['output']}")
-    if record["mesh"]:
-        click.echo(
-            "wrote {triangles:,} triangles, voxels of {voxel:.3g}: {path}".format(**record["mesh"])
-        )

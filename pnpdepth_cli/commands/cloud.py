@@ -1,4 +1,4 @@
-"""`pnpdepth cloud`: depth maps as one coloured point cloud, and as a mesh."""
+"""`pnpdepth cloud`: depth maps as one coloured point cloud."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from pnpdepth_cli.commands.refinement.frame_camera import (
 )
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
-from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
-from pnpdepth_cli.io.cloud_files import check_cloud_suffix, write_cloud
+from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.io.rgb import read_rgb
@@ -33,10 +33,8 @@ from pnpdepth_cli.sensors.cloud import (
     VoxelGrid,
     cloud_from_depth,
     consistent_depth,
-    kept_pixels,
     neighbouring_views,
 )
-from pnpdepth_cli.sensors.mesh import MeshVolume
 
 _IN_MEMORY = 12
 """Depth maps of neighbouring views that are kept, with their points."""
@@ -49,7 +47,7 @@ class CloudRequest:
     depth: Path
     """A depth file, or a folder with files NAME_depth.SUFFIX, as `refine` and `batch` write."""
     output: Path
-    """The file to write: .ply, .glb or .laz."""
+    """The PLY file to write."""
     image: Path | None = None
     """The colours. None: the image that the record NAME.json beside the depth names, if any."""
     calib: Path | None = None
@@ -71,10 +69,7 @@ class CloudRequest:
     min_views: int = 1
     """Views that have to agree on a pixel, its own included; see `consistent_depth`."""
     voxel: float | None = None
-    """Side of the cubes in which points are merged, and of the voxels of the mesh. None: all
-    points are kept, and voxels follow from the depth."""
-    mesh: bool = False
-    """Whether a triangle mesh is written beside the cloud."""
+    """Side of the cubes in which points are merged. None: all points are kept."""
     overwrite: bool = False
 
 
@@ -94,13 +89,9 @@ def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
         )
     coloured = all(request.image or frame.image for frame in frames)
     notes: list[str] = []
-    mesh = MeshVolume(request.voxel) if request.mesh else None
-    parts = _parts(request, frames, poses, coloured, notes, mesh)
+    parts = _parts(request, frames, poses, coloured, notes)
     make_folder(request.output.parent)
-    outputs = [request.output, *([] if mesh is None else [mesh_path(request.output)])]
-    with all_or_none(outputs):
-        points = write_cloud(request.output, _merged(request, parts, coloured))
-        triangles = None if mesh is None else _write_mesh(outputs[-1], mesh, coloured)
+    points = write_cloud(request.output, _merged(request, parts, coloured))
     inputs = ("depth", "output", "image", "overwrite", "camera", "calib", "poses")
     settings = {name: value for name, value in asdict(request).items() if name not in inputs}
     record = {
@@ -108,7 +99,6 @@ def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
         "version": __version__,
         "output": str(request.output),
         "points": points,
-        "mesh": triangles,
         "coloured": coloured,
         "unit": frames[0].unit,
         "inputs": {
@@ -129,22 +119,10 @@ def record_path(output: Path) -> Path:
     return output.with_name(f"{output.name}.json")
 
 
-def mesh_path(output: Path) -> Path:
-    """Returns the path of the mesh of a cloud."""
-    return output.with_name(f"{output.stem}_mesh.ply")
-
-
-def _write_mesh(path: Path, mesh: MeshVolume, coloured: bool) -> dict[str, Any]:
-    """Writes the mesh and returns what the record says of it."""
-    with atomic_path(path) as temporary:
-        triangles = mesh.write(temporary, coloured=coloured)
-    return {"path": str(path), "triangles": triangles, "voxel": mesh.voxel}
-
-
 def _check(request: CloudRequest) -> None:
-    check_cloud_suffix(request.output)
-    meshes = [mesh_path(request.output)] if request.mesh else []
-    for path in (request.output, record_path(request.output), *meshes):
+    if request.output.suffix.lower() != ".ply":
+        raise OutputError(f"{request.output}: a cloud is written as PLY; name it NAME.ply")
+    for path in (request.output, record_path(request.output)):
         if path.exists() and not request.overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
     if request.calib is not None and request.fov_deg is not None:
@@ -178,12 +156,8 @@ def _parts(
     poses: list[NDArray[np.float64] | None],
     coloured: bool,
     notes: list[str],
-    mesh: MeshVolume | None,
 ) -> Iterator[PointCloud]:
-    """Yields the clouds of all depth maps, in the world's frame if there are poses.
-
-    Adds them to the mesh as well.
-    """
+    """Yields the clouds of all depth maps, in the world's frame if there are poses."""
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def view(index: int) -> View:
@@ -200,9 +174,6 @@ def _parts(
             others = (view(other) for other in neighbouring_views(known, index))
             depth = consistent_depth(here, others, request.min_views)
         rgb = _colours(request, frame, here.depth) if coloured else None
-        if mesh is not None:
-            kept = np.where(kept_pixels(depth, edge=request.edge), depth, np.float32(0))
-            mesh.add(replace(here, depth=kept), rgb)
         for part in cloud_from_depth(depth, here.camera, rgb=rgb, edge=request.edge):
             yield part if pose is None else part.transformed(pose)
 

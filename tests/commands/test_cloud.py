@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.budget import budget
 from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
-from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
-from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.sensors.camera import Camera
 
 HEIGHT, WIDTH = 24, 32
 
@@ -191,77 +186,7 @@ def test_an_existing_output_is_kept_without_overwrite(tmp_path: Path) -> None:
     assert written(path, tmp_path / "o.ply", overwrite=True)["points"]
 
 
-def test_a_mesh_without_open3d_is_an_error_that_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    path = frame(tmp_path / "out", "a")
-    with pytest.raises(UsageError, match=r"pnpdepth\[mesh\]"):
-        written(path, tmp_path / "o.ply", mesh=True)
-    assert not list(tmp_path.glob("o*.*"))
-
-
-FOCAL = 40.0
-LENS = (0.2, 0.0, 0.0, 0.0)
-
-
-def slanted_frame(folder: Path, name: str, shift: float, distortion: tuple[float, ...]) -> Path:
-    """A depth file of the plane z = 2 + x / 2 in the world, seen from x = shift."""
-    path = frame(folder, name)
-    intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    xy = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).reshape(-1, 2)
-    camera = Camera(intrinsics=intrinsics, distortion=distortion)
-    ray = camera.unproject(xy, np.ones(len(xy)))[:, 0]
-    depth = (2 + shift / 2) / (1 - ray / 2)
-    path.unlink()
-    path = path.with_suffix(".npy")
-    write_depth(path, depth.reshape(HEIGHT, WIDTH).astype(np.float32))
-    pose = np.column_stack([np.eye(3), [shift, 0, 0]])
-    found = FrameCamera(camera=camera, source="test", pose=pose)
-    record = json.loads((folder / f"{name}.json").read_text())
-    record |= {"camera": found.record(), "size": [WIDTH, HEIGHT]}
-    (folder / f"{name}.json").write_text(json.dumps(record))
-    return path
-
-
-@pytest.mark.parametrize("distortion", [(), LENS])
-def test_the_mesh_of_two_views_lies_on_their_surface_in_the_colours_of_the_images(
-    tmp_path: Path, distortion: tuple[float, ...]
-) -> None:
-    open3d = pytest.importorskip("open3d")
-    for name, shift in (("a", 0.0), ("b", 0.4)):
-        slanted_frame(tmp_path / "out", name, shift, distortion)
-    record = written(tmp_path / "out", tmp_path / "o.ply", fov_deg=None, mesh=True, voxel=0.05)
-    mesh = open3d.io.read_triangle_mesh(str(tmp_path / "o_mesh.ply"))
-    x, _, z = np.asarray(mesh.vertices).T
-    off = z - 2 - x / 2
-    assert record["mesh"] == {
-        "path": str(tmp_path / "o_mesh.ply"), "triangles": len(mesh.triangles), "voxel": 0.05,
-    }  # fmt: skip
-    assert abs(off.mean()) < 0.002
-    assert np.abs(off).max() < 0.028
-    assert np.ptp(x) > 1.7  # a view alone spans 1.6
-    assert np.asarray(mesh.vertex_colors).mean(0) * 255 == pytest.approx([30, 20, 10], abs=1)
-    assert np.asarray(mesh.vertex_normals).mean(0)[2] == pytest.approx(
-        -1 / math.hypot(1, 0.5), 0.02
-    )
-
-
-def test_the_voxels_of_a_mesh_have_three_pixels_at_the_median_depth(tmp_path: Path) -> None:
-    pytest.importorskip("open3d")
-    path = slanted_frame(tmp_path / "out", "a", 0, ())
-    voxel = 3 * float(np.median(read_depth(path).values)) / FOCAL
-    record = written(path, tmp_path / "o.ply", fov_deg=None, mesh=True)
-    assert record["mesh"]["voxel"] == pytest.approx(voxel)
-
-
-def test_a_mesh_too_large_for_the_memory_is_refused_and_nothing_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("open3d")
-    limits = replace(budget(), max_decoded_bytes=1 << 20)
-    monkeypatch.setattr("pnpdepth_cli.sensors.mesh.budget", lambda: limits)
-    path = frame(tmp_path / "out", "a")
-    with pytest.raises(InputError, match=r"--mesh with voxels of 0.02 .* larger --voxel"):
-        written(path, tmp_path / "o.ply", mesh=True, voxel=0.02)
-    assert not list(tmp_path.glob("o*.*"))
+def test_a_cloud_is_written_as_ply(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"NAME\.ply"):
+        written(frame(tmp_path / "out", "a"), tmp_path / "o.glb")
+    assert not list(tmp_path.glob("o.*"))

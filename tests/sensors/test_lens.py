@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.sensors.camera import LENS_MODELS, Camera, distort, largest_radius, undistort
-from pnpdepth_cli.sensors.mesh import _without_lens
 
 K = np.array([[420.0, 0, 320], [0, 410, 240], [0, 0, 1]])
 small = st.floats(-0.05, 0.05)
@@ -83,14 +82,6 @@ def test_a_lens_turns_back_by_its_radial_coefficients_alone(lens: str, radial: s
     for number, turns in enumerate(radial):
         alone = tuple(-9.0 if i == number else 0.0 for i in range(len(radial)))
         assert (largest_radius(lens, alone) < np.inf) == (turns == "1")
-
-
-def test_an_image_without_its_lens_is_unknown_where_the_lens_shows_nothing() -> None:
-    barrel = (-0.4, 0.0, 0.0, 0.0)
-    camera = Camera(intrinsics=np.array([[9.0, 0, 10], [0, 9, 10], [0, 0, 1]]), distortion=barrel)
-    seen = _without_lens(np.ones((21, 21), np.float32), camera)
-    radius = np.hypot(*(np.mgrid[:21, :21] - 10)) / 9
-    assert np.array_equal(seen == 1, radius <= largest_radius("radial-tangential", barrel))
 
 
 def test_a_point_that_the_lens_shows_nothing_at_has_no_direction() -> None:
