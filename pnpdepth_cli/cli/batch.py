@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from dataclasses import replace
 from types import FrameType
 from typing import Any
 
@@ -15,6 +16,7 @@ import click
 
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.streams import INTERRUPTED, print_json, printable, say
+from pnpdepth_cli.cli.vary import Combination, combinations_of
 from pnpdepth_cli.commands.batch.request import (
     BatchRequest,
     ClusterOptions,
@@ -39,13 +41,14 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     short_help="Refine all frames of a folder or a list.",
     cls=grouped_help.GroupedCommand,
     common=grouped_help.COMMON - {"--sparse", "--gt"}
-    | {"--layout", "--sample", "--limit", "--shard", "--html", "--workers", "--dry-run"},
+    | {"--layout", "--sample", "--limit", "--shard", "--html", "--workers", "--dry-run", "--vary"},
     groups={
         "Frames": ("--sample", FrameSelection, "--shard", BagOptions),
         "Sequences": (SequenceOptions, "--adapt"),
         "Input": (ScanOptions, ColmapOptions, FrameFiles),
         "Network": (NetworkChoice,),
         "Method": (Settings, "--set", HoldOut),
+        "Study": ("--vary",),
         "Output": ("--output", OutputOptions, "--json", "--html", "--html-3d"),
         "Run": (BatchRequest, "--dry-run"),
         "Cluster": (ClusterOptions,),
@@ -55,17 +58,20 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @options.sample
 @options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions, BagOptions)
+@click.option(
+    "--vary",
+    multiple=True,
+    metavar="NAME=VALUE,…",
+    help="Refine with each value of an option of the method, network or points, or without it:"
+    " default. Several --vary make all combinations, each in a folder of OUTPUT.",
+)
 @click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")
 @options.scan
 @options.refinement
 @options.as_json
+@click.pass_context
 def batch(
-    source: Path,
-    output: Path,
-    sample: str | None,
-    dry_run: bool,
-    as_json: bool,
-    **values: Any,
+    context: click.Context, /, vary: tuple[str, ...], dry_run: bool, as_json: bool, **values: Any
 ) -> None:
     """Refine all frames of FOLDER, of a LIST of them (CSV or JSON lines), or of a ROS BAG.
 
@@ -76,6 +82,7 @@ def batch(
     pnpdepth batch drive_0001/ -o out/ --shard 1/4        # one of four processes
     pnpdepth batch drive_0001/ -o out/ --ray              # all devices of this machine
     pnpdepth batch drive_0001/ -o out/ --html report/     # then open report/index.html
+    pnpdepth batch frames.csv -o study/ --vary preset=default,paper --vary sample=20,100,500
 
     The layout of a folder is recognised from its content. The simplest layout has files of the same
     stem in rgb/, sparse/, gt/ (optional) and calib/ (optional). A list has a header with image,
@@ -86,50 +93,93 @@ def batch(
     missing or whose settings or files have changed. OUTPUT/summary.json and OUTPUT/summary.csv list
     all frames; the record NAME.json beside a result says how it was made.
     """
-    from pnpdepth_cli.commands.batch.batch import plan_batch
+    requests = [
+        _request_of(values | combination.values, combination, not dry_run)
+        for combination in combinations_of(context, vary)
+    ]
+    if dry_run:
+        _print_plans(requests, as_json)
+        return
+    summaries = []
+    with _finishing_on_interrupt() as pressed:
+        for request in requests:
+            summary, stopped = _run(request, as_json, pressed)
+            summaries.append(summary)
+            if stopped or pressed():
+                break
+    if as_json:
+        print_json(summaries if vary else summaries[0])
+    if stopped or len(summaries) < len(requests):
+        raise click.exceptions.Exit(INTERRUPTED)
+    counts = sum((Counter(summary["counts"]) for summary in summaries), Counter[str]())
+    bad = [f"{counts[kind]:,} {kind}" for kind in ("failed", "diverged") if counts[kind]]
+    if bad:
+        raise FramesFailedError(
+            f"{' and '.join(bad)} of {counts['frames']:,} frames; the reasons are in"
+            f" {values['output']}{'/*' if vary else ''}/summary.csv; run the same command to retry"
+            " the failed frames"
+        )
+
+
+def _request_of(values: dict[str, Any], combination: Combination, may_write: bool) -> BatchRequest:
+    """Returns the request of these options, with the frames of a bag unpacked.
+
+    The results of a combination of varied options lie in a folder of its own.
+    """
     from pnpdepth_cli.commands.batch.frames import unpacked
 
+    values = dict(values)
     own = options.taken(BatchRequest, values)
     own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, values))
     bag_options = BagOptions(**options.taken(BagOptions, values))
     own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, values))
-    refine = options.request_of(values, sample=parse_sample(sample))
-    request = BatchRequest(source=source, output=output, refine=refine, **own)
-    request = unpacked(
+    own |= {name: values.pop(name) for name in ("source", "output")}
+    sample = parse_sample(values.pop("sample"))
+    request = BatchRequest(refine=options.request_of(values, sample=sample), **own)
+    request = unpacked(request, bag_options, say, may_write=may_write)
+    if not combination.texts:
+        return request
+    return replace(
         request,
-        bag_options,
-        say,
-        may_write=not dry_run,
+        varied=combination.texts,
+        output=request.output / combination.folder,
+        html=request.html and request.html / combination.folder,
     )
-    if dry_run:
-        planned = plan_batch(request, say)
-        if as_json:
-            print_json([{"name": name, "why": why} for name, why in planned])
-        else:
-            for name, why in planned:
-                click.echo(f"{printable(name)}  ({printable(why)})")
+
+
+def _print_plans(requests: Sequence[BatchRequest], as_json: bool) -> None:
+    """Prints the frames that would be refined, and why."""
+    from pnpdepth_cli.commands.batch.batch import plan_batch
+
+    planned = [
+        {"name": f"{request.output.name}/{name}" if request.varied else name, "why": why}
+        for request in requests
+        for name, why in plan_batch(request, say)
+    ]
+    if as_json:
+        print_json(planned)
         return
-    raise click.exceptions.Exit(_run(request, as_json))
+    for frame in planned:
+        click.echo(f"{printable(frame['name'])}  ({printable(frame['why'])})")
 
 
-def _run(request: BatchRequest, as_json: bool) -> int:
-    """Runs the batch and prints its summary. Returns the exit code."""
+def _run(
+    request: BatchRequest, as_json: bool, pressed: Callable[[], bool]
+) -> tuple[dict[str, Any], bool]:
+    """Returns the batch's summary, printed unless wanted as JSON, and whether it was stopped."""
     from pnpdepth_cli.cli.progress import BatchProgress
     from pnpdepth_cli.cli.tables import print_batch, print_profile
     from pnpdepth_cli.commands.batch.batch import run_batch
 
-    with BatchProgress() as progress, _finishing_on_interrupt() as stopped:
+    with BatchProgress() as progress:
         try:
-            outcome = run_batch(request, progress, stopped)
+            outcome = run_batch(request, progress, pressed)
         except StorageError as error:
             raise StorageError(f"{error}; run the same command to continue") from error
         except KeyboardInterrupt:
             click.echo("stopped; run the same command to continue", err=True)
-            return INTERRUPTED
-    counts = outcome.summary["counts"]
-    if as_json:
-        print_json(outcome.summary)
-    else:
+            raise click.exceptions.Exit(INTERRUPTED) from None
+    if not as_json:
         print_batch(outcome.summary)
     if request.profile:
         print_profile(outcome.summary["profile"])
@@ -141,14 +191,7 @@ def _run(request: BatchRequest, as_json: bool) -> int:
             " to continue",
             err=True,
         )
-        return INTERRUPTED
-    bad = [f"{counts[kind]:,} {kind}" for kind in ("failed", "diverged") if counts[kind]]
-    if bad:
-        raise FramesFailedError(
-            f"{' and '.join(bad)} of {counts['frames']:,} frames; the reasons are in"
-            f" {request.output}/summary.csv; run the same command to retry the failed frames"
-        )
-    return 0
+    return outcome.summary, outcome.stopped
 
 
 @contextmanager

@@ -43,6 +43,13 @@ columns = click.option(
 )
 @columns
 @click.option(
+    "--plot",
+    type=options.FILE,
+    metavar="FILE",
+    help="Plot results of `batch --vary` over the varied values: PNG, SVG or PDF. Needs the extra"
+    " plot.",
+)
+@click.option(
     "--all",
     "all_measures",
     is_flag=True,
@@ -55,6 +62,7 @@ def compare(
     no_groups: bool,
     all_measures: bool,
     columns: tuple[str, ...] | None,
+    plot: Path | None,
     **table_files: Any,
 ) -> None:
     """Compare RUNs with the first of them, on the frames that all of them scored.
@@ -62,16 +70,18 @@ def compare(
     \b
     pnpdepth compare runs/a.json runs/b.json
     pnpdepth compare out/summary.json:before out/summary.json
+    pnpdepth compare study/*/ --columns mae --plot mae.png
 
-    A RUN is the output of `pnpdepth eval --json`, the summary.json of a batch, or the record of a
-    refinement with ground truth; FILE:before takes the depth before refinement. Gains are in per
-    cent of the first run and positive if the other run is better. p is the p-value of a paired
-    permutation test over groups of frames (manifest column group, sequence or folder), in a single
-    sequence over blocks as long as its errors are correlated, adjusted for the number of measures
-    (Holm); it is exact for few groups, else with N random permutations.
+    A RUN is the output of `pnpdepth eval --json`, the folder or summary.json of a batch, or the
+    record of a refinement with ground truth; FILE:before takes the depth before refinement. Gains
+    are in per cent of the first run and positive if the other run is better. p is the p-value of a
+    paired permutation test over groups of frames (manifest column group, sequence or folder), in a
+    single sequence over blocks as long as its errors are correlated, adjusted for the number of
+    measures (Holm); it is exact for few groups, else with N random permutations.
     """
     from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
     from pnpdepth_cli.commands.evaluation.compare import compare as compare_runs
+    from pnpdepth_cli.commands.evaluation.plot import plot_comparison
     from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
 
     files = TableFiles(**table_files)
@@ -84,6 +94,8 @@ def compare(
         all_measures=all_measures,
         columns=columns,
     )
+    if plot is not None:
+        plot_comparison(comparison, plot, overwrite=files.overwrite)
     print_notes(comparison["notes"])
     table = comparison_table(comparison)
     to_stdout = files.write(csv=table, markdown=table, latex=methods_table(comparison))

@@ -322,6 +322,8 @@ class _Batch:
             **tally.means(),
             "unmatched": [str(each) for each in found.unmatched],
         }
+        if request.varied:
+            head["varied"] = dict(request.varied)
         if tally.unsure:
             head["unsure"] = list(tally.unsure)
         if request.sequence != SequenceOptions():

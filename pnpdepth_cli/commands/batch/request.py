@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -147,6 +148,8 @@ class BatchRequest(FrameSelection):
     )
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
     profile: bool = option(False, "Print the time spent in each stage.")
+    varied: Mapping[str, str] = field(default_factory=dict)
+    """Options that a study varies, and their values here, as the user wrote them."""
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
 
     def __post_init__(self) -> None:

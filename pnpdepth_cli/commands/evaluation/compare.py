@@ -43,13 +43,16 @@ class Run(NamedTuple):
     """The scored frames of one saved run, by name."""
 
     label: str
-    """The file's name without its folder."""
+    """The name of the folder, or that of the file without its ending."""
     path: str
     measures: Sequence[Measure]
     scoring: dict[str, Any]
     frames: dict[str, dict[str, Any]]
-    """`values` by measure (NaN for null), scored `pixels`, `known` pixels of the ground truth (None
-    where the file does not say), `group`, and `sums` of a pooled run."""
+    """`values` by measure (NaN for null), those `before` refinement (empty for an evaluation),
+    scored `pixels`, `known` pixels of the ground truth (None where the file does not say), `group`,
+    and `sums` of a pooled run."""
+    varied: dict[str, str]
+    """Options that `batch --vary` varied, with their values; empty for other runs."""
 
     def coverage(self, names: Sequence[str]) -> float | None:
         """Returns the fraction of the ground truth that is scored; None where files do not say."""
@@ -142,6 +145,8 @@ def compare(
                 "label": label,
                 "path": run.path,
                 "mean": dict(zip(keys, mean.tolist(), strict=True)),
+                "before": _mean_before(run, names, keys),
+                "varied": run.varied,
                 "coverage": run.coverage(names),
             }
             for label, run, mean in zip(_labels(runs), runs, means, strict=True)
@@ -160,6 +165,13 @@ def compare(
     }
     result: dict[str, Any] = plain(record)
     return result
+
+
+def _mean_before(run: Run, names: Sequence[str], keys: Sequence[str]) -> dict[str, float]:
+    """The means of these frames before refinement; NaN where there are none."""
+    before = [[run.frames[name]["before"].get(k, math.nan) for k in keys] for name in names]
+    mean = FrameTable.of_frames(np.array(before)).mean()
+    return dict(zip(keys, mean.tolist(), strict=True))
 
 
 def _check_rules(first: Run, other: Run) -> None:
@@ -260,8 +272,9 @@ def read_run(text: str) -> Run:
     start, colon, end = text.rpartition(":")
     if colon and end in _STAGES and not path.exists():
         path, stage = Path(start), end
+    label = path.stem
     if path.is_dir():
-        path = path / "summary.json"
+        label, path = path.name, path / "summary.json"
     record = read_json(path)
     if record.get("command") == "eval" and stage == "before":
         raise UsageError(f"{path} is of eval, which has no before; leave out :before")
@@ -274,7 +287,7 @@ def read_run(text: str) -> Run:
         raise FileFormatError(
             f"{path} does not hold scores as pnpdepth writes them ({fact}); create it again"
         ) from error
-    label = f"{path.stem}:before" if stage == "before" else path.stem
+    label = f"{label}:before" if stage == "before" else label
     return Run(label=label, path=text, **read)
 
 
@@ -291,6 +304,7 @@ def _evaluated(record: Mapping[str, Any]) -> dict[str, Any]:
         "frames": {
             str(frame["name"]): {
                 "values": _numbers(frame["values"]),
+                "before": {},
                 "pixels": int(frame["pixels"]),
                 "group": str(frame["group"]),
                 "known": None if frame["known"] is None else int(frame["known"]),
@@ -299,6 +313,7 @@ def _evaluated(record: Mapping[str, Any]) -> dict[str, Any]:
             for frame in record["frames"]
             if frame["error"] is None
         },
+        "varied": {},
     }
 
 
@@ -320,6 +335,7 @@ def _refined(record: Mapping[str, Any], path: Path, stage: str) -> dict[str, Any
         "frames": {
             name: {
                 "values": each,
+                "before": _numbers(scores[name]["before"]),
                 "pixels": round(each["pixels"]),
                 "group": group,
                 "known": round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
@@ -328,6 +344,7 @@ def _refined(record: Mapping[str, Any], path: Path, stage: str) -> dict[str, Any
                 values.items(), groups_by_name(list(values)), strict=True
             )
         },
+        "varied": {str(name): str(value) for name, value in record.get("varied", {}).items()},
     }
 
 

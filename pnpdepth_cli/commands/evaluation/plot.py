@@ -1,0 +1,98 @@
+"""The plot of a comparison of what `batch --vary` wrote: measures over the varied values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pnpdepth_cli.commands.evaluation.statistics import gain
+from pnpdepth_cli.commands.tables import column_title
+from pnpdepth_cli.core.metrics import Measure
+from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.io.atomic import atomic_path
+
+_CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
+"""By the suffix of a plot, what is not written to it, so that the same runs give the same bytes."""
+_SIDE_INCHES = 3.2
+
+
+def plot_comparison(comparison: Mapping[str, Any], path: Path, *, overwrite: bool = False) -> None:
+    """Writes a plot of each measure over a varied option, and of its improvement by refinement.
+
+    Numbers, and of several options the one of most values, lie along the axis; each combination of
+    the others is a line. The means before refinement are dashed; the improvement is in per cent of
+    them.
+
+    Raises:
+        UsageError: The runs are not of `batch --vary` with the same options, the suffix is of no
+            known format, or matplotlib is not installed.
+        OutputError: The file exists and is not to be replaced.
+    """
+    if path.suffix not in _CHANGING:
+        raise UsageError(f"--plot {path}: name a file that ends in {', '.join(_CHANGING)}")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path} exists; --overwrite replaces it")
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UsageError("--plot needs matplotlib: pip install 'pnpdepth[plot]'") from None
+    # where each value lies, and the runs of each line in this order
+    across, positions = _axis(comparison["runs"])
+    lines: dict[str, list[Mapping[str, Any]]] = {}
+    for run in sorted(comparison["runs"], key=lambda run: positions[run["varied"][across]]):
+        others = [f"{name}={value}" for name, value in run["varied"].items() if name != across]
+        lines.setdefault(", ".join(others), []).append(run)
+    # a column of two panels for each measure
+    measures = [Measure(**each) for each in comparison["measures"]]
+    size = _SIDE_INCHES * len(measures) + 1, 2 * _SIDE_INCHES
+    with mpl.rc_context({"svg.hashsalt": "pnpdepth", "font.size": 8, "axes.grid": True}):
+        figure = Figure(size, layout="constrained", dpi=150)
+        panels = figure.subplots(2, len(measures), squeeze=False, sharex=True)
+        for measure, above, below in zip(measures, *panels, strict=True):
+            for number, (label, runs) in enumerate(lines.items()):
+                x = [positions[run["varied"][across]] for run in runs]
+                before, after, improved = _values(measure, runs)
+                above.plot(x, before, f"C{number}--", linewidth=0.8)
+                above.plot(x, after, f"C{number}o-", label=label)
+                below.plot(x, improved, f"C{number}o-")
+            above.set_ylabel(column_title(measure))
+            below.set(ylabel=f"improvement of {measure.title} [%]", xlabel=across)
+            below.set_xscale("log" if min(positions.values()) > 0 else "linear")
+            below.set_xticks([*positions.values()], [*positions])
+            below.set_xticks([], minor=True)
+        if any(lines):
+            figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center")
+        with atomic_path(path) as temporary:
+            metadata: dict[str, Any] = {_CHANGING[path.suffix]: None}
+            figure.savefig(temporary, format=path.suffix[1:], metadata=metadata)
+
+
+def _values(measure: Measure, runs: Sequence[Mapping[str, Any]]) -> tuple[Any, Any, Any]:
+    """The means before and after, in the shown unit, and the improvement in per cent."""
+    means = [[run[stage][measure.key] for run in runs] for stage in ("before", "mean")]
+    before, after = np.array(means, np.float64) * measure.shown_factor  # None becomes NaN
+    better = np.array(1.0 if measure.higher_is_better else -1.0)
+    return before, after, gain(before, after, better)
+
+
+def _axis(runs: Sequence[Mapping[str, Any]]) -> tuple[str, dict[str, float]]:
+    """The option that lies along the axis, and where its values do: names from 0 on."""
+    options = {tuple(run["varied"]) for run in runs}
+    if len(options) > 1 or () in options:
+        raise UsageError("--plot needs results of `batch --vary`, all of the same options")
+    values = {name: [*dict.fromkeys(run["varied"][name] for run in runs)] for name in options.pop()}
+    across = max(values, key=lambda name: (_numbers(values[name]) is not None, len(values[name])))
+    places = {value: float(place) for place, value in enumerate(values[across])}
+    return across, _numbers(values[across]) or places
+
+
+def _numbers(texts: Sequence[str]) -> dict[str, float] | None:
+    """The number that each of the texts is; None if one is none."""
+    try:
+        return {text: float(text.removesuffix("%")) for text in texts}
+    except ValueError:
+        return None
