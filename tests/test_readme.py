@@ -37,10 +37,10 @@ def shown_commands(page: Path) -> list[list[str]]:
 
 
 def titled_blocks(page: Path) -> dict[str, str]:
-    """The Python files that a page shows, by their name."""
+    """The files that a page shows, by their name."""
     text = page.read_text(encoding="utf-8")
     return dict(
-        re.findall(r'^```python title="([^"]+)"\n(.*?)^```', text, re.DOTALL | re.MULTILINE)
+        re.findall(r'^```(?:python|csv) title="([^"]+)"\n(.*?)^```', text, re.DOTALL | re.MULTILINE)
     )
 
 
@@ -73,6 +73,15 @@ def run(arguments: list[str], folder: Path, *path: str) -> str:
     return done.stdout
 
 
+def expanded(arguments: list[str], folder: Path) -> list[str]:
+    """The arguments, those with a * as the shell hands them over."""
+    found = list[str]()
+    for each in arguments:
+        paths = sorted(folder.glob(each.rstrip("/"))) if "*" in each else []
+        found += [path.relative_to(folder).as_posix() for path in paths] or [each]
+    return found
+
+
 def test_the_readme_shows_the_main_commands() -> None:
     shown = {arguments[0] for arguments in shown_commands(README)}
     assert {"refine", "batch"} <= shown
@@ -91,7 +100,7 @@ def test_the_commands_of_a_page_run(page: Path, folder: Path) -> None:
             run(arguments[1:], folder)
             continue
         overwrite = ["--overwrite"] if arguments[0] in WRITES_FILES else []
-        run(["-m", "pnpdepth_cli", *arguments, *overwrite], folder)
+        run(["-m", "pnpdepth_cli", *expanded(arguments, folder), *overwrite], folder)
 
 
 @pytest.mark.slow
