@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 _BYTES_OF_TYPE = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 _POINTERS = (34665, 34853, 40965)  # to further tags: Exif, GPS and interoperability
-_MOST_NUMBERS = 1 << 20  # of a tag; 64 megapixels have fewer strips or tiles
 _EXIF_ORIENTATION = 0x0112
 _END_OF_PNG = b"\xaeB`\x82"
 """The checksum of the last chunk, which Pillow does not read."""
@@ -40,7 +39,7 @@ def check_tags(data: bytes) -> None:
     Thousands of tags can share the same bytes.
 
     Raises:
-        ValueError: The tags together claim more bytes than there are, or one has too many numbers.
+        ValueError: The tags together claim more bytes than there are.
         struct.error: A page or a tag lies outside the data.
     """
     order = "<" if data[:2] == b"II" else ">"
@@ -53,9 +52,8 @@ def check_tags(data: bytes) -> None:
         end = start + 2 + 12 * struct.unpack_from(f"{order}H", data, start)[0]
         pages += struct.unpack_from(f"{order}I", data, end)  # the list of tags is complete
         for tag, kind, number, value in struct.iter_unpack(f"{order}HHII", data[start + 2 : end]):
-            size = _BYTES_OF_TYPE.get(kind, 1)
-            claimed += number * size
-            if claimed > len(data) or (size > 1 and number > _MOST_NUMBERS):
+            claimed += number * _BYTES_OF_TYPE.get(kind, 1)
+            if claimed > len(data):
                 raise ValueError(f"its tags claim more than {len(data):,} bytes")
             pages += [value] if tag in _POINTERS else []
 

@@ -20,7 +20,7 @@ import numpy as np
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.colmap import model_files, read_model
 from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Unmatched, as_pose, find_files
-from pnpdepth_cli.io.file_bytes import check_value_count, one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout
 from pnpdepth_cli.io.poses import read_trajectory
 
@@ -51,7 +51,7 @@ def _of_tum(root: Path) -> Iterator[Frame | Unmatched]:
         )
         partner_of: dict[int, int] = {}
         taken: set[int] = set()
-        for image, depth in _close_pairs(root, images, depths):
+        for image, depth in _close_pairs(images, depths):
             if image not in partner_of and depth not in taken:
                 partner_of[image] = depth
                 taken.add(depth)
@@ -97,13 +97,12 @@ def _is_depth(timed: Timed) -> bool:
     return "depth" in timed[1].parts[-2:][0].lower()
 
 
-def _close_pairs(root: Path, images: list[Timed], depths: list[Timed]) -> list[list[int]]:
+def _close_pairs(images: list[Timed], depths: list[Timed]) -> list[list[int]]:
     """Indices of images and depths at most 0.02 s apart, the closest first; times are sorted."""
     image_times, depth_times = (np.array([time for time, _ in files]) for files in (images, depths))
     first = np.searchsorted(depth_times, image_times - 2 * _LONGEST_GAP_S)
     last = np.searchsorted(depth_times, image_times + 2 * _LONGEST_GAP_S, side="right")
     count = last - first
-    check_value_count(root, int(count.sum()))
     image = np.repeat(np.arange(len(images)), count)
     depth = np.arange(len(image)) + np.repeat(last - np.cumsum(count), count)
     gap = np.abs(image_times[image] - depth_times[depth])
