@@ -15,6 +15,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from pnpdepth_cli import measures
 from pnpdepth_cli.errors import UsageError
 
 
@@ -191,13 +192,8 @@ EXPORTS = Table(
 )
 """Files for reconstruction programs: `pnpdepth_cli.commands.exports.Export`."""
 
-MEASURE_GROUPS = Table(
-    "commands/evaluation/measures",
-    group="measures",
-    noun="group of measures",
-    names=("edges",),
-)
-"""Measures that `eval` computes only on request."""
+MEASURES = Table("measures", group="measures", noun="measure", names=tuple(measures.TABLE))
+"""Measures that `eval` computes only on request: `pnpdepth_cli.measures.Measure`."""
 
 # The method
 PRESETS = ("paper",)  # methods by one name: `pnpdepth_cli.settings.PAPER`

@@ -13,10 +13,13 @@ from pnpdepth_cli.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
-GROUND_FLOOR = {"errors", "choices", "points", "budget", "scan_pattern", "settings"}
+GROUND_FLOOR = {
+    "errors", "choices", "points", "budget", "scan_pattern", "settings", "measures",
+}  # fmt: skip
 MAY_IMPORT = {
     "errors": set(),
-    "choices": {"errors"},
+    "measures": {"errors"},
+    "choices": {"errors", "measures"},
     "budget": {"errors"},
     "points": {"errors"},
     "scan_pattern": {"errors"},
@@ -125,7 +128,10 @@ def test_help_imports_neither_torch_nor_numpy_nor_rich() -> None:
 @pytest.mark.parametrize(
     ("module", "heavy"),
     [
-        *((module, "torch numpy") for module in ("pnpdepth_cli", "pnpdepth_cli.points")),
+        *(
+            (module, "torch numpy")
+            for module in ("pnpdepth_cli", "pnpdepth_cli.points", "pnpdepth_cli.measures")
+        ),
         ("pnpdepth_cli.models.definition", "torch"),
         ("pnpdepth_cli.io.depth, pnpdepth_cli.io.rgb", "OpenEXR PIL torch scipy"),
         ("pnpdepth_cli.io.visualisation, pnpdepth_cli.io.record", "OpenEXR PIL torch scipy"),

@@ -77,7 +77,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     from pnpdepth_cli.commands.evaluation.evaluate import evaluate as run_evaluation
     from pnpdepth_cli.commands.evaluation.protocols import choose_protocol
     from pnpdepth_cli.commands.report import evaluation as report_eval
-    from pnpdepth_cli.commands.tables import chosen_measures
+    from pnpdepth_cli.measures import chosen_measures
 
     files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
     files.check((prediction, ground_truth))

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pnpdepth_cli.commands.tables import Cell, Style, Table
+from pnpdepth_cli.measures import MEASURES
 
 GT, HELD_OUT, HIDDEN, USED = "scores", "held_out_error", "check", "sparse_error"
 BASES = {
@@ -25,15 +26,7 @@ _STAGES = {
     "linear": "linear interpolation",
 }
 """Rows of the default method, by the name of the stage."""
-_FORMATS = {
-    "rmse": ("RMSE", "{:.4f} {}"),
-    "mae": ("MAE", "{:.4f} {}"),
-    "mre": ("MRE", "{:.4f}"),
-    "irmse": ("iRMSE", "{:.2f} 1/km"),
-    "silog": ("SILog", "{:.2f}"),
-    **{f"delta{n}": (f"δ{n}", "{:.2%}") for n in (1, 2, 3)},
-}
-"""Title and text of a measure."""
+_MEASURES = {measure.key: measure for measure in MEASURES}
 
 
 def errors_by_basis(errors: Mapping[str, Any]) -> dict[str, dict[str, Mapping[str, Any]]]:
@@ -70,9 +63,8 @@ def error_table(caption: str, errors: Mapping[str, Any], unit: str) -> Table:
     for basis, sides in errors_by_basis(errors).items():
         before, after = sides["before"], sides["after"]
         count = f"{after['points']:,} " if "points" in after else ""
-        for key, (title, _) in _FORMATS.items():
-            if key not in before:
-                continue
+        for key in (key for key in _MEASURES if key in before):
+            title = _title(key)
             values = [side.get(key) for side in (before, after, sides["linear"])]
             shown = [format_error(key, value, unit) for value in values]
             changes = ["", ""]
@@ -131,7 +123,7 @@ def _stages_table(record: Mapping[str, Any]) -> Table:
         cells = [format_error(key, scores[key], record["unit"]) for key in keys]
         title = _STAGES[name].format(name=record["model"]["name"])
         lines.append([*(Cell(text, style) for text in (title, *cells)), against])
-    header = ["", *(_FORMATS[key][0] for key in keys), "MAE vs linear"]
+    header = ["", *(_title(key) for key in keys), "MAE vs linear"]
     return Table(caption=f"{' + '.join(names)}; {caption}", header=header, rows=lines)
 
 
@@ -160,20 +152,29 @@ def baselines_table(baselines: Mapping[str, Mapping[str, Any]], unit: str) -> Ta
 
 
 def format_error(key: str, value: float | None, unit: str) -> str:
-    """Returns the value of a measure as text; – for NaN and None."""
-    return "–" if value is None or math.isnan(value) else _FORMATS[key][1].format(value, unit)
+    """Returns the value of a measure as text, lengths with their unit; – for NaN and None."""
+    measure = _MEASURES[key]
+    return measure.text(value, unit if measure.unit == "m" else "")
+
+
+def _title(key: str) -> str:
+    """The title of a measure, with its unit unless the values are lengths."""
+    measure = _MEASURES[key]
+    return measure.title if measure.unit in ("", "m") else f"{measure.title} [{measure.unit}]"
 
 
 def change(key: str, before: float | None, after: float | None) -> Cell:
     """Returns how much a measure rose or fell, in per cent or percentage points."""
     if before is None or after is None or math.isnan(before) or math.isnan(after):
         return Cell("–", "dim")
-    if key.startswith("delta"):
-        gain, text = after - before, f"{100 * (after - before):+.2f} pt"
+    measure = _MEASURES[key]
+    if measure.percent:
+        rise, text = after - before, f"{100 * (after - before):+.2f} pt"
     elif before == 0:
         return Cell("–", "dim")
     else:
-        gain, text = 1 - after / before, f"{after / before - 1:+.1%}"
+        rise, text = after / before - 1, f"{after / before - 1:+.1%}"
+    gain = measure.sign * rise
     return Cell(text, "good" if gain > 0 else "bad" if gain < 0 else "dim")
 
 

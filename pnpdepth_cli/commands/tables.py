@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.core.metrics import Measure
 
 Style = Literal["", "bold", "dim", "good", "bad"]
 
@@ -99,36 +94,3 @@ def write_text(path: Path, text: str) -> None:
     """Writes the text whole or not at all; characters of a name that is not UTF-8 as escapes."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(text.encode("utf-8", "backslashreplace"))
-
-
-def chosen_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> tuple[Measure, ...]:
-    """Returns the measures with these keys, in their order; all for None.
-
-    Raises:
-        UsageError: If one is unknown.
-    """
-    by_key = {measure.key: measure for measure in measures}
-    if unknown := [key for key in keys or () if key not in by_key]:
-        raise UsageError(f"--columns {unknown[0]} is not one of {', '.join(by_key)}")
-    return tuple(by_key[key] for key in (by_key if keys is None else keys))
-
-
-def format_value(measure: Measure, value: float | None, *, unit: bool = False) -> str:
-    """Returns the value as text in the measure's shown unit; – for NaN and None."""
-    if value is None or math.isnan(value):
-        return "–"
-    if measure.percent:
-        return f"{value:.{measure.decimals}%}"
-    text = f"{value * measure.shown_factor:,.{measure.decimals}f}"
-    return f"{text} {unit_of(measure)}".rstrip() if unit else text
-
-
-def unit_of(measure: Measure) -> str:
-    """Returns the unit of `format_value`; empty for ratios and percentages."""
-    return measure.shown_unit or measure.unit
-
-
-def column_title(measure: Measure) -> str:
-    """Returns a title such as `RMSE [m] ↓`."""
-    unit = "" if not unit_of(measure) else f" [{unit_of(measure)}]"
-    return f"{measure.title}{unit} {'↑' if measure.higher_is_better else '↓'}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from math import nan
 from typing import Any
 
@@ -16,7 +15,7 @@ from pnpdepth_cli.commands.error_tables import (
 )
 from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
 from pnpdepth_cli.commands.tables import Table
-from pnpdepth_cli.core.metrics import MEASURES
+from pnpdepth_cli.measures import MEASURES
 
 
 @pytest.mark.parametrize(
@@ -120,7 +119,7 @@ def styled(table: Table) -> list[list[tuple[str, str]]]:
 
 
 def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -> None:
-    measures = [asdict(measure) for measure in MEASURES if measure.key in ("rmse", "delta1")]
+    measures = [measure.to_json() for measure in MEASURES if measure.key in ("rmse", "delta1")]
 
     def gain(percent: float | None, p: float | None) -> dict[str, Any]:
         return {"percent": percent, "p_adjusted": p, "low_percent": None, "high_percent": 1.0}

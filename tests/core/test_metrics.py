@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
+import pickle
 from math import isnan, log, sqrt
 
 import numpy as np
@@ -11,7 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pnpdepth_cli.core.metrics import MEASURES, Scores, error_sums, score
+from pnpdepth_cli.core.metrics import error_sums, score
+from pnpdepth_cli.measures import MEASURES
 
 
 def test_two_pixels_by_hand() -> None:
@@ -67,7 +68,7 @@ def test_scores_are_those_of_plain_numpy(pairs: list[tuple[float, float]]) -> No
     predicted, gt = np.array([(2.0, 3.0), *pairs], np.float32).T
     scores = score(torch.from_numpy(predicted.copy()), torch.from_numpy(gt.copy()))
     expected = brute(predicted, gt)
-    assert asdict(scores) == {
+    assert scores.to_json() == {
         name: pytest.approx(value, rel=1e-9, abs=1e-5) for name, value in expected.items()
     }
 
@@ -86,12 +87,16 @@ def test_a_ratio_on_the_threshold_is_not_below_it() -> None:
 
 
 def test_every_measure_is_a_score_with_a_unit() -> None:
-    keys = [measure.key for measure in MEASURES]
-    assert sorted([*keys, "pixels", "coverage"]) == sorted(f.name for f in fields(Scores))
+    scores = score(torch.ones(2), torch.ones(2))
+    assert [*scores.to_json()] == [*(m.key for m in MEASURES), "pixels", "coverage"]
+    assert scores.delta3 == 1
+    with pytest.raises(AttributeError):
+        _ = scores.delta4
+    assert pickle.loads(pickle.dumps(scores)) == scores
     units = {measure.key: measure.unit for measure in MEASURES}
     assert {key for key, unit in units.items() if unit == "m"} == {"rmse", "mae", "sq_rel"}
     assert {key for key, unit in units.items() if unit == "1/km"} == {"irmse", "imae"}
-    assert [m.key for m in MEASURES if m.higher_is_better] == ["delta1", "delta2", "delta3"]
+    assert [m.key for m in MEASURES if m.better == "higher"] == ["delta1", "delta2", "delta3"]
 
 
 def test_the_thresholds_of_delta_can_be_the_papers_kitti_ones() -> None:

@@ -12,6 +12,7 @@ from typing import IO, Any
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.measures import MEASURES
 
 Row = dict[str, Any]
 # a file name that is no UTF-8 has surrogates; JSON escapes them so
@@ -19,10 +20,7 @@ TEXT: Any = {"encoding": "utf-8", "errors": "backslashreplace", "newline": "\n"}
 CSV, JSON = "summary.csv", "summary.json"
 
 _POINT_ERRORS = ("mae", "rmse")
-_SCORES = (
-    *("rmse", "mae", "mre", "sq_rel", "log10", "rmse_log", "irmse", "imae", "silog"),
-    *("delta1", "delta2", "delta3", "coverage"),
-)
+_SCORES = (*(measure.key for measure in MEASURES), "coverage")
 _MEASURED = {
     "sparse_error": _POINT_ERRORS,
     "held_out_error": _POINT_ERRORS,

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.choices import MEASURE_GROUPS
 from pnpdepth_cli.commands.evaluation.pairing import some_names
 from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS
 from pnpdepth_cli.commands.evaluation.statistics import (
@@ -25,16 +23,14 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     interval,
     swap_p_values,
 )
-from pnpdepth_cli.commands.tables import chosen_measures
-from pnpdepth_cli.core.metrics import MEASURES, Measure
+from pnpdepth_cli.core.metrics import sum_count
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.dataset import groups_by_name
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import plain, read_json
+from pnpdepth_cli.measures import MEASURES, Measure, chosen_measures
 
 ALPHA = 0.05
-MAIN_MEASURES = ("rmse", "mae", "mre", "delta1", "inverse_rmse", "inverse_mae")
-"""Keys of the measures that are compared by default; the last two are the kit's."""
 _STAGES = ("before", "after")
 _GAIN = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
 
@@ -84,7 +80,7 @@ def compare(
         resamples: Bootstrap samples, and the most swaps of the permutation test.
         seed: Of both.
         grouped: False if every frame counts as independent.
-        all_measures: Whether every measure that all runs have is compared, not MAIN_MEASURES.
+        all_measures: Whether every measure that all runs have is compared, not the main ones.
         columns: Keys of the measures to compare by, instead.
 
     Raises:
@@ -104,7 +100,10 @@ def compare(
         raise InputError(f"the runs have no scored frame in common: {first}; and {other}")
     shared = set.intersection(*({m.key for m in run.measures} for run in runs))
     measures = tuple(measure for measure in runs[0].measures if measure.key in shared)
-    main = tuple(measure for measure in measures if measure.key in MAIN_MEASURES)
+    pooled = runs[0].scoring.get("average") == "pooled"
+    if pooled:  # others' sums depend on the options of eval
+        measures = tuple(measure for measure in MEASURES if measure.key in shared)
+    main = tuple(measure for measure in measures if measure.main)
     if columns is not None or all_measures or not main:
         measures = chosen_measures(measures, columns)
     else:
@@ -117,13 +116,13 @@ def compare(
     differences = np.concatenate(list(values[1:] - values[0]), axis=1)
     groups = [runs[0].frames[name]["group"] for name in names]
     clusters = find_clusters(groups, differences, grouped=grouped)
-    pooled = runs[0].scoring.get("average") == "pooled"
     if pooled:
-        sums = (np.array([run.frames[name]["sums"] for name in names]) for run in runs)
+        count = sum_count(MEASURES)
+        sums = (np.array([run.frames[name]["sums"][:count] for name in names]) for run in runs)
         tables = [FrameTable.of_pixels(of_run, keys) for of_run in sums]
     else:
         tables = [FrameTable.of_frames(np.where(known, of_run, math.nan)) for of_run in values]
-    better = np.array([1.0 if m.higher_is_better else -1.0 for m in measures])
+    better = np.array([measure.sign for measure in measures], np.float64)
     means, gains, exact = [table.mean() for table in tables], [], True
     for table, mean in zip(tables[1:], means[1:], strict=True):
         drawing = clusters, resamples, seed
@@ -138,7 +137,7 @@ def compare(
     record = {
         "command": "compare",
         "frames": names,
-        "measures": [asdict(measure) for measure in measures],
+        "measures": [measure.to_json() for measure in measures],
         "scoring": runs[0].scoring,
         "runs": [
             {
@@ -292,15 +291,10 @@ def read_run(text: str) -> Run:
 
 
 def _evaluated(record: Mapping[str, Any]) -> dict[str, Any]:
-    """What `eval --json` printed; measures that are unknown here are left out."""
-    groups = (group.measures for group in MEASURE_GROUPS.values())
-    known = {measure.key: measure for measures in groups for measure in measures}
-    protocol = record["protocol"]
-    known |= {measure.key: measure for measure in PROTOCOLS[protocol["name"]].measures}
-    keys = [each["key"] for each in record["measures"]]
+    """What `eval --json` printed."""
     return {
-        "measures": tuple(known[key] for key in keys if key in known),
-        "scoring": dict(protocol["scoring"]),
+        "measures": tuple(Measure.from_json(entry) for entry in record["measures"]),
+        "scoring": dict(record["protocol"]["scoring"]),
         "frames": {
             str(frame["name"]): {
                 "values": _numbers(frame["values"]),

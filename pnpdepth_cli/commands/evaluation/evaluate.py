@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -123,7 +123,7 @@ class Evaluation:
                 "described": protocol.describe(),
                 "scoring": protocol.scoring(),
             },
-            "measures": [asdict(measure) for measure in protocol.measures],
+            "measures": [measure.to_json() for measure in protocol.measures],
             "counts": {
                 "frames": len(self.frames),
                 "scored": len(self.scored),
@@ -214,7 +214,8 @@ def evaluate(
     groups = [row.pair.group for row in scored]
     clusters = find_clusters(groups, values, grouped=request.grouped)
     if protocol.average == "pooled":
-        table = FrameTable.of_pixels(np.array([row.sums for row in scored]), keys)
+        sums = np.array([row.sums for row in scored])
+        table = FrameTable.of_pixels(sums, keys, protocol.measures)
     else:  # a measure that a frame lacks is averaged over the other frames
         table = FrameTable.of_frames(values)
     mean = devkit_mean(values) if protocol.is_devkit else table.mean()

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.evaluation.measures import Depth, Mask, MeasuredFrame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, load_stacked
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, crop_window
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
@@ -30,6 +30,8 @@ from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors.sparse import as_depth_image
 
+Depth = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 Size = tuple[int, ...]
 Window = tuple[slice, slice]
 
@@ -42,9 +44,13 @@ class Fit(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoadedFrame(MeasuredFrame):
+class LoadedFrame:
     """The depths as they are scored: scaled, clipped, and filled in as the protocol says."""
 
+    depth: Depth
+    """(H, W) metres, 0 where unknown."""
+    gt: Depth
+    """(H, W) metres, 0 where unknown or not scored."""
     kinds: dict[str, DepthKind]
     """Of the files by "prediction", "gt" and "sparse"."""
     sparse: Depth | None = None
@@ -54,6 +60,11 @@ class LoadedFrame(MeasuredFrame):
     fit: Fit | None = None
     sigma: Depth | None = None
     """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
+
+    @property
+    def both(self) -> Mask:
+        """(H, W) true where prediction and ground truth are known."""
+        return (self.depth > 0) & (self.gt > 0)
 
     @property
     def tolerance(self) -> float:

@@ -12,23 +12,13 @@ relative errors by 100.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.core.metrics import Measure
-
-DEVKIT_MEASURES = tuple(
-    Measure(key=title.lower().replace(" ", "_"), title=title, unit=unit, decimals=6)
-    for unit, *titles in (
-        ("m", "MAE", "RMSE"),
-        ("1/m", "inverse MAE", "inverse RMSE"),
-        ("", "log MAE", "log RMSE", "scale invariant log", "abs relative", "squared relative"),
-    )
-    for title in titles
-)
-"""In the kit's order and with its six decimals. Its squared relative is (p − g)²/g²."""
+from pnpdepth_cli.measures import Measure
 
 Floats = NDArray[np.float32]
 _MISSING = np.float32(-1)
@@ -62,6 +52,54 @@ def fill_background(depth: Floats) -> Floats:
     return filled
 
 
+class _Pixels(NamedTuple):
+    """The scored pixels of a frame, (N,) each, in the order in which the kit adds them up."""
+
+    error: Floats
+    """|g − p|"""
+    log_error: Floats
+    """log g − log p"""
+    inverse_error: Floats
+    """|1/g − 1/p|"""
+    gt: Floats
+
+    def mean(self, values: Floats) -> np.float32:
+        return _sum(values) / np.float32(len(values))
+
+
+def _row(
+    title: str, formula: Callable[[_Pixels], np.float32 | np.float64], unit: str = ""
+) -> Measure:
+    key = title.lower().replace(" ", "_")
+    return Measure(
+        key=key,
+        title=title,
+        unit=unit,
+        decimals=6,
+        main=key in ("mae", "rmse", "inverse_mae", "inverse_rmse"),
+        formula=lambda pixels: float(formula(pixels)),
+    )
+
+
+def _scale_invariant(pixels: _Pixels) -> np.float32:
+    count, total = np.float32(len(pixels.gt)), _sum(pixels.log_error)
+    return np.float32(np.sqrt(pixels.mean(pixels.log_error**2) - total * total / (count * count)))
+
+
+DEVKIT_MEASURES = (
+    _row("MAE", lambda p: p.mean(p.error), "m"),
+    _row("RMSE", lambda p: np.sqrt(p.mean(p.error * p.error)), "m"),
+    _row("inverse MAE", lambda p: p.mean(p.inverse_error), "1/m"),
+    _row("inverse RMSE", lambda p: np.sqrt(p.mean(p.inverse_error**2)), "1/m"),
+    _row("log MAE", lambda p: p.mean(np.abs(p.log_error))),
+    _row("log RMSE", lambda p: np.sqrt(p.mean(p.log_error**2))),
+    _row("scale invariant log", _scale_invariant),
+    _row("abs relative", lambda p: p.mean(p.error / p.gt)),
+    _row("squared relative", lambda p: p.mean(p.error * p.error / (p.gt * p.gt))),
+)
+"""In the kit's order and with its six decimals. Its squared relative is (p − g)²/g²."""
+
+
 def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
     """Returns the measures of one frame; the logarithmic ones are NaN where the fill left −1.
 
@@ -73,24 +111,14 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
     known = gt.T > 0  # the kit walks down each column
     p, g = filled.T[known], gt.T[known]
     with np.errstate(invalid="ignore"):
-        error, log_error = np.abs(g - p), _log(g) - _log(p)
         inverse_error = np.abs(1.0 / g.astype(np.float64) - 1.0 / p.astype(np.float64))
-        inverse_error = inverse_error.astype(np.float32)
-        count = np.float32(len(g))
-        log_mean_squared = _sum(log_error * log_error) / count
-        log_sum = _sum(log_error)
-        measures = {
-            "mae": _sum(error) / count,
-            "rmse": np.sqrt(_sum(error * error) / count),
-            "inverse_mae": _sum(inverse_error) / count,
-            "inverse_rmse": np.sqrt(_sum(inverse_error * inverse_error) / count),
-            "log_mae": _sum(np.abs(log_error)) / count,
-            "log_rmse": np.sqrt(log_mean_squared),
-            "scale_invariant_log": np.sqrt(log_mean_squared - log_sum * log_sum / (count * count)),
-            "abs_relative": _sum(error / g) / count,
-            "squared_relative": _sum(error * error / (g * g)) / count,
-        }
-    return {name: float(value) for name, value in measures.items()}
+        pixels = _Pixels(
+            error=np.abs(g - p),
+            log_error=_log(g) - _log(p),
+            inverse_error=inverse_error.astype(np.float32),
+            gt=g,
+        )
+        return {measure.key: measure.value(pixels) for measure in DEVKIT_MEASURES}
 
 
 def devkit_mean(values: NDArray[Any]) -> NDArray[np.float64]:

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from pnpdepth_cli.commands.evaluation.statistics import gain
-from pnpdepth_cli.commands.tables import column_title
-from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.measures import Measure
 
 _CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
 """By the suffix of a plot, what is not written to it, so that the same runs give the same bytes."""
@@ -47,7 +46,7 @@ def plot_comparison(comparison: Mapping[str, Any], path: Path, *, overwrite: boo
         others = [f"{name}={value}" for name, value in run["varied"].items() if name != across]
         lines.setdefault(", ".join(others), []).append(run)
     # a column of two panels for each measure
-    measures = [Measure(**each) for each in comparison["measures"]]
+    measures = [Measure.from_json(each) for each in comparison["measures"]]
     size = _SIDE_INCHES * len(measures) + 1, 2 * _SIDE_INCHES
     with mpl.rc_context({"svg.hashsalt": "pnpdepth", "font.size": 8, "axes.grid": True}):
         figure = Figure(size, layout="constrained", dpi=150)
@@ -59,7 +58,7 @@ def plot_comparison(comparison: Mapping[str, Any], path: Path, *, overwrite: boo
                 above.plot(x, before, f"C{number}--", linewidth=0.8)
                 above.plot(x, after, f"C{number}o-", label=label)
                 below.plot(x, improved, f"C{number}o-")
-            above.set_ylabel(column_title(measure))
+            above.set_ylabel(measure.heading)
             below.set(ylabel=f"improvement of {measure.title} [%]", xlabel=across)
             below.set_xscale("log" if min(positions.values()) > 0 else "linear")
             below.set_xticks([*positions.values()], [*positions])
@@ -75,8 +74,7 @@ def _values(measure: Measure, runs: Sequence[Mapping[str, Any]]) -> tuple[Any, A
     """The means before and after, in the shown unit, and the improvement in per cent."""
     means = [[run[stage][measure.key] for run in runs] for stage in ("before", "mean")]
     before, after = np.array(means, np.float64) * measure.shown_factor  # None becomes NaN
-    better = np.array(1.0 if measure.higher_is_better else -1.0)
-    return before, after, gain(before, after, better)
+    return before, after, gain(before, after, np.array(measure.sign, np.float64))
 
 
 def _axis(runs: Sequence[Mapping[str, Any]]) -> tuple[str, dict[str, float]]:

@@ -7,11 +7,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.choices import MEASURE_GROUPS
+from pnpdepth_cli import choices
 from pnpdepth_cli.commands.evaluation.kitti_devkit import DEVKIT_MEASURES
-from pnpdepth_cli.commands.evaluation.measures import MeasureGroup
-from pnpdepth_cli.core.metrics import DELTA_THRESHOLDS, MEASURES, Measure
 from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.measures import DELTA_THRESHOLDS, MEASURES, Measure, by_depth
 
 KITTI_DEVKIT = "kitti-devkit"
 
@@ -50,7 +49,8 @@ class EvalProtocol:
     prediction_kind: str = "depth"
     scale_by: str = "none"
     prediction_crop: str | None = None
-    groups: tuple[str, ...] = ()
+    more_measures: tuple[str, ...] = ()
+    depth_limits: tuple[float, float] | None = None
     resize: str | None = None
 
     @property
@@ -64,12 +64,8 @@ class EvalProtocol:
         if self.is_devkit:
             return DEVKIT_MEASURES
         base = _IN_MILLIMETRES if self.name == "kitti" else MEASURES
-        return (*base, *(m for group in self.measure_groups for m in group.measures))
-
-    @property
-    def measure_groups(self) -> tuple[MeasureGroup, ...]:
-        """The groups of additional measures."""
-        return tuple(MEASURE_GROUPS[name] for name in self.groups)
+        of_parts = () if self.depth_limits is None else by_depth(*self.depth_limits)
+        return (*base, *of_parts, *(choices.MEASURES[key] for key in self.more_measures))
 
     def scoring(self) -> dict[str, Any]:
         """Returns what decides the figures; equal for two evaluations that can be compared."""
@@ -112,8 +108,11 @@ _IN_MILLIMETRES = tuple(
     for m in MEASURES
 )
 
-_OF_READING = ("name", "scale", "resize", "mask", "prediction_kind", "prediction_crop", "groups")
-"""Fields that say how files are read, not how they are scored."""
+_OF_READING = (
+    *("name", "scale", "resize", "mask", "prediction_kind", "prediction_crop"),
+    *("more_measures", "depth_limits"),
+)
+"""Fields that say how files are read and what is measured, not which pixels are scored and how."""
 
 _MISSING_TEXTS = {
     "skip": "",
@@ -146,7 +145,8 @@ _NOT_OF_DEVKIT = {
     "average": "--average",
     "thresholds": "--delta",
     "missing": "--missing",
-    "groups": "--measures",
+    "more_measures": "--measures",
+    "depth_limits": "--by-depth",
 }
 
 
@@ -172,15 +172,18 @@ def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
         changed.setdefault("missing", "skip")  # there is no bound to score empty predictions as
     protocol = replace(published, **changed)
     low, high = protocol.min_depth, protocol.max_depth
-    for name in protocol.groups:
-        _ = MEASURE_GROUPS[name]
+    for key in protocol.more_measures:
+        _ = choices.MEASURES[key]
+    near, far = protocol.depth_limits or (1.0, 2.0)
+    if not (0 < near < far and math.isfinite(far)):
+        raise UsageError(f"--by-depth must be two rising depths in metres, got {near:g},{far:g}")
     if not (math.isfinite(low) and low >= 0):
         raise UsageError(f"--min-depth must be metres >= 0, got {low:g}")
     if high is not None and not (math.isfinite(high) and high > low):
         raise UsageError(f"--max-depth must be metres above --min-depth {low:g}, got {high:g}")
     if not all(math.isfinite(limit) and limit > 1 for limit in protocol.thresholds):
         raise UsageError("--delta must be above 1: δ counts ratios below it")
-    if protocol.groups and protocol.average == "pooled":
+    if protocol.more_measures and protocol.average == "pooled":
         raise UsageError("--measures are of each image; --average pooled does not apply to them")
     if protocol.missing == "min" and low == 0:
         raise UsageError("--missing min scores empty predictions as --min-depth; set it above 0")

@@ -29,6 +29,15 @@ def parse_names(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(text.split(",")))
 
 
+def parse_depth_limits(text: str) -> tuple[float, float]:
+    """Returns the two depths of a text such as `10,30`."""
+    try:
+        near, far = (float(word) for word in text.split(","))
+    except ValueError:
+        raise UsageError(f"--by-depth {text!r} is not two depths such as 10,30") from None
+    return near, far
+
+
 @dataclass(frozen=True, kw_only=True)
 class ScoringRules:
     """Fields of the protocol that the user sets otherwise; None leaves the protocol's."""
@@ -70,12 +79,20 @@ class ScoringRules:
         flag="--pred-kind",
         choices=choices.PREDICTION_KINDS,
     )
-    groups: tuple[str, ...] | None = option(
+    more_measures: tuple[str, ...] | None = option(
         None,
-        f"Additional measures: {', '.join(choices.MEASURE_GROUPS)}.",
+        f"More measures, for dense ground truth: {', '.join(choices.MEASURES)}.",
         flag="--measures",
-        metavar="GROUP,…",
+        metavar="KEY,…",
         parse=parse_names,
+    )
+    depth_limits: tuple[float, float] | None = option(
+        None,
+        "Also errors of pixels nearer than NEAR metres, farther than FAR, and between, by their"
+        " true depth.",
+        flag="--by-depth",
+        metavar="NEAR,FAR",
+        parse=parse_depth_limits,
     )
     resize: str | None = option(
         None, "Resize predictions to the size of the ground truth.", choices=choices.RESIZES

@@ -18,15 +18,17 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from pnpdepth_cli.commands.evaluation.frames import Fit, load_frame
+from pnpdepth_cli.commands.evaluation.frames import Depth, Fit, load_frame
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
-from pnpdepth_cli.commands.evaluation.measures import Depth, Floats
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.core.metrics import MEASURES, error_sums, measures_of
+from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import DepthKind
+from pnpdepth_cli.measures import Formula
+
+Floats = NDArray[np.float64]
 
 ONE_SIGMA, TWO_SIGMA = (float(2 * norm.cdf(k) - 1) for k in (1, 2))
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, ONE_SIGMA, 0.8, 0.9, TWO_SIGMA, 0.99)
@@ -68,7 +70,7 @@ class FrameScores:
     leaked: int | None = None
     """Scored pixels whose ground truth is a value of the sparse input; None if that is unknown."""
     sums: tuple[float, ...] = ()
-    """Over the pixels, in the order of core.metrics.SUMS."""
+    """Over the pixels, in the order of core.metrics.error_sums."""
     kinds: dict[str, DepthKind] = field(default_factory=dict)
     """Of the files by "prediction", "gt" and "sparse"."""
     uncertainty: FrameUncertainty | None = field(default=None, compare=False)
@@ -111,7 +113,9 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
     row = FrameScores(pair=pair, known=known, kinds=frame.kinds)
     if frame.predicted is None:
         return replace(row, error="there is no prediction")
-    sums = error_sums(torch.from_numpy(depth), torch.from_numpy(gt), protocol.thresholds)
+    summed = [m for m in protocol.measures if isinstance(m.formula, Formula)]
+    both_depths = torch.from_numpy(depth), torch.from_numpy(gt)
+    sums = error_sums(*both_depths, protocol.thresholds, summed)
     row = replace(
         row,
         pixels=pixels,
@@ -125,11 +129,9 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
         where = " where the ground truth is known" if (depth > 0).any() else ""
         return replace(row, error=f"{pair.prediction} holds no valid depth{where}")
     else:
-        keys = (measure.key for measure in MEASURES)
-        values = dict(zip(keys, measures_of(sums).tolist(), strict=True))
-        for group in protocol.measure_groups:  # NaN where the frame lacks a measure
-            own = (measure.key for measure in group.measures)
-            values |= zip(own, group.values(frame), strict=True)
+        of_pixels = measures_of(sums, summed).tolist()
+        values = {m.key: value for m, value in zip(summed, of_pixels, strict=True)}
+        values |= {m.key: m.value(depth, gt) for m in protocol.measures if m.key not in values}
     leaked, sparse_ratio = min(pair.sampled, pixels) or None, math.nan
     if frame.sparse is not None:
         equal = np.abs(frame.sparse - gt) <= frame.tolerance + 1e-6 * gt

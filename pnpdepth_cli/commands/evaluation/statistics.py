@@ -17,7 +17,8 @@ import torch
 from numpy.typing import NDArray
 from scipy import stats
 
-from pnpdepth_cli.core.metrics import MEASURES, measures_of
+from pnpdepth_cli.core.metrics import measures_of
+from pnpdepth_cli.measures import MEASURES, Measure
 
 Floats = NDArray[np.float64]
 
@@ -125,12 +126,21 @@ class FrameTable:
         return cls(sums=sums, mean_of=mean_of)
 
     @classmethod
-    def of_pixels(cls, sums: Floats, keys: Sequence[str]) -> FrameTable:
-        """Every pixel counts alike; (N, len(SUMS)), and the measures of MEASURES that are meant."""
-        kept = [number for number, measure in enumerate(MEASURES) if measure.key in keys]
+    def of_pixels(
+        cls, sums: Floats, keys: Sequence[str], measures: Sequence[Measure] = MEASURES
+    ) -> FrameTable:
+        """Every pixel counts alike.
+
+        Args:
+            sums: (N, S) as `error_sums` has them.
+            keys: Of the measures that are meant.
+            measures: Those that the sums are of.
+        """
+        kept = [number for number, measure in enumerate(measures) if measure.key in keys]
 
         def mean_of(sums: Floats) -> Floats:
-            return np.asarray(measures_of(torch.from_numpy(sums[..., 0])).numpy()[..., kept])
+            found = measures_of(torch.from_numpy(sums[..., 0]), measures)
+            return np.asarray(found.numpy()[..., kept])
 
         return cls(sums=sums[..., None], mean_of=mean_of)
 

@@ -13,12 +13,9 @@ from pnpdepth_cli.commands.tables import (
     Cell,
     Style,
     Table,
-    chosen_measures,
-    column_title,
-    format_value,
 )
-from pnpdepth_cli.core.metrics import Measure
 from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.measures import Measure, chosen_measures
 
 _FRAMES_SHOWN = 12
 _FRAME_COLUMNS = 6
@@ -45,8 +42,8 @@ def means_by_measure(evaluation: Evaluation, columns: Sequence[str] | None = Non
     rows = []
     for measure in chosen_measures(evaluation.protocol.measures, columns):
         interval = [_interval(evaluation, measure)] if has_interval else []
-        mean = format_value(measure, evaluation.mean[measure.key])
-        rows.append([column_title(measure), mean, *interval])
+        mean = measure.text(evaluation.mean[measure.key])
+        rows.append([measure.heading, mean, *interval])
     coverage = ["coverage ↑", f"{evaluation.coverage:.2%}", *[""] * has_interval]
     return Table(header=header, rows=[*rows, coverage], caption=caption)
 
@@ -54,7 +51,7 @@ def means_by_measure(evaluation: Evaluation, columns: Sequence[str] | None = Non
 def means_row(evaluation: Evaluation, name: str, columns: Sequence[str] | None) -> Table:
     """Returns one row: the chosen means with their intervals, the frames and the coverage."""
     measures = chosen_measures(evaluation.protocol.measures, columns)
-    cells = [format_value(measure, evaluation.mean[measure.key]) for measure in measures]
+    cells = [measure.text(evaluation.mean[measure.key]) for measure in measures]
     if evaluation.interval is not None:
         ends = [_interval(evaluation, measure) for measure in measures]
         cells = [f"{cell} ({end})" for cell, end in zip(cells, ends, strict=True)]
@@ -66,7 +63,7 @@ def means_row(evaluation: Evaluation, name: str, columns: Sequence[str] | None) 
         if kind.assumed
     }
     return Table(
-        header=["", *map(column_title, measures), "frames", "coverage"],
+        header=["", *(m.heading for m in measures), "frames", "coverage"],
         rows=[[name, *cells, scored, f"{evaluation.coverage:.2%}"]],
         caption="; ".join([evaluation.protocol.describe(), *sorted(assumed)]),
     )
@@ -74,7 +71,7 @@ def means_row(evaluation: Evaluation, name: str, columns: Sequence[str] | None) 
 
 def _interval(evaluation: Evaluation, measure: Measure) -> str:
     ends = (evaluation.interval or {}).get(measure.key, ())
-    return " … ".join(format_value(measure, end) for end in ends)
+    return " … ".join(measure.text(end) for end in ends)
 
 
 def frames_csv(evaluation: Evaluation) -> Table:
@@ -97,9 +94,9 @@ def frames_table(evaluation: Evaluation, columns: Sequence[str] | None) -> Table
     frames = evaluation.frames if everything else worst(evaluation, "rmse")[:_FRAMES_SHOWN]
     return Table(
         caption="Frames" if everything else f"The {len(frames)} worst by RMSE; --csv has all",
-        header=["frame", *map(column_title, measures), "coverage"],
+        header=["frame", *(m.heading for m in measures), "coverage"],
         rows=[
-            [frame.name, *(format_value(m, frame.values.get(m.key)) for m in measures),
+            [frame.name, *(m.text(frame.values.get(m.key)) for m in measures),
              _coverage(frame)]
             for frame in frames
         ],
@@ -109,7 +106,7 @@ def frames_table(evaluation: Evaluation, columns: Sequence[str] | None) -> Table
 def worst(evaluation: Evaluation, key: str) -> list[FrameScores]:
     """Returns the scored frames by one measure, worst first, those with NaN at the very end."""
     (measure,) = (m for m in evaluation.protocol.measures if m.key == key)
-    sign = 1 if measure.higher_is_better else -1
+    sign = measure.sign
     values = ((frame, frame.values[key]) for frame in evaluation.scored)
     ordered = sorted(values, key=lambda of: (math.isnan(of[1]), sign * of[1]))
     return [frame for frame, _ in ordered]
@@ -141,7 +138,7 @@ def comparison_table(comparison: Mapping[str, Any]) -> Table:
     (base, *others), measures = comparison["runs"], _measures(comparison)
     rows = []
     for measure in measures:
-        title, mean = column_title(measure), format_value(measure, base["mean"][measure.key])
+        title, mean = measure.heading, measure.text(base["mean"][measure.key])
         rows.append([title, base["label"], mean, *["–"] * 4])
         for run, gains in zip(others, comparison["gains"], strict=True):
             found = gains[measure.key]
@@ -151,7 +148,7 @@ def comparison_table(comparison: Mapping[str, Any]) -> Table:
             rows.append([
                 title,
                 run["label"],
-                format_value(measure, run["mean"][measure.key]),
+                measure.text(run["mean"][measure.key]),
                 Cell(_signed(percent), style),
                 *(_signed(found[end]) for end in ("low_percent", "high_percent")),
                 "–" if p is None else f"{p:.4f}",
@@ -169,7 +166,7 @@ def comparison_table(comparison: Mapping[str, Any]) -> Table:
 
 
 def _measures(comparison: Mapping[str, Any]) -> list[Measure]:
-    return [Measure(**measure) for measure in comparison["measures"]]
+    return [Measure.from_json(entry) for entry in comparison["measures"]]
 
 
 def _tested(comparison: Mapping[str, Any]) -> str:
@@ -191,18 +188,18 @@ def methods_table(comparison: Mapping[str, Any]) -> Table:
     rows: list[list[str]] = [[run["label"]] for run in runs]
     for measure in measures:
         means = [run["mean"][measure.key] for run in runs]
-        pick = max if measure.higher_is_better else min
-        best = format_value(measure, pick((m for m in means if m is not None), default=None))
+        pick = max if measure.better == "higher" else min
+        best = measure.text(pick((m for m in means if m is not None), default=None))
         p_values = [1.0, *(gains[measure.key]["p_adjusted"] for gains in comparison["gains"])]
         for row, mean, p in zip(rows, means, p_values, strict=True):
             text, stars = (
-                format_value(measure, mean),
+                measure.text(mean),
                 "*" * sum(p is not None and p < limit for limit in _STARS),
             )
             is_best = text == best and mean is not None
             row.append(Cell(text + stars, "bold" if is_best else ""))
     return Table(
-        header=["", *map(column_title, measures)],
+        header=["", *(m.heading for m in measures)],
         rows=rows,
         caption=(
             f"means over {len(comparison['frames']):,} frames, the best in bold; *, **, ***:"

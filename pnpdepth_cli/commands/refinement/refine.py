@@ -204,7 +204,7 @@ def _scores(depth: DepthMap, gt: DepthMap | None) -> dict[str, Any] | None:
     """The errors of depth (H, W) against the ground truth."""
     if gt is None:
         return None
-    return asdict(score(torch.from_numpy(depth), torch.from_numpy(gt)))
+    return score(torch.from_numpy(depth), torch.from_numpy(gt)).to_json()
 
 
 def _before_after(

@@ -13,7 +13,6 @@ from pnpdepth_cli.commands.evaluation.frames import image_of, load_frame
 from pnpdepth_cli.commands.evaluation.scoring import FrameScores, filled
 from pnpdepth_cli.commands.evaluation.tables import calibration_tables, means_by_measure
 from pnpdepth_cli.commands.ordered_pool import in_order
-from pnpdepth_cli.commands.tables import format_value, unit_of
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
@@ -29,7 +28,6 @@ from pnpdepth_cli.io.report import (
 from pnpdepth_cli.io.visualisation import error_map
 
 _SOURCE = {"command": "eval"}
-_LISTED = ("rmse", "mae", "mre", "irmse", "delta1")
 
 
 def check_eval_report(folder: Path, inputs: list[Path], *, overwrite: bool) -> None:
@@ -77,22 +75,19 @@ def frames_text(count: int) -> str:
 
 
 def _columns(evaluation: Evaluation) -> list[dict[str, Any]]:
-    measures = evaluation.protocol.measures
-    keys = {measure.key for measure in measures}
-    listed = _LISTED if keys.issuperset(_LISTED) else tuple(keys)
     return [
         *(
             column(
                 key=measure.key,
                 title=measure.title,
-                unit=unit_of(measure),
+                unit=measure.table_unit,
                 decimals=measure.decimals,
                 factor=measure.shown_factor,
                 percent=measure.percent,
-                higher_is_better=measure.higher_is_better,
-                listed=measure.key in listed,
+                higher_is_better=measure.better == "higher",
+                listed=measure.main,
             )
-            for measure in measures
+            for measure in evaluation.protocol.measures
         ),
         column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
     ]
@@ -138,9 +133,9 @@ def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
     return [
         ("Frames scored", of, ", ".join(unscored)),
         *(
-            (measure.title, format_value(measure, evaluation.mean[measure.key], unit=True), "")
+            (measure.title, measure.text(evaluation.mean[measure.key], measure.table_unit), "")
             for measure in evaluation.protocol.measures
-            if measure.key in ("rmse", "mae", "delta1")
+            if measure.main
         ),
         ("Coverage", coverage, "of the ground truth has a prediction"),
     ]

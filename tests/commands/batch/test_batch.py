@@ -21,10 +21,10 @@ from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import _SCORES, Tally
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.commands.report.batch import write_batch_report
-from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.measures import MEASURES
 from pnpdepth_cli.sensors import SamplePattern
 from tests.commands.batches import (
     NAMES,
@@ -313,7 +313,7 @@ def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path
     assert float(table[1]["rmse_after"]) == row["scores"]["after"]["rmse"]
     assert float(table[1]["held_out_error_mae_before"]) == row["held_out_error"]["before"]["mae"]
     assert [float(line["baseline_linear_held_out_mae"]) for line in table] == held_out
-    assert set(_SCORES) == set(Scores.__dataclass_fields__) - {"pixels"}
+    assert set(_SCORES) == {*(measure.key for measure in MEASURES), "coverage"}
 
 
 def test_a_profile_counts_the_frames_and_seconds_of_the_run(root: Path) -> None:

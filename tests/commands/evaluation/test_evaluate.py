@@ -442,9 +442,11 @@ REFUSED = [
     ({"layout_protocol": "whole"}, "--layout-protocol whole is for data sets"),
     ({"gt_scale": 0.0}, "--gt-scale"),
     ({"pred_scale": math.nan}, "--pred-scale"),
-    ({"groups": ("edge",)}, "unknown group of measures 'edge'; did you mean 'edges'"),
-    ({"groups": ("edges",), "average": "pooled"}, "--average pooled does not apply"),
-    ({"groups": ("edges",), "protocol": "kitti-devkit"}, "--measures does not apply to kitti-"),
+    ({"more_measures": ("boundary",)}, "unknown measure 'boundary'"),
+    ({"more_measures": ("boundary_f1",), "average": "pooled"}, "--average pooled does not apply"),
+    ({"more_measures": ("boundary_f1",), "protocol": "kitti-devkit"}, "--measures does not apply"),
+    ({"depth_limits": (1.0, 2.0), "protocol": "kitti-devkit"}, "--by-depth does not apply"),
+    ({"depth_limits": (2.0, 1.0)}, "--by-depth must be two rising depths"),
 ]
 
 
@@ -469,10 +471,16 @@ def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
         gt = rng.uniform(2, 9, (20, 30)) if name != "b" else np.full((20, 30), 2.0)
         depth_file(tmp_path / "gt" / f"{name}.npy", gt)
         depth_file(tmp_path / "out" / f"{name}.npy", gt * rng.uniform(0.9, 1.1, gt.shape))
-    default, more = scored(tmp_path), scored(tmp_path, groups=("edges",))
+    default, more = (
+        scored(tmp_path),
+        scored(tmp_path, more_measures=("boundary_f1",), depth_limits=(4.0, 6.0)),
+    )
     assert list(more.mean)[: len(default.mean)] == list(default.mean)
     assert default.mean.items() <= more.mean.items()
     assert more.protocol.scoring() == default.protocol.scoring()
-    first, second, third = (frame.values["dbe_completeness"] for frame in more.frames)
-    assert math.isnan(second)  # a wall has no edges
-    assert more.mean["dbe_completeness"] == pytest.approx((first + third) / 2)
+    first, second, third = (frame.values["rmse_far"] for frame in more.frames)
+    assert math.isnan(second)  # a wall in 2 m has no far pixels
+    assert more.mean["rmse_far"] == pytest.approx((first + third) / 2)
+    assert [frame.values["boundary_f1"] for frame in more.frames][1] == 0
+    pooled = scored(tmp_path, depth_limits=(4.0, 6.0), average="pooled")
+    assert pooled.mean["mae_near"] != more.mean["mae_near"]

@@ -24,8 +24,9 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     holm,
     swap_p_values,
 )
-from pnpdepth_cli.core.metrics import SUMS, error_sums, score
+from pnpdepth_cli.core.metrics import error_sums, score, sum_count
 from pnpdepth_cli.io.dataset import groups_by_name
+from pnpdepth_cli.measures import MEASURES
 
 
 def clusters_of(ids: list[int] | np.ndarray) -> Clusters:
@@ -72,9 +73,9 @@ def test_each_end_is_the_farther_one_of_bootstrap_t_and_students_t() -> None:
 
 
 def test_the_standard_error_of_a_pooled_measure_is_the_delta_methods() -> None:
-    sums = np.random.default_rng(3).uniform(1, 2, (300, len(SUMS)))
+    sums = np.random.default_rng(3).uniform(1, 2, (300, sum_count(MEASURES)))
     low, high = interval(FrameTable.of_pixels(sums, ["rmse"]), 4000)
-    squared, pixels = sums[:, SUMS.index("squared")], sums[:, SUMS.index("pixels")]
+    _, pixels, squared = sums.T[:3]
     mean = squared.sum() / pixels.sum()
     error = np.sqrt(((squared - mean * pixels) ** 2).sum()) / pixels.sum() / (2 * np.sqrt(mean))
     assert (high[0] - low[0]) / 2 == pytest.approx(1.96 * error, rel=0.05)

@@ -1,0 +1,389 @@
+"""The error measures of depth: what each is called, how it is shown, and its formula.
+
+`MEASURES` are computed everywhere, `TABLE` has those that `eval --measures` computes on request. A
+measure is one entry of either, and nowhere else. Importing this module imports no library.
+
+Sources: Eigen et al. 2014 (RMSE, RMSE of the logarithm, AbsRel = MRE, SqRel, δ < 1.25^k, SILog),
+the paper and NYU's tables (log10), the KITTI depth completion benchmark (iRMSE, iMAE), Depth Pro
+(Bochkovskii et al., ICLR 2025) and MoGe-2 (Wang et al. 2025) for the boundaries.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Literal
+
+from pnpdepth_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    Image = NDArray[np.float32]
+
+DELTA_THRESHOLDS = (1.25, 1.25**2, 1.25**3)
+"""Thresholds of δ1 to δ3 (Eigen et al. 2014). The paper's KITTI rows use 1.01^k."""
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """N scored pixels, (N,) float64 each; all depths are known and positive."""
+
+    predicted: Tensor
+    """Metres."""
+    truth: Tensor
+    """Metres."""
+    thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
+    """Of δ1 to δ3."""
+
+    @cached_property
+    def error(self) -> Tensor:
+        """p − g, metres."""
+        return self.predicted - self.truth
+
+    @cached_property
+    def log_error(self) -> Tensor:
+        """log p − log g, natural logarithm."""
+        return self.predicted.log() - self.truth.log()
+
+    @cached_property
+    def inverse_error(self) -> Tensor:
+        """1/p − 1/g, 1/m."""
+        return 1 / self.predicted - 1 / self.truth
+
+    @cached_property
+    def ratio(self) -> Tensor:
+        """max(p/g, g/p)."""
+        return (self.predicted / self.truth).maximum(self.truth / self.predicted)
+
+
+Term = Callable[[Pixels], "Tensor"]
+"""What is summed over the pixels: (N,) of N pixels."""
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A measure as a function of sums over pixels.
+
+    So the sums of several images can be added, which gives all their pixels equal weight.
+    """
+
+    terms: tuple[Term, ...]
+    """What is summed; the first term counts the pixels."""
+    of_sums: Callable[..., Tensor]
+    """From the sum of each term, of any shape, to the measure."""
+
+
+def pixel_count(pixels: Pixels) -> Tensor:
+    """Returns 1 for each pixel."""
+    return pixels.truth.new_ones(pixels.truth.shape)
+
+
+def mean(term: Term, factor: float = 1.0) -> Formula:
+    """Returns the formula factor · mean of the term."""
+    return Formula((pixel_count, term), lambda count, total: factor * (total / count))
+
+
+def root_mean_square(term: Term, factor: float = 1.0) -> Formula:
+    """Returns the formula factor · √ mean of the squared term."""
+    terms = (pixel_count, lambda pixels: term(pixels).square())
+    return Formula(terms, lambda count, total: factor * (total / count).sqrt())
+
+
+def deviation(term: Term, factor: float = 1.0) -> Formula:
+    """Returns the formula factor · standard deviation of the term."""
+
+    def of_sums(count: Tensor, squares: Tensor, total: Tensor) -> Tensor:
+        return factor * (squares / count - (total / count).square()).clamp_min(0).sqrt()
+
+    return Formula((pixel_count, lambda pixels: term(pixels).square(), term), of_sums)
+
+
+def fraction_below(number: int) -> Formula:
+    """Returns the formula of δ: the fraction of pixels whose ratio is below a threshold."""
+    return mean(lambda pixels: (pixels.ratio < pixels.thresholds[number - 1]).double())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """A measure: its name, how it is shown, and its formula."""
+
+    key: str
+    """Its name in files and on the command line."""
+    title: str
+    unit: str = ""
+    """Unit in files."""
+    better: Literal["lower", "higher"] = "lower"
+    decimals: int = 4
+    percent: bool = False
+    """True for a fraction of 1 that tables show in per cent."""
+    shown_unit: str = ""
+    """Unit in tables; empty: `unit`."""
+    shown_factor: float = 1.0
+    """Factor from `unit` to the unit in tables."""
+    main: bool = False
+    """True if short tables have it."""
+    formula: Formula | Callable[..., float] | None = field(default=None, compare=False, repr=False)
+    """Of the scored pixels; or of the images (H, W) of predicted and true depth in metres, 0 where
+    unknown or not scored, to NaN where there is no value. None for a measure read from a file."""
+
+    @property
+    def table_unit(self) -> str:
+        """The unit in tables; empty for ratios and percentages."""
+        return self.shown_unit or self.unit
+
+    @property
+    def heading(self) -> str:
+        """A title such as `RMSE [m] ↓`."""
+        unit = f" [{self.table_unit}]" if self.table_unit else ""
+        return f"{self.title}{unit} {'↑' if self.better == 'higher' else '↓'}"
+
+    @property
+    def sign(self) -> int:
+        """1 if higher is better, else −1."""
+        return 1 if self.better == "higher" else -1
+
+    def text(self, value: float | None, unit: str = "") -> str:
+        """Returns the value as tables show it, followed by a unit; – for NaN and None."""
+        if value is None or math.isnan(value):
+            return "–"
+        if self.percent:
+            return f"{value:.{self.decimals}%}"
+        return f"{value * self.shown_factor:,.{self.decimals}f} {unit}".rstrip()
+
+    def value(self, *inputs: Any) -> float:
+        """Returns the value by a formula that is not of sums."""
+        assert callable(self.formula)
+        return self.formula(*inputs)
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns all but the formula."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "formula"}
+
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> Measure:
+        """Returns a measure without formula. Raises TypeError for an entry of something else."""
+        return cls(**entry)
+
+
+MEASURES = (
+    Measure(
+        key="rmse", title="RMSE", unit="m", main=True, formula=root_mean_square(lambda p: p.error)
+    ),
+    Measure(key="mae", title="MAE", unit="m", main=True, formula=mean(lambda p: p.error.abs())),
+    Measure(key="mre", title="MRE", main=True, formula=mean(lambda p: p.error.abs() / p.truth)),
+    Measure(
+        key="sq_rel", title="SqRel", unit="m", formula=mean(lambda p: p.error.square() / p.truth)
+    ),
+    Measure(
+        key="log10", title="log10", formula=mean(lambda p: p.log_error.abs(), 1 / math.log(10))
+    ),
+    Measure(key="rmse_log", title="RMSE log", formula=root_mean_square(lambda p: p.log_error)),
+    Measure(
+        key="irmse",
+        title="iRMSE",
+        unit="1/km",
+        decimals=2,
+        formula=root_mean_square(lambda p: p.inverse_error, 1000),
+    ),
+    Measure(
+        key="imae",
+        title="iMAE",
+        unit="1/km",
+        decimals=2,
+        formula=mean(lambda p: p.inverse_error.abs(), 1000),
+    ),
+    Measure(
+        key="silog",
+        title="SILog",
+        unit="100·log m",
+        decimals=2,
+        formula=deviation(lambda p: p.log_error, 100),
+    ),
+    *(
+        Measure(
+            key=f"delta{number}",
+            title=f"δ{number}",
+            better="higher",
+            percent=True,
+            decimals=2,
+            main=number == 1,
+            formula=fraction_below(number),
+        )
+        for number in (1, 2, 3)
+    ),
+)
+"""The measures that are computed everywhere, in the order of all tables."""
+
+
+def by_depth(near_m: float, far_m: float) -> tuple[Measure, ...]:
+    """Returns the main measures of near, middle and far pixels, by their true depth.
+
+    Args:
+        near_m: Depth below which a pixel is near, metres.
+        far_m: Depth from which on a pixel is far, metres.
+    """
+    parts = (
+        ("near", f"< {near_m:g} m", 0.0, near_m),
+        ("middle", f"{near_m:g}–{far_m:g} m", near_m, far_m),
+        ("far", f"≥ {far_m:g} m", far_m, math.inf),
+    )
+    return tuple(
+        replace(
+            measure,
+            key=f"{measure.key}_{name}",
+            title=f"{measure.title} {title}",
+            main=False,
+            formula=_within(measure.formula, low_m, high_m),
+        )
+        for name, title, low_m, high_m in parts
+        for measure in MEASURES
+        if measure.main and isinstance(measure.formula, Formula)
+    )
+
+
+def _within(formula: Formula, low_m: float, high_m: float) -> Formula:
+    """The formula over the pixels whose true depth lies in [low_m, high_m)."""
+
+    def within(term: Term, pixels: Pixels) -> Tensor:
+        inside = (pixels.truth >= low_m) & (pixels.truth < high_m)
+        return term(pixels) * inside
+
+    return Formula(tuple(partial(within, term) for term in formula.terms), formula.of_sums)
+
+
+_RATIOS = tuple(1.05 + 0.2 * step / 9 for step in range(10))
+"""A pixel is on a boundary if its neighbour is farther by such a factor: ten from 1.05 to 1.25."""
+
+
+def boundary_f1(predicted: Image, truth: Image) -> float:
+    """Returns the scale-invariant F1 of the boundaries as Depth Pro's code prints it.
+
+    Precision and recall are means over the four directions to a neighbour, and F1 is the mean over
+    the ratios weighted by the ratio. Depth Pro scores dense ground truth; here pairs with an
+    unknown pixel are left out.
+
+    Args:
+        predicted: (H, W) metres, 0 where unknown; an unknown pixel is on no boundary.
+        truth: (H, W) metres, 0 where unknown.
+
+    Returns:
+        0 without any boundary, NaN without any pair of known neighbours.
+    """
+    sides = ((0, 1), (0, -1), (1, 0), (-1, 0))
+    counts = [_boundary_counts(predicted, truth, side, 0) for side in sides]
+    if not any(pairs for pairs, _ in counts):
+        return math.nan
+    scores = []
+    for of_sides in zip(*(of_ratio for _, of_ratio in counts), strict=True):
+        recall = sum(both / max(true, 1) for both, _, true in of_sides) / 4
+        precision = sum(both / max(own, 1) for both, own, _ in of_sides) / 4
+        scores.append(2 * recall * precision / (recall + precision) if recall + precision else 0.0)
+    return _weighted(scores, _RATIOS)
+
+
+def boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
+    """Returns the F1 of the boundaries as MoGe's code prints it.
+
+    Pairs are of a pixel and all others within the radius; F1 is of all pairs together, and its mean
+    over the ratios is weighted by the ratio − 1. Pixels nearer than the radius to the border are
+    neighbours alone.
+
+    Args:
+        predicted: As of `boundary_f1`.
+        truth: As of `boundary_f1`.
+        radius: Pixels, 1 to 3 in MoGe's tables.
+    """
+    span = range(-radius, radius + 1)
+    disc = [(down, right) for down in span for right in span if down**2 + right**2 <= radius**2]
+    counts = [_boundary_counts(predicted, truth, offset, radius) for offset in disc]
+    if not any(pairs for pairs, _ in counts):
+        return math.nan
+    scores = []
+    for of_disc in zip(*(of_ratio for _, of_ratio in counts), strict=True):
+        both, own, true = (sum(column) for column in zip(*of_disc, strict=True))
+        scores.append(2 * both / (own + true) if own + true else 0.0)
+    return _weighted(scores, [ratio - 1 for ratio in _RATIOS])
+
+
+def _weighted(scores: Sequence[float], weights: Sequence[float]) -> float:
+    total = sum(weight * score for weight, score in zip(weights, scores, strict=True))
+    return total / sum(weights)
+
+
+def _boundary_counts(
+    predicted: Image, truth: Image, offset: tuple[int, int], margin: int
+) -> tuple[int, list[tuple[int, int, int]]]:
+    """How many pixels have a neighbour that is farther, for one place of the neighbour.
+
+    Args:
+        predicted: (H, W) metres, 0 where unknown.
+        truth: (H, W) metres, 0 where unknown.
+        offset: Rows and columns from the pixel to its neighbour.
+        margin: Width of the border whose pixels are neighbours alone.
+
+    Returns:
+        The number of pairs of known true depth; and of each ratio how many pairs are farther by it
+        in both, in the prediction, and in the truth.
+    """
+    import numpy as np
+
+    # the pixels, and their neighbours
+    windows = []
+    for step, side in zip(offset, truth.shape, strict=True):
+        start, stop = max(margin, -step), side - max(margin, step)
+        windows.append((slice(start, stop), slice(start + step, stop + step)))
+    (rows, other_rows), (columns, other_columns) = windows
+    known = (truth[rows, columns] > 0) & (truth[other_rows, other_columns] > 0)
+    # by which factor the neighbours are farther
+    factors = []
+    for image in (predicted, truth):
+        own, other = (
+            image[part][known].astype(np.float64)
+            for part in ((rows, columns), (other_rows, other_columns))
+        )
+        has_both = (own > 0) & (other > 0)
+        factors.append(np.divide(other, own, out=np.zeros_like(own), where=has_both))
+    of_ratios = []
+    for ratio in _RATIOS:
+        is_own, is_true = (factor > ratio for factor in factors)
+        both, alone, true = (int(each.sum()) for each in (is_own & is_true, is_own, is_true))
+        of_ratios.append((both, alone, true))
+    return int(np.count_nonzero(known)), of_ratios
+
+
+ON_REQUEST = (
+    Measure(
+        key="boundary_f1",
+        title="boundary F1",
+        better="higher",
+        formula=boundary_f1,
+    ),
+    *(
+        Measure(
+            key=f"boundary_f1_{radius}px",
+            title=f"boundary F1, {radius} px",
+            better="higher",
+            formula=partial(boundary_f1_within, radius=radius),
+        )
+        for radius in (1, 2, 3)
+    ),
+)
+TABLE = {measure.key: measure for measure in ON_REQUEST}
+"""The measures that are computed on request alone."""
+
+
+def chosen_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> tuple[Measure, ...]:
+    """Returns the measures with these keys, in their order; all for None.
+
+    Raises:
+        UsageError: If one is unknown.
+    """
+    by_key = {measure.key: measure for measure in measures}
+    if unknown := [key for key in keys or () if key not in by_key]:
+        raise UsageError(f"--columns {unknown[0]} is not one of {', '.join(by_key)}")
+    return tuple(by_key[key] for key in (by_key if keys is None else keys))

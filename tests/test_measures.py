@@ -1,0 +1,122 @@
+"""Boundary F1 and the errors by depth against plain numpy, from the formulas of the papers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pnpdepth_cli.choices import MEASURES as ON_REQUEST
+from pnpdepth_cli.core.metrics import error_sums, measures_of
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.measures import TABLE, by_depth
+
+SAMPLES = Path(__file__).parents[1] / "samples"
+LIMITS = np.linspace(1.05, 1.25, 10)
+
+
+def depth_pro(predicted: np.ndarray, truth: np.ndarray) -> float:
+    """Equations 2 to 5 of Depth Pro, over the pairs whose true depths are known."""
+    scores = []
+    for limit in LIMITS:
+        precision, recall = [], []
+        for axis in (0, 1):
+            for order in (1, -1):
+                own, true, known = [], [], []
+                for image, found in ((predicted, own), (truth, true)):
+                    first, second = (
+                        np.take(image, np.arange(image.shape[axis] - 1) + n, axis) for n in (0, 1)
+                    )
+                    near, far = (first, second)[::order]
+                    both = (near > 0) & (far > 0)
+                    found.append(both & (far / np.where(near > 0, near, 1) > limit))
+                    known.append(both)
+                own, true = own[0] & known[1], true[0]
+                precision.append((own & true).sum() / max(own.sum(), 1))
+                recall.append((own & true).sum() / max(true.sum(), 1))
+        p, r = np.mean(precision), np.mean(recall)
+        scores.append(2 * p * r / (p + r) if p + r else 0.0)
+    return float(np.average(scores, weights=LIMITS))
+
+
+def moge(predicted: np.ndarray, truth: np.ndarray, radius: int) -> float:
+    """The boundary metric of MoGe: all pixels within the radius, counted together."""
+    counts = np.zeros((len(LIMITS), 3))
+    height, width = truth.shape
+    for y in range(-radius, radius + 1):
+        for x in range(-radius, radius + 1):
+            if x * x + y * y > radius * radius:
+                continue
+            inner = np.s_[radius : height - radius, radius : width - radius]
+            moved = np.s_[radius + y : height - radius + y, radius + x : width - radius + x]
+            valid = (truth[inner] > 0) & (truth[moved] > 0)
+            labels = []
+            for image in (predicted, truth):
+                known = valid & (image[inner] > 0) & (image[moved] > 0)
+                ratio = image[moved] / np.where(image[inner] > 0, image[inner], 1)
+                labels.append([known & (ratio > limit) for limit in LIMITS])
+            for row, own, true in zip(counts, *labels, strict=True):
+                row += (own & true).sum(), own.sum(), true.sum()
+    hits, own, true = counts.T
+    f1 = 2 * hits / np.maximum(own + true, 1)
+    return float(np.average(f1, weights=LIMITS - 1))
+
+
+def frames() -> list[tuple[np.ndarray, np.ndarray]]:
+    """Real ground truth, and what a smooth and a noisy network would say of it."""
+    rng = np.random.default_rng(0)
+    found = []
+    for name in ("indoor", "street"):
+        truth = read_depth(SAMPLES / name / "gt.png").values[::4, ::4]
+        noisy = truth * rng.lognormal(0, 0.05, truth.shape).astype(np.float32)
+        shifted = np.roll(truth, 1, axis=1)
+        shifted[rng.random(truth.shape) < 0.01] = 0  # holes in the prediction
+        found += [(noisy, truth), (shifted, truth)]
+    return found
+
+
+def test_boundary_f1_is_that_of_depth_pro_and_of_moge() -> None:
+    for depth, truth in frames():
+        wide = depth.astype(np.float64), truth.astype(np.float64)
+        assert TABLE["boundary_f1"].value(depth, truth) == pytest.approx(depth_pro(*wide), abs=1e-9)
+        for radius in (1, 2, 3):
+            found = TABLE[f"boundary_f1_{radius}px"].value(depth, truth)
+            assert found == pytest.approx(moge(*wide, radius), abs=1e-9)
+            assert 0 <= found < 1
+
+
+def test_a_step_in_its_place_scores_one_and_a_shifted_or_a_missing_one_nothing() -> None:
+    step = np.where(np.arange(20) < 10, np.float32(2), np.float32(3)) + np.zeros((9, 1), np.float32)
+    scores = {key: measure.value(step, step) for key, measure in TABLE.items()}
+    # Depth Pro: the step is seen in one of four directions, and the others count as missed
+    assert scores.pop("boundary_f1") == 0.25
+    assert set(scores.values()) == {1}
+    assert TABLE["boundary_f1_1px"].value(np.roll(step, 1, axis=1)[:, 1:], step[:, 1:]) == 0
+    assert TABLE["boundary_f1_1px"].value(np.ones_like(step), step) == 0
+    lone = np.where(np.arange(20) % 5 == 0, step, 0)
+    assert np.isnan(TABLE["boundary_f1"].value(step, np.where(np.arange(9)[:, None] % 5, 0, lone)))
+
+
+def test_errors_by_depth_are_those_of_the_pixels_of_each_part() -> None:
+    for depth, truth in frames():
+        measures = by_depth(3.0, 12.0)
+        tensors = (torch.from_numpy(each.copy()) for each in (depth, truth))
+        values = measures_of(error_sums(*tensors, measures=measures), measures).tolist()
+        found = dict(zip([measure.key for measure in measures], values, strict=True))
+        p, g = (each[(depth > 0) & (truth > 0)].astype(np.float64) for each in (depth, truth))
+        parts = {"near": g < 3, "middle": (g >= 3) & (g < 12), "far": g >= 12}
+        expected = {}
+        for name, part in parts.items():
+            e, true = (p - g)[part], g[part]
+            ratio = np.maximum(p[part] / true, true / p[part])
+            with np.errstate(invalid="ignore"):
+                expected |= {
+                    f"rmse_{name}": np.sqrt(np.sum(e**2) / part.sum()),
+                    f"mae_{name}": np.abs(e).sum() / part.sum(),
+                    f"mre_{name}": (np.abs(e) / true).sum() / part.sum(),
+                    f"delta1_{name}": (ratio < 1.25).sum() / part.sum(),
+                }
+        assert found == {k: pytest.approx(v, abs=1e-9, nan_ok=True) for k, v in expected.items()}
+    assert "rmse_near" not in ON_REQUEST
