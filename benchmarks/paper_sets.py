@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
+from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.io.dataset import PROTOCOLS, Protocol
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, Camera, as_depth_image, simulate_lidar
+from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, as_depth_image, simulate_lidar
 
 T = TypeVar("T")
 
@@ -154,12 +155,9 @@ def within(depth: Depth, limit: float) -> Depth:
 def scan_of(gt: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
     """(H, W) one turn of the 64-line scanner on KITTI's roof; lens: fx, fy, cx, cy in pixels."""
     fx, fy, cx, cy = (float(value) for value in lens)
-    camera = Camera(
-        intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
-        rotation=FORWARD_LEFT_UP,
-        translation=SCANNER_IN_CAMERA,
-    )
-    return as_depth_image(simulate_lidar(gt, camera, SCANNER, seed))
+    camera = Camera(intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    pose = Extrinsics(FORWARD_LEFT_UP, SCANNER_IN_CAMERA)
+    return as_depth_image(simulate_lidar(gt, camera, pose, SCANNER, seed))
 
 
 def shared(root: Path, most: int) -> list[FrameSet]:

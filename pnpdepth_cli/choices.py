@@ -238,7 +238,7 @@ SENSORS = (
 """LiDARs by data sheet, and as the paper has them: `pnpdepth_cli.sensors.LIDARS`."""
 
 LENSES = ("radial-tangential", "fisheye")
-"""Lens distortions: `pnpdepth_cli.sensors.camera`."""
+"""Lens distortions: `pnpdepth_cli.sensors.lens`."""
 
 # Evaluation
 EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")

@@ -14,7 +14,8 @@ from pnpdepth_cli.cli.main import COMMANDS
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
 GROUND_FLOOR = {
-    "errors", "choices", "points", "budget", "scan_pattern", "settings", "measures",
+    "errors", "choices", "points", "camera", "budget", "scan_pattern", "settings",
+    "measures",
 }  # fmt: skip
 MAY_IMPORT = {
     "errors": set(),
@@ -22,6 +23,7 @@ MAY_IMPORT = {
     "choices": {"errors", "measures"},
     "budget": {"errors"},
     "points": {"errors"},
+    "camera": {"errors"},
     "scan_pattern": {"errors"},
     "settings": {"errors", "choices"},
     "core": GROUND_FLOOR,

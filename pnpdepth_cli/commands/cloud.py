@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.frame_camera import (
-    FrameCamera,
+    Pose,
     camera_of_exif,
     camera_of_file,
     camera_of_fov,
+    describe_pinhole,
 )
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
@@ -135,12 +137,11 @@ def _check(request: CloudRequest) -> None:
         raise UsageError(f"--edge must be a fraction such as {EDGE}, got {request.edge:g}")
 
 
-def _poses(request: CloudRequest, frames: list[ResultFrame]) -> list[NDArray[np.float64] | None]:
+def _poses(request: CloudRequest, frames: list[ResultFrame]) -> list[Pose | None]:
     """The pose of each frame: of the file that is given, else of the records."""
     if request.poses is not None:
         return list(read_poses(request.poses, len(frames), "depth files"))
-    cameras = [frame.camera for frame in frames]
-    poses = [None if camera is None else camera.pose for camera in cameras]
+    poses = [frame.camera_and_pose[1] for frame in frames]
     without = [f.depth for f, pose in zip(frames, poses, strict=True) if pose is None]
     if without and len(without) < len(frames):
         raise InputError(
@@ -153,7 +154,7 @@ def _poses(request: CloudRequest, frames: list[ResultFrame]) -> list[NDArray[np.
 def _parts(
     request: CloudRequest,
     frames: list[ResultFrame],
-    poses: list[NDArray[np.float64] | None],
+    poses: list[Pose | None],
     coloured: bool,
     notes: list[str],
 ) -> Iterator[PointCloud]:
@@ -161,10 +162,11 @@ def _parts(
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def view(index: int) -> View:
-        depth, found = _depth_and_camera(request, frames[index])
+        depth = _depth(request, frames[index])
+        camera, found = _camera(request, frames[index], (depth.shape[0], depth.shape[1]))
         pose = poses[index]
-        notes.extend(note for note in found.notes if note not in notes)
-        return View(depth=depth, camera=found.camera, pose=np.eye(4)[:3] if pose is None else pose)
+        notes.extend(note for note in found if note not in notes)
+        return View(depth=depth, camera=camera, pose=np.eye(4)[:3] if pose is None else pose)
 
     for index, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
         here = view(index)
@@ -196,10 +198,8 @@ def _merged(
         yield grid.cloud(coloured=coloured)
 
 
-def _depth_and_camera(
-    request: CloudRequest, frame: ResultFrame
-) -> tuple[NDArray[np.float32], FrameCamera]:
-    """The depth of a frame, 0 where it is excluded, and its camera."""
+def _depth(request: CloudRequest, frame: ResultFrame) -> NDArray[np.float32]:
+    """The depth of a frame (H, W), 0 where it is excluded."""
     depth, keep = frame.read(request.depth_scale)
     keep &= depth <= request.max_depth
     if request.max_sigma is not None:
@@ -209,8 +209,7 @@ def _depth_and_camera(
                 " that `pnpdepth refine --uncertainty` writes"
             )
         keep &= frame.of_size(frame.sigma, depth) <= request.max_sigma * depth
-    size = (depth.shape[0], depth.shape[1])
-    return np.where(keep, depth, np.float32(0)), _camera(request, frame, size)
+    return np.where(keep, depth, np.float32(0))
 
 
 def _colours(
@@ -229,25 +228,31 @@ def _colours(
     return rgb
 
 
-def _camera(request: CloudRequest, frame: ResultFrame, size: tuple[int, int]) -> FrameCamera:
-    """The camera of a depth map (H, W): as it is given, else of its record, else of EXIF."""
+def _camera(
+    request: CloudRequest, frame: ResultFrame, size: tuple[int, int]
+) -> tuple[Camera, list[str]]:
+    """The camera of a depth map (H, W), and lines for a person.
+
+    It is the one that is given, else that of the record, else that of EXIF.
+    """
     if request.calib is not None:
         return camera_of_file(request.calib, request.camera, size, frame.depth)
     if request.fov_deg is not None:
-        return camera_of_fov(request.fov_deg, size)
-    if frame.camera is not None:
+        camera = camera_of_fov(request.fov_deg, size)
+        return camera, [describe_pinhole(camera)]
+    of_record, _ = frame.camera_and_pose
+    if of_record is not None:
         if frame.record.get("size") != [size[1], size[0]]:
             raise SizeError(
                 f"{frame.depth} is {size[1]}×{size[0]}, unlike its record; refine it again, or give"
                 " --calib"
             )
-        note = f"camera: {frame.camera.source} (from the record)"
-        return replace(frame.camera, notes=(note,))
+        return of_record, [f"camera: {of_record.source} (from the record)"]
     image = request.image or frame.image
-    camera = None if image is None else camera_of_exif(image, size)
-    if camera is None:
+    of_exif = None if image is None else camera_of_exif(image, size)
+    if of_exif is None:
         raise UsageError(
             f"a cloud needs the camera, and neither a record nor EXIF gives that of {frame.depth};"
             " give --calib or --fov"
         )
-    return camera
+    return of_exif, [describe_pinhole(of_exif)]

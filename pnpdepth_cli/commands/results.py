@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
+from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.commands.refinement.frame_camera import Pose, camera_from_json
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
 from pnpdepth_cli.io.dataset import find_files
@@ -47,12 +49,12 @@ class ResultFrame:
         """The unit of the depth."""
         return str(self.record.get("unit", METRES))
 
-    @property
-    def camera(self) -> FrameCamera | None:
-        """The camera that the record holds. Raises FileFormatError if it is damaged."""
+    @functools.cached_property
+    def camera_and_pose(self) -> tuple[Camera | None, Pose | None]:
+        """The camera that the record holds, and its pose. Raises FileFormatError if damaged."""
         entry = _entry(self.record, "camera")
         try:
-            return FrameCamera.of_record(entry) if entry else None
+            return camera_from_json(entry) if entry else (None, None)
         except (KeyError, ValueError, TypeError, OverflowError) as error:
             raise FileFormatError(
                 f"{self.depth}: the camera in the record beside it is damaged; refine it again"

@@ -27,14 +27,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import SAME_FRAME, Camera, Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
-from pnpdepth_cli.io.extrinsics import (
-    Extrinsics,
-    chained,
-    checked_pose,
-    numbers_in,
-    pose_of_matrix,
-)
+from pnpdepth_cli.io.extrinsics import checked_pose, numbers_in, pose_of_matrix
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.yaml_file import parse_yaml
@@ -73,20 +68,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """A camera and a scanner: x_camera = rotation · x_scanner + translation."""
+    """A camera and the scanner beside it."""
 
-    intrinsics: Floats  # (3, 3), last row 0 0 1, in pixels
-    rotation: Floats = field(default_factory=lambda: np.eye(3))
-    translation: Floats = field(default_factory=lambda: np.zeros(3))
-    """(3,) metres, the scanner's origin in the camera's frame."""
-    distortion: tuple[float, ...] = ()
-    size: tuple[int, int] | None = None  # (H, W) of the images; None if the file does not give it
-    has_pose: bool
-    """False if the file has no pose of a scanner; rotation and translation are then identity."""
-    source: str  # what was read, for a person
-    lens: str = "radial-tangential"  # one of `choices.LENSES`
-    rectified: Mapping[str, Calibration] = field(default_factory=dict)
-    """Cameras of rectified images by what they are made of, relative to this one, of raw images."""
+    camera: Camera
+    scanner: Extrinsics | None = None  # None: the file does not state its pose
+    rectified: Mapping[str, tuple[Camera, Extrinsics]] = field(default_factory=dict)
+    """Cameras of rectified images by what they are made of, where `camera` is of raw images, each
+    with the pose of `camera` in its frame."""
 
 
 def read_calibration(path: Path, camera: int | None = None) -> Calibration:
@@ -152,15 +140,17 @@ def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
         kind = "ROS camera_info" if "distortion_model" in content else "OpenCV calibration"
         fields = {name: content[name] for name in content if name != "R"}  # the rectification
         calibration = _single(path, fields, camera, kind)
-        calibration = replace(calibration, rectified=_rectified_cameras(path, content, calibration))
-    if not calibration.distortion:
+        rectified = _rectified_cameras(path, content, calibration.camera)
+        calibration = replace(calibration, rectified=rectified)
+    read = calibration.camera
+    if not read.distortion:
         return calibration
-    return replace(calibration, source=f"{calibration.source}, {calibration.lens} lens")
+    return replace(calibration, camera=replace(read, source=f"{read.source}, {read.lens} lens"))
 
 
 def _rectified_cameras(
-    path: Path, content: Mapping[str, Any], raw: Calibration
-) -> dict[str, Calibration]:
+    path: Path, content: Mapping[str, Any], raw: Camera
+) -> dict[str, tuple[Camera, Extrinsics]]:
     """The cameras of a rectified image of camera_info, without distortion.
 
     Whether the transforms lead to the rectified camera (kitti2bag) or to the raw one, to which R
@@ -177,16 +167,14 @@ def _rectified_cameras(
     turn = r.reshape(3, 3) if r.size == 9 and r.any() else np.eye(3)
     if np.linalg.det(intrinsics):
         offset = np.linalg.solve(intrinsics, p.reshape(3, 4)[:, 3])
-    plain = Calibration(
-        intrinsics=intrinsics, size=raw.size, has_pose=raw.has_pose, source=raw.source
-    )
+    plain = Camera(intrinsics=intrinsics, size=raw.size, source=raw.source)
     turned = not np.allclose(turn, np.eye(3), atol=1e-9)
-    cameras = {"P": plain}
+    cameras = {"P": (plain, SAME_FRAME)}
     if turned:
-        cameras = {"P and R": replace(plain, rotation=turn)} | cameras
+        cameras = {"P and R": (plain, Extrinsics(turn, np.zeros(3)))} | cameras
     if np.abs(offset).max() > 1e-9:
         name = "P with its offset, and R" if turned else "P with its offset"
-        cameras = {name: replace(plain, rotation=turn, translation=offset)} | cameras
+        cameras = {name: (plain, Extrinsics(turn, offset))} | cameras
     is_raw = np.allclose(intrinsics, raw.intrinsics, atol=1e-3) and not raw.distortion
     return {} if is_raw and len(cameras) == 1 else cameras
 
@@ -213,32 +201,33 @@ def _kitti_raw(folder: Path, camera: int | None) -> Calibration:
     fields = _fields(cameras, _text(cameras))
     numbers = [int(name[-2:]) for name in fields if re.fullmatch(r"P_rect_\d\d", name)]
     number = _camera(cameras, camera, numbers)
+    size = _numbers(cameras, fields, f"S_rect_{number:02}", 2)
     # The raw data's development kit rotates every camera by camera 0's rectification.
-    calibration = _rectified(
+    return _rectified(
         cameras,
         _matrix(cameras, fields, f"P_rect_{number:02}", (3, 4)),
         _matrix(cameras, fields, "R_rect_00", (3, 3)),
         read_rigid_motion(scanner) if scanner.is_file() else None,
         f"KITTI raw calibration, camera {number}",
+        _height_width(cameras, size),
     )
-    size = _numbers(cameras, fields, f"S_rect_{number:02}", 2)
-    return replace(calibration, size=_height_width(cameras, size))
 
 
 def _rectified(
-    path: Path, projection: Floats, rectify: Floats, scanner: Extrinsics | None, source: str
+    path: Path,
+    projection: Floats,
+    rectify: Floats,
+    scanner: Extrinsics | None,
+    source: str,
+    size: tuple[int, int] | None = None,
 ) -> Calibration:
     """P · R_rect · [R t], with the camera's own offset in P's last column as a translation."""
     intrinsics = _checked_intrinsics(path, projection[:, :3])
     offset = np.asarray(np.linalg.solve(intrinsics, projection[:, 3]), np.float64)
     rectify_pose = checked_pose(path, "rectification", rectify, offset)
-    pose = chained() if scanner is None else chained(rectify_pose, scanner)
     return Calibration(
-        intrinsics=intrinsics,
-        rotation=pose[0],
-        translation=pose[1],
-        has_pose=scanner is not None,
-        source=source,
+        camera=Camera(intrinsics=intrinsics, size=size, source=source),
+        scanner=None if scanner is None else rectify_pose @ scanner,
     )
 
 
@@ -266,18 +255,14 @@ def _single(path: Path, fields: Mapping[str, Any], camera: int | None, source: s
         raise UsageError(f"{path} describes one camera; leave out --camera {camera}")
     matrix = next((name for name in _MATRICES if name in fields), "K")
     intrinsics = _checked_intrinsics(path, _matrix(path, fields, matrix, (3, 3)))
-    pose = _pose(path, fields)
+    scanner = _pose(path, fields)
     lens, distortion = _lens(path, fields)
-    rotation, translation = pose or chained()
+    size = _size(path, fields)
     return Calibration(
-        intrinsics=intrinsics,
-        rotation=rotation,
-        translation=translation,
-        distortion=distortion,
-        lens=lens,
-        size=_size(path, fields),
-        has_pose=pose is not None,
-        source=source,
+        camera=Camera(
+            intrinsics=intrinsics, lens=lens, distortion=distortion, size=size, source=source
+        ),
+        scanner=scanner,
     )
 
 

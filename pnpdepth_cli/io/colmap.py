@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.extrinsics import rotation_of
 from pnpdepth_cli.io.file_bytes import (
@@ -29,18 +30,6 @@ from pnpdepth_cli.io.file_bytes import (
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ColmapCamera:
-    """A camera of the model; several images may share it."""
-
-    model: str  # COLMAP's name, such as "SIMPLE_RADIAL"
-    size: tuple[int, int]  # (H, W) of its images
-    intrinsics: Floats
-    """(3, 3) in pixels, with whole numbers at pixel centres (COLMAP has them at .5)."""
-    lens: str  # one of `choices.LENSES`
-    distortion: tuple[float, ...]  # coefficients of the lens, or none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +57,7 @@ class ColmapModel:
     """A sparse model: its cameras by number, and its registered images by name."""
 
     folder: Path
-    cameras: dict[int, ColmapCamera]
+    cameras: dict[int, Camera]
     images: dict[str, ColmapImage]  # the name is a path below the image folder
     points: ColmapPoints
 
@@ -225,9 +214,7 @@ def _parameter_count(path: Path, name: str) -> int:
     return MODELS[name].parameters
 
 
-def _camera(
-    path: Path, name: str, size: tuple[int, int], parameters: Sequence[float]
-) -> ColmapCamera:
+def _camera(path: Path, name: str, size: tuple[int, int], parameters: Sequence[float]) -> Camera:
     """The camera of a model `name` with its parameters in COLMAP's order."""
     model = MODELS[name]
     check_pixel_count(path, size[1], size[0])
@@ -241,12 +228,13 @@ def _camera(
     distortion = tuple(parameters[model.focals + 2 :])
     if model.lens == _RADIAL and distortion:
         distortion = (*distortion, *[0.0] * (4 - len(distortion)))
-    return ColmapCamera(
-        model=name,
-        size=size,
+    # whole numbers are at pixel centres, where COLMAP has .5
+    return Camera(
         intrinsics=np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]),
         lens=model.lens,
         distortion=distortion,
+        size=size,
+        source=f"{name} camera",
     )
 
 

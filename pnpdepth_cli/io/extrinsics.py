@@ -19,13 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.yaml_file import parse_yaml
 
 Floats = NDArray[np.float64]
-Extrinsics = tuple[Floats, Floats]
-"""(rotation (3, 3), translation (3,))."""
 
 _SEPARATORS = re.compile(r"[\[\](),;\s]+")
 _ROTATION_TOLERANCE = 1e-3
@@ -33,7 +32,7 @@ _FARTHEST_M = 1e6
 
 
 def read_extrinsics(path: Path) -> Extrinsics:
-    """Returns (rotation, translation) from the scanner's frame to the camera's.
+    """Returns the pose of the scanner in the camera's frame.
 
     Raises:
         FileFormatError: The file holds no pose.
@@ -100,35 +99,13 @@ def checked_pose(path: Path, name: str, rotation: Floats, translation: Floats) -
         raise FileFormatError(
             f"{path}: a translation of {one_line(translation)} m is none of a sensor; correct it"
         )
-    return rotation, translation
+    return Extrinsics(rotation, translation)
 
 
 def is_rotation(matrix: Floats) -> bool:
     """Returns whether a matrix (3, 3) turns without mirroring, to 0.1 %."""
     off = np.abs(matrix @ matrix.T - np.eye(3)).max()
     return bool(off <= _ROTATION_TOLERANCE and np.linalg.det(matrix) > 0)
-
-
-def inverse(pose: Extrinsics) -> Extrinsics:
-    """Returns the pose of the camera in the scanner's frame."""
-    rotation, translation = pose
-    return rotation.T, -rotation.T @ translation
-
-
-def chained(*poses: Extrinsics) -> Extrinsics:
-    """Returns the pose of the last frame in the first, from that of each in the one before it."""
-    rotation, translation = np.eye(3), np.zeros(3)
-    for turn, shift in poses:
-        translation = rotation @ shift + translation
-        rotation = rotation @ turn
-    return rotation, translation
-
-
-def square(pose: Extrinsics) -> Floats:
-    """Returns the pose as a (4, 4) matrix."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose
-    return matrix
 
 
 def rotation_of(wxyz: Floats) -> Floats:

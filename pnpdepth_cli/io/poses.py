@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration, read_rigid_motion
-from pnpdepth_cli.io.extrinsics import is_rotation, rotation_of, square
+from pnpdepth_cli.io.extrinsics import is_rotation, rotation_of
 from pnpdepth_cli.io.file_bytes import read_bytes
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
@@ -133,10 +134,11 @@ def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) 
 
     The calibration is the folder with KITTI's raw calibrations.
     """
-    to_camera = read_calibration(calibration, camera)
-    of_scanner = square((to_camera.rotation, to_camera.translation))
-    of_imu = square(read_rigid_motion(calibration / IMU_CALIBRATION))
-    from_camera = np.linalg.inv(of_scanner @ of_imu)
+    of_scanner = read_calibration(calibration, camera).scanner
+    if of_scanner is None:
+        raise FileFormatError(f"{calibration} has no pose of the scanner; add its calibration")
+    of_imu = read_rigid_motion(calibration / IMU_CALIBRATION)
+    from_camera = np.linalg.inv(of_scanner.square() @ of_imu.square())
     rows = [_packet(path) for path in packets]
     scale = math.cos(math.radians(rows[0][0]))
     return np.stack([(_pose_of_packet(row, scale) @ from_camera)[:3] for row in rows])
@@ -162,4 +164,4 @@ def _pose_of_packet(packet: Floats, scale: float) -> Floats:
     east = radius * math.radians(longitude)
     north = radius * math.log(math.tan(math.pi / 4 + math.radians(latitude) / 2))
     turn = Rotation.from_euler("xyz", packet[3:6]).as_matrix()  # roll, pitch, yaw
-    return square((turn, np.array([east, north, altitude])))
+    return Extrinsics(turn, np.array([east, north, altitude])).square()

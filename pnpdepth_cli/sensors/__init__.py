@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from pnpdepth_cli.sensors.accumulation import NeighbourScan as NeighbourScan
 from pnpdepth_cli.sensors.accumulation import accumulated as accumulated
-from pnpdepth_cli.sensors.camera import Camera as Camera
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP as FORWARD_LEFT_UP
 from pnpdepth_cli.sensors.lidar import LIDARS as LIDARS
 from pnpdepth_cli.sensors.lidar import Lidar as Lidar

@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.sparse import DropCounter, Floats, Mask, Points
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def accumulated(points: Points, neighbours: Sequence[NeighbourScan], camera: Cam
         moved = []
         for scan in neighbours:
             if scan.apart == apart:
-                xyz = camera.unproject(scan.points.xy, scan.points.depth)
+                xyz = unproject(camera, scan.points.xy, scan.points.depth)
                 motion = registered(surface, xyz, scan.motion, camera)
                 moved.append(xyz @ motion[:, :3].T + motion[:, 3])
         result = _added(result, np.concatenate(moved), surface, camera, apart)
@@ -95,7 +96,7 @@ def _added(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: 
 
     drops = DropCounter()
     xyz = xyz[drops.keep(xyz[:, 2] > 0, "behind the camera")]
-    xy = camera.pixels_of(xyz)
+    xy = pixels_of(camera, xyz)
     inside = drops.keep(in_frame(xy, known.size), "outside the image")
     xy, depth = xy[inside], xyz[inside, 2]
     agrees = drops.keep(_agrees(xy, depth, surface), "moved, occluded or seen through")
@@ -131,7 +132,7 @@ def surface_of(points: Points, camera: Camera) -> Surface:
     tree = cKDTree(points.xy)
     _, near = tree.query(points.xy, k=min(_NEIGHBOURS, len(points)))
     near = near.reshape(len(points), -1)
-    xyz = camera.unproject(points.xy, points.depth)
+    xyz = unproject(camera, points.xy, points.depth)
     around = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
     jump = np.abs(np.log(points.depth[near] / points.depth[:, None])).max(axis=1)
@@ -168,7 +169,7 @@ def registered(surface: Surface, xyz: Floats, motion: Floats, camera: Camera) ->
 def _pairs(surface: Surface, moved: Floats, camera: Camera) -> tuple[Floats, NDArray[np.intp]]:
     """The points in the image with a plane beside them, and the index of that plane."""
     moved = moved[moved[:, 2] > 0]
-    xy = camera.pixels_of(moved)
+    xy = pixels_of(camera, moved)
     inside = in_frame(xy, surface.points.size)
     moved, xy = moved[inside], xy[inside]
     distance, index = surface.tree.query(xy, distance_upper_bound=_REACH * surface.spacing_px)

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.sparse import Floats, Mask, pixel_index
 
 EDGE = 0.05
@@ -124,7 +125,7 @@ def _points(depth: NDArray[np.float32], known: Mask, camera: Camera, top: int = 
     """(H, W, 3) points in the camera's frame, 0 where unknown; `top` is the number of row 0."""
     rows, columns = np.nonzero(known)
     points = np.zeros((*depth.shape, 3))
-    points[known] = camera.unproject(np.column_stack([columns, rows + top]), depth[known])
+    points[known] = unproject(camera, np.column_stack([columns, rows + top]), depth[known])
     return points
 
 
@@ -220,7 +221,7 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
     total, count = depth.copy(), np.ones(len(depth))
     for other in others:
         index, back = _seen_back(world, here, other)
-        away = np.linalg.norm(here.camera.pixels_of(back) - xy[index], axis=1)
+        away = np.linalg.norm(pixels_of(here.camera, back) - xy[index], axis=1)
         same = np.abs(back[:, 2] - depth[index]) <= _RETURN_DEPTH * depth[index]
         agrees = (away <= _RETURN_PX) & same
         total[index[agrees]] += back[agrees, 2]
@@ -234,7 +235,7 @@ def _seen_back(world: Floats, here: View, other: View) -> tuple[NDArray[np.intp]
     """The points that another view has a depth of, and its own points there in this one's frame."""
     seen = _moved_back(world, other.pose)
     index = np.flatnonzero(seen[:, 2] > 0)
-    xy = other.camera.pixels_of(seen[index])
+    xy = pixels_of(other.camera, seen[index])
     size = (other.depth.shape[0], other.depth.shape[1])
     inside = in_frame(xy, size)
     index, points = index[inside], other.points[pixel_index(xy[inside], size)]

@@ -8,14 +8,16 @@ horizontal; its frame is x forward, y left, z up.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.sparse import FARTHEST_M, DropCounter, Floats, Mask, Points, pixel_index
 
 FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -152,13 +154,16 @@ def ideal_lidar(beams: int, top_deg: float, bottom_deg: float) -> Lidar:
     return Lidar(name=f"{beams} beams", elevations_deg=elevations, azimuth_step_deg=0.2)
 
 
-def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, seed: int) -> Points:
+def simulate_lidar(
+    depth: NDArray[np.floating], camera: Camera, scanner: Extrinsics, sensor: Lidar, seed: int
+) -> Points:
     """Returns sparse depth of one revolution of the scanner, in the image of the dense depth.
 
     Args:
         depth: (H, W) metres along the camera's axis, 0 = unknown.
-        camera: Intrinsics, and the scanner's pose (`FORWARD_LEFT_UP` and zero: at the camera).
-        sensor: The scanner, with its noise.
+        camera: The camera of the image.
+        scanner: The scanner's pose (`FORWARD_LEFT_UP` and zero: at the camera).
+        sensor: What the scanner measures, with its noise.
         seed: Of all noise; the same seed gives the same points.
 
     Raises:
@@ -166,22 +171,22 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     """
     size = (depth.shape[0], depth.shape[1])
     rng = np.random.default_rng(seed)
-    beams = sensor.directions(rng) @ camera.rotation.T
+    beams = sensor.directions(rng) @ scanner.rotation.T
     drops = DropCounter()
-    z = _depth_at_first_hit(np.asarray(depth, np.float64), camera, beams)
+    z = _depth_at_first_hit(np.asarray(depth, np.float64), camera, scanner.translation, beams)
     met = drops.keep(np.isfinite(z), "meets nothing that the camera sees")
-    distance = (z[met] - camera.translation[2]) / beams[met, 2]
+    distance = (z[met] - scanner.translation[2]) / beams[met, 2]
     kept = drops.keep(distance <= sensor.max_range, "out of range")
     distance, beams = distance[kept], beams[met][kept]
     if sensor.range_noise > 0:
         distance = distance + rng.normal(0, sensor.range_noise, len(distance))
-    points = camera.translation + beams * distance[:, None]
+    points = scanner.translation + beams * distance[:, None]
     ahead = drops.keep((distance > 0) & (points[:, 2] > 0), "noise put it behind the camera")
     points = points[ahead]
     near = np.abs(points).max(axis=1, initial=0) < FARTHEST_M
     if not near.all():
         points = points[drops.keep(near, "noise put it too far")]
-    points, xy = drops.keep_seen(points, camera.pixels_of(points), size)
+    points, xy = drops.keep_seen(points, pixels_of(camera, points), size)
     if not len(xy):
         raise NoPointsError(
             f"no beam of {sensor.name} gives a point in the image ({drops}); check depth,"
@@ -195,16 +200,15 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     )
 
 
-def _depth_at_first_hit(depth: Floats, camera: Camera, directions: Floats) -> Floats:
+def _depth_at_first_hit(depth: Floats, camera: Camera, start: Floats, directions: Floats) -> Floats:
     """(M,) depth z at which each beam first hits the depth map; NaN where it does not.
 
-    directions are (M, 3) unit vectors in the camera's frame, from the scanner's origin. A beam is
-    followed outwards in steps of about a pixel. One that passes behind an edge has no hit, because
-    the camera does not see what is there.
+    In the camera's frame, `start` is the scanner's origin (3,) and `directions` are (M, 3) unit
+    vectors from there. A beam is followed outwards in steps of about a pixel. One that passes
+    behind an edge has no hit, because the camera does not see what is there.
     """
     hit = np.full(len(directions), np.nan)
     known = depth[depth > 0]
-    start = camera.translation
     if not known.size:
         return hit
     near, far = max(0.999 * known.min(), start[2] + _FIRST_M), 1.001 * known.max()
@@ -213,7 +217,8 @@ def _depth_at_first_hit(depth: Floats, camera: Camera, directions: Floats) -> Fl
     # The others never get beyond `near`.
     forward = np.flatnonzero(directions[:, 2] > 1e-9)
     beams = directions[forward]
-    depths_z = 1 / np.linspace(1 / near, 1 / far, _walk_length(camera, beams, near, far, depth) + 1)
+    ends = [pixels_of(camera, _reached(start, beams, z)) for z in (near, far)]
+    depths_z = 1 / np.linspace(1 / near, 1 / far, _walk_length(ends, depth) + 1)
     before_z, before_map = near, np.full(len(forward), np.inf)
     been_inside = np.zeros(len(forward), bool)
     walking = np.arange(len(forward))
@@ -232,24 +237,25 @@ def _depth_at_first_hit(depth: Floats, camera: Camera, directions: Floats) -> Fl
         left = been_inside[walking] & ~inside  # a straight line never re-enters the image
         been_inside[walking] |= inside
         walking = walking[~(met | left)]
-    return _on_their_surface(hit, depth, camera, directions)
+    shown = np.flatnonzero(np.isfinite(hit))
+    points = _reached(start, directions[shown], hit[shown])
+    hit[shown] = np.where(_is_on_its_surface(points, depth, camera), hit[shown], np.nan)
+    return hit
 
 
-def _on_their_surface(hit: Floats, depth: Floats, camera: Camera, beams: Floats) -> Floats:
-    """The hits whose own pixel shows that surface; NaN for one that grazed an edge by a pixel."""
-    index = np.flatnonzero(np.isfinite(hit))
-    z, start = hit[index], camera.translation
-    shown, _ = _map_at(depth, camera, _reached(start, beams[index], z))
-    same = (z <= _SAME_SURFACE * shown) & (shown <= _SAME_SURFACE * z)
-    checked = hit.copy()
-    checked[index[~same]] = np.nan
-    return checked
+def _is_on_its_surface(points: Floats, depth: Floats, camera: Camera) -> Mask:
+    """(M,) whether a hit's own pixel shows its surface; one that grazed an edge may not."""
+    z = points[:, 2]
+    shown, _ = _map_at(depth, camera, points)
+    same: Mask = (z <= _SAME_SURFACE * shown) & (shown <= _SAME_SURFACE * z)
+    return same
 
 
-def _walk_length(camera: Camera, beams: Floats, near: float, far: float, depth: Floats) -> int:
-    """The number of steps in which no beam in the image moves by more than a pixel."""
-    start = camera.translation
-    ends = [camera.pixels_of(_reached(start, beams, z)) for z in (near, far)]
+def _walk_length(ends: Sequence[Floats], depth: Floats) -> int:
+    """The number of steps in which no beam in the image moves by more than a pixel.
+
+    `ends` are the pixels (M, 2) at which the beams begin and end.
+    """
     size = depth.shape[0], depth.shape[1]
     seen = in_frame(ends[0], size) | in_frame(ends[1], size)
     if not seen.any():
@@ -265,7 +271,7 @@ def _reached(start: Floats, beams: Floats, z: float | Floats) -> Floats:
 
 def _map_at(depth: Floats, camera: Camera, points: Floats) -> tuple[Floats, Mask]:
     """(M,) depth map at the pixels of points, 0 outside the image; and (M,) whether inside."""
-    xy = camera.pixels_of(points)
+    xy = pixels_of(camera, points)
     size = (depth.shape[0], depth.shape[1])
     inside = in_frame(xy, size)
     values = np.zeros(len(points))

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.sensors.lens import rays_of, unproject
 from pnpdepth_cli.sensors.sparse import Floats, Mask, Points
 
 MIN_INLIERS = 30
@@ -67,9 +68,9 @@ def motion_of_images(
     if len(at) < MIN_INLIERS:
         return MotionEstimate(None, f"{len(at)} matches with depth, at least {MIN_INLIERS} needed")
     focal_px = float(camera.intrinsics[0, 0])
-    rays = camera.unproject(to, np.ones(len(to)))[:, :2]
+    rays = rays_of(camera, to)
     solved, turn, shift, index = cv2.solvePnPRansac(
-        camera.unproject(at, depth), rays, np.eye(3), None, iterationsCount=1000,
+        unproject(camera, at, depth), rays, np.eye(3), None, iterationsCount=1000,
         reprojectionError=_REPROJECTION_PX / focal_px, confidence=0.9999,
         flags=cv2.SOLVEPNP_SQPNP,
     )  # fmt: skip
@@ -77,7 +78,7 @@ def motion_of_images(
     basis = f"{len(inliers)} of {len(at)} matches of the images"
     if len(inliers) < max(MIN_INLIERS, MIN_FRACTION * len(at)):
         return MotionEstimate(None, f"{basis} agree")
-    xyz = camera.unproject(at[inliers], depth[inliers])
+    xyz = unproject(camera, at[inliers], depth[inliers])
     turn, shift = cv2.solvePnPRefineLM(xyz, rays[inliers], np.eye(3), None, turn, shift)
     motion = np.column_stack([cv2.Rodrigues(turn)[0], shift])
     return _plausible(motion, float(np.median(points.depth)), basis)

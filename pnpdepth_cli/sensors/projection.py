@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.scan_pattern import scan_pattern
-from pnpdepth_cli.sensors.camera import Camera
+from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.sparse import (
     DropCounter,
     Floats,
@@ -58,6 +59,7 @@ _INTERLEAVED_REACH = (4, 2)  # pixels to each side, and half the width, of the a
 def project_velodyne(
     points: NDArray[np.floating],
     camera: Camera,
+    scanner: Extrinsics,
     size: tuple[int, int],
     *,
     euclidean: bool = False,
@@ -68,7 +70,8 @@ def project_velodyne(
 
     Args:
         points: (N, 3) or more columns, x y z in metres in the scanner's frame.
-        camera: Intrinsics and the scanner's pose.
+        camera: The camera of the image.
+        scanner: The scanner's pose.
         size: (H, W) of the image.
         euclidean: Whether depth is the distance from the camera's centre instead of z.
         limits: Smallest and largest distance from the scanner, metres.
@@ -86,13 +89,13 @@ def project_velodyne(
     drops = DropCounter()
     distance = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     in_range = (distance >= limits[0]) & (distance <= limits[1])
-    seen = camera.from_scanner(xyz[drops.keep(in_range, "out of range")])
+    seen = scanner.moved(xyz[drops.keep(in_range, "out of range")])
     seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
-    seen, xy = drops.keep_seen(seen, camera.pixels_of(seen), size)
+    seen, xy = drops.keep_seen(seen, pixels_of(camera, seen), size)
     if not keep_occluded:
         focal_px = float(camera.intrinsics[0, 0])
-        scanner = np.asarray(camera.intrinsics @ camera.translation)
-        hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=scanner)
+        origin = np.asarray(camera.intrinsics @ scanner.translation)
+        hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=origin)
         visible = drops.keep(~hidden, "hidden by foreground")
         seen, xy = seen[visible], xy[visible]
     if not len(xy):

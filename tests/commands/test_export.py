@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.exports import export_results
-from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
+from pnpdepth_cli.commands.refinement.frame_camera import camera_to_json
 from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
 from pnpdepth_cli.commands.sparse.options import ColmapOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
@@ -42,11 +42,10 @@ def results(root: Path, depth: np.ndarray = DEPTH, unit_scale: float | None = No
     for name in NAMES:
         image = root / "images" / f"{name}.png"
         seen = read_colmap_points(root, options, image, (HEIGHT, WIDTH), any_size=False)
-        camera = FrameCamera(camera=seen.camera, source="model", pose=seen.pose)
         write_depth(folder / f"{name}_depth.exr", depth * np.float32(unit_scale or 1))
         record = {
             "unit": seen.unit,
-            "camera": camera.record(),
+            "camera": camera_to_json(seen.camera, seen.pose),
             "size": [WIDTH, HEIGHT],
             "points": {"farthest": 4.5 * (unit_scale or 1)},
             "inputs": {"image": {"path": str(image)}, "sparse": seen.record},

@@ -12,7 +12,7 @@ import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
-from pnpdepth_cli.io.extrinsics import inverse, read_extrinsics
+from pnpdepth_cli.io.extrinsics import read_extrinsics
 
 pytest.importorskip("yaml")
 
@@ -116,8 +116,8 @@ def opencv_file(coefficients: list[float], **others: int) -> str:
 
 
 def facts(calibration: Calibration) -> tuple[Any, ...]:
-    size, lens, has_pose = calibration.size, calibration.lens, calibration.has_pose
-    return calibration.intrinsics.tolist(), size, lens, calibration.distortion, has_pose
+    camera, has_pose = calibration.camera, calibration.scanner is not None
+    return camera.intrinsics.tolist(), camera.size, camera.lens, camera.distortion, has_pose
 
 
 def test_kittis_object_file_becomes_one_pinhole_camera(tmp_path: Path) -> None:
@@ -125,11 +125,13 @@ def test_kittis_object_file_becomes_one_pinhole_camera(tmp_path: Path) -> None:
     got = read_calibration(path)
     pinhole = [[700, 0, 600], [0, 700, 170], [0, 0, 1]]
     assert facts(got) == (pinhole, None, "radial-tangential", (), True)
-    assert got.rotation.tolist() == TURN
+    assert got.scanner.rotation.tolist() == TURN
     # P · [0 -0.08 -0.27 1] must come out the same as K · translation
     p2 = np.array([[700, 0, 600, 42], [0, 700, 170, -0.35], [0, 0, 1, 0.005]])
-    np.testing.assert_allclose(got.intrinsics @ got.translation, p2 @ [0, -0.08, -0.27, 1])
-    assert read_calibration(path, 0).translation.tolist() == [0, -0.08, -0.27]
+    np.testing.assert_allclose(
+        got.camera.intrinsics @ got.scanner.translation, p2 @ [0, -0.08, -0.27, 1]
+    )
+    assert read_calibration(path, 0).scanner.translation.tolist() == [0, -0.08, -0.27]
     with pytest.raises(UsageError, match="has no camera 3; --camera can be one of: 0, 2"):
         read_calibration(path, 3)
 
@@ -138,8 +140,7 @@ def test_kittis_odometry_file_has_the_scanner_in_tr(tmp_path: Path) -> None:
     lines = KITTI.splitlines()
     odometry = "\n".join([*lines[:2], lines[3].replace("Tr_velo_to_cam", "Tr")])
     got, want = (read_calibration(write(tmp_path, text)) for text in (odometry, KITTI))
-    assert np.array_equal(got.rotation, want.rotation)
-    assert np.array_equal(got.translation, want.translation)
+    assert np.array_equal(got.scanner.square(), want.scanner.square())
 
 
 def test_kittis_cameras_are_read_without_their_scanner(tmp_path: Path) -> None:
@@ -163,13 +164,13 @@ def test_kittis_raw_folder_gives_all_four_cameras(shared_data: Path) -> None:
     x = []
     for camera in range(4):
         got = read_calibration(folder, camera)
-        assert got.size == (375, 1242)
-        assert got.intrinsics[0, 0] == 721.5377
-        x.append(got.translation[0])
+        assert got.camera.size == (375, 1242)
+        assert got.camera.intrinsics[0, 0] == 721.5377
+        x.append(got.scanner.translation[0])
     # the baselines of the set-up: 54 cm between the greys, the colours 6 cm to their left
     np.testing.assert_allclose(np.diff(x), [-0.537, 0.597, -0.533], atol=0.002)
     same = read_calibration(folder / "calib_velo_to_cam.txt")
-    assert np.array_equal(same.translation, read_calibration(folder, 2).translation)
+    assert np.array_equal(same.scanner.square(), read_calibration(folder, 2).scanner.square())
 
 
 def test_a_plain_text_file_and_its_json_are_read_the_same(tmp_path: Path) -> None:
@@ -184,23 +185,21 @@ def test_a_plain_text_file_and_its_json_are_read_the_same(tmp_path: Path) -> Non
         got = read_calibration(write(tmp_path, text))
         distortion = tuple(values["distortion"])
         assert facts(got) == (values["K"], (375, 1242), "radial-tangential", distortion, True)
-        assert (got.rotation.tolist(), got.translation.tolist()) == (values["R"], values["t"])
+        assert [each.tolist() for each in got.scanner] == [values["R"], values["t"]]
     with pytest.raises(UsageError, match="leave out --camera 1"):
         read_calibration(tmp_path / "calib.txt", 1)
 
 
 def test_an_image_of_one_pixel_without_distortion_is_read(tmp_path: Path) -> None:
     text = PLAIN.replace("[1242, 375]", "[1, 1]").replace("[-0.3, 0.1, 0.0, 0.001]", "[]")
-    calibration = read_calibration(write(tmp_path, text))
-    assert (calibration.size, calibration.distortion) == ((1, 1), ())
+    camera = read_calibration(write(tmp_path, text)).camera
+    assert (camera.size, camera.distortion) == ((1, 1), ())
 
 
 def test_nine_numbers_are_intrinsics_alone(tmp_path: Path) -> None:
     got = read_calibration(write(tmp_path, "585 0 320\n0 585 240\n0 0 1\n"))
     assert facts(got)[0] == [[585, 0, 320], [0, 585, 240], [0, 0, 1]]
-    assert not got.has_pose
-    assert got.rotation.tolist() == np.eye(3).tolist()
-    assert got.translation.tolist() == [0, 0, 0]
+    assert got.scanner is None
 
 
 FIVE = [-0.1, 0.02, 0.001, -0.002, 0.01]
@@ -231,8 +230,8 @@ def test_files_of_opencv_and_ros_are_read(
     got = read_calibration(write(tmp_path, text))
     assert facts(got) == (K, (480, 640), lens, tuple(coefficients), False)
     kind = "ROS camera_info" if "distortion_model" in text else "OpenCV calibration"
-    assert got.source == kind + (f", {lens} lens" if coefficients else "")
-    assert read_calibration(write(tmp_path, text.replace("height:", "rows:"))).size is None
+    assert got.camera.source == kind + (f", {lens} lens" if coefficients else "")
+    assert read_calibration(write(tmp_path, text.replace("height:", "rows:"))).camera.size is None
 
 
 @pytest.mark.parametrize(
@@ -258,13 +257,14 @@ def test_the_cameras_of_rectified_images_follow_p_and_r(
     p: list[float], r: Any, cameras: dict[str, Any], tmp_path: Path
 ) -> None:
     raw = read_calibration(write(tmp_path, TOPIC.replace("---", f"p: {p}\nr: {r}\n---")))
-    turns = {name: camera.rotation.tolist() for name, camera in raw.rectified.items()}
-    shifts = {name: camera.translation.tolist() for name, camera in raw.rectified.items()}
+    turns = {name: pose.rotation.tolist() for name, (_, pose) in raw.rectified.items()}
+    shifts = {name: pose.translation.tolist() for name, (_, pose) in raw.rectified.items()}
     assert list(turns) == list(cameras)
     assert turns == {name: turn or np.eye(3).tolist() for name, (turn, _) in cameras.items()}
     assert shifts == {name: [x, 0, 0] for name, (_, x) in cameras.items()}
-    for camera in raw.rectified.values():
-        assert facts(camera)[:4] == ([[9, 0, 3], [0, 8, 2], [0, 0, 1]], (480, 640), raw.lens, ())
+    for camera, _ in raw.rectified.values():
+        got = facts(Calibration(camera=camera))[:4]
+        assert got == ([[9, 0, 3], [0, 8, 2], [0, 0, 1]], (480, 640), raw.camera.lens, ())
 
 
 def test_images_without_distortion_have_no_rectified_camera_but_that_of_k(tmp_path: Path) -> None:
@@ -279,8 +279,8 @@ def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
     path = write(tmp_path, KALIBR)
     first, second = read_calibration(path), read_calibration(path, 1)
     assert facts(first) == (K, (480, 640), "fisheye", (-0.02, 0.01, -0.003, 0.001), False)
-    assert (second.lens, second.has_pose) == ("radial-tangential", True)
-    assert (second.rotation.tolist(), second.translation.tolist()) == (TURN, SHIFT)
+    assert second.camera.lens == "radial-tangential"
+    assert [each.tolist() for each in second.scanner] == [TURN, SHIFT]
     with pytest.raises(UsageError, match="has no cam7; --camera can be one of: cam0, cam1"):
         read_calibration(path, 7)
 
@@ -331,11 +331,10 @@ def test_what_is_missing_or_wrong_is_named_in_one_line(
 
 @pytest.mark.parametrize("form", POSES)
 def test_extrinsics_are_read_in_each_form(form: str, tmp_path: Path) -> None:
-    rotation, translation = read_extrinsics(write(tmp_path, POSES[form]))
-    np.testing.assert_allclose(rotation, TURN, atol=1e-12)
-    np.testing.assert_allclose(translation, SHIFT)
-    turned_back, origin = inverse((rotation, translation))
-    np.testing.assert_allclose(turned_back @ translation + origin, 0, atol=1e-12)
+    pose = read_extrinsics(write(tmp_path, POSES[form]))
+    np.testing.assert_allclose(pose.rotation, TURN, atol=1e-12)
+    np.testing.assert_allclose(pose.translation, SHIFT)
+    np.testing.assert_allclose((pose.inverse() @ pose).square(), np.eye(4), atol=1e-12)
 
 
 @pytest.mark.parametrize(

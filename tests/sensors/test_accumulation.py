@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.sensors import Camera, NeighbourScan, Points, accumulated
+from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.sensors import NeighbourScan, Points, accumulated
 from pnpdepth_cli.sensors.accumulation import registered, surface_of
+from pnpdepth_cli.sensors.lens import unproject
 
 SIZE = (120, 160)
 CAMERA = Camera(intrinsics=np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
@@ -20,7 +22,7 @@ def room(
     rng = np.random.default_rng(seed)
     pixels = rng.permutation(SIZE[0] * SIZE[1])[:count]
     xy = np.column_stack([pixels % SIZE[1], pixels // SIZE[1]]).astype(np.float32)
-    rays = CAMERA.unproject(xy, np.ones(count))
+    rays = unproject(CAMERA, xy, np.ones(count))
     shift = np.array(position)
     depth = depth_of_walls(rays, shift)
     if box_x is not None:
@@ -51,7 +53,7 @@ def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
     assert both.xy[: len(own)].tobytes() == own.xy.tobytes()
     assert both.depth[: len(own)].tobytes() == own.depth.tobytes()
     moved = both.xy[len(own) :]
-    expected = depth_of_walls(CAMERA.unproject(moved, np.ones(len(moved))), np.zeros(3))
+    expected = depth_of_walls(unproject(CAMERA, moved, np.ones(len(moved))), np.zeros(3))
     assert len(moved) > 1000
     assert np.median(np.abs(both.depth[len(own) :] / expected - 1)) < 1e-3
 
@@ -82,7 +84,7 @@ def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
 
 def test_an_inaccurate_motion_is_corrected_by_the_surfaces() -> None:
     own, ahead = room((0, 0, 0), -1.0, 0), room((0, 0, 0.5), -1.0, 1)
-    xyz = CAMERA.unproject(ahead.xy, ahead.depth)
+    xyz = unproject(CAMERA, ahead.xy, ahead.depth)
     motion = registered(surface_of(own, CAMERA), xyz, from_ahead(0.6), CAMERA)
     np.testing.assert_allclose(motion[:, :3], np.eye(3), atol=2e-3)
     assert abs(motion[2, 3] - 0.5) < 0.01
@@ -90,6 +92,6 @@ def test_an_inaccurate_motion_is_corrected_by_the_surfaces() -> None:
 
 def test_a_motion_is_kept_where_few_points_have_a_plane() -> None:
     own, ahead = room((0, 0, 0), None, 0, count=60), room((0, 0, 0.5), None, 1, count=60)
-    xyz = CAMERA.unproject(ahead.xy, ahead.depth)
+    xyz = unproject(CAMERA, ahead.xy, ahead.depth)
     motion = registered(surface_of(own, CAMERA), xyz, from_ahead(0.6), CAMERA)
     assert motion.tobytes() == from_ahead(0.6).tobytes()

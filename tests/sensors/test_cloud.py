@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.sensors import cloud as module
-from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.cloud import PointCloud, VoxelGrid, cloud_from_depth, depth_edges
+from pnpdepth_cli.sensors.lens import pixels_of
 
 HEIGHT, WIDTH = 24, 32
 INTRINSICS = np.array([[30.0, 0, 15.5], [0, 28.0, 11.0], [0, 0, 1]])
@@ -42,7 +43,7 @@ def test_points_of_a_lens_with_distortion_project_back_onto_their_pixels() -> No
     xyz = whole(depth, camera).xyz.astype(np.float64)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
-    assert camera.pixels_of(xyz) == pytest.approx(pixels, abs=1e-3)
+    assert pixels_of(camera, xyz) == pytest.approx(pixels, abs=1e-3)
 
 
 @settings(max_examples=25, deadline=None)

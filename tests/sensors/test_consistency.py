@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pnpdepth_cli.sensors import Camera
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.sensors.cloud import View, consistent_depth, neighbouring_views
 
 SIZE = (36, 48)

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors import Camera, Points
+from pnpdepth_cli.sensors import Points
+from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.motion import Keypoints, keypoints_of, motion_of_images
 from tests.sensors.test_accumulation import CAMERA as ROOM_CAMERA
 from tests.sensors.test_accumulation import room
@@ -52,8 +54,8 @@ def test_an_image_without_texture_gives_no_motion() -> None:
 def seen_from(points: Points, shift: tuple[float, float, float]) -> tuple[Keypoints, Keypoints]:
     """Keypoints at the points, as matched in a camera that has moved, and in their own image."""
     descriptors = np.random.default_rng(0).random((len(points), 128)).astype(np.float32)
-    moved = ROOM_CAMERA.unproject(points.xy, points.depth) + np.array(shift)
-    here = Keypoints(xy=ROOM_CAMERA.pixels_of(moved), descriptors=descriptors)
+    moved = unproject(ROOM_CAMERA, points.xy, points.depth) + np.array(shift)
+    here = Keypoints(xy=pixels_of(ROOM_CAMERA, moved), descriptors=descriptors)
     return here, Keypoints(xy=points.xy.astype(np.float64), descriptors=descriptors)
 
 

@@ -9,11 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import FORWARD_LEFT_UP, Camera, project_velodyne
+from pnpdepth_cli.sensors import FORWARD_LEFT_UP, project_velodyne
+from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.projection import edge_agreement, hidden_points
 
 K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+CAMERA = Camera(intrinsics=K)
 SIZE = (480, 640)
 
 
@@ -38,12 +41,10 @@ def board_before_wall(left_m: float) -> tuple[NDArray[np.float64], NDArray[np.bo
 @pytest.mark.parametrize("left_m", [0.05, 0.09, -0.13])
 def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None:
     scan, hidden = board_before_wall(left_m)
-    camera = Camera(
-        intrinsics=K, rotation=FORWARD_LEFT_UP, translation=np.array([-left_m, 0.0, 0.0])
-    )
-    tree = cKDTree(camera.pixels_of(camera.from_scanner(scan)))
+    scanner = Extrinsics(FORWARD_LEFT_UP, np.array([-left_m, 0.0, 0.0]))
+    tree = cKDTree(pixels_of(CAMERA, scanner.moved(scan)))
     everything, kept = (
-        tree.query(project_velodyne(scan, camera, SIZE, keep_occluded=keep).xy)[1]
+        tree.query(project_velodyne(scan, CAMERA, scanner, SIZE, keep_occluded=keep).xy)[1]
         for keep in (True, False)
     )
     removed = np.setdiff1d(everything, kept)
@@ -67,10 +68,9 @@ def test_ground_at_a_grazing_angle_hides_no_ground() -> None:
             np.full(distance.size, -1.7),
         ]
     )
-    camera = Camera(
-        intrinsics=K, rotation=FORWARD_LEFT_UP, translation=np.array([0.06, -0.08, -0.27])
-    )
-    assert project_velodyne(scan, camera, SIZE).dropped["hidden by foreground"] == 0
+    scanner = Extrinsics(FORWARD_LEFT_UP, np.array([0.06, -0.08, -0.27]))
+    got = project_velodyne(scan, CAMERA, scanner, SIZE)
+    assert got.dropped["hidden by foreground"] == 0
 
 
 def test_the_scanner_in_front_of_the_camera_needs_no_parallax_to_be_defined() -> None:

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scans import camera_of
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
-    Camera,
     Points,
     SamplePattern,
     as_depth_image,
@@ -50,11 +49,12 @@ def boards_before_a_wall(*, keep_occluded: bool = True) -> Points:
     y, z = np.tan(azimuth).ravel(), (np.tan(elevation) / np.cos(azimuth)).ravel()
     on_board = (np.floor(5 * y / 0.25) % 2 == 0) & (np.abs(5 * z) < 0.4)
     x = np.where(on_board, 5.0, 20.0)
-    camera = Camera(
-        intrinsics=INTRINSICS, rotation=FORWARD_LEFT_UP, translation=np.array([0.06, -0.08, -0.27])
-    )
     scan = project_velodyne(
-        np.column_stack([x, x * y, x * z]), camera, SIZE, keep_occluded=keep_occluded
+        np.column_stack([x, x * y, x * z]),
+        Camera(intrinsics=INTRINSICS),
+        Extrinsics(FORWARD_LEFT_UP, np.array([0.06, -0.08, -0.27])),
+        SIZE,
+        keep_occluded=keep_occluded,
     )
     return points_of(as_depth_image(scan))
 
@@ -116,7 +116,8 @@ def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: 
         assert (~hidden[known & agrees]).mean() > 0.985
         assert hidden[known & ~agrees].mean() > 0.4
     folder = shared_data / "kitti_object"
-    camera = camera_of(read_calibration(folder / "calib" / "000001.txt"))
+    calibration = read_calibration(folder / "calib" / "000001.txt")
+    assert calibration.scanner is not None
     scan = read_scan(folder / "velodyne" / "000001.bin").points
-    filtered = project_velodyne(scan, camera, (375, 1242))
+    filtered = project_velodyne(scan, calibration.camera, calibration.scanner, (375, 1242))
     assert occluded_in_map(points_of(as_depth_image(filtered))) is None

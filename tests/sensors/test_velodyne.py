@@ -2,19 +2,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from pnpdepth_cli.sensors import FORWARD_LEFT_UP, Camera, as_depth_image, project_velodyne
+from pnpdepth_cli.camera import Camera, Extrinsics
+from pnpdepth_cli.sensors import FORWARD_LEFT_UP, as_depth_image, project_velodyne
+from pnpdepth_cli.sensors.lens import pixels_of
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 SIZE = (80, 101)
 
 
-def camera(**fields: object) -> Camera:
-    return Camera(**({"intrinsics": K, "rotation": FORWARD_LEFT_UP} | fields))  # type: ignore[arg-type]
+CAMERA = Camera(intrinsics=K)
+HERE = Extrinsics(FORWARD_LEFT_UP, np.zeros(3))
 
 
 def test_a_scan_projects_as_computed_by_hand() -> None:
     # The scanner (x forward, y left, z up) is 0.5 m left of, 1 m above, 2 m behind the camera.
-    posed = camera(translation=np.array([-0.5, -1.0, -2.0]))
+    behind = Extrinsics(FORWARD_LEFT_UP, np.array([-0.5, -1.0, -2.0]))
     scan = np.array(
         [
             [12.0, 0.0, 0.0, 0.3],  # camera (-0.5, -1, 10): u = 50 - 5, v = 40 - 10
@@ -24,7 +26,7 @@ def test_a_scan_projects_as_computed_by_hand() -> None:
             [12.0, 9.0, 0.0, 0.3],  # camera (-9.5, ., 10): u = -45
         ]
     )
-    got = project_velodyne(scan, posed, SIZE, keep_occluded=True)
+    got = project_velodyne(scan, CAMERA, behind, SIZE, keep_occluded=True)
     np.testing.assert_allclose(got.xy, [[45, 30], [65, 50], [52, 41.5]], atol=1e-5)
     np.testing.assert_allclose(got.depth, [10, 5, 4], rtol=1e-6)
     assert got.dropped == {
@@ -37,14 +39,14 @@ def test_a_scan_projects_as_computed_by_hand() -> None:
 
 def test_range_is_the_distance_from_the_camera_instead_of_z() -> None:
     scan = np.array([[4.0, 0.0, -3.0]])  # 3 m below the axis, 4 m ahead
-    wide = camera(intrinsics=np.array([[40.0, 0, 50], [0, 40, 40], [0, 0, 1]]))
-    assert project_velodyne(scan, wide, SIZE).depth.tolist() == [4]
-    assert project_velodyne(scan, wide, SIZE, euclidean=True).depth.tolist() == [5]
+    wide = Camera(intrinsics=np.array([[40.0, 0, 50], [0, 40, 40], [0, 0, 1]]))
+    assert project_velodyne(scan, wide, HERE, SIZE).depth.tolist() == [4]
+    assert project_velodyne(scan, wide, HERE, SIZE, euclidean=True).depth.tolist() == [5]
 
 
 def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_position() -> None:
     scan = np.array([[20.0, 0.02, 0.0], [10.0, 0.03, 0.0], [10.0, 1.0, 0.0]])
-    got = project_velodyne(scan, camera(), SIZE, keep_occluded=True)
+    got = project_velodyne(scan, CAMERA, HERE, SIZE, keep_occluded=True)
     np.testing.assert_allclose(got.depth, [10, 10], rtol=1e-6)
     np.testing.assert_allclose(got.xy[0], [49.7, 40], atol=1e-5)
     assert got.dropped["behind another in their pixel"] == 1
@@ -53,8 +55,8 @@ def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_positio
 
 def test_minimum_and_maximum_range_are_distances_from_the_scanner() -> None:
     scan = np.array([[3.0, 0, 0], [5.0, 0.5, 0], [9.0, 2.0, 0], [4.0, 0, 0], [8.0, 4.0, 1.0]])
-    ahead = camera(translation=np.array([0, 0, 1.0]))
-    got = project_velodyne(scan, ahead, SIZE, limits=(4, 9), keep_occluded=True)
+    ahead = Extrinsics(FORWARD_LEFT_UP, np.array([0, 0, 1.0]))
+    got = project_velodyne(scan, CAMERA, ahead, SIZE, limits=(4, 9), keep_occluded=True)
     assert got.depth.tolist() == [6, 5, 9]  # the third is 9.2 m away
     assert got.dropped["out of range"] == 2
 
@@ -62,14 +64,14 @@ def test_minimum_and_maximum_range_are_distances_from_the_scanner() -> None:
 def test_the_outermost_half_pixels_belong_to_the_image_and_no_more() -> None:
     # u = 50 - 10 y: the left border of the image is at -0.5, the right one at 100.5
     scan = np.array([[10.0, y, 0] for y in (5.0499, 5.0501, -5.0499, -5.0501)])
-    got = project_velodyne(scan, camera(), SIZE, keep_occluded=True)
+    got = project_velodyne(scan, CAMERA, HERE, SIZE, keep_occluded=True)
     np.testing.assert_allclose(got.xy[:, 0], [-0.499, 100.499], atol=1e-4)
 
 
 def test_a_lens_model_does_not_fold_points_from_outside_into_the_image() -> None:
     # 1 - 0.4 r² turns back at r = 0.91: a point at r = 1.58 would land on the axis
-    eye = camera(distortion=(-0.4, 0.0, 0.0, 0.0))
+    eye = Camera(intrinsics=K, distortion=(-0.4, 0.0, 0.0, 0.0))
     folded = np.array([[10.0, 15.8, 0.0]])
-    assert np.isnan(eye.pixels_of(eye.from_scanner(folded))).all()
+    assert np.isnan(pixels_of(eye, HERE.moved(folded))).all()
     inside = np.array([[10.0, 5.0, 0.0], *folded])
-    assert len(project_velodyne(inside, eye, SIZE, keep_occluded=True)) == 1
+    assert len(project_velodyne(inside, eye, HERE, SIZE, keep_occluded=True)) == 1

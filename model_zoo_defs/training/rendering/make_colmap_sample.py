@@ -23,7 +23,7 @@ from model_zoo_defs.training.rendering.shading import seen
 from model_zoo_defs.training.rendering.shapes import FloatArray, rotation
 from model_zoo_defs.training.scenes.scenes import build, generator, pick_view
 from model_zoo_defs.training.scenes.world import View
-from pnpdepth_cli.sensors.camera import undistort
+from pnpdepth_cli.sensors.lens import undistort
 
 SCENE, VIEW = 6, 1
 PHOTOS = 8

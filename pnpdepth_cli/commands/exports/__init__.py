@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import EXPORTS
-from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
+from pnpdepth_cli.commands.refinement.frame_camera import Pose
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
@@ -39,8 +40,9 @@ class ExportFrame:
     """Its path below the folder of the images, as COLMAP names it, with slashes."""
     size: tuple[int, int]
     """(H, W)."""
-    camera: FrameCamera
-    """Its pose is in the unit of the result."""
+    camera: Camera
+    pose: Pose | None
+    """In the unit of the result. None: unknown."""
     unit_scale: float
     """Units of the depth per unit of the COLMAP model; 1 without a model."""
     farthest: float
@@ -76,7 +78,7 @@ def new_file(path: Path) -> Iterator[Path]:
 
 def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
     """Returns a warning if images are distorted, for a program that takes undistorted ones."""
-    count = sum(frame.camera.camera.has_lens for frame in frames)
+    count = sum(frame.camera.has_lens for frame in frames)
     if not count:
         return []
     return [
@@ -130,13 +132,13 @@ def export_results(
 
 
 def _frame(result: ResultFrame, export: Export) -> ExportFrame:
-    record, camera, image = result.record, result.camera, result.image
+    record, image, (camera, pose) = result.record, result.image, result.camera_and_pose
     if camera is None or image is None:
         lacks = "its image; run this in the folder where it was refined, or refine it again"
         if camera is None:
             lacks = "a record with its camera; refine it with a COLMAP model, --calib or --fov"
         raise InputError(f"{result.depth} lacks {lacks}")
-    if export.needs_pose and camera.pose is None:
+    if export.needs_pose and pose is None:
         raise InputError(
             f"{result.depth} has no pose in its record; refine it with a COLMAP model, as"
             " `batch --layout colmap` does"
@@ -163,6 +165,7 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
         image_name=name,
         size=(height, width),
         camera=camera,
+        pose=pose,
         unit_scale=numbers[1],
         farthest=numbers[0],
     )

@@ -29,7 +29,7 @@ def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
 def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
     for frame in frames:
         depth = frame.valid_depth()
-        _write_map(_map(folder, frame, "normal"), depth_normals(depth, frame.camera.camera))
+        _write_map(_map(folder, frame, "normal"), depth_normals(depth, frame.camera))
         _write_map(_map(folder, frame, "depth"), depth[..., None] / frame.unit_scale)
     for listed in _files(folder, frames)[2 * len(frames) :]:
         with new_file(listed) as temporary:

@@ -55,7 +55,7 @@ def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
-    lenses = sorted({frame.camera.camera.lens for frame in frames})
+    lenses = sorted({frame.camera.lens for frame in frames})
     if len(lenses) > 1:
         raise InputError(
             f"the cameras have lenses of different kinds ({', '.join(lenses)}), but Nerfstudio"
@@ -102,7 +102,7 @@ def _factor(frames: Sequence[ExportFrame]) -> float:
 
 def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
     """The frame's entry in transforms.json."""
-    camera, pose = frame.camera.camera, frame.camera.pose
+    camera, pose = frame.camera, frame.pose
     assert pose is not None
     names = _COEFFICIENTS[camera.lens]
     values = dict(zip(names, camera.distortion, strict=False))

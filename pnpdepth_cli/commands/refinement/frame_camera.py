@@ -4,74 +4,69 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.commands.refinement.request import RefineRequest
-from pnpdepth_cli.commands.sparse.scans import SparseDepth, camera_of, check_size
+from pnpdepth_cli.commands.sparse.scans import SparseDepth, check_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.rgb import read_focal_length
-from pnpdepth_cli.sensors.camera import Camera
+
+Pose = NDArray[np.float64]
+"""(3, 4) x_world = pose · (x, 1), in the unit of the depth."""
 
 _MAX_FOV_DEG = 170.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameCamera:
-    """The camera that took a frame."""
+def camera_to_json(camera: Camera, pose: Pose | None) -> dict[str, Any]:
+    """Returns what a record keeps of a camera and its pose; `camera_from_json` reads it."""
+    return {
+        "intrinsics": camera.intrinsics.tolist(),
+        "lens": camera.lens,
+        "distortion": list(camera.distortion),
+        "pose": None if pose is None else pose.tolist(),
+        "source": camera.source,
+    }
 
-    camera: Camera
-    source: str
-    pose: NDArray[np.float64] | None = None
-    """(3, 4) x_world = pose · (x, 1), in the unit of the depth. None: unknown."""
-    notes: tuple[str, ...] = ()
 
-    def record(self) -> dict[str, Any]:
-        """Returns what a record keeps of it; `of_record` reads it."""
-        return {
-            "intrinsics": self.camera.intrinsics.tolist(),
-            "lens": self.camera.lens,
-            "distortion": list(self.camera.distortion),
-            "pose": None if self.pose is None else self.pose.tolist(),
-            "source": self.source,
-        }
+def camera_from_json(entry: Mapping[str, Any]) -> tuple[Camera, Pose | None]:
+    """Returns the camera and its pose of an entry of `camera_to_json`.
 
-    @classmethod
-    def of_record(cls, entry: Mapping[str, Any]) -> FrameCamera:
-        """Returns the camera of an entry of `record`.
-
-        Raises:
-            KeyError: A part is missing.
-            TypeError: A part is not of numbers.
-            ValueError: No camera has these numbers.
-        """
-        intrinsics = np.array(entry["intrinsics"], np.float64).reshape(3, 3)
-        distortion = tuple(float(each) for each in entry["distortion"])
-        pose = None if entry["pose"] is None else np.array(entry["pose"], float).reshape(3, 4)
-        numbers = np.concatenate(
-            [intrinsics.ravel(), distortion, [] if pose is None else pose.ravel()]
-        )
-        if not np.isfinite(numbers).all() or entry["lens"] not in LENSES:
-            raise ValueError("no camera has these numbers")
-        if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or intrinsics[2].tolist() != [0, 0, 1]:
-            raise ValueError("no camera has these intrinsics")
-        return cls(
-            camera=Camera(intrinsics=intrinsics, distortion=distortion, lens=entry["lens"]),
-            source=str(entry["source"]),
-            pose=pose,
-        )
+    Raises:
+        KeyError: A part is missing.
+        TypeError: A part is not of numbers.
+        ValueError: No camera has these numbers.
+    """
+    intrinsics = np.array(entry["intrinsics"], np.float64).reshape(3, 3)
+    distortion = tuple(float(each) for each in entry["distortion"])
+    pose = None if entry["pose"] is None else np.array(entry["pose"], float).reshape(3, 4)
+    numbers = np.concatenate([intrinsics.ravel(), distortion, [] if pose is None else pose.ravel()])
+    if not np.isfinite(numbers).all() or entry["lens"] not in LENSES:
+        raise ValueError("no camera has these numbers")
+    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or intrinsics[2].tolist() != [0, 0, 1]:
+        raise ValueError("no camera has these intrinsics")
+    camera = Camera(
+        intrinsics=intrinsics,
+        lens=entry["lens"],
+        distortion=distortion,
+        source=str(entry["source"]),
+    )
+    return camera, pose
 
 
 def camera_of_frame(
     request: RefineRequest, sparse: SparseDepth, size: tuple[int, int]
-) -> FrameCamera | None:
-    """Returns the camera of the frame in the part that its protocol keeps; None if unknown.
+) -> tuple[Camera | None, list[str]]:
+    """Returns the camera of the part of the frame that its protocol keeps, and lines for a person.
+
+    The camera is None if it is unknown.
 
     Args:
         request: What is asked for. EXIF is read only where an output needs the camera.
@@ -83,17 +78,16 @@ def camera_of_frame(
         SizeError: The calibration is of another image.
     """
     files, outputs, image = request.files, request.outputs, request.files.image_file
-    known: FrameCamera | None = None
-    if sparse.camera is not None:
-        known = FrameCamera(camera=sparse.camera, source=sparse.camera_source, pose=sparse.pose)
-    elif files.scan.calib is not None:
-        known = camera_of_file(files.scan.calib, files.scan.camera, size, image)
-    elif files.camera_file is not None:
-        known = camera_of_file(files.camera_file, files.camera_number, size, image)
+    known, notes = sparse.camera, list[str]()
+    if known is None and files.scan.calib is not None:
+        known, notes = camera_of_file(files.scan.calib, files.scan.camera, size, image)
+    elif known is None and files.camera_file is not None:
+        known, notes = camera_of_file(files.camera_file, files.camera_number, size, image)
     if outputs.fov_deg is not None:
         if known is not None:
             raise UsageError(f"the camera is known ({known.source}); leave out --fov")
         known = camera_of_fov(outputs.fov_deg, size)
+        notes = [describe_pinhole(known)]
     if known is None and outputs.needs_camera:
         known = None if image is None else camera_of_exif(image, size)
         if known is None:
@@ -102,29 +96,25 @@ def camera_of_frame(
                 f"{flag} needs the camera, and {named} has neither a calibration nor a focal length"
                 " in EXIF; give --calib or --fov"
             )
-    if known is None:
-        return None
-    intrinsics = files.protocol.intrinsics_in_crop(known.camera.intrinsics, size)
-    return replace(known, camera=replace(known.camera, intrinsics=intrinsics))
+        notes = [describe_pinhole(known)]
+    return None if known is None else files.protocol.camera_in_crop(known, size), notes
 
 
 def camera_of_file(
     path: Path, number: int | None, size: tuple[int, int], image: Path | None = None
-) -> FrameCamera:
-    """Returns the camera of a calibration file for an image (H, W) of this file.
+) -> tuple[Camera, list[str]]:
+    """Returns the camera of a calibration file for an image (H, W) of this file, and warnings.
 
     Raises:
         InputError: The file is no calibration.
         SizeError: It is of another image.
     """
-    calibration = read_calibration(path, number)
-    notes = check_size(path, calibration, size, image)
-    return FrameCamera(
-        camera=camera_of(calibration), source=f"{path}: {calibration.source}", notes=tuple(notes)
-    )
+    camera = read_calibration(path, number).camera
+    notes = check_size(path, camera, size, image)
+    return replace(camera, source=f"{path}: {camera.source}"), notes
 
 
-def camera_of_fov(fov_deg: float, size: tuple[int, int]) -> FrameCamera:
+def camera_of_fov(fov_deg: float, size: tuple[int, int]) -> Camera:
     """Returns a camera without distortion of this horizontal field of view, for (H, W) pixels.
 
     Raises:
@@ -136,16 +126,21 @@ def camera_of_fov(fov_deg: float, size: tuple[int, int]) -> FrameCamera:
     return _pinhole(focal_px, size, f"--fov {fov_deg:g}")
 
 
-def camera_of_exif(image: Path, size: tuple[int, int]) -> FrameCamera | None:
+def camera_of_exif(image: Path, size: tuple[int, int]) -> Camera | None:
     """Returns the camera of an image's EXIF, without distortion; None if EXIF does not give it."""
     focal = read_focal_length(image, size)
     return None if focal is None else _pinhole(focal.pixels, size, focal.source)
 
 
-def _pinhole(focal_px: float, size: tuple[int, int], source: str) -> FrameCamera:
+def describe_pinhole(camera: Camera) -> str:
+    """Returns a line on a camera of a field of view or of EXIF, for a person."""
+    focal_px = camera.intrinsics[0, 0]
+    return f"camera: {focal_px:.1f} pixels of focal length, no distortion ({camera.source})"
+
+
+def _pinhole(focal_px: float, size: tuple[int, int], source: str) -> Camera:
     height, width = size
     intrinsics = np.array(
         [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
     )
-    note = f"camera: {focal_px:.1f} pixels of focal length, no distortion ({source})"
-    return FrameCamera(camera=Camera(intrinsics=intrinsics), source=source, notes=(note,))
+    return Camera(intrinsics=intrinsics, size=size, source=source)

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera, camera_of_frame
+from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.commands.refinement.frame_camera import Pose, camera_of_frame
 from pnpdepth_cli.commands.refinement.neighbours import read_neighbours
 from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
@@ -59,8 +60,10 @@ class Inputs(Frame):
     record: dict[str, Any] = field(default_factory=dict)
     """Files and digests, for a record."""
     notes: tuple[str, ...] = ()
-    camera: FrameCamera | None = None
+    camera: Camera | None = None
     """The camera in pixels of the image frame. None: unknown."""
+    pose: Pose | None = None
+    """From the camera's frame to the world's. None: unknown."""
     has_neighbours: bool = False
 
 
@@ -109,7 +112,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     else:
         size = whole or own.size
     kinds = {"gt": None if files.gt is None else truth.kind, "sparse": sparse.kind}
-    camera = camera_of_frame(request, sparse, size)
+    camera, of_camera = camera_of_frame(request, sparse, size)
     used, held_out = _split(own, request.hold_out.holdout, method.seed)
     points, neighbours, lost = read_neighbours(
         files, used, camera, lambda other: _points_of(request, other, size)
@@ -119,7 +122,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         notes += _leak_warning(depth, gt)
         by_option = {"--depth-scale": kinds["sparse"], "--gt-scale": kinds["gt"]}
         notes += _scale_warning(depth, gt, by_option)
-    notes += (*(() if camera is None else camera.notes), *lost)
+    notes += (*of_camera, *lost)
     if neighbours:
         record["neighbours"] = neighbours
     return Inputs(
@@ -136,6 +139,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         notes=tuple(notes),
         unit=sparse.unit,
         camera=camera,
+        pose=sparse.pose,
         has_neighbours=bool(neighbours),
     )
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.refinement.frame_camera import FrameCamera
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.request import FrameFiles
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.dataset import Protocol, Source, file_of
 from pnpdepth_cli.io.dataset.reading import read_image
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import Camera, NeighbourScan, Points, accumulated
+from pnpdepth_cli.sensors import NeighbourScan, Points, accumulated
 from pnpdepth_cli.sensors.motion import Keypoints, MotionEstimate, keypoints_of, motion_of_images
 
 _IN_MEMORY = 16
@@ -25,7 +25,7 @@ _IN_MEMORY = 16
 def read_neighbours(
     files: FrameFiles,
     used: SparsePoints,
-    camera: FrameCamera | None,
+    camera: Camera | None,
     points_of: Callable[[FrameFiles], SparsePoints],
 ) -> tuple[SparsePoints, list[dict[str, Any]], list[str]]:
     """Returns the points with those of the neighbours that agree with them.
@@ -62,7 +62,7 @@ def read_neighbours(
         assert source is not None
         known = neighbour.motion
         if known is None:
-            estimate = _estimated(files, neighbour.files, points, camera.camera)
+            estimate = _estimated(files, neighbour.files, points, camera)
         else:
             estimate = MotionEstimate(motion=np.array(known), basis=neighbour.poses)
         entry: dict[str, Any] = {
@@ -86,7 +86,7 @@ def read_neighbours(
             f"{_name_of(files)}: no motion to a neighbour can be estimated ({estimate.basis}); give"
             " --poses, or leave out --accumulate"
         )
-    return accumulated(own, scans, camera.camera).tensors(), record, notes
+    return accumulated(own, scans, camera).tensors(), record, notes
 
 
 def _estimated(

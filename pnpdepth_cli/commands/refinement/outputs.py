@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.refinement.output_files import Outputs
 from pnpdepth_cli.frames.frame import Refined
@@ -30,8 +31,8 @@ from pnpdepth_cli.io.visualisation import (
     sigma_preview,
     write_mask,
 )
-from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.cloud import cloud_from_depth, kept_pixels
+from pnpdepth_cli.sensors.lens import rays_of
 
 Image = NDArray[np.float32]
 
@@ -122,8 +123,8 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str,
         )
     if "cloud" in outputs:
         assert inputs.camera is not None
-        pose = inputs.camera.pose  # known, it moves the cloud into the world's frame
-        parts = cloud_from_depth(frame.after, inputs.camera.camera, rgb=image, keep=frame.valid)
+        pose = inputs.pose  # known, it moves the cloud into the world's frame
+        parts = cloud_from_depth(frame.after, inputs.camera, rgb=image, keep=frame.valid)
         moved = (part if pose is None else part.transformed(pose) for part in parts)
         points = write_cloud(outputs["cloud"], moved)
         record["cloud"] = {"points": points, "frame": "camera" if pose is None else "world"}
@@ -186,7 +187,7 @@ def _write_view(path: Path, image: Image | None, inputs: Inputs, frame: Refined)
     known = np.concatenate([depth[depth > 0] for depth in depths.values()])
     near, far = (float(known.min()), float(known.max())) if len(known) else (1.0, 1.0)
     far = max(far, near * 1.001)
-    rays = _rays(inputs.camera.camera, (height, width))
+    rays = _rays(inputs.camera, (height, width))
     write_json(
         path,
         {
@@ -196,7 +197,7 @@ def _write_view(path: Path, image: Image | None, inputs: Inputs, frame: Refined)
             "range": [near, far],
             "middle": float(np.median(known)) if len(known) else 1.0,
             "farthest": far,
-            "spacing": stride / float(inputs.camera.camera.intrinsics[0, 0]),
+            "spacing": stride / float(inputs.camera.intrinsics[0, 0]),
             "unit": inputs.unit,
             "rays": {"size": [rays.shape[1], rays.shape[0]], "values": _text(rays, "<f4")},
             "depths": {name: _text(_codes(d, near, far), "<u2") for name, d in depths.items()},
@@ -225,8 +226,7 @@ def _rays(camera: Camera, size: tuple[int, int]) -> NDArray[np.float64]:
     """(rows, columns, 2) x/z and y/z at the nodes of a grid from the first to the last pixel."""
     rows, columns = (np.linspace(0, n - 1, 2 + _RAY_NODES * (n - 1) // max(size)) for n in size)
     xy = np.stack(np.meshgrid(columns, rows), axis=-1)
-    points = camera.unproject(xy.reshape(-1, 2), np.ones(xy.shape[0] * xy.shape[1]))
-    return points[:, :2].reshape(xy.shape)
+    return rays_of(camera, xy.reshape(-1, 2)).reshape(xy.shape)
 
 
 def _colours(image: Image | None, frame: Refined) -> NDArray[np.uint8]:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from pnpdepth_cli.choices import BASELINES
+from pnpdepth_cli.commands.refinement.frame_camera import camera_to_json
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs, plan_outputs
 from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
@@ -129,7 +130,7 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: Refined) -> dict[str, Any
         "versions": versions(),
         "unit": inputs.unit,
         "inputs": inputs.record,
-        "camera": None if inputs.camera is None else inputs.camera.record(),
+        "camera": inputs.camera and camera_to_json(inputs.camera, inputs.pose),
         "model": model_record(network, request.network.model),
         "method": {
             "kind": "default" if refiner.is_default else "fixed",

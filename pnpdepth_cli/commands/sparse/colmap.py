@@ -11,7 +11,6 @@ from pnpdepth_cli.commands.sparse.options import METRES, MODEL_UNITS, ColmapOpti
 from pnpdepth_cli.commands.sparse.scans import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
 from pnpdepth_cli.io.colmap import (
-    ColmapCamera,
     ColmapModel,
     find_model,
     model_files,
@@ -21,7 +20,8 @@ from pnpdepth_cli.io.colmap import (
 from pnpdepth_cli.io.dataset.reading import check_same_view
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.sensors import Camera, Points
+from pnpdepth_cli.sensors import Points
+from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.sparse import DropCounter, describe_dropped
 
 _SIZES_IN_RANGE = 8.0
@@ -52,6 +52,7 @@ def read_colmap_points(
     model = read_model(path)
     name = name_in_model(model, image)
     camera = model.cameras[model.images[name].camera]
+    assert camera.size is not None  # of every camera of a model
     if camera.size != size and not any_size:
         raise SizeError(
             f"{image} is {size[1]}×{size[0]} but its camera in {model.folder} is"
@@ -62,9 +63,9 @@ def read_colmap_points(
     points = _observed(model, name, options)
     turn, shift = model.images[name].rotation.T, model.images[name].translation
     unit = MODEL_UNITS if options.unit_scale is None else METRES
-    source = f"COLMAP model, image {name}, {camera.model} camera"
+    source = f"COLMAP model, image {name}, {camera.source}"
     notes = [f"sparse: {describe_range(points.depth, source, unit=unit)}"]
-    if _eye(camera).has_lens:
+    if camera.has_lens:
         notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
     lost = describe_dropped(points.dropped)
     notes += [f"sparse: dropped {lost}"] if lost else []
@@ -72,8 +73,7 @@ def read_colmap_points(
         notes.append("unit: depth is in model units; --colmap unit-scale=M gives metres per unit")
     return SparseDepth(
         points=points.resized(*size),
-        camera=_resized(_eye(camera), camera.size, size),
-        camera_source=f"COLMAP model {path}",
+        camera=replace(camera.resized(*size), source=f"COLMAP model {path}"),
         pose=np.column_stack([turn, -turn @ shift * (options.unit_scale or 1.0)]),
         unit=unit,
         scale=_output_scale(model) if unit == MODEL_UNITS else None,
@@ -97,6 +97,7 @@ def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
     """The points in the image's tracks that pass the filters, in the frame of its camera's size."""
     image, points = model.images[name], model.points
     camera = model.cameras[image.camera]
+    assert camera.size is not None
     row = np.searchsorted(points.number, image.points)
     known = row < len(points.number)
     known[known] = points.number[row[known]] == image.points[known]
@@ -116,7 +117,7 @@ def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
             " model is damaged, or its poses are inverted"
         )
     seen = seen[front]
-    seen, xy = drops.keep_seen(seen, _eye(camera).pixels_of(seen), camera.size)
+    seen, xy = drops.keep_seen(seen, pixels_of(camera, seen), camera.size)
     depth = seen[:, 2] * (options.unit_scale or 1.0)
     if not len(depth):
         raise NoPointsError(
@@ -129,20 +130,6 @@ def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
         size=camera.size,
         dropped=drops.dropped,
     )
-
-
-def _eye(camera: ColmapCamera) -> Camera:
-    return Camera(intrinsics=camera.intrinsics, distortion=camera.distortion, lens=camera.lens)
-
-
-def _resized(camera: Camera, old: tuple[int, int], new: tuple[int, int]) -> Camera:
-    """The camera for another size of the image, (H, W); pixel centres are at whole numbers."""
-    scale = np.array([[new[1] / old[1]], [new[0] / old[0]]])
-    intrinsics = camera.intrinsics.copy()
-    intrinsics[:2, 2] += 0.5
-    intrinsics[:2] *= scale
-    intrinsics[:2, 2] -= 0.5
-    return replace(camera, intrinsics=intrinsics)
 
 
 def _output_scale(model: ColmapModel) -> float:

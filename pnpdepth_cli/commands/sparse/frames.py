@@ -193,11 +193,11 @@ def _write_calibration(
         return frames[0]
     else:
         calibration, source = of_bag[0], str(topic)
-    pose = None if calibration.has_pose else static_pose(bag, *names)
-    if pose is not None:
+    scanner = None if calibration.scanner else static_pose(bag, *names)
+    if scanner is not None:
         source += f", and /tf_static from {names[0]} to {names[1]}"
-        calibration = replace(calibration, rotation=pose[0], translation=pose[1], has_pose=True)
-    if not calibration.has_pose:
+        calibration = replace(calibration, scanner=scanner)
+    if calibration.scanner is None:
         say(
             f"warning: {bag.path} has no static transform from {names[0]} to {names[1]}; refine"
             " with --scan extrinsics=FILE"
@@ -225,16 +225,17 @@ def _some_frames(
 
 
 def _calibration_text(calibration: Calibration) -> str:
-    fields: dict[str, Any] = {"K": calibration.intrinsics.ravel().tolist()}
-    if calibration.has_pose:
-        fields["R"] = calibration.rotation.ravel().tolist()
-        fields["t"] = calibration.translation.tolist()
-    if calibration.distortion:
-        fields["distortion"] = list(calibration.distortion)
-    if calibration.size is not None:
-        fields["size"] = [calibration.size[1], calibration.size[0]]
+    camera, scanner = calibration.camera, calibration.scanner
+    fields: dict[str, Any] = {"K": camera.intrinsics.ravel().tolist()}
+    if scanner is not None:
+        fields["R"] = scanner.rotation.ravel().tolist()
+        fields["t"] = scanner.translation.tolist()
+    if camera.distortion:
+        fields["distortion"] = list(camera.distortion)
+    if camera.size is not None:
+        fields["size"] = [camera.size[1], camera.size[0]]
     lines = [f"{name}: {json.dumps(value)}\n" for name, value in fields.items()]
-    return "".join([*lines, f"lens: {calibration.lens}\n"])
+    return "".join([*lines, f"lens: {camera.lens}\n"])
 
 
 def _write_poses(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
+from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scans import camera_of, check_size, read_scan_points
+from pnpdepth_cli.commands.sparse.scans import check_size, read_scan_points
 from pnpdepth_cli.errors import OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
@@ -24,7 +25,6 @@ from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors import (
     FORWARD_LEFT_UP,
     LIDARS,
-    Camera,
     Lidar,
     Points,
     SampleNoise,
@@ -220,17 +220,17 @@ def simulate_scan(
     target.check((depth, calib))
     dense, notes = _dense(depth, **reading)
     calibration = read_calibration(calib, camera)
-    notes += check_size(calib, calibration, (dense.shape[0], dense.shape[1]), depth)
-    eye = _placed(calib, calibration, position)
-    points = simulate_lidar(dense, eye, sensor, seed)
+    notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
+    scanner = _placed(calib, calibration, position)
+    points = simulate_lidar(dense, calibration.camera, scanner, sensor, seed)
     notes.append(f"sparse: {describe_range(points.depth, f'{sensor.name}, seed {seed}')}")
     settings = {
         "sensor": plain(asdict(sensor)),
-        "rotation": eye.rotation.tolist(),
-        "translation": eye.translation.tolist(),
+        "rotation": scanner.rotation.tolist(),
+        "translation": scanner.translation.tolist(),
         "seed": seed,
     }
-    read_as = {"path": str(calib), "read_as": calibration.source}
+    read_as = {"path": str(calib), "read_as": calibration.camera.source}
     inputs = {"depth": depth, "calibration": read_as}
     return target.write("simulate", points, settings, inputs=inputs, notes=notes)
 
@@ -282,17 +282,16 @@ def find_sensor(
     return ideal_lidar(beams, *vertical_fov)
 
 
-def _placed(path: Path, calibration: Calibration, position: str | None) -> Camera:
-    """The camera, with the scanner at the position that is asked for."""
-    camera = camera_of(calibration)
+def _placed(path: Path, calibration: Calibration, position: str | None) -> Extrinsics:
+    """The pose of the scanner that is asked for."""
     if position == AT_CALIBRATION:
-        if not calibration.has_pose:
+        if calibration.scanner is None:
             raise UsageError(f"{path} has no pose of the scanner; add R and t")
-        return camera
+        return calibration.scanner
     try:
         metres = np.array((position or "0,0,0").split(","), np.float64)
     except ValueError:
         metres = np.empty(0)
     if metres.shape != (3,) or not np.isfinite(metres).all():
         raise UsageError(f"--position must be X,Y,Z in metres or calib, got {position!r}")
-    return replace(camera, rotation=FORWARD_LEFT_UP, translation=metres)
+    return Extrinsics(FORWARD_LEFT_UP, metres)

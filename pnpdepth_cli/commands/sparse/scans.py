@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.commands.sparse.options import METRES, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import DepthKind, describe_range
-from pnpdepth_cli.io.extrinsics import inverse, read_extrinsics
+from pnpdepth_cli.io.extrinsics import read_extrinsics
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors import Camera, describe_dropped, edge_agreement, project_velodyne
+from pnpdepth_cli.sensors import describe_dropped, edge_agreement, project_velodyne
+from pnpdepth_cli.sensors.lens import pixels_of
 
 _MORE_IF_INVERTED = 3.0  # times as many points in the image with inverted extrinsics: a warning
 _NEXT_TO_NONE = 0.05  # of them; fewer points with the extrinsics themselves are an error
@@ -45,7 +47,6 @@ class SparseDepth:
     unit: str = METRES
     camera: Camera | None = None
     """The camera of the whole image, where it came with the points."""
-    camera_source: str = ""
     pose: NDArray[np.float64] | None = None
     """(3, 4) from the camera's frame to the world's, in `unit`. None: unknown."""
 
@@ -76,45 +77,44 @@ def read_scan_points(
         )
     calibration = read_calibration(named, options.camera)
     if options.extrinsics is not None:
-        rotation, translation = read_extrinsics(options.extrinsics)
-        calibration = _with_pose(calibration, rotation, translation)
-    if not calibration.has_pose:
+        calibration = replace(calibration, scanner=read_extrinsics(options.extrinsics))
+    if calibration.scanner is None:
         raise UsageError(
             f"{named} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or"
             " give --scan extrinsics=FILE"
         )
     if options.inverse_extrinsics:
-        pose = inverse((calibration.rotation, calibration.translation))
-        calibration = _with_pose(calibration, *pose)
-    size = size or calibration.size
+        calibration = replace(calibration, scanner=calibration.scanner.inverse())
+    size = size or calibration.camera.size
     if size is None:
         raise SizeError(f"{named} does not give the image's size; give --image or --size")
-    warnings = check_size(named, calibration, size, image)
+    warnings = check_size(named, calibration.camera, size, image)
     scan = read_scan(path, options.point_fields)
     if calibration.rectified:
         frames = [] if image is None else [(read_rgb(image).values, scan.points)]
         calibration, note = chosen_camera(calibration, frames)
         warnings.append(note)
-    camera = camera_of(calibration)
-    if not calibration.source.startswith("KITTI"):  # whose pose has one direction
-        warnings += check_direction(scan.points, camera, size)
+    camera, scanner = calibration.camera, calibration.scanner
+    assert scanner is not None
+    if not camera.source.startswith("KITTI"):  # whose pose has one direction
+        warnings += check_direction(scan.points, camera, scanner, size)
     points = project_velodyne(
         scan.points,
         camera,
+        scanner,
         size,
         euclidean=options.euclidean,
         limits=(options.min_range, np.inf if options.max_range is None else options.max_range),
         keep_occluded=options.keep_occluded,
     )
-    warnings += _outside_warning(scan.points, camera, size)
-    source = f"{scan.source} of {len(scan.points):,} points, {calibration.source}"
+    warnings += _outside_warning(scanner.moved(scan.points), camera, size)
+    source = f"{scan.source} of {len(scan.points):,} points, {camera.source}"
     notes = [f"sparse: {describe_range(points.depth, source)}"]
     if lost := describe_dropped(points.dropped):
         notes.append(f"sparse: dropped {lost}")
     return SparseDepth(
         points=points,
-        camera=camera,
-        camera_source=f"calibration of {path.name}",
+        camera=replace(camera, source=f"calibration of {path.name}"),
         record={
             "path": str(path),
             "sha256": sha256_of(path),
@@ -145,22 +145,17 @@ def chosen_camera(
     image_raw.
 
     Args:
-        raw: K, distortion and the pose of the scanner, with the rectified cameras.
+        raw: The camera of raw images and the pose of the scanner, with the rectified cameras.
         frames: Images (H, W, 3) in 0..1, each with a scan (N, 3).
         topic: Of the images, where it is known.
     """
     named = "image_rect" in topic
     cameras = {
-        name: _with_pose(
-            camera,
-            camera.rotation @ raw.rotation,
-            camera.rotation @ raw.translation + camera.translation,
-            has_pose=raw.has_pose,
-        )
-        for name, camera in raw.rectified.items()
+        name: Calibration(camera=camera, scanner=raw.scanner and of_raw @ raw.scanner)
+        for name, (camera, of_raw) in raw.rectified.items()
     }
     candidates = cameras if named else {"K and distortion": raw} | cameras
-    scores = _scores(frames, candidates) if raw.has_pose and len(candidates) > 1 else {}
+    scores = _scores(frames, candidates) if raw.scanner and len(candidates) > 1 else {}
     choice = first = next(iter(candidates))
     best = max(scores, key=lambda name: scores[name], default=first)
     if best != first and scores[best] - scores[first] > _CLEARLY_BETTER:
@@ -174,16 +169,6 @@ def chosen_camera(
     return candidates[choice], note
 
 
-def _with_pose(
-    camera: Calibration,
-    rotation: NDArray[np.float64],
-    translation: NDArray[np.float64],
-    *,
-    has_pose: bool = True,
-) -> Calibration:
-    return replace(camera, rotation=rotation, translation=translation, has_pose=has_pose)
-
-
 def _scores(
     frames: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
     candidates: Mapping[str, Calibration],
@@ -193,8 +178,11 @@ def _scores(
     counts = dict.fromkeys(candidates, 0)
     for rgb, xyz in frames:
         for name, calibration in candidates.items():
+            assert calibration.scanner is not None
             try:
-                points = project_velodyne(xyz, camera_of(calibration), rgb.shape[:2])
+                points = project_velodyne(
+                    xyz, calibration.camera, calibration.scanner, rgb.shape[:2]
+                )
             except NoPointsError:
                 continue
             counts[name] += len(points)
@@ -207,7 +195,9 @@ def _scores(
     }
 
 
-def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]) -> list[str]:
+def check_direction(
+    scan: NDArray[np.floating], camera: Camera, scanner: Extrinsics, size: tuple[int, int]
+) -> list[str]:
     """Returns a warning if the inverse of the scanner's pose fits the image (H, W) better.
 
     That is: it puts far more points into the image, or more points and the camera upright in the
@@ -216,14 +206,12 @@ def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int,
     Raises:
         UsageError: The pose puts next to none of the points into the image.
     """
-    rotation, translation = inverse((camera.rotation, camera.translation))
-    turned = replace(camera, rotation=rotation, translation=translation)
-    seen = (eye.from_scanner(scan) for eye in (camera, turned))
+    poses = (scanner, scanner.inverse())
     inside, inverted = (
-        int(np.count_nonzero(in_frame(eye.pixels_of(xyz[xyz[:, 2] > 0]), size)))
-        for eye, xyz in zip((camera, turned), seen, strict=True)
+        int(np.count_nonzero(in_frame(pixels_of(camera, xyz[xyz[:, 2] > 0]), size)))
+        for xyz in (pose.moved(scan) for pose in poses)
     )
-    upright, upright_inverted = _is_upright(scan, camera), _is_upright(scan, turned)
+    upright, upright_inverted = (_is_upright(scan, pose.rotation) for pose in poses)
     far_more = inverted >= _MORE_IF_INVERTED * max(inside, 1) and upright is not True
     if not far_more and not (inverted > inside and upright is False and upright_inverted):
         return []
@@ -236,14 +224,11 @@ def check_direction(scan: NDArray[np.floating], camera: Camera, size: tuple[int,
     return [f"warning: {text}"]
 
 
-def _outside_warning(
-    scan: NDArray[np.floating], camera: Camera, size: tuple[int, int]
-) -> list[str]:
-    """A warning if many points straight ahead of the camera are outside the image."""
-    seen = camera.from_scanner(scan)
+def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: tuple[int, int]) -> list[str]:
+    """A warning if many points (N, 3) straight ahead of the camera are outside the image."""
     off_axis = np.hypot(seen[:, 0], seen[:, 1])
     ahead = seen[off_axis < np.tan(np.radians(_AHEAD_DEG)) * seen[:, 2]]
-    outside = len(ahead) - int(np.count_nonzero(in_frame(camera.pixels_of(ahead), size)))
+    outside = len(ahead) - int(np.count_nonzero(in_frame(pixels_of(camera, ahead), size)))
     if outside <= _MOST_OUTSIDE * len(ahead):
         return []
     return [
@@ -253,42 +238,31 @@ def _outside_warning(
     ]
 
 
-def _is_upright(scan: NDArray[np.floating], camera: Camera) -> bool | None:
+def _is_upright(scan: NDArray[np.floating], rotation: NDArray[np.float64]) -> bool | None:
     """Whether the thin direction of the scan is the camera's y; None for a scan without one."""
     rays = scan / np.maximum(np.linalg.norm(scan, axis=1, keepdims=True), 1e-9)
     variances, axes = np.linalg.eigh(rays.T @ rays / len(rays))
     if variances[0] > _THIN * variances[1]:
         return None
-    return bool(np.argmax(np.abs(camera.rotation @ axes[:, 0])) == 1)
-
-
-def camera_of(calibration: Calibration) -> Camera:
-    """Returns the camera and the scanner's pose that a calibration describes."""
-    return Camera(
-        intrinsics=calibration.intrinsics,
-        rotation=calibration.rotation,
-        translation=calibration.translation,
-        distortion=calibration.distortion,
-        lens=calibration.lens,
-    )
+    return bool(np.argmax(np.abs(rotation @ axes[:, 0])) == 1)
 
 
 def check_size(
-    path: Path, calibration: Calibration, size: tuple[int, int], image: Path | None = None
+    path: Path, camera: Camera, size: tuple[int, int], image: Path | None = None
 ) -> list[str]:
-    """Returns warnings if image (H, W) and calibration seem to belong to different cameras.
+    """Returns warnings if an image (H, W) seems to be of another camera than a calibration.
 
     Raises:
         SizeError: They cannot belong together.
     """
     name = f"{image} is" if image else "the image is"
-    if calibration.size is not None and calibration.size != size:
-        height, width = calibration.size
+    if camera.size is not None and camera.size != size:
+        height, width = camera.size
         raise SizeError(
             f"{name} {size[1]}×{size[0]} but {path} is for images of {width}×{height}; give the"
             " image at that size"
         )
-    x, y = calibration.intrinsics[:2, 2]
+    x, y = camera.intrinsics[:2, 2]
     if not (0 <= x < size[1] and 0 <= y < size[0]):
         raise SizeError(
             f"{name} {size[1]}×{size[0]}, which does not contain the principal point"

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import SAME_FRAME, Extrinsics
 from pnpdepth_cli.io.bags import CAMERAS, ODOMETRY, POSES, TRANSFORMS, Bag
 from pnpdepth_cli.io.bags.messages import seconds_of
 from pnpdepth_cli.io.calibration import Calibration, camera_in_yaml
-from pnpdepth_cli.io.extrinsics import Extrinsics, chained, inverse, pose_of_quaternion, square
+from pnpdepth_cli.io.extrinsics import pose_of_quaternion
 from pnpdepth_cli.io.poses import Trajectory, trajectory_of
 
 _STATIC = "/tf_static"
@@ -54,7 +55,9 @@ def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
         }
         if np.isfinite(p).all() and np.isfinite(r).all():
             content |= {"projection_matrix": p.tolist(), "rectification_matrix": r.tolist()}
-        return replace(camera_in_yaml(bag.path, content, None), source=topic), frame_of(message)
+        calibration = camera_in_yaml(bag.path, content, None)
+        camera = replace(calibration.camera, source=topic)
+        return replace(calibration, camera=camera), frame_of(message)
     return None
 
 
@@ -90,7 +93,7 @@ def camera_trajectory(bag: Bag, topic: str, camera: str) -> Trajectory | None:
         body = str(getattr(message, "child_frame_id", "")).lstrip("/") or camera
         pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
         times.append(seconds_of(message, logged_ns))
-        poses.append(square(_pose_in(bag, pose.position, pose.orientation)))
+        poses.append(_pose_in(bag, pose.position, pose.orientation).square())
     return _of_camera(times, poses, _chained(_static_links(bag), body, camera))
 
 
@@ -99,13 +102,13 @@ def _of_transforms(bag: Bag, topic: str, camera: str) -> Trajectory | None:
     for link, time_s, pose in _transforms(bag, [topic]):
         times, poses = series.setdefault(link, ([], []))
         times.append(time_s)
-        poses.append(square(pose))
+        poses.append(pose.square())
     links, moving = _static_links(bag), []
     for link, (_, poses) in series.items():
         if np.ptp(np.stack(poses), axis=0).max() > _STILL:
             moving.append(link)
         else:  # ROS 1 repeats fixed transforms
-            _add_link(links, link, (poses[0][:3, :3], poses[0][:3, 3]))
+            _add_link(links, link, Extrinsics(poses[0][:3, :3], poses[0][:3, 3]))
     above = [
         link
         for link in moving
@@ -121,7 +124,7 @@ def _of_camera(
 ) -> Trajectory | None:
     if not poses or in_body is None:
         return None
-    return trajectory_of(np.array(times), (np.stack(poses) @ square(in_body))[:, :3])
+    return trajectory_of(np.array(times), (np.stack(poses) @ in_body.square())[:, :3])
 
 
 def _static_topics(bag: Bag) -> list[str]:
@@ -155,17 +158,17 @@ def _pose_in(bag: Bag, shift: Any, turn: Any) -> Extrinsics:
 def _add_link(links: Links, link: tuple[str, str], pose: Extrinsics) -> None:
     parent, child = link
     links.setdefault(parent, {})[child] = pose
-    links.setdefault(child, {})[parent] = inverse(pose)
+    links.setdefault(child, {})[parent] = pose.inverse()
 
 
 def _chained(links: Links, start: str, end: str) -> Extrinsics | None:
     """The pose x_start = pose · x_end along the shortest chain of links; None if none."""
-    poses = {start: chained()}
+    poses = {start: SAME_FRAME}
     waiting = deque([start])
     while waiting and end not in poses:
         frame = waiting.popleft()
         for other, pose in links.get(frame, {}).items():
             if other not in poses:
-                poses[other] = chained(poses[frame], pose)
+                poses[other] = poses[frame] @ pose
                 waiting.append(other)
     return poses.get(end)

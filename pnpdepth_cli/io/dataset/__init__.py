@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import FileFormatError, SizeError, UsageError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".exr")
@@ -47,17 +48,15 @@ class Protocol:
         moved = (np.asarray(xy, np.float64) + 0.5) / 2 - 0.5 if self.halved else xy
         return np.asarray(moved - np.array([left, top]), np.float32)
 
-    def intrinsics_in_crop(
-        self, intrinsics: NDArray[np.float64], size: tuple[int, int]
-    ) -> NDArray[np.float64]:
-        """Returns the (3, 3) intrinsics of that part, from those of the whole image of (H, W)."""
-        top, left, _, _ = self._window(size)
-        result = np.array(intrinsics, np.float64)
+    def camera_in_crop(self, camera: Camera, size: tuple[int, int]) -> Camera:
+        """Returns the camera of that part, from that of the whole image of (H, W)."""
+        top, left, height, width = self._window(size)
+        intrinsics = camera.intrinsics.copy()
         if self.halved:  # x becomes (x + 0.5) / 2 - 0.5
-            result[:2] /= 2
-            result[:2, 2] -= 0.25
-        result[:2, 2] -= (left, top)
-        return result
+            intrinsics[:2] /= 2
+            intrinsics[:2, 2] -= 0.25
+        intrinsics[:2, 2] -= (left, top)
+        return replace(camera, intrinsics=intrinsics, size=(height, width))
 
     def _window(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
         """(top, left, height, width) after halving."""

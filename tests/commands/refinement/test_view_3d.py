@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.outputs import LARGEST_VIEW, _rays, _stride
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors.camera import Camera
 from pnpdepth_cli.sensors.cloud import kept_pixels
+from pnpdepth_cli.sensors.lens import rays_of
 from tests.commands.frames import frame_on_disk, run
 
 
@@ -85,7 +86,7 @@ def test_interpolated_directions_are_exact_to_a_twentieth_of_a_pixel() -> None:
     y, x = np.mgrid[: size[0], : size[1]].reshape(2, -1)
     at = [y / (size[0] - 1) * (nodes.shape[0] - 1), x / (size[1] - 1) * (nodes.shape[1] - 1)]
     rays = np.stack([map_coordinates(nodes[:, :, axis], at, order=1) for axis in (0, 1)], axis=1)
-    exact = camera.unproject(np.column_stack([x, y]), np.ones(len(x)))[:, :2]
+    exact = rays_of(camera, np.column_stack([x, y]))
     assert np.abs(rays - exact).max() * focal_px < 0.05
 
 

@@ -53,9 +53,11 @@ def test_a_bag_becomes_frames_with_a_calibration(
     assert frames[1].sparse is not None
     assert len(read_scan(frames[1].sparse).points) == 150
     calibration = read_calibration(tmp_path / "frames" / "calib.txt")
-    assert (calibration.size, calibration.has_pose) == ((HEIGHT, WIDTH), True)
-    np.testing.assert_allclose(calibration.rotation, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-9)
-    np.testing.assert_allclose(calibration.translation, [0, -0.2, 0], atol=1e-9)
+    assert calibration.camera.size == (HEIGHT, WIDTH)
+    np.testing.assert_allclose(
+        calibration.scanner.rotation, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-9
+    )
+    np.testing.assert_allclose(calibration.scanner.translation, [0, -0.2, 0], atol=1e-9)
     options = ScanOptions(calib=frames[1].calib)
     points = read_scan_points(frames[1].sparse, options, (HEIGHT, WIDTH)).points
     # y = 0, z = -0.1667 in the LiDAR is 0.0333 m above the camera's axis, 5 m ahead
@@ -102,7 +104,7 @@ def test_a_bag_without_calibration_gets_a_note_that_names_it(tmp_path: Path) -> 
     bag = write_bag(tmp_path / "a.mcap", static=False)
     messages = written(bag, tmp_path / "a")
     assert "no static transform from camera to lidar; refine with --scan extrinsics" in messages[-1]
-    assert not read_calibration(tmp_path / "a" / "calib.txt").has_pose
+    assert read_calibration(tmp_path / "a" / "calib.txt").scanner is None
     messages = written(write_bag(tmp_path / "b.mcap", info=False), tmp_path / "b")
     assert "has no camera_info of /front/image_raw; refine with --calib" in messages[-1]
 

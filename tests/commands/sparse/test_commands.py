@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.sparse.make import (
     simulate_scan,
 )
 from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scans import camera_of, read_scan_points
+from pnpdepth_cli.commands.sparse.scans import read_scan_points
 from pnpdepth_cli.errors import (
     OutputError,
     PnpDepthError,
@@ -31,6 +31,7 @@ from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.sensors import Lidar, SampleNoise, SamplePattern, ideal_lidar
+from pnpdepth_cli.sensors.lens import unproject
 from tests.commands.scan_frames import ScanOnDisk, scan_on_disk
 
 
@@ -177,11 +178,11 @@ def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(
     folder = shared_data / "kitti_dc"
     name = "0000000005.png"
     theirs = cv2.imread(str(folder / "velodyne_raw" / name), cv2.IMREAD_UNCHANGED)
-    camera = camera_of(read_calibration(folder, 2))
+    calibration = read_calibration(folder, 2)
     row, column = np.nonzero(theirs)
     xy = np.column_stack([column, row]).astype(np.float64)
-    points = camera.unproject(xy, theirs[row, column] / 256)
-    points = (points - camera.translation) @ camera.rotation
+    points = unproject(calibration.camera, xy, theirs[row, column] / 256)
+    points = calibration.scanner.inverse().moved(points)
     scan = tmp_path / "scan.bin"
     np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(scan)
     project_scan(

@@ -9,20 +9,18 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.commands.sparse.scans import (
     _is_upright,
-    camera_of,
     check_direction,
     read_scan_points,
 )
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.extrinsics import inverse
 from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.sensors import Camera
 from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
 
 TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -77,13 +75,13 @@ def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> 
     folder = shared_data / "kitti_object"
     for path in sorted((folder / "calib").glob("*.txt")):
         scan = read_scan(folder / "velodyne" / f"{path.stem}.bin").points
-        right = camera_of(read_calibration(path))
-        turn, shift = inverse((right.rotation, right.translation))
-        wrong = replace(right, rotation=turn, translation=shift)
-        portrait = replace(right, intrinsics=np.array([[700.0, 0, 180], [0, 700, 600], [0, 0, 1]]))
-        assert check_direction(scan, right, (375, 1242)) == []
-        assert check_direction(scan, portrait, (1242, 375)) == []
-        (warning,) = check_direction(scan, wrong, (375, 1242))
+        calibration = read_calibration(path)
+        camera, right = calibration.camera, calibration.scanner
+        assert right is not None
+        portrait = Camera(intrinsics=np.array([[700.0, 0, 180], [0, 700, 600], [0, 0, 1]]))
+        assert check_direction(scan, camera, right, (375, 1242)) == []
+        assert check_direction(scan, portrait, right, (1242, 375)) == []
+        (warning,) = check_direction(scan, camera, right.inverse(), (375, 1242))
         assert "if they map the camera to the scanner, add --scan inverse-extrinsics" in warning
 
 
@@ -92,6 +90,5 @@ def test_a_thin_scan_shows_whether_the_image_is_upright(turns: int, upright: boo
     rays = np.random.default_rng(0).normal(size=(400, 3)) * (1, 1, 0.1)
     c, s = np.cos(turns * np.pi / 2), np.sin(turns * np.pi / 2)
     about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    camera = Camera(intrinsics=np.eye(3), rotation=about_z @ TURN)
-    assert _is_upright(rays, camera) is upright
-    assert _is_upright(np.random.default_rng(0).normal(size=(400, 3)), camera) is None
+    assert _is_upright(rays, about_z @ TURN) is upright
+    assert _is_upright(np.random.default_rng(0).normal(size=(400, 3)), about_z @ TURN) is None

@@ -97,8 +97,8 @@ def test_images_of_a_bag_are_rectified_by_their_topic_or_else_by_their_edges(
     (camera,) = (m for m in written(bag, tmp_path / "frames") if m.startswith("camera:"))
     assert said in camera
     calibration = read_calibration(tmp_path / "frames" / "calib.txt")
-    np.testing.assert_array_equal(calibration.intrinsics, RECTIFIED if rectified else K)
-    assert calibration.distortion == (() if rectified else tuple(D))
+    np.testing.assert_array_equal(calibration.camera.intrinsics, RECTIFIED if rectified else K)
+    assert calibration.camera.distortion == (() if rectified else tuple(D))
     if rectified:
         assert pixel_error(tmp_path / "frames", RECTIFIED) < 1e-3
 
@@ -124,7 +124,7 @@ def test_the_edges_say_whether_the_transforms_lead_to_the_rectified_camera(
     calibration = read_calibration(tmp_path / "frames" / "calib.txt")
     to_camera = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     expected = to_camera if to_rectified else turn @ to_camera
-    np.testing.assert_allclose(calibration.rotation, expected, atol=1e-9)
+    np.testing.assert_allclose(calibration.scanner.rotation, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("rectified", [True, False])
@@ -161,8 +161,8 @@ def test_a_calibration_replaces_that_of_the_bag(tmp_path: Path) -> None:
     messages = written(bag, tmp_path / "frames", calib=tmp_path / "own.txt")
     assert not any(text.startswith("camera:") for text in messages)
     calibration = read_calibration(tmp_path / "frames" / "calib.txt")
-    assert calibration.intrinsics[:2, :2].tolist() == [[200, 0], [0, 201]]
-    np.testing.assert_allclose(calibration.translation, ABOVE, atol=1e-9)  # of /tf_static
+    assert calibration.camera.intrinsics[:2, :2].tolist() == [[200, 0], [0, 201]]
+    np.testing.assert_allclose(calibration.scanner.translation, ABOVE, atol=1e-9)  # of /tf_static
 
 
 def test_points_ahead_that_fall_outside_the_image_give_a_warning(tmp_path: Path) -> None:

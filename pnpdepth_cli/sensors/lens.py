@@ -1,4 +1,4 @@
-"""Camera with lens distortion, and its pose relative to a scanner.
+"""From points of a camera's frame to its pixels and back, with lens distortion.
 
 A lens is a name of `choices.LENSES` and its coefficients. It maps the direction of a ray, x / z and
 y / z, to the point on the image plane z = 1 where it is seen, so all lenses here cover less than
@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from pnpdepth_cli.camera import Camera
 
 Floats = NDArray[np.float64]
 Coefficients = tuple[float, ...]
@@ -30,48 +31,31 @@ _NEWTON_STEPS = 12
 _NEWTON_STEP = 1e-7
 
 
-@dataclass(frozen=True, kw_only=True)
-class Camera:
-    """x_camera = rotation · x_scanner + translation; pixels = intrinsics · distorted(x / z).
+def pixels_of(camera: Camera, points: NDArray[np.floating]) -> Floats:
+    """Returns the (N, 2) pixel coordinates of (N, 3) points of the camera's frame, z > 0.
 
-    Camera axes are x right, y down, z forward, in metres; whole pixel numbers are pixel centres.
+    NaN for a direction beyond the one where the distortion turns back on itself.
     """
+    plane = points[:, :2] / points[:, 2:3]
+    if camera.has_lens:
+        plane = distort(plane, camera.lens, camera.distortion)
+    return np.asarray(plane @ camera.intrinsics[:2, :2].T + camera.intrinsics[:2, 2])
 
-    intrinsics: Floats  # (3, 3), last row 0 0 1, in pixels
-    rotation: Floats = field(default_factory=lambda: np.eye(3))
-    """(3, 3), from the scanner's frame to the camera's."""
-    translation: Floats = field(default_factory=lambda: np.zeros(3))
-    """(3,) metres, the scanner's origin in the camera's frame."""
-    distortion: Coefficients = ()
-    lens: str = "radial-tangential"  # one of `choices.LENSES`: what the coefficients are
 
-    @property
-    def has_lens(self) -> bool:
-        """Whether the image differs from a pinhole camera's."""
-        return self.lens != "radial-tangential" or any(self.distortion)
+def rays_of(camera: Camera, xy: NDArray[np.floating]) -> Floats:
+    """Returns the directions at (N, 2) pixels, (N, 2) x / z and y / z of the camera's frame.
 
-    def from_scanner(self, points: NDArray[np.floating]) -> Floats:
-        """Returns (N, 3) points of the scanner's frame in the camera's frame, metres."""
-        return np.asarray(points, np.float64) @ self.rotation.T + self.translation
+    NaN where the lens shows nothing.
+    """
+    inverse = np.linalg.inv(camera.intrinsics)
+    plane = np.asarray(xy, np.float64) @ inverse[:2, :2].T + inverse[:2, 2]
+    return undistort(plane, camera.lens, camera.distortion) if camera.has_lens else plane
 
-    def pixels_of(self, points: NDArray[np.floating]) -> Floats:
-        """Returns the (N, 2) pixel coordinates of (N, 3) points of the camera's frame, z > 0.
 
-        NaN for a direction beyond the one where the distortion turns back on itself.
-        """
-        plane = points[:, :2] / points[:, 2:3]
-        if self.has_lens:
-            plane = distort(plane, self.lens, self.distortion)
-        return np.asarray(plane @ self.intrinsics[:2, :2].T + self.intrinsics[:2, 2])
-
-    def unproject(self, xy: NDArray[np.floating], depth: NDArray[np.floating]) -> Floats:
-        """Returns the (N, 3) points of the camera's frame at (N, 2) pixels of (N,) depth z."""
-        inverse = np.linalg.inv(self.intrinsics)
-        plane = np.asarray(xy, np.float64) @ inverse[:2, :2].T + inverse[:2, 2]
-        if self.has_lens:
-            plane = undistort(plane, self.lens, self.distortion)
-        rays = np.column_stack([plane, np.ones(len(plane))])
-        return rays * np.asarray(depth, np.float64)[:, None]
+def unproject(camera: Camera, xy: NDArray[np.floating], depth: NDArray[np.floating]) -> Floats:
+    """Returns the (N, 3) points of the camera's frame at (N, 2) pixels of (N,) depth z."""
+    rays = np.column_stack([rays_of(camera, xy), np.ones(len(xy))])
+    return rays * np.asarray(depth, np.float64)[:, None]
 
 
 def distort(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
