@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors.lens import pixels_of, unproject
+from pnpdepth_cli.sensors.lens import pixels_of, rays_of_image
 from pnpdepth_cli.sensors.sparse import Floats, Mask, pixel_index
 
 EDGE = 0.05
@@ -71,11 +71,12 @@ def cloud_from_depth(
     """
     known = kept_pixels(depth, keep, edge)
     height, width = depth.shape
+    rays = rays_of_image(camera, (height, width))
     rows = max(1, _PART_PIXELS // width)
     for top in range(0, height, rows):
         part = slice(top, top + rows)
         around = slice(max(0, top - 1), part.stop + 1)  # the normals take neighbours
-        points = _points(depth[around], known[around], camera, around.start)
+        points = _points(depth[around], known[around], rays[around])
         normals = _normals(points, known[around])
         inner = slice(top - around.start, part.stop - around.start)
         kept = known[part]
@@ -118,14 +119,15 @@ def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:
 def depth_normals(depth: NDArray[np.float32], camera: Camera) -> Floats:
     """Returns (H, W, 3) unit normals towards the camera; 0 where depth is unknown."""
     known = kept_pixels(depth, edge=0)
-    return _normals(_points(depth, known, camera), known)
+    rays = rays_of_image(camera, (depth.shape[0], depth.shape[1]))
+    return _normals(_points(depth, known, rays), known)
 
 
-def _points(depth: NDArray[np.float32], known: Mask, camera: Camera, top: int = 0) -> Floats:
-    """(H, W, 3) points in the camera's frame, 0 where unknown; `top` is the number of row 0."""
-    rows, columns = np.nonzero(known)
+def _points(depth: NDArray[np.float32], known: Mask, rays: Floats) -> Floats:
+    """(H, W, 3) points in the camera's frame on rays (H, W, 2), 0 where depth is unknown."""
+    z = depth[known].astype(np.float64)
     points = np.zeros((*depth.shape, 3))
-    points[known] = unproject(camera, np.column_stack([columns, rows + top]), depth[known])
+    points[known] = np.column_stack([rays[known] * z[:, None], z])
     return points
 
 
@@ -198,7 +200,8 @@ class View:
     def points(self) -> NDArray[np.float32]:
         """(H·W, 3) point of each pixel in the camera's frame, 0 where unknown."""
         known = kept_pixels(self.depth, edge=0)
-        return _points(self.depth, known, self.camera).reshape(-1, 3).astype(np.float32)
+        rays = rays_of_image(self.camera, (self.depth.shape[0], self.depth.shape[1]))
+        return _points(self.depth, known, rays).reshape(-1, 3).astype(np.float32)
 
 
 def neighbouring_views(poses: Floats, index: int) -> list[int]:

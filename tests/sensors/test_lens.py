@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
-from pnpdepth_cli.sensors.lens import LENS_MODELS, distort, largest_radius, pixels_of, undistort
+from pnpdepth_cli.sensors.lens import (
+    LENS_MODELS,
+    distort,
+    largest_radius,
+    pixels_of,
+    rays_of,
+    rays_of_image,
+    undistort,
+)
 
 K = np.array([[420.0, 0, 320], [0, 410, 240], [0, 0, 1]])
 small = st.floats(-0.05, 0.05)
@@ -97,3 +105,12 @@ def test_no_points_are_shown_and_undone_as_none(lens: str) -> None:
     nothing = np.zeros((0, 2))
     assert distort(nothing, lens, EXAMPLES[lens]).shape == (0, 2)
     assert undistort(nothing, lens, EXAMPLES[lens]).shape == (0, 2)
+
+
+def test_the_rays_of_an_image_are_those_of_its_own_cameras_pixels() -> None:
+    row, column = np.mgrid[:5, :7]
+    xy = np.column_stack([column.ravel(), row.ravel()])
+    for lens in (*LENSES, *LENSES):
+        camera = Camera(intrinsics=K, lens=lens, distortion=EXAMPLES[lens])
+        rays = rays_of_image(camera, (5, 7))
+        np.testing.assert_allclose(rays.reshape(-1, 2), rays_of(camera, xy), rtol=0, atol=1e-12)
