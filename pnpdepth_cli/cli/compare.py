@@ -26,15 +26,21 @@ columns = click.option(
 @click.command(short_help="Compare runs that eval or batch scored.")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN RUN…")
 @click.option(
-    "--bootstrap",
-    "resamples",
+    "--permutations",
     type=int,
     default=10_000,
     show_default=True,
     metavar="N",
-    help="Number of bootstrap resamples and of random permutations.",
+    help="Most permutations of the test; all are tried where there are no more.",
 )
-@options.bootstrap_seed
+@click.option(
+    "--seed",
+    type=options.SEED,
+    default=0,
+    show_default=True,
+    metavar="N",
+    help="Random seed of the permutations.",
+)
 @options.no_groups
 @options.table_files(
     csv="Write the table as CSV.",
@@ -57,7 +63,7 @@ columns = click.option(
 )
 def compare(
     runs: tuple[str, ...],
-    resamples: int,
+    permutations: int,
     seed: int,
     no_groups: bool,
     all_measures: bool,
@@ -77,7 +83,7 @@ def compare(
     are in per cent of the first run and positive if the other run is better. p is the p-value of a
     paired permutation test over groups of frames (manifest column group, sequence or folder), in a
     single sequence over blocks as long as its errors are correlated, adjusted for the number of
-    measures (Holm); it is exact for few groups, else with N random permutations.
+    measures and runs (Holm); it is exact for few groups, else with N random permutations.
     """
     from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
     from pnpdepth_cli.commands.evaluation.compare import compare as compare_runs
@@ -88,7 +94,7 @@ def compare(
     files.check([Path(run) for run in runs])
     comparison = compare_runs(
         runs,
-        resamples=resamples,
+        permutations=permutations,
         seed=seed,
         grouped=not no_groups,
         all_measures=all_measures,

@@ -30,7 +30,7 @@ _OUTPUT = ("--csv", "--markdown", "--latex", "--columns", "--html", "--overwrite
     )
     - {"--columns"},
     groups={
-        "Protocol": ("--protocol", ScoringRules, "--bootstrap", "--no-groups", "--seed"),
+        "Protocol": ("--protocol", ScoringRules, "--no-groups"),
         "Input": (EvalRequest,),
         "Output": _OUTPUT,
     },
@@ -38,7 +38,6 @@ _OUTPUT = ("--csv", "--markdown", "--latex", "--columns", "--html", "--overwrite
 @click.argument("prediction", type=options.FILE, metavar="PRED")
 @click.argument("ground_truth", type=options.FILE, metavar="GT")
 @options.options_of_groups(EvalRequest)
-@options.bootstrap_seed
 @options.no_groups
 @options.table_files(
     csv="Write a row per frame.",
@@ -99,7 +98,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     print_notes([f"protocol {evaluation.protocol.describe()}", *evaluation.notes])
     name = prediction.stem if prediction.is_file() else prediction.resolve().name
     means = tables.means_row(evaluation, name, keys)
-    to_stdout = files.write(csv=tables.frames_csv(evaluation), markdown=means, latex=means)
+    to_stdout = files.write(csv=tables.frames_csv(evaluation, keys), markdown=means, latex=means)
     if files.as_json:
         print_json(evaluation.as_record())
     elif not to_stdout:
@@ -107,7 +106,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
             print_table(table)
     if html is not None:
         with progress_bar("report", "frame") as show:
-            report_eval.write_eval_report(html, evaluation, on_frame=show)
+            report_eval.write_eval_report(html, evaluation, keys, on_frame=show)
         say(f"wrote {html / 'index.html'}")
     unscored = evaluation.unscored()
     if unscored is not None:

@@ -205,9 +205,6 @@ def table_files(*, csv: str, markdown: str, latex: str) -> Callable[[Any], Any]:
     return decorate
 
 
-bootstrap_seed = click.option(
-    "--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of --bootstrap."
-)
 no_groups = click.option(
     "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
 )

@@ -137,7 +137,7 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -
         ],
         "frames": ["1", "2"],
         "clusters": {"count": 2, "unit": "frames"},
-        "resamples": 1000,
+        "permutations": 1000,
         "exact_p_values": False,
     }
     assert styled(methods_table(comparison)) == [

@@ -57,6 +57,8 @@ class Task:
     inputs: dict[str, Path]
     """The files that are read for it, by their part."""
     outputs: Outputs
+    group: str | None = None
+    """The sequence that the data set says it belongs to."""
 
     @property
     def record(self) -> Path:
@@ -167,6 +169,7 @@ def task_of(request: FrameSelection, frame: Frame) -> Task:
         request=replace(refine, files=files),
         inputs=dict(_input_files(files)),
         outputs=outputs_in(request.output, frame.name, refine),
+        group=frame.group,
     )
 
 

@@ -233,7 +233,8 @@ def _row(task: Task, record: Mapping[str, Any], entry: Mapping[str, Any]) -> Row
     inputs = {part: str(path) for part, path in task.inputs.items()}
     if "failed" in entry:
         return failed_row(task.name, inputs, entry["failed"])
-    return row_of(task.name, inputs, record, entry["outputs"])
+    row = row_of(task.name, inputs, record, entry["outputs"])
+    return row if task.group is None else row | {"group": task.group}
 
 
 def _record(path: Path) -> dict[str, Any]:

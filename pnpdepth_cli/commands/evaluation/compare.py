@@ -61,7 +61,7 @@ class Run(NamedTuple):
 def compare(
     paths: Sequence[str],
     *,
-    resamples: int = 10_000,
+    permutations: int = 10_000,
     seed: int = 0,
     grouped: bool = True,
     all_measures: bool = False,
@@ -72,13 +72,14 @@ def compare(
     A measure that a frame lacks in one of the runs is averaged and tested over the other frames.
     `runs` has the means of each run, `gains` those of each but the first: in per cent of the first
     run's mean with the ends of the 95 % interval, and as a difference; positive per cents are
-    better. `p_value` is that of no difference, `p_adjusted` by the number of measures. None is a
+    better. `p_value` is that of no difference, `p_adjusted` by the number of tests, of all
+    measures and runs. None is a
     value that there is not, as for a single frame.
 
     Args:
         paths: Files as `read_run` takes them; the first is the reference.
-        resamples: Bootstrap samples, and the most swaps of the permutation test.
-        seed: Of both.
+        permutations: Most swaps of the permutation test.
+        seed: Random seed of the swaps, where not all are tried.
         grouped: False if every frame counts as independent.
         all_measures: Whether every measure that all runs have is compared, not the main ones.
         columns: Keys of the measures to compare by, instead.
@@ -89,8 +90,8 @@ def compare(
     """
     if len(paths) < 2:
         raise UsageError("two runs at least are needed to compare")
-    if resamples < 1:
-        raise UsageError(f"--bootstrap must be >= 1, got {resamples}")
+    if permutations < 1:
+        raise UsageError(f"--permutations must be >= 1, got {permutations}")
     runs = [read_run(path) for path in paths]
     for run in runs[1:]:
         _check_rules(runs[0], run)
@@ -123,17 +124,17 @@ def compare(
     else:
         tables = [FrameTable.of_frames(np.where(known, of_run, math.nan)) for of_run in values]
     better = np.array([measure.sign for measure in measures], np.float64)
-    means, gains, exact = [table.mean() for table in tables], [], True
+    means, found, exact = [table.mean() for table in tables], [], True
     for table, mean in zip(tables[1:], means[1:], strict=True):
-        drawing = clusters, resamples, seed
-        low, high = interval(lambda a, b: gain(a, b, better), (tables[0], table), *drawing)
-        p_values, exact = swap_p_values(tables[0], table, *drawing)
-        percent, difference = gain(means[0], mean, better), mean - means[0]
-        rows = np.stack([percent, low, high, difference, p_values, holm(p_values)], axis=1)
-        gains.append({
-            key: dict(zip(_GAIN, row, strict=True))
-            for key, row in zip(keys, rows.tolist(), strict=True)
-        })  # fmt: skip
+        ends = interval(lambda a, b: gain(a, b, better), (tables[0], table), clusters)
+        p_values, exact = swap_p_values(tables[0], table, clusters, permutations, seed)
+        found.append([gain(means[0], mean, better), *ends, mean - means[0], p_values])
+    of_runs = np.array(found)  # (runs − 1, 5, measures)
+    of_runs = np.concatenate([of_runs, holm(of_runs[:, 4:])], axis=1)
+    gains = [
+        {key: dict(zip(_GAIN, row, strict=True)) for key, row in zip(keys, rows, strict=True)}
+        for rows in of_runs.transpose(0, 2, 1).tolist()
+    ]
     record = {
         "command": "compare",
         "frames": names,
@@ -154,12 +155,13 @@ def compare(
         "level": LEVEL,
         "clusters": {"count": clusters.count, "unit": clusters.unit},
         "exact_p_values": exact,
-        "resamples": resamples,
+        "permutations": permutations,
         "seed": seed,
+        "tests": of_runs[:, 0].size,
         "notes": [
             *_notes(runs, names),
             *([] if pooled else _lacking(names, measures, known)),
-            *_cluster_notes(clusters, len(names), len(measures)),
+            *_cluster_notes(clusters, len(names), of_runs[:, 0].size),
         ],
     }
     result: dict[str, Any] = plain(record)
@@ -193,7 +195,7 @@ def _labels(runs: Sequence[Run]) -> list[str]:
         names = ["/".join(parts[-length:]) for parts in paths]
         if len(set(names)) == len(names):
             return names
-    return [run.path for run in runs]
+    return [f"{run.label} ({number})" for number, run in enumerate(runs, start=1)]
 
 
 def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
@@ -241,15 +243,15 @@ def _lacking(
     ]
 
 
-def _cluster_notes(clusters: Clusters, frames: int, measures: int) -> list[str]:
+def _cluster_notes(clusters: Clusters, frames: int, tests: int) -> list[str]:
     """A warning where the frames are too dependent, or too few, to conclude anything."""
     smallest = 2.0 ** (1 - clusters.count)
-    if frames == 1 or measures * smallest < ALPHA:
+    if frames == 1 or tests * smallest < ALPHA:
         return []
-    adjusted = min(1.0, measures * smallest)
+    adjusted = min(1.0, tests * smallest)
     return [
         f"warning: {clusters.describe()} are too few independent ones to conclude anything from"
-        f" {measures} measures: the smallest possible p is {smallest:.2g}, adjusted {adjusted:.2g}"
+        f" {tests} tests: the smallest possible p is {smallest:.2g}, adjusted {adjusted:.2g}"
         + ("" if clusters.count >= MIN_CLUSTERS else f"; there is no interval below {MIN_CLUSTERS}")
     ]
 
@@ -313,8 +315,10 @@ def _evaluated(record: Mapping[str, Any]) -> dict[str, Any]:
 
 def _refined(record: Mapping[str, Any], path: Path, stage: str) -> dict[str, Any]:
     """The scores in a batch's summary, or of the one frame of a record."""
+    named: dict[str, str] = {}  # groups that the data set named
     if isinstance(record.get("frames"), list):
         scores = {entry["name"]: entry.get("scores") for entry in record["frames"]}
+        named = {entry["name"]: entry["group"] for entry in record["frames"] if "group" in entry}
     else:
         scores = {path.stem: record.get("scores")}
     values = {name: _numbers(each[stage]) for name, each in scores.items() if each is not None}
@@ -331,7 +335,7 @@ def _refined(record: Mapping[str, Any], path: Path, stage: str) -> dict[str, Any
                 "values": each,
                 "before": _numbers(scores[name]["before"]),
                 "pixels": round(each["pixels"]),
-                "group": group,
+                "group": named.get(name, group),
                 "known": round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
             }
             for (name, each), group in zip(

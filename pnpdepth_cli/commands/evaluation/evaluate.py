@@ -95,8 +95,6 @@ class Evaluation:
         if self.interval is not None:
             bounds = {
                 "level": LEVEL,
-                "resamples": request.resamples,
-                "seed": request.seed,
                 "clusters": self.clusters.count,
                 "unit": self.clusters.unit,
                 "low": {key: low for key, (low, _) in self.interval.items()},
@@ -220,13 +218,13 @@ def evaluate(
         table = FrameTable.of_frames(values)
     mean = devkit_mean(values) if protocol.is_devkit else table.mean()
     bounds, no_interval = None, []
-    if request.resamples and clusters.count >= MIN_CLUSTERS:
-        ends = interval(lambda means: means, [table], clusters, request.resamples, request.seed)
+    if clusters.count >= MIN_CLUSTERS:
+        ends = interval(lambda means: means, [table], clusters)
         highest = [1.0 if measure.percent else math.inf for measure in protocol.measures]
         low, high = (np.where(np.isnan(mean), math.nan, end) for end in ends)
         inside = np.maximum(low, 0.0).tolist(), np.minimum(high, highest).tolist()
         bounds = dict(zip(keys, zip(*inside, strict=True), strict=True))
-    elif request.resamples and len(scored) > 1:
+    elif len(scored) > 1:
         no_interval.append(
             f"no interval: {clusters.describe()} are too few to tell how sure the means are;"
             f" {MIN_CLUSTERS} are needed"

@@ -142,15 +142,6 @@ class EvalRequest(ScoringRules):
         "Crop of the frames of a data set GT, as in batch.  [default: the layout's own]",
         choices=choices.FRAME_PROTOCOLS,
     )
-    resamples: int = option(
-        2000,
-        "Number of bootstrap resamples for the intervals; 0 prints none.",
-        flag="--bootstrap",
-        metavar="N",
-        least=0,
-        show_default=True,
-    )
-    seed: int = 0
     grouped: bool = True
     """False if every frame counts as independent."""
     workers: int = option(

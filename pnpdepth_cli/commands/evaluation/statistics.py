@@ -1,21 +1,20 @@
-"""How sure means over frames are: independent clusters, bootstrap, permutations, Holm's correction.
+"""How sure means over frames are: independent clusters, intervals, permutations, Holm's correction.
 
-Errors of neighbouring frames of a video are alike, so whole clusters of frames are resampled. The
-bootstrap is studentised, which few values of skewed errors need (coverage in
-docs/guides/evaluation.md) and scipy.stats does not have.
+Errors of neighbouring frames of a video are alike, so whole clusters of frames are left out or
+swapped. The bootstraps of scipy.stats cover too little with few clusters of skewed errors; the
+coverage of the intervals here is in docs/notes/statistics.md.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import stats
 
 from pnpdepth_cli.core.metrics import measures_of
 from pnpdepth_cli.measures import MEASURES, Measure
@@ -24,15 +23,13 @@ Floats = NDArray[np.float64]
 
 LEVEL = 0.95
 MIN_CLUSTERS = 5
-"""Fewer give no interval: with lognormal errors (σ 0.5) even a studentised one misses too often."""
+"""Fewer give no interval: with lognormal errors (σ 0.5) even a corrected one misses too often."""
 BLOCK_BIAS = 0.1
 """Fraction of the variance of a mean that blocks of a single sequence may miss."""
 MAX_BLOCKS = 10
 """Most blocks of a single sequence. Few long blocks stay independent also where the correlation is
 not that of a first-order autoregression, at a small loss of power (Ibragimov and Müller 2010)."""
 
-_STEP = 1e-5
-"""Of the numerical derivative, relative to the sums; its error is near 1e-10."""
 _CELLS = 1 << 21
 """Numbers held at once, so that memory stays bounded for any number of clusters."""
 
@@ -169,78 +166,64 @@ def gain(before: Floats, after: Floats, better: Floats) -> Floats:
 
 
 def interval(
-    statistic: Callable[..., Floats],
-    tables: Sequence[FrameTable],
-    clusters: Clusters,
-    resamples: int,
-    seed: int,
+    statistic: Callable[..., Floats], tables: Sequence[FrameTable], clusters: Clusters
 ) -> tuple[Floats, Floats]:
     """Returns (M,), (M,): the ends of the 95 % interval of statistic(*means of the tables).
 
-    Each end is that of the bootstrap-t (Efron and Tibshirani 1993, section 12.5) or of Student's t,
-    whichever is farther out: the first follows the skewness of the errors, the second the error of
-    a standard error from few clusters. Standard errors are linearised in the sums (infinitesimal
-    jackknife). NaN for a measure that fewer than MIN_CLUSTERS clusters have.
+    The jackknife leaves out one cluster after the other; its pseudo-values are a sample whose mean
+    is the statistic. Each end is that of Student's t, or of t corrected for the skewness of the
+    sample (Hall 1992), whichever is farther out. NaN for a measure that fewer than MIN_CLUSTERS
+    clusters have.
 
     Args:
-        statistic: From means (…, M) of each table to (…, M); differentiable.
-        tables: Of the same frames and measures; clusters are resampled whole.
+        statistic: From means (…, M) of each table to (…, M).
+        tables: Of the same frames and measures.
         clusters: Of the frames.
-        resamples: How many bootstrap samples are drawn.
-        seed: Of the drawing.
     """
-    totals = np.concatenate([table.totals(clusters) for table in tables], axis=1)  # (G, K, M)
-    ends = np.cumsum([table.sums.shape[1] for table in tables])[:-1]
+    from scipy import stats
 
-    def means(sums: Floats) -> list[Floats]:
-        parts = np.split(sums, ends, axis=-2)
-        return [table.mean_of(part) for table, part in zip(tables, parts, strict=True)]
+    totals = [table.totals(clusters) for table in tables]
 
-    held = np.isfinite(means(totals)).all(axis=0).sum(axis=0)
-    steps = np.maximum(_STEP * np.abs(totals).sum(axis=0), 1e-300)
-    one_each = np.eye(len(steps))[..., None] * steps  # (K, K, M)
+    def value_of(sums: Iterable[Floats]) -> Floats:
+        return statistic(*(table.mean_of(s) for table, s in zip(tables, sums, strict=True)))
 
-    def linearised(counts: Floats) -> tuple[Floats, Floats]:
-        """(B, M) the statistic where clusters count as (B, G), and (B, M) its standard errors."""
-        sums = np.tensordot(counts, totals, axes=1)
-        ahead, behind = (statistic(*means(sums[:, None] + sign * one_each)) for sign in (1, -1))
-        slopes = (ahead - behind) / (2 * steps)  # (B, K, M)
-        with np.errstate(invalid="ignore"):
-            influence = sum(totals[:, k] * slopes[:, None, k] for k in range(len(steps)))
-            variance = np.einsum("bg,bgm->bm", counts, np.square(influence))
-        return statistic(*means(sums)), np.sqrt(variance)
+    value = value_of(each.sum(axis=0) for each in totals)
+    without = value_of(each.sum(axis=0) - each for each in totals)
+    # a cluster without the measure is no observation of it
+    has = np.all([np.isfinite(t.mean_of(s)) for t, s in zip(tables, totals, strict=True)], axis=0)
+    count = has.sum(axis=0).astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the pseudo-values' deviations from their mean, and standard error and skewness of it
+        pseudo = np.where(has, count * value - (count - 1) * without, 0.0)
+        deviation = np.where(has, pseudo - pseudo.sum(axis=0) / count, 0.0)
+        variance, third = ((deviation**power).sum(axis=0) / count for power in (2, 3))
+        error = np.sqrt(variance / (count - 1))
+        skew = third / variance**1.5 * np.sqrt(count - 1) / (count - 2)
+        skew = np.where(error > 1e-8 * np.maximum(np.abs(value), 1.0), skew, 0.0)
+    error = np.where(count >= MIN_CLUSTERS, error, math.nan)
+    reach = stats.t.ppf((1 + LEVEL) / 2, np.maximum(count - 1, 1))
+    below, above = _corrected(reach, skew), -_corrected(-reach, skew)
+    return value - np.maximum(below, reach) * error, value + np.maximum(above, reach) * error
 
-    size = len(totals)
-    value, error = (row[0] for row in linearised(np.ones((1, size))))
-    error = np.where(error > 1e-8 * np.maximum(np.abs(value), 1.0), error, 0.0)
-    generator, ratios = np.random.default_rng(seed), []
-    batch = max(1, _CELLS // (max(size, len(steps) ** 2) * len(held)))
-    for start in range(0, resamples, batch):
-        count = min(batch, resamples - start)
-        drawn = generator.multinomial(size, np.full(size, 1 / size), count).astype(np.float64)
-        values, errors = linearised(drawn)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            # a resample without variance says nothing of the ratio's distribution
-            ratios.append(np.where(errors > 1e-6 * error, (values - value) / errors, math.nan))
-    all_ratios = np.concatenate(ratios)
-    all_ratios[:, np.isnan(all_ratios).all(axis=0)] = 0.0
-    tail = (1 - LEVEL) / 2
-    low, high = np.nanquantile(all_ratios, [tail, 1 - tail], axis=0)
-    dof = np.maximum(held - 1, 1)
-    student = stats.t.ppf(1 - tail, dof) * np.sqrt((dof + 1) / dof)
-    error = np.where(held >= MIN_CLUSTERS, error, math.nan)
-    return value - np.maximum(high, student) * error, value - np.minimum(low, -student) * error
+
+def _corrected(t: Floats, skew: Floats) -> Floats:
+    """The values that t has in samples of this skewness over √n (Hall 1992, equation 5)."""
+    slight = np.abs(skew) < 1e-6
+    skew = np.where(slight, 1.0, skew)
+    return np.where(slight, t, 3 / skew * (np.cbrt(1 + skew * (t - skew / 6)) - 1))
 
 
 def swap_p_values(
-    first: FrameTable, other: FrameTable, clusters: Clusters, resamples: int, seed: int
+    first: FrameTable, other: FrameTable, clusters: Clusters, permutations: int, seed: int
 ) -> tuple[Floats, bool]:
     """Returns (M,) two-sided p-values of paired runs, and whether they are exact.
 
     The p-value is the fraction of swaps of the two runs, cluster by cluster, after which the means
     differ at least as much as observed (Good 2005, chapter 3). All 2^G swaps are tried if they are
-    at most `resamples`; else so many random ones, with the observed one counted in.
+    at most `permutations`; else so many random ones, with the observed one counted in.
     """
+    from scipy import stats
+
     a, b = first.totals(clusters), other.totals(clusters)
     count = len(a)
 
@@ -255,7 +238,7 @@ def swap_p_values(
         # rounding must not make an equal difference look smaller than the observed one
         return np.asarray(difference(np.atleast_2d(swapped)) >= observed * (1 - 1e-9), np.float64)
 
-    exact = count < 60 and 2**count <= resamples
+    exact = count < 60 and 2**count <= permutations
     if count < 2:
         return np.full(len(observed), math.nan), exact
     result = stats.permutation_test(
@@ -263,7 +246,7 @@ def swap_p_values(
         differs_as_much,
         permutation_type="samples",
         vectorized=True,
-        n_resamples=np.inf if exact else resamples,
+        n_resamples=np.inf if exact else permutations,
         batch=max(1, _CELLS // count),
         alternative="greater",
         axis=-1,
@@ -273,10 +256,11 @@ def swap_p_values(
 
 
 def holm(p_values: Floats) -> Floats:
-    """Returns (M,) p-values adjusted for testing M hypotheses (Holm 1979); NaN stays NaN."""
-    order = np.argsort(p_values)
-    order = order[np.isfinite(p_values[order])]
-    adjusted = np.full(len(p_values), math.nan)
-    steps = p_values[order] * np.arange(len(order), 0, -1)
+    """Returns p-values adjusted for testing all of these hypotheses (Holm 1979); NaN stays NaN."""
+    values = p_values.ravel()
+    order = np.argsort(values)
+    order = order[np.isfinite(values[order])]
+    adjusted = np.full(len(values), math.nan)
+    steps = values[order] * np.arange(len(order), 0, -1)
     adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
-    return adjusted
+    return adjusted.reshape(p_values.shape)

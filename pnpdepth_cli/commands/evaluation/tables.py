@@ -28,7 +28,7 @@ def text_tables(evaluation: Evaluation, columns: Sequence[str] | None) -> list[T
     return [means_by_measure(evaluation, columns), *frames, *calibration_tables(evaluation)]
 
 
-def means_by_measure(evaluation: Evaluation, columns: Sequence[str] | None = None) -> Table:
+def means_by_measure(evaluation: Evaluation, columns: Sequence[str] | None) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
     count = len(evaluation.scored)
     pixels = sum(frame.pixels for frame in evaluation.frames)
@@ -38,7 +38,7 @@ def means_by_measure(evaluation: Evaluation, columns: Sequence[str] | None = Non
     header, has_interval = ["", "mean"], evaluation.interval is not None
     if has_interval:
         header.append("95 %")
-        caption += f"; 95 % interval: studentised bootstrap over {evaluation.clusters.describe()}"
+        caption += f"; 95 % interval over {evaluation.clusters.describe()}"
     rows = []
     for measure in chosen_measures(evaluation.protocol.measures, columns):
         interval = [_interval(evaluation, measure)] if has_interval else []
@@ -74,16 +74,16 @@ def _interval(evaluation: Evaluation, measure: Measure) -> str:
     return " … ".join(measure.text(end) for end in ends)
 
 
-def frames_csv(evaluation: Evaluation) -> Table:
-    """Returns a row for each frame: its files, its counts, and its measures as stored."""
-    keys = [measure.key for measure in evaluation.protocol.measures]
+def frames_csv(evaluation: Evaluation, columns: Sequence[str] | None) -> Table:
+    """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
+    keys = [measure.key for measure in chosen_measures(evaluation.protocol.measures, columns)]
     records = [plain(frame_record(frame)) for frame in evaluation.frames]
-    columns = [name for name in records[0] if name not in ("values", "error")]
+    facts = [name for name in records[0] if name not in ("values", "error")]
     rows = [
-        [*(r[name] for name in columns), *(r["values"].get(key) for key in keys), r["error"]]
+        [*(r[name] for name in facts), *(r["values"].get(key) for key in keys), r["error"]]
         for r in records
     ]
-    return Table(header=[*columns, *keys, "error"], rows=rows)
+    return Table(header=[*facts, *keys, "error"], rows=rows)
 
 
 def frames_table(evaluation: Evaluation, columns: Sequence[str] | None) -> Table:
@@ -153,7 +153,7 @@ def comparison_table(comparison: Mapping[str, Any]) -> Table:
                 *(_signed(found[end]) for end in ("low_percent", "high_percent")),
                 "–" if p is None else f"{p:.4f}",
             ])  # fmt: skip
-    swaps = "all" if comparison["exact_p_values"] else f"{comparison['resamples']:,} random"
+    swaps = "all" if comparison["exact_p_values"] else f"{comparison['permutations']:,} random"
     return Table(
         header=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
         rows=rows,
@@ -170,9 +170,10 @@ def _measures(comparison: Mapping[str, Any]) -> list[Measure]:
 
 
 def _tested(comparison: Mapping[str, Any]) -> str:
-    clusters, count = comparison["clusters"], len(comparison["measures"])
+    clusters, runs = comparison["clusters"], len(comparison["gains"])
     over = f"{clusters['count']:,} {clusters['unit']}"
-    return f"over {over}, p adjusted for {count} measures (Holm)"
+    tests = f"{len(comparison['measures'])} measures" + (f" of {runs} runs" if runs > 1 else "")
+    return f"over {over}, p adjusted for {tests} (Holm)"
 
 
 def _signed(value: float | None) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from pnpdepth_cli.io.report import (
     write_report,
 )
 from pnpdepth_cli.io.visualisation import error_map
+from pnpdepth_cli.measures import chosen_measures
 
 _SOURCE = {"command": "eval"}
 
@@ -38,6 +39,7 @@ def check_eval_report(folder: Path, inputs: list[Path], *, overwrite: bool) -> N
 def write_eval_report(
     folder: Path,
     evaluation: Evaluation,
+    keys: Sequence[str] | None = None,
     *,
     on_frame: Callable[[int, int], None] = lambda done, of: None,
 ) -> None:
@@ -46,12 +48,13 @@ def write_eval_report(
     Args:
         folder: Where the page and its images are written.
         evaluation: The scores.
+        keys: Measures of the report; None for all.
         on_frame: Called with (done, of) after each frame.
 
     Raises:
         OutputError: If the report cannot be written; then the folder is as it was before.
     """
-    columns = _columns(evaluation)
+    columns = _columns(evaluation, keys)
     scored = evaluation.scored
 
     def entries(images: Path) -> Iterator[dict[str, Any]]:
@@ -66,7 +69,7 @@ def write_eval_report(
 
     with whole_report(folder) as temporary:
         images = begin_report(temporary, _SOURCE)
-        write_report(temporary, _head(evaluation, columns), entries(images))
+        write_report(temporary, _head(evaluation, keys, columns), entries(images))
 
 
 def frames_text(count: int) -> str:
@@ -74,7 +77,7 @@ def frames_text(count: int) -> str:
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
-def _columns(evaluation: Evaluation) -> list[dict[str, Any]]:
+def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[dict[str, Any]]:
     return [
         *(
             column(
@@ -85,15 +88,17 @@ def _columns(evaluation: Evaluation) -> list[dict[str, Any]]:
                 factor=measure.shown_factor,
                 percent=measure.percent,
                 higher_is_better=measure.better == "higher",
-                listed=measure.main,
+                listed=measure.main or keys is not None,
             )
-            for measure in evaluation.protocol.measures
+            for measure in chosen_measures(evaluation.protocol.measures, keys)
         ),
         column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
     ]
 
 
-def _head(evaluation: Evaluation, columns: list[dict[str, Any]]) -> Head:
+def _head(
+    evaluation: Evaluation, keys: Sequence[str] | None, columns: list[dict[str, Any]]
+) -> Head:
     request = evaluation.request
     without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
     fill = " (filled in)" if evaluation.protocol.is_devkit else ""
@@ -109,12 +114,12 @@ def _head(evaluation: Evaluation, columns: list[dict[str, Any]]) -> Head:
             ("Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"),
         ],
         notes=evaluation.notes,
-        tables=[means_by_measure(evaluation), *calibration_tables(evaluation)],
+        tables=[means_by_measure(evaluation, keys), *calibration_tables(evaluation)],
         charts=_charts(evaluation),
         without_title=f"Not scored: {len(without):,}",
         without=without,
         columns=columns,
-        sort_by="rmse",
+        sort_by=columns[0]["key"],
         labels={
             "first": f"Prediction{fill}", "second": "Ground truth", "map": "Error",
             "image": "Image",

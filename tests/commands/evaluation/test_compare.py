@@ -23,7 +23,7 @@ def run(root: Path, name: str, errors: dict[str, list[float]], **frames: Any) ->
         for folder, depth in ((name, 10 + np.array([error])), ("gt", np.full((1, len(error)), 10))):
             (root / folder).mkdir(exist_ok=True)
             write_depth(root / folder / f"{frame}.npy", depth.astype(np.float32))
-    request = EvalRequest(prediction=root / name, ground_truth=root / "gt", resamples=0, **frames)
+    request = EvalRequest(prediction=root / name, ground_truth=root / "gt", **frames)
     path = root / f"{name}.json"
     write_json(path, evaluate(request).as_record())
     return str(path)
@@ -45,7 +45,7 @@ def test_a_lower_error_is_a_positive_gain(tmp_path: Path) -> None:
     assert comparison["runs"][0]["mean"]["mae"] == pytest.approx(7 / 3)
     (note,) = comparison["notes"]
     assert note == (
-        "warning: 3 frames are too few independent ones to conclude anything from 4 measures: the"
+        "warning: 3 frames are too few independent ones to conclude anything from 4 tests: the"
         " smallest possible p is 0.25, adjusted 1; there is no interval below 5"
     )
 
@@ -55,7 +55,7 @@ def test_a_run_is_no_better_than_itself(tmp_path: Path) -> None:
     comparison = compare([path, path])
     for gain in comparison["gains"][0].values():
         assert (gain["percent"], gain["p_value"], gain["p_adjusted"]) == (0, 1, 1)
-    assert [r["label"] for r in comparison["runs"]] == [path, path]
+    assert [r["label"] for r in comparison["runs"]] == ["one (1)", "one (2)"]
 
 
 def test_frames_are_paired_by_name_and_the_others_reported(tmp_path: Path) -> None:
@@ -108,7 +108,12 @@ def test_six_frames_have_an_interval_around_the_gain_and_p_is_adjusted(tmp_path:
     assert gain["low_percent"] < gain["percent"] < gain["high_percent"]
     assert gain["p_value"] == everything["gains"][0]["mae"]["p_value"] == 2 / 64
     (note,) = main["notes"]
-    assert note.endswith("4 measures: the smallest possible p is 0.031, adjusted 0.12")
+    assert note.endswith("4 tests: the smallest possible p is 0.031, adjusted 0.12")
+    of_three = compare([*paths, paths[1]])
+    assert of_three["tests"] == 8
+    for gains in of_three["gains"]:
+        p_value = gains["mae"]["p_value"]
+        assert gains["mae"]["p_adjusted"] >= main["gains"][0]["mae"]["p_adjusted"] > p_value
     assert [m["key"] for m in compare(paths, columns=("delta1", "silog"))["measures"]] == [
         "delta1",
         "silog",
@@ -144,6 +149,16 @@ def test_frames_of_one_group_are_swapped_together(tmp_path: Path) -> None:
     alone = compare(paths, grouped=False)
     assert alone["clusters"]["count"] == 12
     assert alone["gains"][0]["mae"]["p_value"] == 2 / 4096
+
+
+def test_groups_that_the_list_of_a_batch_named_are_swapped_together(tmp_path: Path) -> None:
+    frames = [
+        {"name": f"{number}", "group": "ab"[number % 2], "scores": SCORES} for number in range(6)
+    ]
+    path = tmp_path / "summary.json"
+    path.write_text(json.dumps({"counts": {}, "frames": frames}))
+    comparison = compare([f"{path}:before", str(path)])
+    assert comparison["clusters"] == {"count": 2, "unit": "groups of frames"}
 
 
 def test_different_definitions_are_refused_and_named(tmp_path: Path) -> None:
@@ -217,12 +232,12 @@ def test_a_file_without_scores_is_refused(tmp_path: Path, text: str, message: st
         compare([one, str(tmp_path / "broken.json")])
 
 
-def test_before_is_only_for_what_has_one_and_resamples_are_needed(tmp_path: Path) -> None:
+def test_before_is_only_for_what_has_one_and_permutations_are_needed(tmp_path: Path) -> None:
     one = run(tmp_path, "one", FIRST)
     with pytest.raises(UsageError, match="leave out :before"):
         compare([one, f"{one}:before"])
-    with pytest.raises(UsageError, match="--bootstrap must be >= 1, got 0"):
-        compare([one, one], resamples=0)
+    with pytest.raises(UsageError, match="--permutations must be >= 1, got 0"):
+        compare([one, one], permutations=0)
 
 
 def test_runs_are_named_by_the_shortest_ends_of_their_paths(tmp_path: Path) -> None:
