@@ -60,7 +60,8 @@ class OtherRoundings(TorchDispatchMode):
     ) -> Any:
         """What func returns, changed in place if it is a product of real numbers."""
         result = func(*args, **(kwargs or {}))
-        if func.overloadpacket.__name__.removesuffix("_") in PRODUCTS:
+        is_product = func.overloadpacket.__name__.removesuffix("_") in PRODUCTS
+        if is_product and not torch.jit.is_tracing():
             for tensor in result if isinstance(result, tuple | list) else (result,):
                 # neither what stands for a tensor in torch.export, nor half precision
                 if type(tensor) is torch.Tensor and tensor.dtype in _INTEGERS:

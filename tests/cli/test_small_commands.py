@@ -21,27 +21,31 @@ from pnpdepth_cli.sensors.cloud import EDGE
 from tests.commands.test_export import project, results
 
 
-def test_the_points_of_a_cloud_are_counted_and_the_camera_is_reported(tmp_path: Path) -> None:
+def test_the_points_of_a_cloud_are_counted_and_the_camera_is_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_depth(tmp_path / "d.exr", np.full((24, 32), 2, np.float32))
     arguments = ["cloud", str(tmp_path / "d.exr"), "--fov", "60", "-o", str(tmp_path / "d.ply")]
-    result = CliRunner().invoke(cli, arguments)
-    assert result.exit_code == 0, result.output
-    assert "wrote 768 points, without colours (no image is known)" in result.stdout
-    assert "camera: 27.7 pixels of focal length" in result.stderr
-    result = CliRunner().invoke(cli, [*arguments, "--overwrite", "--json"])
-    assert json.loads(result.stdout)["points"] == 768
+    assert run(arguments) == 0
+    out, err = capsys.readouterr()
+    assert "wrote 768 points, without colours (no image is known)" in out
+    assert "camera: 27.7 pixels of focal length" in err
+    assert run([*arguments, "--overwrite", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["points"] == 768
     assert next(option for option in cloud.params if option.name == "edge").default == EDGE
 
 
-def test_exported_frames_are_counted_and_warnings_go_to_stderr(tmp_path: Path) -> None:
+def test_exported_frames_are_counted_and_warnings_go_to_stderr(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = results(project(tmp_path, "OPENCV"))
     arguments = ["export", str(folder), "--to", "colmap", "-o", str(tmp_path / "dense")]
-    result = CliRunner().invoke(cli, arguments)
-    assert result.exit_code == 0, result.output
-    assert result.stdout == f"wrote 3 frames in model units: {tmp_path / 'dense'}\n"
-    assert " 3 of 3 images have lens distortion" in result.stderr
-    result = CliRunner().invoke(cli, [*arguments, "--overwrite", "--json"])
-    record = json.loads(result.stdout)
+    assert run(arguments) == 0
+    out, err = capsys.readouterr()
+    assert out == f"wrote 3 frames in model units: {tmp_path / 'dense'}\n"
+    assert " 3 of 3 images have lens distortion" in err
+    assert run([*arguments, "--overwrite", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
     assert record == json.loads((tmp_path / "dense" / "export_colmap.json").read_text())
 
 

@@ -149,7 +149,8 @@ def test_a_heic_photo_is_read_upright_and_without_the_extra_says_what_to_do(
 def test_files_that_hold_no_image_are_named(tmp_path: Path) -> None:
     (tmp_path / "f").write_bytes(b"x")
     write_exr(tmp_path / "uv.exr", {"U": ONES, "V": ONES})
-    cv2.imwrite(str(tmp_path / "float.tif"), np.ones((3, 4, 3), np.float32))
+    plain = [cv2.IMWRITE_TIFF_COMPRESSION, 1]
+    cv2.imwrite(str(tmp_path / "float.tif"), np.ones((3, 4, 3), np.float32), plain)
     for name, message in (
         ("none.png", r"none\.png: no such file"),
         ("", "is a folder"),
@@ -198,7 +199,7 @@ def test_a_progressive_jpeg_cut_between_scans_and_an_altered_png_are_refused(
 def photo(path: Path, tags: dict[int, object]) -> Path:
     image = Image.new("RGB", (400, 300))
     exif = image.getexif()
-    exif.get_ifd(EXIF).update(tags)
+    exif[EXIF] = tags
     image.save(path, exif=exif)
     return path
 

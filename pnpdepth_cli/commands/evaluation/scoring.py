@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.integrate import trapezoid
 from scipy.stats import norm
 
 from pnpdepth_cli.commands.evaluation.frames import Depth, Fit, load_frame
@@ -198,7 +199,7 @@ def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> dict[str, Any] 
     pixels, within, by_sigma, by_error = zip(*frames, strict=True)
     observed = np.sum(within, axis=0) / sum(pixels)
     sparsification, oracle = np.mean(by_sigma, axis=0), np.mean(by_error, axis=0)
-    area = float(np.trapezoid(sparsification - oracle, REMOVED))
+    area = float(trapezoid(sparsification - oracle, REMOVED))
     return {
         "frames": len(frames),
         "pixels": sum(pixels),

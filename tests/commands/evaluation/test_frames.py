@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.frames import scaled
@@ -111,7 +112,7 @@ def test_sparsification_is_by_definition() -> None:
     total, none = summarise_uncertainty([worst]), summarise_uncertainty([best])
     assert total is not None
     assert none is not None
-    area = np.trapezoid(worst.sparsification - worst.oracle, np.arange(20) / 20)
+    area = trapezoid(worst.sparsification - worst.oracle, np.arange(20) / 20)
     assert (total["ause"], none["ause"]) == pytest.approx((area / error.mean(), 0))
 
 

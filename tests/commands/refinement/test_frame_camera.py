@@ -75,7 +75,7 @@ def test_kittis_camera_is_known_without_a_calibration_of_the_scanner(frame: Fram
 def test_exif_is_used_where_nothing_else_gives_the_camera(frame: FrameOnDisk) -> None:
     image = Image.open(frame.image)
     exif = image.getexif()
-    exif.get_ifd(0x8769)[0xA405] = 26
+    exif[0x8769] = {0xA405: 26}
     photo = frame.folder / "img.jpg"
     image.save(photo, exif=exif)
     record = run(replace(frame, image=photo), ply=True).record

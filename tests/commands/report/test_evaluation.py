@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.integrate import trapezoid
 
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
@@ -124,7 +125,7 @@ def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(
     by_sigma, by_error = map(dict, sparsification["lines"].values())
     assert by_sigma[0] == by_error[0] == 1
     assert 1 > by_sigma[0.5] > by_error[0.5] > 0
-    area = np.trapezoid([by_sigma[x] - by_error[x] for x in by_sigma], list(by_sigma))
+    area = trapezoid([by_sigma[x] - by_error[x] for x in by_sigma], list(by_sigma))
     assert area == pytest.approx(result.uncertainty["ause"])
 
 

@@ -20,6 +20,21 @@ from pnpdepth_cli.models.onnx.graph import OnnxGraph  # noqa: E402
 from pnpdepth_cli.models.onnx.table import OPERATORS  # noqa: E402
 
 F32, I64 = np.float32, np.int64
+RIGHT_SINCE = {
+    "test_reductions_of_old_and_new_opsets[ReduceLogSum]": (1, 24),
+    "test_reductions_of_old_and_new_opsets[ReduceSumSquare]": (1, 24),
+    "test_pools[{'strides': [2, 2], 'pads': [0, 0, 1, 1]}]": (1, 26),
+    "test_pools[{'strides': [2, 2], 'auto_pad': 'SAME_UPPER'}]": (1, 26),
+    "test_resize_to_sizes[nearest-size2-asymmetric]": (1, 29),
+}
+"""The versions from which onnxruntime computes these cases as the standard says."""
+
+
+@pytest.fixture(autouse=True)
+def _right_reference(request: pytest.FixtureRequest) -> None:
+    version = tuple(map(int, ort.__version__.split(".")[:2]))
+    if version < RIGHT_SINCE.get(request.node.name, version):
+        pytest.skip("this onnxruntime is no reference")
 
 
 def normal(*shape: int) -> np.ndarray:
