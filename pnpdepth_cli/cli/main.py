@@ -6,7 +6,10 @@ import errno
 import importlib
 import io
 import os
+import shlex
 import sys
+import tempfile
+from traceback import format_exception
 from typing import NoReturn
 
 import click
@@ -86,7 +89,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def run(arguments: list[str]) -> int:
-    """Returns the exit code. Every error but our own bugs becomes one line on stderr."""
+    """Returns the exit code. Every error becomes one line on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal without σ still shows the rest
     try:
@@ -100,13 +103,30 @@ def run(arguments: list[str]) -> int:
         return _end("interrupted", INTERRUPTED)
     except MemoryError:
         return _end(_NO_MEMORY, DeviceError.exit_code)
-    except (ImportError, RuntimeError) as error:
-        if not any(text in str(error) for text in _MEMORY_MESSAGES):
-            raise
-        return _end(_NO_MEMORY, DeviceError.exit_code)
     except OSError as error:
         full = error.errno in _OUTPUT_ERRORS
         return _end(_describe(error), (OutputError if full else InputError).exit_code)
+    except Exception as error:
+        exhausted = any(text in str(error) for text in _MEMORY_MESSAGES)
+        if exhausted and isinstance(error, ImportError | RuntimeError):
+            return _end(_NO_MEMORY, DeviceError.exit_code)
+        return _end(_bug(error, arguments), PnpDepthError.exit_code)
+
+
+def _bug(error: Exception, arguments: list[str]) -> str:
+    """Writes the traceback to a new file, for a bug report. Returns the message that names it."""
+    versions = f"pnpdepth {__version__}, Python {sys.version}, {sys.platform}"
+    text = f"{versions}\npnpdepth {shlex.join(arguments)}\n\n" + "".join(format_exception(error))
+    fact = f"internal error ({type(error).__name__}: {error})"
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="pnpdepth-", suffix=".txt", encoding="utf-8", errors="replace", delete=False
+        ) as file:
+            file.write(text)
+    except OSError:  # nowhere to write
+        sys.stderr.write(text)
+        return f"{fact}; it is a bug of this program, please report it"
+    return f"{fact}; it is a bug of this program, please report it with {file.name}"
 
 
 def _run_command(arguments: list[str]) -> int:

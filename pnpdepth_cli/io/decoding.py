@@ -12,6 +12,7 @@ import struct
 import sys
 import threading
 import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -20,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, one_line
 
 if TYPE_CHECKING:
@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 _BYTES_OF_TYPE = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 _POINTERS = (34665, 34853, 40965)  # to further tags: Exif, GPS and interoperability
 _EXIF_ORIENTATION = 0x0112
+IMAGE_ERRORS = (
+    *(OSError, SyntaxError, ValueError, EOFError, LookupError, ArithmeticError),
+    *(RuntimeError, struct.error, zlib.error),  # RuntimeError: libheif
+)
+"""What Pillow and its plugins raise on damaged files."""
 _END_OF_PNG = b"\xaeB`\x82"
 """The checksum of the last chunk, which Pillow does not read."""
 
@@ -94,9 +99,7 @@ def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image
                     file_bytes=len(data),
                 )  # fmt: skip
                 yield image
-    except FileFormatError:
-        raise
-    except Exception as error:  # Pillow's plugins raise many kinds on damaged files
+    except IMAGE_ERRORS as error:
         kinds = {"truncated": "is cut short", "checksum": "has a wrong checksum"}
         text = one_line(error) or type(error).__name__
         fact = next((f for word, f in kinds.items() if word in text.lower()), "cannot be decoded")
@@ -108,7 +111,7 @@ def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image
 def raw_mode(image: PIL.Image.Image) -> str:
     """Returns how a file that is not yet decoded stores its pixels, such as "RGB;16B"."""
     tiles = getattr(image, "tile", [])
-    arguments = tiles[0].args if tiles else ""
+    arguments = tiles[0][3] if tiles else ""  # no named tuple before Pillow 11
     return str(arguments[0] if isinstance(arguments, tuple) else arguments)
 
 
@@ -117,7 +120,7 @@ def orientation_of(image: PIL.Image.Image) -> int:
     try:
         check_exif(image)
         return int(image.getexif().get(_EXIF_ORIENTATION, 1))
-    except Exception:  # unreadable EXIF in a valid image says nothing of its rotation
+    except IMAGE_ERRORS:  # unreadable EXIF in a valid image says nothing of its rotation
         return 1
 
 

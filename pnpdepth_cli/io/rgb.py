@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.decoding import (
+    IMAGE_ERRORS,
     check_exif,
     decode_with_opencv,
     opened_image,
@@ -224,7 +225,7 @@ def _tags(path: Path) -> dict[int, float]:
         with silence(), Image.open(path) as image:
             check_exif(image)
             folder: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_FOLDER)
-    except Exception:  # Pillow raises many kinds; damaged EXIF gives no focal length
+    except IMAGE_ERRORS:  # damaged EXIF gives no focal length
         return {}
     numbers = {}
     for tag, value in folder.items():

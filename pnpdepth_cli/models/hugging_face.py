@@ -287,9 +287,7 @@ def _build(folder: Path) -> nn.Module:
             trust_remote_code=False,
             output_loading_info=True,
         )
-    except ModelError:
-        raise
-    except Exception as error:  # transformers raises what its parts raise
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError, ImportError) as error:
         raise ModelError(f"{folder}: transformers cannot load it: {describe(error)}") from None
     missing = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
     if missing:

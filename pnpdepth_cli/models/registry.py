@@ -126,6 +126,7 @@ def _from_file(spec: str) -> ModelDefinition | None:
 
 def _why_weights_are_no_network(file: Path) -> str:
     """What the file is, and the lines that make a network of it."""
+    from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS
     from pnpdepth_cli.models.weights.torch_file import TORCHSCRIPT, is_module, read_torch_file
 
     what, load = "is a file of weights", None
@@ -133,7 +134,7 @@ def _why_weights_are_no_network(file: Path) -> str:
         try:
             if is_module(read_torch_file(file)[0]):
                 what, load = "is a whole pickled module", "torch.load({!r}, weights_only=False)"
-        except Exception as error:  # another file of weights, or none
+        except CONTENT_ERRORS as error:  # another file of weights, or none
             if TORCHSCRIPT in str(error):
                 what, load = "is a TorchScript archive", "torch.jit.load({!r})"
     if load is None:

@@ -26,7 +26,7 @@ from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
 from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
-from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, view_of
+from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
 from pnpdepth_cli.models.weights.torch_file import refuse_inflated
 
 _ASSUMED_MULTIPLE = 32
@@ -74,7 +74,7 @@ class ExportedGraph(nn.Module):
         self.held: dict[str, str] = {}  # the attribute for a value of the graph
         self.inputs: list[str] = []
         for spec in module["signature"]["input_specs"]:
-            ((kind, value),) = spec.items()
+            ((kind, value),) = dict(spec).items()
             if kind == "user_input":
                 self.inputs.append(value["arg"]["as_tensor"]["name"])
             elif kind in ("parameter", "buffer", "tensor_constant"):
@@ -113,7 +113,7 @@ class ExportedGraph(nn.Module):
                 yield self._step(target, node["inputs"], outputs)
 
     def _step(self, target: str, inputs: list[Any], outputs: list[Any]) -> Step:
-        run = _function(target)
+        run, inputs = _function(target), [dict(one) for one in inputs]
         named = [one for output in outputs for one in _outputs_in(output)]
         alone = len(outputs) == 1 and "as_tensors" not in outputs[0]
         if any(kind in output for output in outputs for kind in ("as_tensor", "as_tensors")):
@@ -160,8 +160,8 @@ def exported_definition(file: Path) -> ModelDefinition:
         program, tensors = _read(file)
         graph = ExportedGraph(program, tensors)
         values = program["graph_module"]["graph"]["tensor_values"]
-        shapes = [[s.get("as_int") for s in values[name]["sizes"]] for name in graph.inputs]
-    except Exception as error:  # nothing but the file decides what is raised
+        shapes = [[dict(s).get("as_int") for s in values[name]["sizes"]] for name in graph.inputs]
+    except CONTENT_ERRORS as error:
         reason = str(error) if isinstance(error, BrokenFileError) else describe(error)
         raise ModelError(
             f"exported program {file} cannot be read: {reason[:160]}; it must be written by"
@@ -192,7 +192,7 @@ def _read(file: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
         tensors, storages = {}, {}
         for folder, kind in (("weights", "model_weights"), ("constants", "model_constants")):
             config = json.loads(archive.read(entries[f"data/{folder}/{kind}_config.json"]))
-            for name, stated in config["config"].items():
+            for name, stated in dict(config["config"]).items():
                 if stated["use_pickle"]:
                     raise BrokenFileError(f"{name[:80]!r} is pickled, and no pickle is run")
                 path = f"data/{folder}/{stated['path_name']}"
@@ -215,20 +215,22 @@ def _function(target: str) -> Callable[..., Any]:
     if found is not None and not _TOUCHES_FILES.search(found[2]):
         called: Any = torch.ops
         for part in found.groups():
-            called = getattr(called, part)
+            called = getattr(called, part, None)
         if isinstance(called, torch._ops.OpOverload):  # and no other attribute on the way
             return called
     found = _ARITHMETIC.fullmatch(target)
     if found is None:
         raise BrokenFileError(f"it calls {target[:80]!r}, which is no operator of torch")
     place: Any = {"_": operator, "m": math, "t": torch}[target[0]]
-    arithmetic: Callable[..., Any] = getattr(place, found[1] or found[2] or found[3])
+    arithmetic: Callable[..., Any] | None = getattr(place, found[1] or found[2] or found[3], None)
+    if arithmetic is None:
+        raise BrokenFileError(f"it calls {target[:80]!r}, which this version of torch lacks")
     return arithmetic
 
 
 def _argument(stated: Mapping[str, Any]) -> Any:
     """An argument of a call, with `Value` for what the graph computes."""
-    ((kind, value),) = stated.items()
+    ((kind, value),) = dict(stated).items()
     match kind.removeprefix("as_").replace("optional_", "").replace("sym_", ""):
         case "none":
             return None
@@ -257,7 +259,7 @@ def _argument(stated: Mapping[str, Any]) -> Any:
 
 def _outputs_in(stated: Mapping[str, Any]) -> list[str | None]:
     """The names that a stated output gives to values; None for a part without one."""
-    ((kind, value),) = stated.items()
+    ((kind, value),) = dict(stated).items()
     if kind == "as_tensors":
         return [one["name"] for one in value]
     if kind == "as_none":

@@ -283,7 +283,7 @@ def read_run(text: str) -> Run:
         read = (
             _evaluated(record) if record.get("command") == "eval" else _refined(record, path, stage)
         )
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         fact = one_line(repr(error))
         raise FileFormatError(
             f"{path} does not hold scores as pnpdepth writes them ({fact}); create it again"
@@ -342,9 +342,9 @@ def _refined(record: Mapping[str, Any], path: Path, stage: str) -> dict[str, Any
                 values.items(), groups_by_name(list(values)), strict=True
             )
         },
-        "varied": {str(name): str(value) for name, value in record.get("varied", {}).items()},
+        "varied": {str(name): str(value) for name, value in dict(record.get("varied", {})).items()},
     }
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    return {key: math.nan if value is None else float(value) for key, value in values.items()}
+    return {key: math.nan if value is None else float(value) for key, value in dict(values).items()}

@@ -145,12 +145,12 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
         )
     try:
         width, height = map(operator.index, record["size"])
-        sparse = record["inputs"]["sparse"]
+        sparse = dict(record["inputs"]["sparse"])
         numbers = float(record["points"]["farthest"]), float(sparse.get("unit_scale") or 1)
         name = sparse.get("image") or (PurePosixPath(result.name).parent / image.name).as_posix()
         if not all(1e-9 < number < 1e9 for number in numbers) or not _is_fit(name):
             raise ValueError
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FileFormatError(
             f"{result.depth}: the record beside it is damaged; refine it again"
         ) from error

@@ -13,6 +13,7 @@ import bz2
 import functools
 import importlib
 import sqlite3
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BytesIO
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from pnpdepth_cli.budget import budget
-from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
+from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes, size_of_regular_file
 from pnpdepth_cli.io.yaml_file import parse_yaml
 
@@ -139,13 +140,27 @@ def check_topics(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> None:
 def _as_our_errors(path: Path) -> Iterator[None]:
     try:
         yield
-    except (PnpDepthError, GeneratorExit):
-        raise
-    except Exception as error:  # rosbags raises many kinds on damaged files
+    except _errors_of_rosbags() as error:
         raise FileFormatError(
             f"{path} cannot be read as a bag ({type(error).__name__}: {one_line(error)}); if it is"
             " cut short, repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
         ) from error
+
+
+def _errors_of_rosbags() -> tuple[type[Exception], ...]:
+    """What rosbags and its parts raise on damaged files."""
+    from rosbags.highlevel import AnyReaderError
+    from rosbags.rosbag1 import ReaderError as Reader1Error
+    from rosbags.rosbag2 import ReaderError as Reader2Error
+    from rosbags.serde import SerdeError
+
+    mcap: Any = importlib.import_module("rosbags.rosbag2.storage_mcap")
+    database: Any = importlib.import_module("rosbags.rosbag2.storage_sqlite3")
+    own = (AnyReaderError, Reader1Error, Reader2Error, SerdeError)
+    libraries = (sqlite3.Error, database.apsw.Error, mcap.zstd.ZstdError, struct.error)
+    parts = (OSError, EOFError, RuntimeError)
+    content = (ValueError, LookupError, TypeError, AssertionError)  # rosbags asserts
+    return (*own, *libraries, *parts, *content)
 
 
 _CHUNK_BYTES = 1 << 28

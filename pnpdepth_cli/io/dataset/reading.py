@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, SizeError, UsageError
+from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Hdf5Array, Source
 from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
@@ -142,7 +142,5 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
                     f"{path}: {name} is stored outside the file; copy its values into this one"
                 )
             yield array
-    except PnpDepthError:
-        raise
-    except Exception as error:  # h5py raises many kinds for a damaged file
+    except (OSError, RuntimeError, ValueError, LookupError, TypeError) as error:  # as h5py has it
         raise FileFormatError(f"{path} cannot be read as HDF5 ({one_line(error)})") from error

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+import lzma
 import math
 import re
+import struct
 import threading
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -22,6 +26,17 @@ from pnpdepth_cli.io.formats.depth_format import DepthFormat, StoredArray
 
 _LONGEST_HEADER = 1 << 14
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_HEADER_ERRORS = (
+    *(ValueError, TypeError, LookupError, SyntaxError, ArithmeticError, EOFError, struct.error),
+    *(tokenize.TokenError, RecursionError, MemoryError),
+)
+"""What NumPy raises as it evaluates a damaged header, or one of another version of the format."""
+_ARCHIVE_ERRORS = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, OSError, EOFError),
+    *(ValueError, LookupError, OverflowError),
+    RuntimeError,  # encrypted, or of another version
+)
+"""What zipfile raises on damaged archives."""
 _LOCK = threading.Lock()
 """NumPy evaluates a header as Python, and threads of CPython 3.11 that do so at once may fail."""
 
@@ -49,7 +64,7 @@ def _npy_header(
             shape, is_fortran, dtype = _HEADERS[npy.read_magic(stream)](stream)
         if min(shape, default=0) < 0 or any(isinstance(side, bool) for side in shape):
             raise ValueError(f"a shape of {shape}")
-    except Exception as error:  # what evaluates a damaged header decides
+    except _HEADER_ERRORS as error:
         raise damaged(path, kind, f"cannot be read ({type(error).__name__}: {error})") from error
     if dtype.hasobject:
         raise FileFormatError(
@@ -100,9 +115,7 @@ def parse_npz(path: Path, data: bytes, key: str | None) -> tuple[str, NDArray[An
                 )
             with archive.open(members[name]) as member:
                 return name, _array(path, name, member, len(data))
-    except (FileFormatError, UsageError):
-        raise
-    except Exception as error:  # zipfile and zlib each have their own
+    except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.decoding import (
+    IMAGE_ERRORS,
     check_tags,
     decode_with_opencv,
     opened_image,
@@ -116,9 +117,7 @@ def read_tiff_facts(path: Path, data: bytes) -> TiffFacts:
             path, int(width), int(height), channels=int(samples),
             value_bytes=max(1, int(bits) // 8), file_bytes=len(data),
         )  # fmt: skip
-    except FileFormatError:
-        raise
-    except Exception as error:  # Pillow raises many kinds on damaged tags
+    except (*IMAGE_ERRORS, TypeError) as error:  # TypeError: a tag has several values
         raise damaged(path, "TIFF", f"is cut short or corrupt ({error})") from error
     return TiffFacts(int(bits), _NUMBERS.get(number, "uint"), int(samples), description)
 
@@ -188,9 +187,7 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
             with OpenEXR.File(str(path), separate_channels=True) as file:
                 parts = [_part_channels(part) for part in file.parts]
                 names = [str(part.name()) for part in file.parts]
-    except FileFormatError:
-        raise
-    except Exception as error:  # the binding raises many kinds, UnicodeDecodeError among them
+    except (RuntimeError, ValueError, LookupError, OSError) as error:  # as the binding has it
         raise damaged(path, "EXR", f"cannot be read ({error})") from error
     if len(parts) != count:  # the binding leaves out a part that it cannot decode
         raise damaged(path, "EXR", "cannot be decoded")

@@ -137,6 +137,7 @@ def _read(file: Path) -> Any:
     try:
         import onnx
         import onnxruntime  # noqa: F401
+        from google.protobuf.message import DecodeError
     except ImportError as error:
         raise ModelError(
             f"{file} is an ONNX file, which needs the package {error.name!r}:"
@@ -145,7 +146,7 @@ def _read(file: Path) -> Any:
     try:
         model = onnx.load(str(file), load_external_data=False)
         load_external(model, file.parent)
-    except Exception as error:  # protobuf's own errors, missing external data, …
+    except (DecodeError, onnx.checker.ValidationError, ValueError, TypeError, OSError) as error:
         raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
     if not model.graph.node:
         raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")

@@ -89,7 +89,7 @@ def session_of(source: str | bytes, file: Path, most_bytes: int | None = None) -
         return ort.InferenceSession(
             source, options, providers=["CPUExecutionProvider"], disabled_optimizers=disabled
         )
-    except Exception as error:  # onnxruntime has a type for each of its status codes
+    except _errors_of_onnxruntime() as error:
         raise _does_not_run(file, error) from None
 
 
@@ -102,8 +102,17 @@ def outputs_of(session: Any, inputs: Mapping[str, Tensor], file: Path) -> Tensor
     }
     try:
         return torch.from_numpy(session.run(None, feed)[0]).float()
-    except Exception as error:
+    except _errors_of_onnxruntime() as error:
         raise _does_not_run(file, error) from None
+
+
+def _errors_of_onnxruntime() -> tuple[type[Exception], ...]:
+    """It has a type for each of its status codes, and none for all of them."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as binding
+
+    types = (value for value in vars(binding).values() if isinstance(value, type))
+    own = (kind for kind in types if issubclass(kind, Exception))
+    return (*own, RuntimeError, ValueError)
 
 
 def _does_not_run(file: Path, error: Exception) -> ModelError:

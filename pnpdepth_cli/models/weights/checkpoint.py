@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -21,7 +22,7 @@ from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
-from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError, StandIn
+from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, StandIn
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
 from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_torch_file
 
@@ -205,7 +206,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     kind, read = _READERS.get(path.suffix, ("torch file", read_torch_file))
     try:
         content = read(path)
-    except Exception as error:  # nothing but the file decides what its readers raise
+    except (*CONTENT_ERRORS, SafetensorError) as error:
         fact = "" if isinstance(error, BrokenFileError) else f"{type(error).__name__}: "
         reason = " ".join(f"{fact}{error}"[:1000].split())[:160]  # parts may come out of the file
         raise CheckpointError(f"checkpoint {path} cannot be read as a {kind} ({reason})") from None

@@ -13,6 +13,9 @@ from __future__ import annotations
 
 import math
 import pickletools
+import struct
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
@@ -43,6 +46,13 @@ _LITERALS = frozenset(
 
 class BrokenFileError(Exception):
     """A file is not what it should be; the message says how."""
+
+
+CONTENT_ERRORS = (
+    *(BrokenFileError, OSError, EOFError, zipfile.BadZipFile, zlib.error, struct.error),
+    *(ValueError, TypeError, LookupError, ArithmeticError, RuntimeError, MemoryError),
+)
+"""What the readers of weights and programs raise on content that is not what it should be."""
 
 
 @dataclass(frozen=True)

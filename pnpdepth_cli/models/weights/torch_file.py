@@ -21,6 +21,7 @@ from torch import Tensor
 from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.weights.pickle_reader import (
+    CONTENT_ERRORS,
     MAX_NAME,
     BrokenFileError,
     Name,
@@ -118,7 +119,7 @@ def _read_row_of_pickles(file: mmap) -> tuple[Any, list[str]]:
     """
     try:
         begins, _ = read_pickle(file)
-    except Exception:  # of another kind of file
+    except CONTENT_ERRORS:  # of another kind of file
         begins = None
     if begins != _MAGIC:
         raise BrokenFileError("it begins as no torch file does")
