@@ -119,6 +119,8 @@ def _unpickled(value: Any, name: str, most: int) -> Tensor:
 
 def _tensor(array: NDArray[Any], name: str) -> Tensor:
     """The tensor of an array of numbers, copied to native byte order."""
+    if not isinstance(array, np.ndarray):
+        raise BrokenFileError(f"{name} is no array")
     if array.dtype.kind not in "fiub":
         raise BrokenFileError(f"{name} is an array of {array.dtype.str}, not of numbers")
     return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C"))

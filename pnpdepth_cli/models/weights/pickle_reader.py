@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import pickletools
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -51,6 +52,7 @@ class BrokenFileError(Exception):
 CONTENT_ERRORS = (
     *(BrokenFileError, OSError, EOFError, zipfile.BadZipFile, zlib.error, struct.error),
     *(ValueError, TypeError, LookupError, ArithmeticError, RuntimeError, MemoryError),
+    *(SyntaxError, tokenize.TokenError),  # NumPy evaluates its headers
 )
 """What the readers of weights and programs raise on content that is not what it should be."""
 

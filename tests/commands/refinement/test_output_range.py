@@ -38,7 +38,7 @@ def refined_to(*depths: float, inputs: Inputs) -> Refined:
         after=depth,
         used=inputs.points,
         held_out=no_points(inputs.points),
-        refinement=Refinement(before=dense, after=dense, losses=(0.0,), step=0.0, kept=0),
+        refinement=Refinement(before=dense, after=dense, losses=(0.0,), step=0.0),
         diverged=None,
     )
 

@@ -1,0 +1,130 @@
+"""Commands on the samples: exit code, names of the files, and a figure or two.
+
+The errors are of the project's own weights, so they move only with the method; the tolerance is far
+above what another processor changes.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pnpdepth_cli.cli.main import run
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+INDOOR = f"refine {SAMPLES}/indoor/rgb.png --sparse {SAMPLES}/indoor/sparse.png"
+FILES = {"rgb.json", "rgb_depth.png", "rgb_improvement.png", "rgb_preview.png"}
+SIGMA = {"rgb_sigma.png", "rgb_sigma_preview.png", "rgb_valid.png"}
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def output(capsys: pytest.CaptureFixture[str], line: str, code: int = 0) -> str:
+    """What the command prints on stdout; it ends with this code."""
+    assert run(line.split()) == code
+    return capsys.readouterr().out
+
+
+def result(capsys: pytest.CaptureFixture[str], line: str) -> Any:
+    return json.loads(output(capsys, f"{line} --json"))
+
+
+@pytest.mark.parametrize(
+    ("options", "before", "after", "more"),
+    [
+        ("", 0.075, 0.070, set()),
+        ("--model sparse2dense-tiny", 0.451, 0.070, set()),
+        ("--model fcrn-tiny --uncertainty", 1.041, 0.070, SIGMA),
+        ("--model fcrn-tiny --holdout 0.2", 1.039, 0.075, set()),
+        ("--model fcrn-tiny --propagate none", 1.386, 0.592, set()),
+        ("--model fcrn-tiny --preset paper", 1.386, 1.317, set()),
+        ("--model fcrn-tiny --preset paper --loss l2", 1.386, 1.318, set()),
+        ("--model fcrn-tiny --preset paper --iterations 10", 1.386, 1.256, set()),
+        ("--model fcrn-tiny --preset paper --ply --fov 60", 1.386, 1.317, {"rgb.ply"}),
+        ("--model sparse2dense-tiny --preset paper --update sgd --lr 0.1", 0.451, 0.450, set()),
+    ],
+)
+def test_refine_writes_its_files_and_lowers_the_error(
+    options: str, before: float, after: float, more: set[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = result(capsys, f"{INDOOR} --gt {SAMPLES}/indoor/gt.png -o out {options}")
+    assert {path.name for path in Path("out").iterdir()} == FILES | more
+    mae = [record["scores"][stage]["mae"] for stage in ("before", "after")]
+    assert mae == pytest.approx([before, after], rel=0.02)
+
+
+def test_refine_takes_a_scan_with_its_calibration(capsys: pytest.CaptureFixture[str]) -> None:
+    street = SAMPLES / "street"
+    record = result(
+        capsys,
+        f"refine {street}/rgb.png --sparse {street}/000000.bin --calib {street}/calib.txt"
+        f" --gt {street}/gt.png -o out --model fcrn-tiny --preset paper",
+    )
+    assert record["points"]["used"] == pytest.approx(16007, abs=5)
+    assert {path.name for path in Path("out").iterdir()} == FILES
+
+
+def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    line = f"batch {SAMPLES}/frames.csv -o out --model fcrn-tiny --preset paper"
+    assert "indoor" in output(capsys, f"{line} --dry-run")
+    output(capsys, line)
+    frames = json.loads(Path("out/summary.json").read_text())["frames"]
+    mae = {frame["name"]: frame["scores"]["after"]["mae"] for frame in frames}
+    assert mae == pytest.approx({"indoor": 1.317, "street": 11.92}, rel=0.02)
+    names = {path.name for path in Path("out").iterdir() if not path.name.startswith(".")}
+    ends = (".json", "_depth.png", "_improvement.png", "_preview.png")
+    expected = {name + end for name in ("indoor", "street") for end in ends}
+    assert names == expected | {"summary.csv", "summary.json"}
+    before = Path("out/indoor_depth.png").stat().st_mtime_ns
+    output(capsys, line)
+    assert Path("out/indoor_depth.png").stat().st_mtime_ns == before
+
+    scored = result(capsys, f"eval out/indoor_depth.png {SAMPLES}/indoor/gt.png")
+    assert scored["frames"][0]["values"]["mae"] == pytest.approx(mae["indoor"], rel=1e-3)
+
+    table = output(capsys, "compare out/summary.json out/summary.json --csv table.csv")
+    assert "MAE" in table
+    rows = [row.split(",") for row in Path("table.csv").read_text().splitlines()]
+    assert [row[3] for row in rows if "MAE" in row[0]][1] == "+0.00"
+
+    cloud = result(capsys, "cloud out/indoor_depth.png --fov 60 -o cloud.ply")
+    assert (cloud["points"], cloud["coloured"]) == (307200, True)
+    assert Path("cloud.ply").is_file()
+    assert output(capsys, "export out --to colmap -o model", 3) == ""
+
+
+@pytest.mark.parametrize(
+    ("line", "count"),
+    [
+        (
+            f"project {SAMPLES}/street/000000.bin --calib {SAMPLES}/street/calib.txt"
+            f" --image {SAMPLES}/street/rgb.png --overlay overlay.png",
+            16007,
+        ),
+        (f"sample {SAMPLES}/indoor/gt.png --count 100", 100),
+        (
+            f"simulate {SAMPLES}/indoor/gt.png --sensor vlp-16 --calib {SAMPLES}/street/calib.txt",
+            3052,
+        ),
+    ],
+    ids=["project", "sample", "simulate"],
+)
+def test_sparse_depth_is_made_and_its_points_are_counted(
+    line: str, count: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = result(capsys, f"{line} -o sparse.png")
+    assert record["points"]["count"] == pytest.approx(count, rel=1e-3)
+    assert {"sparse.png", "sparse.json"} <= {path.name for path in Path().iterdir()}
+
+
+def test_the_layers_of_a_network_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = {row["name"]: row for row in result(capsys, "layers --model fcrn-tiny")}
+    assert rows["layer1_BN"]["shape"] == [1, 144, 4, 5]
