@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,8 @@ from pnpdepth_cli.io.formats import (
     LARGEST_CODE,
     SATURATED_CODE,
     SCALE_KEY,
-    StoredArray,
+    DepthFile,
+    Reading,
     check_scale,
     eight_bits,
     format_of_content,
@@ -40,39 +40,7 @@ _SCALE_QUOTIENTS = (1000.0, 256.0, 100.0, 10.0, 1000.0 / 256.0, 5.0, 5000.0 / 25
 _QUOTIENT_TOLERANCE = math.log(1.1)
 
 
-class DepthKind(NamedTuple):
-    """What kind of depth file was read."""
-
-    source: str  # in words, such as `16-bit PNG ÷ 256`
-    scale: float | None  # codes per metre; None for floats
-    assumed: bool  # true if neither the file nor the user nor the data set states the scale
-
-    def __str__(self) -> str:
-        return self.source + ", assumed" * self.assumed
-
-
-@dataclass(frozen=True, kw_only=True)
-class DepthImage:
-    """A depth image as read from a file."""
-
-    values: NDArray[np.float32]  # (H, W) metres, 0 where unknown
-    source: str  # what was read, for a person
-    assumed_scale: bool  # true if neither the file nor the user gave the scale
-    scale: float | None = None
-    """Codes per metre that integers were divided by; None for a float file."""
-
-    @property
-    def kind(self) -> DepthKind:
-        """What was read."""
-        return DepthKind(self.source, self.scale, self.assumed_scale)
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """(H, W), true where depth is known."""
-        return self.values > 0
-
-
-def read_depth(path: Path, *, scale: float | None = None, channel: str | None = None) -> DepthImage:
+def read_depth(path: Path, *, scale: float | None = None, channel: str | None = None) -> DepthFile:
     """Returns the depth image in a file of any of `choices.FORMATS`.
 
     Zero, NaN, infinite and negative values are unknown, and so is the largest 16-bit code. The
@@ -87,7 +55,7 @@ def read_depth(path: Path, *, scale: float | None = None, channel: str | None = 
     return depth_from_stored(path, load_stored(path, channel), scale)
 
 
-def load_stored(path: Path, channel: str | None) -> StoredArray:
+def load_stored(path: Path, channel: str | None) -> DepthFile:
     """Returns the one array of numbers in the file that can be depth, of whatever shape.
 
     The EXR channel or NPZ array is `channel`; None if there is one candidate.
@@ -108,8 +76,8 @@ def load_stored(path: Path, channel: str | None) -> StoredArray:
     )
 
 
-def depth_from_stored(path: Path, stored: StoredArray, scale: float | None) -> DepthImage:
-    """Returns the stored numbers as a depth image: one channel, metres, 0 where unknown.
+def depth_from_stored(path: Path, stored: DepthFile, scale: float | None) -> DepthFile:
+    """Returns the stored numbers as one channel of float32 metres, 0 where unknown.
 
     Without a scale, integers have the file's own, or KITTI's.
 
@@ -119,13 +87,11 @@ def depth_from_stored(path: Path, stored: StoredArray, scale: float | None) -> D
     values = _as_image(path, stored.values)
     check_pixel_count(path, values.shape[1], values.shape[0])
     if values.dtype.kind == "f":
-        return DepthImage(
-            values=known_metres(values), source=stored.description, assumed_scale=False
-        )
-    divisor = scale or stored.scale or KITTI_SCALE
-    assumed = scale is None and stored.scale is None
-    source = f"{stored.description} ÷ {divisor:.12g}"
-    if scale is None and stored.scale is not None:
+        return DepthFile(values=known_metres(values), reading=Reading(stored.reading.source))
+    own = stored.reading.scale
+    divisor = scale or own or KITTI_SCALE
+    source = f"{stored.reading.source} ÷ {divisor:.12g}"
+    if scale is None and own is not None:
         source += " (from the file)"
     saturated = (values == SATURATED_CODE) & (values.dtype == np.uint16)
     if saturated.any():
@@ -133,9 +99,8 @@ def depth_from_stored(path: Path, stored: StoredArray, scale: float | None) -> D
         source += f", {count:,} pixels of value {SATURATED_CODE} taken as unknown"
         values = np.where(saturated, 0, values)
     metres = values.astype(np.float64) / divisor
-    return DepthImage(
-        values=known_metres(metres), source=source, assumed_scale=assumed, scale=divisor
-    )
+    reading = Reading(source, divisor, assumed=scale is None and own is None)
+    return DepthFile(values=known_metres(metres), reading=reading)
 
 
 def known_metres(values: NDArray[Any]) -> NDArray[np.float32]:
@@ -212,9 +177,8 @@ def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.
 
 def describe_range(
     depth: NDArray[Any],
-    source: str,
+    reading: Reading,
     *,
-    assumed_scale: bool = False,
     noun: str = "points",
     option: str = "--depth-scale",
     unit: str = "m",
@@ -225,10 +189,11 @@ def describe_range(
     only, their range if they are millimetres. Unknown depth is 0 or not finite.
     """
     known = _known(depth)
-    hint = f"; {option} to change" if assumed_scale else ""
+    source, _, assumed = reading
+    hint = f"; {option} to change" if assumed else ""
     if known.size == 0:
         return f"no {noun} with known depth ({source}{hint})"
-    by_kitti = assumed_scale and source.endswith(f"÷ {KITTI_SCALE:g}")
+    by_kitti = assumed and source.endswith(f"÷ {KITTI_SCALE:g}")
     if by_kitti and float(known.max()) < _FARTHEST_INDOORS_M:
         low, high = (metres(float(end) * KITTI_SCALE / 1000) for end in (known.min(), known.max()))
         hint = f" assumed; if it holds millimetres, {option} 1000 makes it {low}–{high} m"
@@ -263,7 +228,7 @@ def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
     )
 
 
-def scale_warning(what: str, ratio: float, kinds: Mapping[str, DepthKind | None]) -> str | None:
+def scale_warning(what: str, ratio: float, kinds: Mapping[str, Reading | None]) -> str | None:
     """Returns a warning if depths are a multiple of the ground truth that a wrong scale explains.
 
     Args:

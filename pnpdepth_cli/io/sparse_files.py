@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,13 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, NoPointsError, SizeError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.depth import (
-    DepthKind,
     depth_from_stored,
     known_metres,
     load_stored,
     write_depth,
 )
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, KITTI_SCALE, check_scale, kind_of
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, KITTI_SCALE, Reading, check_scale, kind_of
 from pnpdepth_cli.points import SparsePoints
 
 SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
@@ -31,24 +29,10 @@ SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
 _PROVENANCE_KEY = "pnpdepth:made"
 """Key of the text in a PNG or CSV that says how its sparse depth was made."""
 
+Points = SparsePoints[NDArray[np.float32]]
+
 _TEXT_SUFFIXES = (".csv", ".txt")
 _SEPARATOR = re.compile(r"[\s,;]+")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SparseFile:
-    """The points of a file, and how it was read."""
-
-    points: SparsePoints[NDArray[np.float32]]
-    source: str  # what the file is, for messages
-    assumed_scale: bool
-    """Whether the scale of an integer file was assumed, because neither user nor file states it."""
-    scale: float | None = None  # codes per metre of an integer file
-
-    @property
-    def kind(self) -> DepthKind:
-        """What was read."""
-        return DepthKind(self.source, self.scale, self.assumed_scale)
 
 
 def read_sparse(
@@ -57,8 +41,8 @@ def read_sparse(
     size: tuple[int, int] | None = None,
     scale: float | None = None,
     channel: str | None = None,
-) -> SparseFile:
-    """Returns the points with known depth of a depth image or a point list.
+) -> tuple[Points, Reading]:
+    """Returns the points with known depth of a depth image or a point list, and how it was read.
 
     Points of an image are in row-major order. A list is a float array of shape (N, 3) in NPY or
     NPZ, or text with one `x y depth` per line (.csv, .txt), in metres; its order is kept.
@@ -83,24 +67,20 @@ def read_sparse(
             raise FileFormatError(
                 f"{path}: a point list of {stored.values.dtype}; save x, y, depth as float metres"
             )
-        return _from_rows(path, stored.values, f"point list, {stored.description}", size)
+        return _from_rows(path, stored.values, f"point list, {stored.reading.source}", size)
     image = depth_from_stored(path, stored, scale)
     rows, columns = np.nonzero(image.valid)
     if rows.size == 0:
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
     height, width = image.values.shape
     xy = np.stack([columns, rows], axis=1).astype(np.float32)
-    return SparseFile(
-        points=SparsePoints(xy=xy, depth=image.values[rows, columns], size=(height, width)),
-        source=image.source,
-        assumed_scale=image.assumed_scale,
-        scale=image.scale,
-    )
+    points = SparsePoints(xy=xy, depth=image.values[rows, columns], size=(height, width))
+    return points, image.reading
 
 
 def _from_rows(
     path: Path, rows: NDArray[np.floating], source: str, size: tuple[int, int] | None
-) -> SparseFile:
+) -> tuple[Points, Reading]:
     depth = known_metres(rows[:, 2])
     known = depth > 0
     if not known.any():
@@ -113,8 +93,7 @@ def _from_rows(
         )
     if size is None:
         raise SizeError(f"{path} is a list of points, which needs an image to say the frame's size")
-    points = SparsePoints(xy=xy, depth=depth[known], size=size)
-    return SparseFile(points=points, source=source, assumed_scale=False)
+    return SparsePoints(xy=xy, depth=depth[known], size=size), Reading(source)
 
 
 def _parse_text(path: Path, data: bytes) -> NDArray[np.float64]:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.depth import DepthKind, describe_range, implausible, scale_warning
+from pnpdepth_cli.io.depth import describe_range, implausible, scale_warning
+from pnpdepth_cli.io.formats import Reading
 
 PNG = "16-bit PNG ÷ 256"
 OTHER = "if it holds millimetres, --depth-scale 1000 makes it 0.8–3.4 m"
@@ -30,7 +31,7 @@ OTHER = "if it holds millimetres, --depth-scale 1000 makes it 0.8–3.4 m"
 def test_the_range_has_count_ends_and_what_was_assumed(
     depth: list[float], source: str, assumed: bool, line: str
 ) -> None:
-    assert describe_range(np.array(depth), source, assumed_scale=assumed) == line
+    assert describe_range(np.array(depth), Reading(source, assumed=assumed)) == line
 
 
 @pytest.mark.parametrize("median", [0, 0.02, 0.5, 80, 1000])
@@ -68,9 +69,9 @@ def test_a_float_file_in_millimetres_is_an_error_that_names_metres() -> None:
     assert warning.endswith(": a float file must hold metres")
 
 
-FLOAT = DepthKind("PFM", None, False)
-BY_256, BY_1000 = (DepthKind("PNG", scale, False) for scale in (256.0, 1000.0))
-OWN_256 = DepthKind("PNG ÷ 256 (from the file)", 256.0, False)
+FLOAT = Reading("PFM", None, False)
+BY_256, BY_1000 = (Reading("PNG", scale, False) for scale in (256.0, 1000.0))
+OWN_256 = Reading("PNG ÷ 256 (from the file)", 256.0, False)
 
 
 @pytest.mark.parametrize("ratio", [np.nan, 0, 1, 2, 3.906 * 1.11, 3.906 / 1.11])
@@ -90,7 +91,7 @@ def test_a_ratio_that_no_wrong_scale_gives_needs_no_word(ratio: float) -> None:
     ],
 )
 def test_a_ratio_that_a_wrong_scale_explains_names_the_scale_that_removes_it(
-    ratio: str, depth: DepthKind, truth: DepthKind | None, about: str, advice: str
+    ratio: str, depth: Reading, truth: Reading | None, about: str, advice: str
 ) -> None:
     got = scale_warning("depths", float(ratio), {"--scale": depth, "--gt-scale": truth})
     assert got == (

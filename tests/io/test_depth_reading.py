@@ -68,9 +68,9 @@ def test_a_given_scale_beats_that_in_the_file_which_beats_kittis(
     depth = read_depth(save(tmp_path / name, CODES, text), scale=scale)
     assert np.array_equal(depth.values, (CODES / used).astype(np.float32))
     assert depth.values.dtype == np.float32
-    assert depth.source == f"16-bit {'PNG' if name == 'd.png' else 'TIFF'} {end}"
-    assert depth.assumed_scale == (text is None and scale is None)
-    assert depth.scale == used
+    assert depth.reading.source == f"16-bit {'PNG' if name == 'd.png' else 'TIFF'} {end}"
+    assert depth.reading.assumed == (text is None and scale is None)
+    assert depth.reading.scale == used
     assert np.array_equal(depth.valid, CODES > 0)
 
 
@@ -132,11 +132,11 @@ def test_every_format_gives_metres_where_they_are_finite_and_above_zero(
     path = save(tmp_path / name, values)
     depth = read_depth(path)
     assert depth.values.tolist() == np.asarray(expected, np.float32).tolist()
-    assert depth.source == source
-    assert depth.assumed_scale == ("÷" in source)
+    assert depth.reading.source == source
+    assert depth.reading.assumed == ("÷" in source)
     if "÷" not in source:  # floats are metres, whatever the scale
         assert np.array_equal(read_depth(path, scale=1000).values, depth.values)
-        assert depth.scale is None
+        assert depth.reading.scale is None
 
 
 def broken_pfm(header: bytes, count: int) -> tuple[str, Any, str]:
@@ -265,7 +265,7 @@ def test_the_parts_of_an_exr_are_read(tmp_path: Path) -> None:
     ]
     with OpenEXR.File(parts) as file:
         file.write(str(tmp_path / "d.exr"))
-    assert read_depth(tmp_path / "d.exr").source == "EXR channel right.Z"
+    assert read_depth(tmp_path / "d.exr").reading.source == "EXR channel right.Z"
     assert np.array_equal(read_depth(tmp_path / "d.exr", channel="left.Y").values, KNOWN * 2)
 
 
@@ -282,7 +282,7 @@ def test_a_transparent_colour_in_a_16_bit_png_changes_no_depth(
     path.write_bytes(content[:start] + chunk + content[start:])
     depth = read_depth(path, scale=100)
     assert np.array_equal(depth.values, (CODES / 100).astype(np.float32))
-    assert ("of three equal channels" in depth.source) == (channels == 3)
+    assert ("of three equal channels" in depth.reading.source) == (channels == 3)
 
 
 @pytest.mark.parametrize("channel", [0, 1, 2])

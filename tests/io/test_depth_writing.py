@@ -35,7 +35,7 @@ def test_float_formats_give_back_every_known_depth_exactly(
     again = read_depth(path)
     assert again.values.dtype == np.float32
     assert np.array_equal(again.values, known)
-    assert not again.assumed_scale
+    assert not again.reading.assumed
 
 
 @settings(max_examples=60, deadline=None)
@@ -52,8 +52,8 @@ def test_png_gives_back_every_code_and_its_scale(
     assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), codes)
     again = read_depth(path)
     assert np.array_equal(again.values, depth)
-    assert (again.scale, again.assumed_scale) == (scale, False)
-    assert again.source.endswith("(from the file)")
+    assert (again.reading.scale, again.reading.assumed) == (scale, False)
+    assert again.reading.source.endswith("(from the file)")
 
 
 @pytest.mark.parametrize("suffix", DEPTH_SUFFIXES)

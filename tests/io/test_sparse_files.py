@@ -19,7 +19,7 @@ IMAGE = np.array([[0, 2, 0, 0], [3, 0, 0, 4]], dtype=np.float32)
 
 
 def rows_of(path: Path) -> list[list[float]]:
-    points = read_sparse(path, size=SIZE).points
+    points = read_sparse(path, size=SIZE)[0]
     assert points.size == SIZE
     return np.column_stack([points.xy, points.depth]).tolist()
 
@@ -27,14 +27,14 @@ def rows_of(path: Path) -> list[list[float]]:
 def test_an_image_gives_its_known_pixels_row_by_row(tmp_path: Path) -> None:
     write_depth(tmp_path / "s.png", IMAGE)
     write_depth(tmp_path / "s.exr", IMAGE)
-    sparse = read_sparse(tmp_path / "s.png")
-    assert sparse.points.depth.tolist() == read_sparse(tmp_path / "s.exr").points.depth.tolist()
-    assert sparse.points.xy.tolist() == [[1, 0], [0, 1], [3, 1]]
-    assert sparse.points.depth.tolist() == [2, 3, 4]
-    assert (sparse.points.xy.dtype, sparse.points.depth.dtype) == (np.float32, np.float32)
-    assert sparse.points.size == (2, 4)
-    assert sparse.source == "16-bit PNG ÷ 256 (from the file)"
-    assert not sparse.assumed_scale
+    sparse, reading = read_sparse(tmp_path / "s.png")
+    assert sparse.depth.tolist() == read_sparse(tmp_path / "s.exr")[0].depth.tolist()
+    assert sparse.xy.tolist() == [[1, 0], [0, 1], [3, 1]]
+    assert sparse.depth.tolist() == [2, 3, 4]
+    assert (sparse.xy.dtype, sparse.depth.dtype) == (np.float32, np.float32)
+    assert sparse.size == (2, 4)
+    assert reading.source == "16-bit PNG ÷ 256 (from the file)"
+    assert not reading.assumed
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -44,7 +44,7 @@ def test_an_array_of_rows_is_a_list_of_points(tmp_path: Path, dtype: type) -> No
     np.savez(tmp_path / "s.npz", rows)
     for name in ("s.npy", "s.npz"):
         assert rows_of(tmp_path / name) == ROWS
-        assert read_sparse(tmp_path / name, size=SIZE).source.startswith("point list")
+        assert read_sparse(tmp_path / name, size=SIZE)[1].source.startswith("point list")
 
 
 @pytest.mark.parametrize(
@@ -117,13 +117,13 @@ def test_what_is_no_sparse_depth_is_refused_by_its_place(
 def test_an_image_is_one_whatever_its_suffix_or_width(tmp_path: Path) -> None:
     write_depth(tmp_path / "s.npy", np.ones((4, 5), np.float32))
     (tmp_path / "s.npy").rename(tmp_path / "s.txt")
-    assert read_sparse(tmp_path / "s.txt").points.size == (4, 5)
+    assert read_sparse(tmp_path / "s.txt")[0].size == (4, 5)
     write_depth(tmp_path / "s.pfm", np.ones((4, 3), np.float32))
-    assert read_sparse(tmp_path / "s.pfm").points.size == (4, 3)
+    assert read_sparse(tmp_path / "s.pfm")[0].size == (4, 3)
 
 
 def test_scale_and_channel_reach_images(tmp_path: Path) -> None:
     np.savez(tmp_path / "s.npz", a=np.full((2, 2), 500, np.uint16), b=np.ones((2, 2), np.uint16))
-    sparse = read_sparse(tmp_path / "s.npz", scale=1000, channel="a")
-    assert sparse.points.depth.tolist() == [0.5] * 4
-    assert sparse.scale == 1000
+    sparse, reading = read_sparse(tmp_path / "s.npz", scale=1000, channel="a")
+    assert sparse.depth.tolist() == [0.5] * 4
+    assert reading.scale == 1000

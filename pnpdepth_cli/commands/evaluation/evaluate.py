@@ -31,8 +31,9 @@ from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.errors import InputError, PnpDepthError
-from pnpdepth_cli.io.depth import DepthKind, scale_warning
+from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.record import plain
 
 _LEAK_WARNING_FRACTION = 0.01
@@ -242,7 +243,7 @@ def evaluate(
     )
 
 
-def kinds_of(rows: Sequence[FrameScores]) -> dict[str, list[tuple[DepthKind, int]]]:
+def kinds_of(rows: Sequence[FrameScores]) -> dict[str, list[tuple[Reading, int]]]:
     """Returns the kinds of files of "prediction", "gt" and "sparse" with counts, frequent first."""
     return {
         side: Counter(row.kinds[side] for row in rows if side in row.kinds).most_common()

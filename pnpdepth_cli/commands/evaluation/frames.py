@@ -20,12 +20,11 @@ from pnpdepth_cli.errors import InputError, SizeError
 from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image, read_mask
 from pnpdepth_cli.io.depth import (
-    DepthImage,
-    DepthKind,
     depth_from_stored,
     known_metres,
     load_stored,
 )
+from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors.sparse import as_depth_image
@@ -51,7 +50,7 @@ class LoadedFrame:
     """(H, W) metres, 0 where unknown."""
     gt: Depth
     """(H, W) metres, 0 where unknown or not scored."""
-    kinds: dict[str, DepthKind]
+    kinds: dict[str, Reading]
     """Of the files by "prediction", "gt" and "sparse"."""
     sparse: Depth | None = None
     """(H, W) metres of the network's sparse input, 0 elsewhere; None if it is not known."""
@@ -83,13 +82,13 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
     frame = pair.frame
     if isinstance(frame.gt, Hdf5Array):
         source = f"{frame.gt.path.suffix} array"
-        whole = DepthImage(values=depth_of(frame.gt), source=source, assumed_scale=False)
+        whole = DepthFile(values=depth_of(frame.gt), reading=Reading(source))
     else:
         assert frame.gt is not None
         scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
         whole = _read(frame.gt, scale, request.channel, protocol, pair.index)
     gt = np.ascontiguousarray(frame.protocol.apply(masked(whole.values, frame.masks)))
-    kinds = {"gt": whole.kind}
+    kinds = {"gt": whole.reading}
     sparse, kind = _known_sparse(pair, protocol, request, gt.shape)
     if kind is not None:
         kinds["sparse"] = kind
@@ -136,7 +135,7 @@ def _with_prediction(
     return replace(
         frame,
         depth=depth,
-        kinds={"prediction": image.kind, **frame.kinds},
+        kinds={"prediction": image.reading, **frame.kinds},
         predicted=values > 0,
         fit=fit,
         sigma=_read_sigma(pair.sigma, size, window) if has_sigma else None,
@@ -160,20 +159,20 @@ def _read_sigma(path: Path | None, size: Size, window: Window) -> Depth | None:
 
 def _read(
     path: Path, scale: float | None, channel: str | None, protocol: EvalProtocol, index: int | None
-) -> DepthImage:
+) -> DepthFile:
     """The depth image; codes are metres × the scale, else the file's own, else the protocol's."""
     stored = load_stored(path, channel) if index is None else load_stacked(path, index)
-    assumed = scale is None and stored.scale is None and stored.values.dtype.kind != "f"
+    assumed = scale is None and stored.reading.scale is None and stored.values.dtype.kind != "f"
     image = depth_from_stored(path, stored, protocol.scale if assumed else scale)
-    if protocol.is_devkit and image.scale is not None and stored.values.ndim == 2:
+    if protocol.is_devkit and image.reading.scale is not None and stored.values.ndim == 2:
         # the development kit reads every code but 0 as a depth, the largest too
-        image = replace(image, values=known_metres(stored.values / image.scale))
-    return replace(image, assumed_scale=assumed)
+        image = replace(image, values=known_metres(stored.values / image.reading.scale))
+    return replace(image, reading=image.reading._replace(assumed=assumed))
 
 
 def _known_sparse(
     pair: FramePair, protocol: EvalProtocol, request: EvalRequest, size: Size
-) -> tuple[Depth | None, DepthKind | None]:
+) -> tuple[Depth | None, Reading | None]:
     """(H, W) metres of the points on their pixels, 0 elsewhere, and the kind of file.
 
     (None, None) for an unusable file that the user did not name.
@@ -185,11 +184,11 @@ def _known_sparse(
         scale = (
             request.sparse_scale if request.sparse_scale is not None else pair.frame.sparse_scale
         )
-        sparse = read_sparse(pair.sparse, size=(height, width), scale=scale)
-        assumed = sparse.assumed_scale
-        if assumed and protocol.scale != sparse.scale:
-            sparse = read_sparse(pair.sparse, size=(height, width), scale=protocol.scale)
-        xy, source_size = sparse.points.xy, sparse.points.size
+        sparse, reading = read_sparse(pair.sparse, size=(height, width), scale=scale)
+        assumed = reading.assumed
+        if assumed and protocol.scale != reading.scale:
+            sparse, reading = read_sparse(pair.sparse, size=(height, width), scale=protocol.scale)
+        xy, source_size = sparse.xy, sparse.size
         if source_size != size:
             xy = pair.frame.protocol.in_crop(xy, source_size)
             if pair.frame.protocol.apply(np.zeros(source_size, bool)).shape != size:
@@ -199,9 +198,9 @@ def _known_sparse(
             raise
         return None, None
     inside = in_frame(xy, (height, width))
-    depth = sparse.points.depth[inside]
+    depth = sparse.depth[inside]
     points = SparsePoints(xy=xy[inside], depth=depth, size=(height, width))
-    return as_depth_image(points), sparse.kind._replace(assumed=assumed)
+    return as_depth_image(points), reading._replace(assumed=assumed)
 
 
 def image_of(pair: FramePair, size: Size) -> Depth | None:

@@ -26,7 +26,7 @@ from pnpdepth_cli.io.dataset import (
     groups_by_name,
 )
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, StoredArray
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, DepthFile, Reading
 from pnpdepth_cli.io.formats.arrays import parse_npy
 from pnpdepth_cli.io.layouts import find_layout, list_frames
 
@@ -284,12 +284,13 @@ def stack_size(path: Path) -> int | None:
     return None if stack is None else len(stack)
 
 
-def load_stacked(path: Path, index: int) -> StoredArray:
+def load_stacked(path: Path, index: int) -> DepthFile:
     """Returns frame `index` of a stack as it is stored."""
     stack = _stack(path)
     assert stack is not None
     values = np.asarray(stack[index])
-    return StoredArray(values=values, description=f"{values.dtype} NPY of {len(stack):,} frames")
+    reading = Reading(f"{values.dtype} NPY of {len(stack):,} frames")
+    return DepthFile(values=values, reading=reading)
 
 
 @functools.lru_cache(maxsize=4)

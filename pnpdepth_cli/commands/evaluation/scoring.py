@@ -26,7 +26,7 @@ from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.depth import DepthKind
+from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.measures import Formula
 
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ class FrameScores:
     """Scored pixels whose ground truth is a value of the sparse input; None if that is unknown."""
     sums: tuple[float, ...] = ()
     """Over the pixels, in the order of core.metrics.error_sums."""
-    kinds: dict[str, DepthKind] = field(default_factory=dict)
+    kinds: dict[str, Reading] = field(default_factory=dict)
     """Of the files by "prediction", "gt" and "sparse"."""
     uncertainty: FrameUncertainty | None = field(default=None, compare=False)
 

@@ -23,8 +23,6 @@ from pnpdepth_cli.frames.frame import Frame, Register, registration_to_make, ten
 from pnpdepth_cli.io.dataset import SCAN_ONLY_SUFFIXES, Hdf5Array, Source, file_of
 from pnpdepth_cli.io.dataset.reading import check_same_view, depth_of, masked, moved_to, rgb_of
 from pnpdepth_cli.io.depth import (
-    DepthImage,
-    DepthKind,
     describe_range,
     implausible,
     metres,
@@ -32,6 +30,7 @@ from pnpdepth_cli.io.depth import (
     scale_warning,
 )
 from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints
@@ -87,7 +86,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     truth_notes: list[str] = []
     if files.gt is not None:
         truth, of_truth, truth_notes = _read_ground_truth(files, files.gt, whole)
-        gt, gt_scale = np.ascontiguousarray(crop(truth.values)), truth.scale
+        gt, gt_scale = np.ascontiguousarray(crop(truth.values)), truth.reading.scale
         if whole not in (None, truth.values.shape):
             raise _size_error(files, truth.values.shape, whole)
         if not bool((gt > 0).any()):
@@ -111,7 +110,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         size = whole or (truth.values.shape[0], truth.values.shape[1])
     else:
         size = whole or own.size
-    kinds = {"gt": None if files.gt is None else truth.kind, "sparse": sparse.kind}
+    readings = {"gt": None if files.gt is None else truth.reading, "sparse": sparse.reading}
     camera, of_camera = camera_of_frame(request, sparse, size)
     used, held_out = _split(own, request.hold_out.holdout, method.seed)
     points, neighbours, lost = read_neighbours(
@@ -120,7 +119,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     if gt is not None and files.sparse is not None:
         depth = own.scatter()[0, 0].numpy()
         notes += _leak_warning(depth, gt)
-        by_option = {"--depth-scale": kinds["sparse"], "--gt-scale": kinds["gt"]}
+        by_option = {"--depth-scale": readings["sparse"], "--gt-scale": readings["gt"]}
         notes += _scale_warning(depth, gt, by_option)
     notes += (*of_camera, *lost)
     if neighbours:
@@ -133,8 +132,8 @@ def read_inputs(request: RefineRequest) -> Inputs:
         held_out=held_out,
         register=_register(request),
         gt=gt,
-        sparse_scale=sparse.scale,
-        assumed=tuple(f"{side}: {kind}" for side, kind in kinds.items() if kind and kind.assumed),
+        sparse_scale=sparse.reading.scale,
+        assumed=tuple(f"{side}: {r}" for side, r in readings.items() if r and r.assumed),
         record=record,
         notes=tuple(notes),
         unit=sparse.unit,
@@ -193,28 +192,22 @@ def _read_image(files: FrameFiles, source: Source) -> tuple[ImageArray, str | No
 
 def _read_ground_truth(
     files: FrameFiles, source: Source, size: tuple[int, int] | None
-) -> tuple[DepthImage, dict[str, Any], list[str]]:
+) -> tuple[DepthFile, dict[str, Any], list[str]]:
     """The ground truth of an image (H, W), what a record keeps of it, and lines for a person."""
     if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
         scan = read_scan_points(source, files.scan, size, files.image_file)
-        truth = DepthImage(values=as_depth_image(scan.points), source="", assumed_scale=False)
+        truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
         return truth, scan.record, [note.replace("sparse:", "gt:", 1) for note in scan.notes]
     if isinstance(source, Hdf5Array):
-        truth = DepthImage(values=depth_of(source), source="HDF5", assumed_scale=False)
+        truth = DepthFile(values=depth_of(source), reading=Reading("HDF5"))
     else:
         scale = files.gt_scale or files.depth_scale
         truth = read_depth(source, scale=scale, channel=files.channel)
     values = masked(truth.values, files.gt_masks)
     if files.gt_size_ok and size is not None and values.shape != size:
         values = moved_to(file_of(source), values, size)
-    described = describe_range(
-        values,
-        truth.source,
-        assumed_scale=truth.assumed_scale,
-        noun="pixels",
-        option="--gt-scale",
-    )
-    record = _file_record(source) | {"read_as": str(truth.kind)}
+    described = describe_range(values, truth.reading, noun="pixels", option="--gt-scale")
+    record = _file_record(source) | {"read_as": str(truth.reading)}
     return replace(truth, values=values), record, [f"gt: {described}"]
 
 
@@ -238,12 +231,12 @@ def _sampled(
         points = sample_points(gt, files.sample, seed, image=rgb)
     except UsageError as error:  # the pattern itself is good, this frame is too poor for it
         raise InputError(f"{files.gt}: {error}") from error
-    source = f"{files.sample.kind} of the ground truth, seed {seed}"
+    reading = Reading(f"{files.sample.kind} of the ground truth, seed {seed}", scale)
     return SparseDepth(
         points=points.tensors(),
-        scale=scale,
+        reading=reading,
         record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": seed},
-        notes=(f"sparse: {describe_range(points.depth, source)}",),
+        notes=(f"sparse: {describe_range(points.depth, reading)}",),
     )
 
 
@@ -282,8 +275,8 @@ def _read_points(
 ) -> SparseDepth:
     """The points of a depth map or a list, in the image."""
     scale = files.sparse_scale or files.depth_scale
-    sparse = read_sparse(path, size=image_size, scale=scale, channel=files.channel)
-    visible, depth = sparse.points, sparse.points.depth
+    visible, reading = read_sparse(path, size=image_size, scale=scale, channel=files.channel)
+    depth = visible.depth
     size = image_size or visible.size
     check_same_view(str(path), visible.size, size)
     if visible.size != size and not files.sparse_size_ok:
@@ -291,8 +284,8 @@ def _read_points(
             f"{path} is {visible.size[1]}×{visible.size[0]} but {files.image} is"
             f" {size[1]}×{size[0]}; --set sparse-size-ok maps the points if both show the same view"
         )
-    described = describe_range(depth, sparse.source, assumed_scale=sparse.assumed_scale)
-    notes, record = [f"sparse: {described}"], _file_record(path) | {"read_as": str(sparse.kind)}
+    notes = [f"sparse: {describe_range(depth, reading)}"]
+    record = _file_record(path) | {"read_as": str(reading)}
     hidden = None if keep_occluded else occluded_in_map(visible)
     if hidden is not None and hidden.any():
         visible, count = visible.select(~hidden), int(hidden.sum())
@@ -304,12 +297,11 @@ def _read_points(
     points = _inside(path, visible.tensors().resized(*size))
     if len(points) < len(visible):
         notes.append(f"sparse: {len(visible) - len(points):,} points outside the image")
-    if unlikely := implausible(depth, sparse.scale):
+    if unlikely := implausible(depth, reading.scale):
         notes.append(f"warning: {unlikely}")
     return SparseDepth(
         points=points,
-        scale=sparse.scale,
-        kind=sparse.kind,
+        reading=reading,
         record=record,
         notes=tuple(notes),
     )
@@ -345,7 +337,7 @@ def _without_far_points(sparse: SparseDepth) -> tuple[SparsePoints, list[str]]:
 
 
 def _scale_warning(
-    sparse: ImageArray, gt: ImageArray, kinds: Mapping[str, DepthKind | None]
+    sparse: ImageArray, gt: ImageArray, readings: Mapping[str, Reading | None]
 ) -> list[str]:
     """A warning if ground truth and sparse depth differ by a factor where both are known.
 
@@ -358,7 +350,7 @@ def _scale_warning(
     ratio = float(np.median(gt[both] / sparse[both]))
     if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
         return []
-    scale_warning("sparse points", 1 / ratio, kinds)
+    scale_warning("sparse points", 1 / ratio, readings)
     return [
         f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
         f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give --gt-scale"

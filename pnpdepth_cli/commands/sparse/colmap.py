@@ -20,6 +20,7 @@ from pnpdepth_cli.io.colmap import (
 from pnpdepth_cli.io.dataset.reading import check_same_view
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.sensors import Points
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.sparse import DropCounter, describe_dropped
@@ -63,8 +64,11 @@ def read_colmap_points(
     points = _observed(model, name, options)
     turn, shift = model.images[name].rotation.T, model.images[name].translation
     unit = MODEL_UNITS if options.unit_scale is None else METRES
-    source = f"COLMAP model, image {name}, {camera.source}"
-    notes = [f"sparse: {describe_range(points.depth, source, unit=unit)}"]
+    reading = Reading(
+        f"COLMAP model, image {name}, {camera.source}",
+        scale=_output_scale(model) if unit == MODEL_UNITS else None,
+    )
+    notes = [f"sparse: {describe_range(points.depth, reading, unit=unit)}"]
     if camera.has_lens:
         notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
     lost = describe_dropped(points.dropped)
@@ -76,11 +80,11 @@ def read_colmap_points(
         camera=replace(camera.resized(*size), source=f"COLMAP model {path}"),
         pose=np.column_stack([turn, -turn @ shift * (options.unit_scale or 1.0)]),
         unit=unit,
-        scale=_output_scale(model) if unit == MODEL_UNITS else None,
+        reading=reading,
         record={
             "path": str(model.folder),
             "sha256": {p.name: fingerprint(p).sha256 for p in model_files(find_model(path))},
-            "read_as": source,
+            "read_as": reading.source,
             "image": name,
             "lens": camera.lens,
             "distortion": list(camera.distortion),

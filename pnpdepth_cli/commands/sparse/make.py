@@ -18,6 +18,7 @@ from pnpdepth_cli.errors import OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
+from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
@@ -187,7 +188,7 @@ def sample_depth(
     sampled = len(points) + sum(points.dropped.values())
     if pattern.kind == "features" and sampled < wanted:
         notes.append(f"warning: the image has {sampled:,} of the {wanted:,} points asked for")
-    notes.append(f"sparse: {describe_range(points.depth, f'{pattern.kind}, seed {seed}')}")
+    notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
     settings = {"pattern": asdict(pattern), "noise": asdict(noise), "seed": seed}
     inputs = {"depth": depth, "image": image}
     return target.write("sample", points, settings, inputs=inputs, notes=notes)
@@ -223,7 +224,7 @@ def simulate_scan(
     notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
     scanner = _placed(calib, calibration, position)
     points = simulate_lidar(dense, calibration.camera, scanner, sensor, seed)
-    notes.append(f"sparse: {describe_range(points.depth, f'{sensor.name}, seed {seed}')}")
+    notes.append(f"sparse: {describe_range(points.depth, Reading(f'{sensor.name}, seed {seed}'))}")
     settings = {
         "sensor": plain(asdict(sensor)),
         "rotation": scanner.rotation.tolist(),
@@ -238,10 +239,8 @@ def simulate_scan(
 def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
     """The dense depth (H, W), and lines for a person."""
     dense = read_depth(path, **reading)
-    text = describe_range(
-        dense.values, dense.source, assumed_scale=dense.assumed_scale, noun="pixels"
-    )
-    unlikely = implausible(dense.values, dense.scale)
+    text = describe_range(dense.values, dense.reading, noun="pixels")
+    unlikely = implausible(dense.values, dense.reading.scale)
     return dense.values, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
 
 

@@ -14,8 +14,9 @@ from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.commands.sparse.options import METRES, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
-from pnpdepth_cli.io.depth import DepthKind, describe_range
+from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.extrinsics import read_extrinsics
+from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
@@ -41,9 +42,8 @@ class SparseDepth:
     """In the image, as arrays of either library."""
     record: dict[str, Any]
     notes: tuple[str, ...]
-    scale: float | None = None
-    """Integers per unit of depth in its file. None: it holds no integers."""
-    kind: DepthKind | None = None
+    reading: Reading
+    """Its scale is that of an integer file of the depth, per unit. None: it holds no integers."""
     unit: str = METRES
     camera: Camera | None = None
     """The camera of the whole image, where it came with the points."""
@@ -108,8 +108,8 @@ def read_scan_points(
         keep_occluded=options.keep_occluded,
     )
     warnings += _outside_warning(scanner.moved(scan.points), camera, size)
-    source = f"{scan.source} of {len(scan.points):,} points, {camera.source}"
-    notes = [f"sparse: {describe_range(points.depth, source)}"]
+    reading = Reading(f"{scan.source} of {len(scan.points):,} points, {camera.source}")
+    notes = [f"sparse: {describe_range(points.depth, reading)}"]
     if lost := describe_dropped(points.dropped):
         notes.append(f"sparse: dropped {lost}")
     return SparseDepth(
@@ -118,7 +118,7 @@ def read_scan_points(
         record={
             "path": str(path),
             "sha256": sha256_of(path),
-            "read_as": source,
+            "read_as": reading.source,
             "calibration": str(named),
             "camera": options.camera,
             "extrinsics": None if options.extrinsics is None else str(options.extrinsics),
@@ -130,6 +130,7 @@ def read_scan_points(
             "dropped": dict(points.dropped),
         },
         notes=(*notes, *warnings),
+        reading=reading,
     )
 
 

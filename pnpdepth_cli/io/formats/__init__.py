@@ -12,8 +12,9 @@ from pnpdepth_cli.io.formats.depth_format import KITTI_SCALE as KITTI_SCALE
 from pnpdepth_cli.io.formats.depth_format import LARGEST_CODE as LARGEST_CODE
 from pnpdepth_cli.io.formats.depth_format import SATURATED_CODE as SATURATED_CODE
 from pnpdepth_cli.io.formats.depth_format import SCALE_KEY as SCALE_KEY
+from pnpdepth_cli.io.formats.depth_format import DepthFile as DepthFile
 from pnpdepth_cli.io.formats.depth_format import DepthFormat as DepthFormat
-from pnpdepth_cli.io.formats.depth_format import StoredArray as StoredArray
+from pnpdepth_cli.io.formats.depth_format import Reading as Reading
 from pnpdepth_cli.io.formats.depth_format import check_scale as check_scale
 from pnpdepth_cli.io.formats.depth_format import eight_bits as eight_bits
 

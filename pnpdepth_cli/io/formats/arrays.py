@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.decoding import silence
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged, one_line
-from pnpdepth_cli.io.formats.depth_format import DepthFormat, StoredArray
+from pnpdepth_cli.io.formats.depth_format import DepthFile, DepthFormat, Reading
 
 _LONGEST_HEADER = 1 << 14
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -76,10 +76,10 @@ def _npy_header(
     return shape, "F" if is_fortran else "C", dtype, stream.tell()
 
 
-def _read_npy(path: Path, data: bytes, channel: str | None) -> StoredArray:
+def _read_npy(path: Path, data: bytes, channel: str | None) -> DepthFile:
     array = parse_npy(path, data)
     check_value_count(path, array.size)
-    return StoredArray(values=array, description=f"{array.dtype} NPY", is_image=False)
+    return DepthFile(values=array, reading=Reading(f"{array.dtype} NPY"), is_image=False)
 
 
 def _write_npy(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
@@ -147,9 +147,10 @@ def _choose(path: Path, keys: list[str], key: str | None) -> str:
     return keys[0]
 
 
-def _read_npz(path: Path, data: bytes, channel: str | None) -> StoredArray:
+def _read_npz(path: Path, data: bytes, channel: str | None) -> DepthFile:
     name, array = parse_npz(path, data, channel)
-    return StoredArray(values=array, description=f"{array.dtype} NPZ array {name}", is_image=False)
+    reading = Reading(f"{array.dtype} NPZ array {name}")
+    return DepthFile(values=array, reading=reading, is_image=False)
 
 
 def _write_npz(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
@@ -198,10 +199,10 @@ def parse_pfm(path: Path, data: bytes) -> tuple[NDArray[np.float32], float]:
     return np.ascontiguousarray(values[::-1], dtype=np.float32), abs(factor)
 
 
-def _read_pfm(path: Path, data: bytes, channel: str | None) -> StoredArray:
+def _read_pfm(path: Path, data: bytes, channel: str | None) -> DepthFile:
     values, factor = parse_pfm(path, data)
     unused = "" if factor == 1 else f", scale factor {factor:g} of its header not applied"
-    return StoredArray(values=values, description=f"PFM{unused}")
+    return DepthFile(values=values, reading=Reading(f"PFM{unused}"))
 
 
 def _write_pfm(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:

@@ -7,8 +7,9 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
@@ -26,15 +27,32 @@ LARGEST_CODE = SATURATED_CODE - 1
 """The largest code that is written."""
 
 
+class Reading(NamedTuple):
+    """How depth was read from a file, or made."""
+
+    source: str  # in words, such as "16-bit PNG ÷ 256"
+    scale: float | None = None  # codes per metre; None for floats
+    assumed: bool = False
+    """Whether the scale is assumed, as neither the file nor the user nor the data set states it."""
+
+    def __str__(self) -> str:
+        return self.source + ", assumed" * self.assumed
+
+
 @dataclass(frozen=True, kw_only=True)
-class StoredArray:
-    """The numbers of a depth file, as stored."""
+class DepthFile:
+    """The numbers of a depth file: as stored, from a format; float32 metres, from `read_depth`."""
 
     values: NDArray[Any]
-    """Floats in metres, or integer codes; (H, W) or any shape that `is_image` allows."""
-    description: str  # what was read, for a person, such as "16-bit PNG"
+    """(H, W). As stored, floats in metres or integer codes, of any shape that `is_image` allows."""
+    reading: Reading
+    """As stored, its scale is the one that the file itself states."""
     is_image: bool = True  # false for NPY and NPZ, whose arrays may also be lists of points
-    scale: float | None = None  # codes per metre that the file itself gives; None if it does not
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(H, W), true where depth is known."""
+        return self.values > 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +64,7 @@ class DepthFormat:
     """Of its files, in lower case; "." and the name in `choices.FORMATS` is one of them."""
     magic: tuple[bytes, ...]
     """What the content begins with; files are recognised by content, never by suffix."""
-    read: Callable[[Path, bytes, str | None], StoredArray]
+    read: Callable[[Path, bytes, str | None], DepthFile]
     """From path (for messages), content and `--channel`. Raises FileFormatError."""
     write: Callable[[Path, NDArray[Any], Mapping[str, str]], None]
     """(H, W) float32 metres or uint16 codes, 0 where unknown, into an existing empty file, with

@@ -23,8 +23,9 @@ from pnpdepth_cli.io.decoding import (
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged
 from pnpdepth_cli.io.formats.depth_format import (
     SCALE_KEY,
+    DepthFile,
     DepthFormat,
-    StoredArray,
+    Reading,
     eight_bits,
     scale_in_text,
 )
@@ -32,7 +33,7 @@ from pnpdepth_cli.io.formats.depth_format import (
 _COMPRESSION_LEVEL = 4  # of zlib: a third of the time of its default 6, files 4 per cent larger
 
 
-def _read_png(path: Path, data: bytes, channel: str | None) -> StoredArray:
+def _read_png(path: Path, data: bytes, channel: str | None) -> DepthFile:
     with opened_image(path, data, "PNG") as image:
         mode, palette = raw_mode(image), image.mode == "P"
         if not palette and ";16" not in mode:
@@ -49,7 +50,7 @@ def _read_png(path: Path, data: bytes, channel: str | None) -> StoredArray:
                 raise _not_grey(path, "several channels")
             description += " of three equal channels"
         text = f"{SCALE_KEY}={image.info.get(SCALE_KEY, '')}"
-    return StoredArray(values=codes, description=description, scale=scale_in_text(path, text))
+    return DepthFile(values=codes, reading=Reading(description, scale_in_text(path, text)))
 
 
 def _not_grey(path: Path, colours: str) -> FileFormatError:
@@ -122,7 +123,7 @@ def read_tiff_facts(path: Path, data: bytes) -> TiffFacts:
     return TiffFacts(int(bits), _NUMBERS.get(number, "uint"), int(samples), description)
 
 
-def _read_tiff(path: Path, data: bytes, channel: str | None) -> StoredArray:
+def _read_tiff(path: Path, data: bytes, channel: str | None) -> DepthFile:
     facts = read_tiff_facts(path, data)
     if facts.samples != 1:
         raise FileFormatError(
@@ -138,8 +139,8 @@ def _read_tiff(path: Path, data: bytes, channel: str | None) -> StoredArray:
     if values.ndim != 2 or values.dtype.itemsize * 8 != facts.bits:
         raise damaged(path, "TIFF", "cannot be decoded as one channel")
     description = f"{facts.bits}-bit {'float ' if facts.number == 'float' else ''}TIFF"
-    scale = scale_in_text(path, facts.description)
-    return StoredArray(values=values, description=description, scale=scale)
+    reading = Reading(description, scale_in_text(path, facts.description))
+    return DepthFile(values=values, reading=reading)
 
 
 def _write_tiff(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
@@ -255,13 +256,13 @@ def _part_channels(part: Any) -> dict[str, NDArray[Any]]:
     return placed
 
 
-def _read_exr(path: Path, data: bytes, channel: str | None) -> StoredArray:
+def _read_exr(path: Path, data: bytes, channel: str | None) -> DepthFile:
     channels = read_exr_channels(path, data)
     name = channel if channel is not None else _depth_channel(path, channels)
     if name not in channels:
         listing = ", ".join(channels)
         raise UsageError(f"{path} has no channel {name!r}; --channel can be one of: {listing}")
-    return StoredArray(values=channels[name], description=f"EXR channel {name}")
+    return DepthFile(values=channels[name], reading=Reading(f"EXR channel {name}"))
 
 
 def _depth_channel(path: Path, channels: dict[str, NDArray[Any]]) -> str:

@@ -92,6 +92,6 @@ def test_an_output_scale_is_mm_or_a_number() -> None:
 def test_a_file_in_millimetres_holds_depth_times_a_thousand(tmp_path: Path) -> None:
     record = run(frame_on_disk(tmp_path), output_scale=1000.0).record
     written = read_depth(tmp_path / "out" / "img_depth.png")
-    assert written.scale == 1000
+    assert written.reading.scale == 1000
     codes = np.asarray(Image.open(record["outputs"]["depth"]))
     assert (np.rint(written.values * 1000) == codes).all()

@@ -131,17 +131,17 @@ def test_depth_is_in_model_units_or_with_a_scale_in_metres(
     assert 3.4 < nearest < farthest < 4.6
     described = "model units (COLMAP model, image a.png"
     assert any(described in note for note in record["notes"]) == (unit_scale is None)
-    scale = read_depth(tmp_path / "out" / "a_depth.png").scale
+    scale = read_depth(tmp_path / "out" / "a_depth.png").reading.scale
     assert (scale == 256) == (unit_scale is not None)
     assert np.log2(scale) % 1 == 0
 
 
 def test_the_scale_of_the_codes_is_that_of_the_model_whatever_lies_far_out(project: Path) -> None:
-    scale = read(project).scale
+    scale = read(project).reading.scale
     first = "9 9 9 0.5 1 0 2 0 3 0"
     change(project, "points3D.txt", first, f"{first}\n99 1e9 0 0 9 9 9 9")
     change(project, "images.txt", "0.2 0 0 1 c.png", "2e9 0 0 1 c.png")
-    assert read(project).scale == scale == 1024
+    assert read(project).reading.scale == scale == 1024
 
 
 def test_what_does_not_fit_a_model_is_refused(tmp_path: Path, project: Path) -> None:

@@ -61,7 +61,7 @@ def test_a_projected_scan_lands_where_it_was_made_to_in_every_format(
     }
     assert json.loads((frame.folder / "sparse.json").read_text()) == json.loads(json.dumps(record))
     if suffix == ".csv":
-        got = read_sparse(frame.folder / "sparse.csv", size=(60, 100)).points
+        got = read_sparse(frame.folder / "sparse.csv", size=(60, 100))[0]
         np.testing.assert_allclose(got.xy, frame.xy, atol=1e-3)
         np.testing.assert_allclose(got.depth, frame.depth, atol=1e-4)
         return
@@ -141,7 +141,7 @@ def test_the_seed_is_in_the_png_and_in_the_record_and_decides_every_byte(frame: 
         sampled(frame, f"{name}.png", count=100, seed=11, noise=SampleNoise(metres=0.1))
     assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
     written = read_depth(frame.folder / "a.png")
-    assert (np.count_nonzero(written.values), written.scale) == (100, 256)
+    assert (np.count_nonzero(written.values), written.reading.scale) == (100, 256)
     settings = json.loads(Image.open(frame.folder / "a.png").text["pnpdepth:made"])
     assert (settings["seed"], settings["pattern"]["kind"]) == (11, "uniform")
     assert json.loads((frame.folder / "a.json").read_text())["seed"] == 11
@@ -165,7 +165,7 @@ def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) ->
     sensor = ideal_lidar(21, 20, -20)
     for output, position in (("camera.csv", {}), ("scanner.csv", {"position": "calib"})):
         record = simulated(frame, output, sensor, **position)
-        got = read_sparse(frame.folder / output, size=(60, 100)).points
+        got = read_sparse(frame.folder / output, size=(60, 100))[0]
         np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
         assert record["sensor"]["name"] == "21 beams"
         assert record["sensor"]["max_range"] is None
