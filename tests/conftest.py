@@ -17,9 +17,8 @@ settings.register_profile("steady", deadline=None, derandomize=True)
 settings.load_profile("steady")
 
 if "PYTEST_XDIST_WORKER" in os.environ:
-    # two workers with a thread each, and one thread in the processes that they start
-    torch.set_num_threads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"
+    # two workers with a thread each, and in the processes that they start, unless more are asked for
+    torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
 
 _SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SLOW_FIXTURES = {"chrome", "shared_data"}
