@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.io.colmap import MODELS
+from pnpdepth_cli.io.colmap_model import MODELS
 
 WIDTH, HEIGHT = 64, 48
 _COEFFICIENTS = {

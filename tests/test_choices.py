@@ -27,7 +27,7 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Table:
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
-        "[pnpdepth.test_table]\nelsewhere = other_package:entry\ncolmap = other_package:entry\n"
+        "[pnpdepth.test_table]\nelsewhere = other_package:entry\nscans = other_package:entry\n"
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -39,13 +39,13 @@ def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_th
 ) -> None:
     names = list(table)
     assert names == ["record", *sorted(set(names) - {"record"})]
-    assert {"colmap", "elsewhere"} <= set(names)
+    assert {"scans", "elsewhere"} <= set(names)
     assert "--init--" not in table
     assert len(table) == len(names)
-    assert table["colmap"] == "pnpdepth_cli.io.colmap"  # of this package first
+    assert table["scans"] == "pnpdepth_cli.io.scans"  # of this package first
     assert table["elsewhere"] == "loaded from elsewhere"
-    with pytest.raises(UsageError, match=r"unknown entry 'colmapp'; did you mean 'colmap'\?"):
-        table["colmapp"]
+    with pytest.raises(UsageError, match=r"unknown entry 'scanss'; did you mean 'scans'\?"):
+        table["scanss"]
 
 
 @pytest.mark.parametrize(

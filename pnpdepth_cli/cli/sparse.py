@@ -209,7 +209,7 @@ def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
     BAG is a file of ROS 1 (.bag) or ROS 2 (.mcap, .db3), or a folder that ROS 2 recorded. OUTPUT
     gets rgb/, sparse/ (PLY), calib.txt from camera_info and tf_static, and poses.txt from odometry.
     """
-    from pnpdepth_cli.commands.sparse.frames import FramesRequest, write_frames
+    from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, write_frames
 
     bag_options = BagOptions(**options.taken(BagOptions, values))
     request = FramesRequest(bag=bag, output=output, options=bag_options, **values)

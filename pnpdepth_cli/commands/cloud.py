@@ -28,7 +28,7 @@ from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors.cloud import (
+from pnpdepth_cli.sensors.point_cloud import (
     EDGE,
     PointCloud,
     View,

@@ -10,7 +10,7 @@ from torch import Tensor
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.models.aligned import AlignedDepth
-from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 

@@ -21,7 +21,7 @@ from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 
 GAPS = 6.0

@@ -17,7 +17,7 @@ from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
-from pnpdepth_cli.models.frame import FrameMap, synthetic_frame
+from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.precision import dtype_of, lower
 from pnpdepth_cli.models.python_file import importing_beside
 from pnpdepth_cli.models.registry import find_definition

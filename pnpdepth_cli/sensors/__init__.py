@@ -13,6 +13,9 @@ from pnpdepth_cli.sensors.lidar import LIDARS as LIDARS
 from pnpdepth_cli.sensors.lidar import Lidar as Lidar
 from pnpdepth_cli.sensors.lidar import ideal_lidar as ideal_lidar
 from pnpdepth_cli.sensors.lidar import simulate_lidar as simulate_lidar
+from pnpdepth_cli.sensors.pixels import Points as Points
+from pnpdepth_cli.sensors.pixels import as_depth_image as as_depth_image
+from pnpdepth_cli.sensors.pixels import describe_dropped as describe_dropped
 from pnpdepth_cli.sensors.projection import edge_agreement as edge_agreement
 from pnpdepth_cli.sensors.projection import occluded_in_map as occluded_in_map
 from pnpdepth_cli.sensors.projection import project_velodyne as project_velodyne
@@ -20,6 +23,3 @@ from pnpdepth_cli.sensors.samplers import PATTERNS as PATTERNS
 from pnpdepth_cli.sensors.samplers import SampleNoise as SampleNoise
 from pnpdepth_cli.sensors.samplers import SamplePattern as SamplePattern
 from pnpdepth_cli.sensors.samplers import sample_points as sample_points
-from pnpdepth_cli.sensors.sparse import Points as Points
-from pnpdepth_cli.sensors.sparse import as_depth_image as as_depth_image
-from pnpdepth_cli.sensors.sparse import describe_dropped as describe_dropped

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.sparse import DropCounter, Floats, Mask, Points
+from pnpdepth_cli.sensors.pixels import DropCounter, Floats, Mask, Points
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

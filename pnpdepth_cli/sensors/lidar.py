@@ -18,7 +18,7 @@ from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import pixels_of
-from pnpdepth_cli.sensors.sparse import FARTHEST_M, DropCounter, Floats, Mask, Points, pixel_index
+from pnpdepth_cli.sensors.pixels import FARTHEST_M, DropCounter, Floats, Mask, Points, pixel_index
 
 FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """The rotation from a scanner's frame to that of a camera facing the same way."""

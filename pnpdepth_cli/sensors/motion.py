@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.sensors.lens import rays_of, unproject
-from pnpdepth_cli.sensors.sparse import Floats, Mask, Points
+from pnpdepth_cli.sensors.pixels import Floats, Mask, Points
 
 MIN_INLIERS = 30
 """Matches that agree with the motion; fewer support no estimate."""

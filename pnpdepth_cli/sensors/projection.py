@@ -20,7 +20,7 @@ from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import pixels_of
-from pnpdepth_cli.sensors.sparse import (
+from pnpdepth_cli.sensors.pixels import (
     DropCounter,
     Floats,
     Mask,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors.sparse import FARTHEST_M, DropCounter, Points
+from pnpdepth_cli.sensors.pixels import FARTHEST_M, DropCounter, Points
 
 Image = NDArray[np.float32]
 Pixels = NDArray[np.intp]

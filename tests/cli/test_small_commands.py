@@ -17,7 +17,7 @@ from pnpdepth_cli.cli.export import export
 from pnpdepth_cli.cli.main import cli, run
 from pnpdepth_cli.commands import doctor
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.sensors.cloud import EDGE
+from pnpdepth_cli.sensors.point_cloud import EDGE
 from tests.commands.test_export import project, results
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from pnpdepth_cli.commands.exports import export_results
 from pnpdepth_cli.commands.refinement.frame_camera import camera_to_json
-from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
+from pnpdepth_cli.commands.sparse.colmap_points import read_colmap_points
 from pnpdepth_cli.commands.sparse.options import ColmapOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import write_depth

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition
-from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings

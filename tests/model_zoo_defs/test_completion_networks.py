@@ -13,7 +13,7 @@ from benchmarks.frames import kitti_dc
 from model_zoo_defs.nconv import NConv, NormalisedConv, halved
 from model_zoo_defs.pncnn import Pncnn
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 

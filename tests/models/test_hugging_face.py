@@ -16,7 +16,7 @@ from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.aligned import AlignedDepth
-from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints

@@ -11,7 +11,7 @@ import torch
 
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import Fixed, Near
-from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.hugging_face import hf_definition
 
 IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}

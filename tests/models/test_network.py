@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
-from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import FARTHEST_DEPTH, Network, find_device, load_network
 from pnpdepth_cli.points import SparsePoints
 

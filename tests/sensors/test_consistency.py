@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.sensors.cloud import View, consistent_depth, neighbouring_views
+from pnpdepth_cli.sensors.point_cloud import View, consistent_depth, neighbouring_views
 
 SIZE = (36, 48)
 CAMERA = Camera(intrinsics=np.array([[40.0, 0, 23.5], [0, 40, 17.5], [0, 0, 1]]))

@@ -17,7 +17,7 @@ from pnpdepth_cli.commands.refinement.request import FrameFiles, NeighbourFiles,
 from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.bags import is_bag
-from pnpdepth_cli.io.colmap import model_files
+from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.dataset import (
     SCAN_ONLY_SUFFIXES,
     Frame,
@@ -86,7 +86,7 @@ def unpacked(
         if options != BagOptions():
             raise UsageError(f"{request.source} is no bag; leave out --topics and --tolerance")
         return request
-    from pnpdepth_cli.commands.sparse.frames import (
+    from pnpdepth_cli.commands.sparse.bag_frames import (
         POSES_FILE,
         FramesRequest,
         write_frames,

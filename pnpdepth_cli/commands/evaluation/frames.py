@@ -27,7 +27,7 @@ from pnpdepth_cli.io.depth import (
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors.sparse import as_depth_image
+from pnpdepth_cli.sensors.pixels import as_depth_image
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note, new_file
-from pnpdepth_cli.sensors.cloud import depth_normals
+from pnpdepth_cli.sensors.point_cloud import depth_normals
 
 
 def _map(folder: Path, frame: ExportFrame, kind: str) -> Path:

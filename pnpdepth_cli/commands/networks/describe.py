@@ -17,7 +17,7 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
-from pnpdepth_cli.models.frame import synthetic_frame
+from pnpdepth_cli.models.frame_map import synthetic_frame
 from pnpdepth_cli.models.measure_layers import MeasuredLayer, measure_layers
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.models.registry import families

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.commands.refinement.request import RefineRequest
-from pnpdepth_cli.commands.sparse.scans import SparseDepth, check_size
+from pnpdepth_cli.commands.sparse.scan_points import SparseDepth, check_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.rgb import read_focal_length

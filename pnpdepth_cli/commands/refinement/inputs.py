@@ -15,9 +15,9 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.frame_camera import Pose, camera_of_frame
 from pnpdepth_cli.commands.refinement.neighbours import read_neighbours
 from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
-from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
+from pnpdepth_cli.commands.sparse.colmap_points import read_colmap_points
 from pnpdepth_cli.commands.sparse.options import METRES, ColmapOptions, ScanOptions
-from pnpdepth_cli.commands.sparse.scans import SparseDepth, read_scan_points
+from pnpdepth_cli.commands.sparse.scan_points import SparseDepth, read_scan_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame, Register, registration_to_make, tensor_of
 from pnpdepth_cli.io.dataset import SCAN_ONLY_SUFFIXES, Hdf5Array, Source, file_of

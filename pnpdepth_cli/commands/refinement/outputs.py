@@ -31,8 +31,8 @@ from pnpdepth_cli.io.visualisation import (
     sigma_preview,
     write_mask,
 )
-from pnpdepth_cli.sensors.cloud import cloud_from_depth, kept_pixels
 from pnpdepth_cli.sensors.lens import rays_of
+from pnpdepth_cli.sensors.point_cloud import cloud_from_depth, kept_pixels
 
 Image = NDArray[np.float32]
 

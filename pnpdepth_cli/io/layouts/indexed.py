@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.colmap import model_files, read_model
+from pnpdepth_cli.io.colmap_model import model_files, read_model
 from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Unmatched, as_pose, find_files
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout

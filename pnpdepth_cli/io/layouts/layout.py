@@ -43,7 +43,7 @@ class Layout:
     """Patterns of what the folder or one in it holds, for the message of an unknown folder."""
 
 
-class _Part:
+class _FilePart:
     """Where the files of one part of a frame lie, and what they are called."""
 
     def __init__(self, text: str, find: Callable[[Path], Path] | None) -> None:
@@ -113,7 +113,7 @@ def row(
         more: From a place to a function from a frame's files to its further fields.
         fields: Fields that all frames have.
     """
-    kinds = {field: _Part(text, (folders or {}).get(field)) for field, text in parts.items()}
+    kinds = {field: _FilePart(text, (folders or {}).get(field)) for field, text in parts.items()}
     wanted = [kind for kind in kinds.values() if not kind.optional]
     probe = marks[0] if marks else wanted[-1].folders[0]
 
@@ -154,7 +154,7 @@ def row(
 
 
 def _joined(
-    place: Path, kinds: Mapping[str, _Part], gaps: bool
+    place: Path, kinds: Mapping[str, _FilePart], gaps: bool
 ) -> Iterator[tuple[str, Files] | Unmatched]:
     """The stem and files of each frame, and the files that lack a partner."""
     first, *others = kinds

@@ -20,9 +20,9 @@ from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.onnx import (  # noqa: F401  (each registers its operators)
     arithmetic,
+    elements,
     layers,
     resizing,
-    tensors,
 )
 from pnpdepth_cli.models.onnx.limits import SizeLimit, largest_activation
 from pnpdepth_cli.models.onnx.table import HOST_INPUTS, OPERATORS, Node, Unsupported

@@ -22,8 +22,8 @@ from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.io.dataset import Protocol
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.sensors.cloud import depth_edges
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
+from pnpdepth_cli.sensors.point_cloud import depth_edges
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 from tests.commands.batches import batch, done, pairs_on_disk
 from tests.commands.frames import FrameOnDisk, frame_on_disk, run

@@ -17,8 +17,8 @@ from pnpdepth_cli.commands.refinement.outputs import LARGEST_VIEW, _rays, _strid
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors.cloud import kept_pixels
 from pnpdepth_cli.sensors.lens import rays_of
+from pnpdepth_cli.sensors.point_cloud import kept_pixels
 from tests.commands.frames import frame_on_disk, run
 
 

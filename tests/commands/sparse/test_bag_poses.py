@@ -12,7 +12,7 @@ pytest.importorskip("rosbags")
 from pnpdepth_cli.commands.batch.frames import unpacked
 from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.commands.refinement.request import RefineRequest
-from pnpdepth_cli.commands.sparse import frames
+from pnpdepth_cli.commands.sparse import bag_frames
 from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.bags import open_bag
@@ -67,7 +67,7 @@ def test_without_poses_of_the_camera_none_are_written(
 def test_poses_that_are_missing_for_some_images_are_not_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frames, "_LONGEST_GAP_S", 0.02)  # they are 0.03 s apart
+    monkeypatch.setattr(bag_frames, "_LONGEST_GAP_S", 0.02)  # they are 0.03 s apart
     messages = written(write_bag(tmp_path / "drive.mcap", poses="odometry"), tmp_path / "frames")
     assert "warning: 3 of 3 images have no pose in /odom within 0.02 s" in messages[-1]
     assert not (tmp_path / "frames/poses.txt").exists()

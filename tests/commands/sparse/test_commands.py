@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.sparse.make import (
     simulate_scan,
 )
 from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scans import read_scan_points
+from pnpdepth_cli.commands.sparse.scan_points import read_scan_points
 from pnpdepth_cli.errors import (
     OutputError,
     PnpDepthError,

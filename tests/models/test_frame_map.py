@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pnpdepth_cli.models.definition import Fixed, Multiple, Near
-from pnpdepth_cli.models.frame import FrameMap
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.points import SparsePoints
 
 sides = st.integers(1, 70)

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.sensors import cloud as module
-from pnpdepth_cli.sensors.cloud import PointCloud, VoxelGrid, cloud_from_depth, depth_edges
+from pnpdepth_cli.sensors import point_cloud as module
 from pnpdepth_cli.sensors.lens import pixels_of
+from pnpdepth_cli.sensors.point_cloud import PointCloud, VoxelGrid, cloud_from_depth, depth_edges
 
 HEIGHT, WIDTH = 24, 32
 INTRINSICS = np.array([[30.0, 0, 15.5], [0, 28.0, 11.0], [0, 0, 1]])

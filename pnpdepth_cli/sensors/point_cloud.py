@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import pixels_of, rays_of_image
-from pnpdepth_cli.sensors.sparse import Floats, Mask, pixel_index
+from pnpdepth_cli.sensors.pixels import Floats, Mask, pixel_index
 
 EDGE = 0.05
 """Default jump of depth: of depth maps of indoor and street scenes, it cuts silhouettes and keeps

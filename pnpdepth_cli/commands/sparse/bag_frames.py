@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.commands.sparse.options import BagOptions
-from pnpdepth_cli.commands.sparse.scans import chosen_camera
+from pnpdepth_cli.commands.sparse.scan_points import chosen_camera
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.bags import (

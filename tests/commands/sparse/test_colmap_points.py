@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.cli.main import run as run_command
-from pnpdepth_cli.commands.sparse.colmap import read_colmap_points
+from pnpdepth_cli.commands.sparse.colmap_points import read_colmap_points
 from pnpdepth_cli.commands.sparse.options import ColmapOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import read_depth

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.colmap import MODELS, name_in_model, read_model
+from pnpdepth_cli.io.colmap_model import MODELS, name_in_model, read_model
 from pnpdepth_cli.sensors.lens import pixels_of
 from tests.colmap_models import CAMERAS, write_binary_model, write_text_model
 

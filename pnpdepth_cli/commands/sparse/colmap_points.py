@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.commands.sparse.options import METRES, MODEL_UNITS, ColmapOptions
-from pnpdepth_cli.commands.sparse.scans import SparseDepth
+from pnpdepth_cli.commands.sparse.scan_points import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
-from pnpdepth_cli.io.colmap import (
+from pnpdepth_cli.io.colmap_model import (
     ColmapModel,
     find_model,
     model_files,
@@ -23,7 +23,7 @@ from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.sensors import Points
 from pnpdepth_cli.sensors.lens import pixels_of
-from pnpdepth_cli.sensors.sparse import DropCounter, describe_dropped
+from pnpdepth_cli.sensors.pixels import DropCounter, describe_dropped
 
 _SIZES_IN_RANGE = 8.0
 """A 16-bit file in model units holds depths up to at least so many times the model's extent."""

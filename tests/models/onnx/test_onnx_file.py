@@ -24,7 +24,7 @@ from pnpdepth_cli.errors import LayerError, ModelError, UsageError
 from pnpdepth_cli.models.definition import Multiple
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.onnx import graph, limits
-from pnpdepth_cli.models.onnx.network import _as_map, _channels_last, _deviation
+from pnpdepth_cli.models.onnx.onnx_file import _as_map, _channels_last, _deviation
 from pnpdepth_cli.models.onnx.table import OPERATORS
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
