@@ -1,10 +1,12 @@
 """What `pnpdepth refine` gives without options: `python -m benchmarks.default --data PATH`.
 
 For each network, set and number of points, means over frames and seeds of the MAE and the RMSE in
-metres: linear interpolation, the stages of the default method (the network aligned with the points,
-the networks fused, z updated, the residual propagated), and its result. All are scored on the same
-pixels, those with ground truth. `worse` is the fraction of frames where the MAE of the result is
-above that of linear interpolation, `moved` the fraction where the check moved it.
+metres: linear interpolation, the network aligned with the points, its z updated, its residual
+propagated, `compact` alone, and the result. All are scored on the same pixels, those with ground
+truth. `worse` is the fraction of frames where the MAE of the result is above that of linear
+interpolation, `weight` the mean weight of the network in the result, its depth as a prior of
+`compact` included, `no part` the fraction of frames where it is below 1 %, and `warned` the
+fraction with a warning that the image does not help.
 
 A second table has the fractions of the ground truth within multiples of `--uncertainty`'s standard
 deviation, the fraction of frames with at least 60 % within one and 90 % within two, and what its
@@ -44,6 +46,7 @@ from benchmarks.frames import (
     without_occluded,
 )
 from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.frames.default import LEAST_PART
 from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network
@@ -62,12 +65,15 @@ NETWORKS = {
     "realsense": ("fastdepth", "compact"),  # its colour is not registered
 }
 """By set; nothing was chosen on the last four."""
-STAGES = ("linear", "aligned", "fused", "updated", "propagated", "result")
+STAGES = ("linear", "aligned", "updated", "propagated", "alone", "result")
 MULTIPLES = (1, 2, 3, 4)
 WRONG = 0.2  # fraction of the points, with `--outliers`
 LARGE_ERROR = 0.25  # of the depth
 MASKED = 0.05  # of the ground truth
-HEAD = ("network", "set, runs", "points", *STAGES, "result / linear", "worse", "moved", "CPU s")
+HEAD = (
+    *("network", "set, runs", "points", *STAGES, "result / linear", "worse", "weight", "no part"),
+    *("warned", "CPU s"),
+)
 UNCERTAINTY_HEAD = (
     *("network", "set, runs", "points", *(f"within ± {k} σ" for k in MULTIPLES), "≥ 60, ≥ 90 %"),
     *("large errors", "of these masked", "kept", "masked at 95 % kept"),
@@ -102,9 +108,17 @@ def measure(
     return {
         "errors": errors_of(depths, torch.from_numpy(frame.gt)),
         "cpu_s": seconds,
-        "moved": not np.array_equal(refined.after, refined.stages["propagated"]),
+        "weight": weight_of(network, refined),
+        "warned": any(note.startswith("warning: the image") for note in refined.notes),
         "uncertainty": uncertainty(with_uncertainty(refined), frame.gt),
     }
+
+
+def weight_of(network: Network, refined: Refined) -> float:
+    """The weight of a network in the result, its depth as another one's prior included."""
+    name = network.definition.name
+    own = (name, f"compact with {name}")
+    return sum(weight for expert, weight in refined.weights.items() if expert in own)
 
 
 def uncertainty(refined: Refined, gt: Depth) -> dict[str, Any]:
@@ -146,7 +160,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "frames": len(rows),
         "mean": {n: tuple(np.mean([each[n] for each in errors], axis=0).tolist()) for n in names},
         "worse": float(np.mean([each["result"][0] > each["linear"][0] for each in errors])),
-        "moved": float(np.mean([row["moved"] for row in rows])),
+        "weight": float(np.mean([row["weight"] for row in rows])),
+        "no_part": float(np.mean([row["weight"] < LEAST_PART for row in rows])),
+        "warned": float(np.mean([row["warned"] for row in rows])),
         "cpu_s": float(np.median([row["cpu_s"] for row in rows])),
     }
 
@@ -183,13 +199,17 @@ def main() -> None:
             for frame in registered(frames, count, seed, args.registration)
         ]
         of = summary(rows)
-        *errors, result = (f"{mae:.4f} / {rmse:.3f}" for mae, rmse in map(of["mean"].get, STAGES))
+        *errors, result = (
+            f"{mae:.4f} / {rmse:.3f}" if mae is not None else ""
+            for mae, rmse in (of["mean"].get(stage, (None, None)) for stage in STAGES)
+        )
         case = (name, f"{set_name}, {of['frames']}", count or "LiDAR")
         second.append((*case, *uncertainty_cells(rows)))
         print_row(
             *(*case, *errors, f"**{result}**"),
             f"{of['mean']['result'][0] / of['mean']['linear'][0]:.3f}",
-            *(f"{of['worse']:.0%}", f"{of['moved']:.0%}", f"{of['cpu_s']:.1f}"),
+            *(f"{of['worse']:.0%}", f"{of['weight']:.0%}", f"{of['no_part']:.0%}"),
+            *(f"{of['warned']:.0%}", f"{of['cpu_s']:.1f}"),
         )
         cell = {"network": name, "frames": set_name, "points": count}
         everything.append({"cell": cell, "summary": of, "frames": rows})

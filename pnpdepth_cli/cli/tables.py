@@ -175,6 +175,12 @@ def print_batch(summary: Mapping[str, Any]) -> None:
         parts.append(f"{worse} worse than linear interpolation")
     console = _Console(stderr=True, highlight=False)
     console.print(", ".join(parts))
+    if summary["weights"]:
+        spans = (
+            f"{name} {each['mean']:.0%} ({each['least']:.0%} to {each['largest']:.0%})"
+            for name, each in summary["weights"].items()
+        )
+        console.print(escape(f"mean weights in the result: {', '.join(spans)}"), soft_wrap=True)
     output = summary["output"]
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
 

@@ -9,21 +9,21 @@ from typing import Any
 from pnpdepth_cli.commands.tables import Cell, Style, Table
 from pnpdepth_cli.measures import MEASURES
 
-GT, HELD_OUT, HIDDEN, USED = "scores", "held_out_error", "check", "sparse_error"
+GT, HELD_OUT, VALIDATION, USED = "scores", "held_out_error", "validation", "sparse_error"
 BASES = {
     GT: "against ground truth",
     HELD_OUT: "at held-out points",
-    HIDDEN: "at hidden points",
+    VALIDATION: "at validation points",
     USED: "at points used",
 }
 """What errors are measured on, the best first. A change at the points used means nothing."""
 _STAGES = {
-    "aligned": "{name} aligned",
-    "fused": "with points, fused",
-    "updated": "z updated",
-    "propagated": "residual propagated",
-    "result": "result",
-    "linear": "linear interpolation",
+    "aligned": "{name}, aligned with the points",
+    "updated": "{name}, z updated",
+    "propagated": "{name}, residual propagated",
+    "alone": "{fusing} alone",
+    "result": "fused ({weights})",
+    "linear": "linear interpolation of all points",
 }
 """Rows of the default method, by the name of the stage."""
 _MEASURES = {measure.key: measure for measure in MEASURES}
@@ -32,7 +32,7 @@ _MEASURES = {measure.key: measure for measure in MEASURES}
 def errors_by_basis(errors: Mapping[str, Any]) -> dict[str, dict[str, Mapping[str, Any]]]:
     """Returns the errors "before", "after" and of "linear" by their basis, the best first.
 
-    Those at hidden points are there only where no others say how good the result is.
+    Those at validation points are there only where no others say how good the result is.
 
     Args:
         errors: A record, a row of a summary, or a summary's means with its `linear`.
@@ -43,9 +43,9 @@ def errors_by_basis(errors: Mapping[str, Any]) -> dict[str, dict[str, Mapping[st
         for basis in (GT, HELD_OUT)
         if errors[basis]
     }
-    if not found and (check := linear.get("check")):
+    if not found and (at := linear.get("validation")):
         stages = {"before": "aligned", "after": "result", "linear": "linear"}
-        found[HIDDEN] = {side: check | {"mae": check[name]} for side, name in stages.items()}
+        found[VALIDATION] = {side: at | {"mae": at[name]} for side, name in stages.items()}
     if errors[USED]:
         found[USED] = {**errors[USED], "linear": {}}
     return found
@@ -101,49 +101,53 @@ def refinement_table(record: Mapping[str, Any]) -> Table:
 
 
 def _stages_table(record: Mapping[str, Any]) -> Table:
-    """The stages of the default method: scores on the ground truth, or errors at hidden points."""
+    """The stages of the default method: scores on the ground truth, or at validation points."""
     beside, names = record["linear"], record["method"]["networks"]
-    keys, rows, caption = ["mae"], dict[str, Any](), "too few points to check the result at some"
+    keys, rows, caption = ["mae"], dict[str, Any](), "too few points to validate the result at some"
     if record["stages"] is not None:
         rows = {stage["stage"]: stage["scores"] for stage in record["stages"]}
         rows |= {"result": record["scores"]["after"], "linear": beside["scores"]}
         keys, caption = ["rmse", "mae", "mre", "delta1"], _scored_on(rows["linear"])
-    elif (check := beside["check"]) is not None:
-        rows = {name: {"mae": check[name]} for name in _STAGES if name in check}
-        caption = f"at {check['points']:,} points that were hidden from the method"
-    if len(names) == 1:
-        rows.pop("fused", None)
-    if rows and rows["result"]["mae"] == rows["propagated"]["mae"]:
-        del rows["result"]
+    elif (at := beside["validation"]) is not None:
+        rows = {name: {"mae": at[name]} for name in _STAGES if name in at}
+        caption = f"at {at['points']:,} validation points, which the rows did not get"
+    if sum(weight > 0 for weight in record["weights"].values()) == 1 and "alone" not in rows:
+        rows.pop("result", None)  # the network's own
     last = [name for name in rows if name != "linear"][-1:]
+    of_names = {"name": names[0], "fusing": names[-1], "weights": weights_text(record["weights"])}
     lines = []
     for name, scores in rows.items():
         style: Style = "bold" if [name] == last else ""
         against = "" if name == "linear" else change("mae", rows["linear"]["mae"], scores["mae"])
         cells = [format_error(key, scores[key], record["unit"]) for key in keys]
-        title = _STAGES[name].format(name=record["model"]["name"])
+        title = _STAGES[name].format(**of_names)
         lines.append([*(Cell(text, style) for text in (title, *cells)), against])
     header = ["", *(_title(key) for key in keys), "MAE vs linear"]
     return Table(caption=f"{' + '.join(names)}; {caption}", header=header, rows=lines)
 
 
+def weights_text(weights: Mapping[str, float]) -> str:
+    """Returns the weights of experts as text, without those below half a per cent."""
+    return ", ".join(f"{name} {w:.0%}" for name, w in weights.items() if w >= 0.005)
+
+
 def baselines_table(baselines: Mapping[str, Mapping[str, Any]], unit: str) -> Table:
-    """Returns the baselines, the network and the result, best first at the held-out points.
+    """Returns the baselines, the network and the result, best first at the validation points.
 
     Args:
         baselines: Of a record or a summary, by name.
         unit: Of the depths.
     """
     rows = {
-        name: {"held_out": row["held_out_mae"], **(row.get("scores", row) or {})}
+        name: {"at_validation": row["validation_mae"], **(row.get("scores", row) or {})}
         for name, row in baselines.items()
     }
-    titles = {"held_out": "MAE, held-out points"}
+    titles = {"at_validation": "MAE, validation points"}
     if any(row.get("mae") is not None for row in rows.values()):
         titles |= {"mae": "MAE, ground truth", "rmse": "RMSE, ground truth"}
-    known = {name: row for name, row in rows.items() if row["held_out"] is not None}
+    known = {name: row for name, row in rows.items() if row["at_validation"] is not None}
     lines = []
-    for name in sorted(known, key=lambda name: known[name]["held_out"]) or list(rows):
+    for name in sorted(known, key=lambda name: known[name]["at_validation"]) or list(rows):
         style: Style = "bold" if name == "result" else ""
         cells = [format_error("mae", rows[name].get(key), unit) for key in titles]
         lines.append([Cell(text, style) for text in (name, *cells)])

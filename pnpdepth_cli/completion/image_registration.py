@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -34,15 +33,10 @@ FOUND = 4.0
 The constants here were chosen on rendered frames, of which 1 % of the registered ones exceed it
 with 500 to 5,000 points, none with 100."""
 
-REGISTERED, DOUBT, CHANCE = 3.0, 1.8, 3.0
+REGISTERED, CHANCE = 3.0, 3.0
 """Log of the Bayes factor of an image that belongs to its points over one that is unrelated: from
-which it is not moved, under whose negative it counts as unrelated, and which the best of all
-registrations exceeds by chance: once for one frame, twice for more."""
-
-ENOUGH = 2.0
-"""An image is called unrelated only where an image that belongs to its points would have at least
-this log Bayes factor in the mean, as with 260 points. With 100 points it has 0.7, and 2 of 40 draws
-of registered frames of ICL-NUIM are below −1.8."""
+which it is not moved, and which the best of all registrations exceeds by chance: once for one
+frame, twice for more."""
 
 _ZOOMS = np.exp(np.linspace(-0.4, 0.4, 81))  # 0.67 to 1.49
 _LARGEST_SHIFT = 0.05  # of the image's sides
@@ -184,13 +178,11 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
     return Evidence(edges=edges, ends=at[pairs], weight=weight, size=points.size, points=len(xy))
 
 
-def estimated(
-    frames: Iterable[Evidence | None],
-) -> ImageRegistration | Literal["unrelated"] | None:
+def estimated(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
     """Returns the registration that frames of one size have in common: the posterior's mean.
 
-    None where the evidence is no better than for an image that is registered already, "unrelated"
-    where depth changes at edges no more often than by chance, wherever the image is moved.
+    None where the evidence is no better than for an image that is registered already, or than
+    chance.
 
     Args:
         frames: Their evidence; None of a frame that says nothing. The first decides the size.
@@ -201,8 +193,7 @@ def estimated(
     size = known[0].size
     usable = [frame for frame in known if frame.size == size]
     middle = tuple(count // 2 for count in usable[0].unmoved.shape)
-    related = _related(usable, [frame.unmoved for frame in usable], middle)
-    if related > REGISTERED:
+    if _related(usable, [frame.unmoved for frame in usable], middle) > REGISTERED:
         return None
     total = np.stack(
         [np.sum([frame.log_likelihood(zoom) for frame in usable], axis=0) for zoom in _ZOOMS]
@@ -215,13 +206,12 @@ def estimated(
     )
     logits = total - prior - logsumexp(-prior)
     unmoved = sum(float(frame.unmoved[middle]) for frame in usable)
-    enough = float(np.square(_expected(usable)).sum() / 2) >= ENOUGH
     if logsumexp(logits) - unmoved < FOUND:
-        return "unrelated" if related < -DOUBT and enough else None
+        return None
     number, *place = np.unravel_index(logits.argmax(), logits.shape)
     maps = [frame.log_likelihood(float(_ZOOMS[number])) for frame in usable]
     if _related(usable, maps, tuple(place)) < CHANCE * min(len(usable), 2):
-        return "unrelated" if enough else None
+        return None
     probability = np.exp(logits - logsumexp(logits))
     return ImageRegistration(
         zoom=round(float(_ZOOMS @ probability.sum((1, 2))), 4),
@@ -240,14 +230,9 @@ def _related(
     number of points (even frames of 7-Scenes and ICL-NUIM).
     """
     standing = np.array([(each[place] - each.mean()) / (each.std() + 1e-9) for each in maps])
-    expected = _expected(frames)
-    return float(np.sum(expected * (standing - expected / 2)))
-
-
-def _expected(frames: Sequence[Evidence]) -> Floats:
-    """(N,) the mean of those standard deviations of images that belong to their points."""
     points = np.array([frame.points for frame in frames])
-    return _EVIDENCE * np.log(np.maximum(points / _NO_EVIDENCE, 1.0))
+    expected = _EVIDENCE * np.log(np.maximum(points / _NO_EVIDENCE, 1.0))
+    return float(np.sum(expected * (standing - expected / 2)))
 
 
 def _shifts(count: int, size: tuple[int, int]) -> Floats:

@@ -24,9 +24,8 @@ METRES = "m"
 DepthMap = NDArray[np.float32]
 Registration = str | tuple[float, float, float]
 """What the user says of the registration: "auto", "off", or zoom, right and down in pixels."""
-Register = ImageRegistration | Literal["auto", "unrelated"] | None
-"""How an image is to be moved into the frame of the points. "auto": as the points say; "unrelated":
-not at all, as it seems not to belong to them."""
+Register = ImageRegistration | Literal["auto"] | None
+"""How an image is to be moved to its points. "auto": as the points say."""
 FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 """Value of white by the type of an image's integers."""
 
@@ -48,8 +47,6 @@ class Frame:
     that take one. None without."""
     registration: ImageRegistration | None = None
     """How `rgb` was moved into the frame of the points. None: it was not."""
-    unrelated: bool = False
-    """Whether depth changes at edges of `rgb` no more often than by chance."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -74,7 +71,7 @@ class Frame:
             return self
         how = self._registration_of_points if how == "auto" else how
         if how is None or isinstance(how, str):
-            return replace(self, register=None, unrelated=how == "unrelated")
+            return replace(self, register=None)
         return replace(self, rgb=tensor_of(how.applied(image)), register=None, registration=how)
 
     def with_points(self, points: SparsePoints) -> Frame:
@@ -113,9 +110,11 @@ class Refined:
     valid: NDArray[np.bool_] | None = None
     """(H, W), where points support `after`. None without `sigma`."""
     stages: Mapping[str, DepthMap] = field(default_factory=dict)
-    """(H, W) metres after each stage of the default method, by its name."""
-    check: Check | None = None
-    """The method and its stages at hidden points. None for a fixed method, or with few points."""
+    """(H, W) metres of stages of the default method, by name; of a frame with ground truth."""
+    validation: Validation | None = None
+    """The stages and the result at validation points. None where nothing was validated."""
+    weights: Mapping[str, float] = field(default_factory=dict)
+    """Weights of the experts of the default method, by name; their sum is 1."""
     registration: ImageRegistration | None = None
     """How the image was moved into the frame of the points. None: it was not."""
 
@@ -131,22 +130,21 @@ class Refined:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
-    """Depth at points that were hidden from the method.
+class Validation:
+    """Depth at validation points, predicted from the other points.
 
-    The predictions are those of the default method, without updates of z in networks that take
-    points, from four fifths of the points.
+    Networks that take points predict without updates of z.
     """
 
-    hidden: SparsePoints  # the M hidden points
-    kept: SparsePoints
-    network: Tensor  # (H, W) metres, 0 = unknown: the user's network, aligned with the kept points
-    weights: Tensor  # (M,) 0…1, how consistent each hidden point is with its neighbours
+    points: SparsePoints  # the M validation points
+    kept: SparsePoints  # all other points that were given
+    network: Tensor  # (H, W) metres, 0 = unknown: the user's network, aligned with the other points
+    weights: Tensor  # (M,) 0…1, how consistent each validation point is with its neighbours
     predicted: Mapping[str, Tensor]
-    """(M,) metres at the hidden points, by stage; also of linear interpolation and the result."""
+    """(M,) metres at the validation points, by stage; also linear interpolation and the result."""
 
-    def with_prediction(self, name: str, depth: Tensor) -> Check:
-        """Returns the same check with a prediction (M,) metres at the hidden points added."""
+    def with_prediction(self, name: str, depth: Tensor) -> Validation:
+        """Returns the same with a prediction (M,) metres at the validation points added."""
         return replace(self, predicted={**self.predicted, name: depth})
 
     def error(self, name: str) -> float:
@@ -154,21 +152,8 @@ class Check:
 
         A point without prediction counts as far off as a depth of 0 is.
         """
-        error = (self.predicted[name] - self.hidden.depth).abs()
+        error = (self.predicted[name] - self.points.depth).abs()
         return float((error * self.weights).sum() / self.weights.sum())
-
-    def gain(self, name: str, other: str) -> float:
-        """Returns by how many standard errors one prediction is better than another, in log depth.
-
-        Negative where it is worse.
-        """
-        at = [self.predicted[n].clamp_min(1e-6).log() for n in (name, other)]
-        truth = self.hidden.depth.log()
-        gain = (at[1] - truth).abs() - (at[0] - truth).abs()
-        share = self.weights / self.weights.sum()
-        mean = (share * gain).sum()
-        deviation = (share.square() * (gain - mean).square()).sum().sqrt()
-        return float(mean / deviation.clamp_min(1e-12))
 
 
 def registration_to_make(registration: Registration, settings: Settings) -> Register:

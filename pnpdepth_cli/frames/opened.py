@@ -6,9 +6,9 @@ once, and so does the image encoder that a definition names.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -25,6 +25,72 @@ from pnpdepth_cli.frames.refine import to_refined_frame
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
 from pnpdepth_cli.settings import Settings
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Member:
+    """A network of the default method."""
+
+    network: Network
+    layer: str  # layer to cut at
+    settings: Settings  # how its output is aligned and z is updated
+
+    @property
+    def name(self) -> str:
+        """What the network is called."""
+        return self.network.definition.name
+
+    @property
+    def takes_points(self) -> bool:
+        """Whether sparse depth is an input."""
+        return "sparse" in self.network.definition.input_kind
+
+    @property
+    def takes_prior(self) -> bool:
+        """Whether another network's depth is an input."""
+        return self.network.definition.takes_prior
+
+
+class OpenNetworks:
+    """The networks of the default method, open from frame to frame, as a context manager.
+
+    Args:
+        members: The networks, the user's first.
+    """
+
+    def __init__(self, members: Sequence[Member]) -> None:
+        self.members = tuple(members)
+        self._opened = {member: OpenNetwork(member.network, member.layer) for member in members}
+        self._stack = ExitStack()
+
+    def __enter__(self) -> OpenNetworks:
+        for opened in self._opened.values():
+            self._stack.enter_context(opened)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def next_image(self) -> None:
+        """Forgets what was computed for the last image."""
+        for opened in self._opened.values():
+            opened.next_image()
+
+    def refine(self, member: Member, frame: Frame, *, updates: bool = True) -> Refined:
+        """Returns the frame refined by one network, its residual not propagated.
+
+        Args:
+            member: The network.
+            frame: The image, the same in all calls until `next_image`, and the points of this call.
+            updates: Whether z is updated.
+
+        Raises:
+            PnpDepthError: The refinement fails.
+        """
+        settings = member.settings
+        if not updates:
+            settings = replace(settings, iterations=0)
+        return self._opened[member].refine(frame, settings)
 
 
 class OpenNetwork:

@@ -24,7 +24,7 @@ from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
 from pnpdepth_cli.frames.adapt import Weights, learn, too_little, weights_in_place
-from pnpdepth_cli.frames.default import check_fixed, refine_default, split_hidden
+from pnpdepth_cli.frames.default import check_fixed, refine_default, split_points
 from pnpdepth_cli.frames.frame import (
     METRES,
     Frame,
@@ -36,7 +36,7 @@ from pnpdepth_cli.frames.frame import (
     no_points,
     registration_to_make,
 )
-from pnpdepth_cli.frames.fuse import Fusion, Member
+from pnpdepth_cli.frames.opened import Member, OpenNetworks
 from pnpdepth_cli.frames.refine import refine_frames
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
 from pnpdepth_cli.frames.tiles import refine_tiled
@@ -65,7 +65,9 @@ class Refiner:
         settings: What is left open, the network decides. With any setting of the method, `network`
             alone is refined by it; without, by the default method.
         uncertainty: Whether the standard deviation of the depth is estimated too.
-        check: Whether the result is checked at hidden points also with a fixed method.
+        check: Whether the result is checked at validation points also with a fixed method.
+        compact: Whether the default method fuses `network` with the included network `compact`,
+            where there is an image. Without, `network` alone is refined.
         registration: Whether images are moved into the frame of the points: "auto", if their depth
             edges show that they are not registered; "off"; or by (zoom, right, down), pixels.
         adapt: Frames of the same sequence, (image, sparse) each, whose points the weights of
@@ -85,6 +87,7 @@ class Refiner:
         *,
         uncertainty: bool = False,
         check: bool = False,
+        compact: bool = True,
         registration: Registration = "auto",
         adapt: Sequence[tuple[ArrayLike | None, ArrayLike | SparsePoints]] = (),
     ) -> None:
@@ -96,13 +99,14 @@ class Refiner:
         self.asked = settings or Settings()
         self.is_default = not self.asked.fixed_by
         self._uncertainty, self._check = uncertainty, check or uncertainty
+        self._compact = compact
         self._register = registration_to_make(registration, self.asked)
         self._adapt = [frame_of_arrays(*pair, self._register, None) for pair in adapt]
         self._weights: Weights | None = None  # learnt ones, where they are better
         self.members: tuple[Member, ...] = ()
         self.registrations: Mapping[tuple[int, int], Register] = MappingProxyType({})
         self._stack = ExitStack()
-        self._opened: Split | Fusion | None = None
+        self._opened: Split | OpenNetworks | None = None
         if len(self._networks) > 1 and not self.is_default:
             raise UsageError(
                 f"several --model are fused, but {self.asked.fixed_by} fixes one network"
@@ -175,7 +179,7 @@ class Refiner:
             PnpDepthError: The frame cannot be refined.
         """
         frame, opened = self._begun(frame)
-        if isinstance(opened, Fusion):
+        if isinstance(opened, OpenNetworks):
             refined = refine_default(opened, frame, seed=self.asked.seed)
         else:
             settings, propagation = self.settings, self.settings.propagate
@@ -234,7 +238,8 @@ class Refiner:
         if self._adapt:
             networks[0] = self._adapted(networks[0])
         named = {network.definition.name for network in networks}
-        if self.is_default and first.rgb is not None and COMPANION not in named:
+        fused = self.is_default and self._compact and first.rgb is not None
+        if fused and COMPANION not in named:
             device, precision = str(networks[0].device), networks[0].precision
             companion = load_network(COMPANION, None, device, precision=precision)
             networks.append(resolve_definition(companion, first))
@@ -270,7 +275,7 @@ class Refiner:
         if usable:
             self.registrations = MappingProxyType({usable[0].size: estimated(usable)})
 
-    def _begun(self, frame: Frame) -> tuple[Frame, Split | Fusion]:
+    def _begun(self, frame: Frame) -> tuple[Frame, Split | OpenNetworks]:
         """The frame as it is refined, and the networks, open."""
         self.decide(frame)
         torch.manual_seed(self.asked.seed)
@@ -279,8 +284,8 @@ class Refiner:
         if self._opened is None:
             if self._weights is not None:
                 self._stack.enter_context(weights_in_place(self.network, self._weights))
-            network: Split | Fusion = (
-                Fusion(self.members) if self.is_default else self.network.cut_at(self.layer)
+            network: Split | OpenNetworks = (
+                OpenNetworks(self.members) if self.is_default else self.network.cut_at(self.layer)
             )
             self._stack.enter_context(network)
             self._opened = network
@@ -315,17 +320,17 @@ class Refiner:
 
         It is returned as it is where its points are too few or the method fails.
         """
-        parts = split_hidden(frame.points, self.asked.seed)
+        parts = split_points(frame.points, self.asked.seed)
         if parts is None:
             return refined
-        kept, hidden = parts
+        kept, points = parts
         unchecked = copy.copy(self)
         unchecked._check = unchecked._uncertainty = False
         try:
             again = unchecked.refine_frame(frame.with_points(kept))
         except PnpDepthError:
             return refined
-        return replace(refined, check=check_fixed(refined, again, kept, hidden))
+        return replace(refined, validation=check_fixed(refined, again, kept, points))
 
 
 def _finished(refined: Refined, frame: Frame) -> Refined:

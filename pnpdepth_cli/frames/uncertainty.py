@@ -1,4 +1,4 @@
-"""The standard deviation of a depth map, calibrated by hidden points (`--uncertainty`).
+"""The standard deviation of a depth map, calibrated by validation points (`--uncertainty`).
 
 Errors of depth have heavy tails: they are small within a surface and as large as the step at a
 depth edge. One standard deviation for all pixels would hold too many errors within ± σ or too few
@@ -27,7 +27,7 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points
 from pnpdepth_cli.frames.default import RESULT
-from pnpdepth_cli.frames.frame import Check, DepthMap, Refined
+from pnpdepth_cli.frames.frame import DepthMap, Refined, Validation
 from pnpdepth_cli.points import SparsePoints
 
 MIN_INLIER_WEIGHT = 0.05
@@ -47,7 +47,7 @@ _WITHIN = (0.68, 0.95)  # of normal errors within one and two standard deviation
 _TAIL = 0.75  # weight of the second in the scale: both cannot hold where tails are heavy
 _TYPICAL, _PER_POINT = 1.75, -0.18  # factor with 100 points, and its power of their number
 _FEWEST_POINTS, _MOST_POINTS = 20, 500  # fewer and more change nothing
-_TYPICAL_WEIGHT = 20  # hidden points that the typical factor counts as
+_TYPICAL_WEIGHT = 20  # validation points that the typical factor counts as
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point are valid
 _BEYOND_HULL = 2.0  # typical distances to the nearest point, outside the hull of the points
 _SAMPLED = 4000  # pixels, for the typical distance
@@ -60,9 +60,9 @@ def with_uncertainty(frame: Refined) -> Refined:
     shape = relative_shape(points, network, torch.from_numpy(depth))
     residual = sigma = torch.empty(0)
     note = "uncertainty: too few points to calibrate it with"
-    if frame.check is not None:
-        residual, sigma = _calibrating(frame.check)
-        note = f"uncertainty: calibrated with {len(residual):,} hidden points"
+    if frame.validation is not None:
+        residual, sigma = _calibrating(frame.validation)
+        note = f"uncertainty: calibrated with {len(residual):,} validation points"
     factor = calibration(residual, sigma, len(points))
     sigma_m = (factor * shape.numpy() * depth).astype(np.float32)
     valid = valid_depth(points, depth, sigma_m)
@@ -71,12 +71,12 @@ def with_uncertainty(frame: Refined) -> Refined:
     return replace(frame, sigma=sigma_m, valid=valid, notes=(*frame.notes, note))
 
 
-def _calibrating(check: Check) -> tuple[Tensor, Tensor]:
-    """Residual of log depth and uncalibrated standard deviation, (M,), at hidden points."""
-    predicted = check.predicted[RESULT]
-    sigma = relative_shape(check.kept, check.network, predicted, check.hidden.xy)
-    good = (check.weights > MIN_INLIER_WEIGHT) & (predicted > 0)
-    return check.hidden.depth[good].log() - predicted[good].log(), sigma[good]
+def _calibrating(validation: Validation) -> tuple[Tensor, Tensor]:
+    """Residual of log depth and uncalibrated standard deviation, (M,), at validation points."""
+    predicted, points = validation.predicted[RESULT], validation.points
+    sigma = relative_shape(validation.kept, validation.network, predicted, points.xy)
+    good = (validation.weights > MIN_INLIER_WEIGHT) & (predicted > 0)
+    return points.depth[good].log() - predicted[good].log(), sigma[good]
 
 
 def relative_shape(

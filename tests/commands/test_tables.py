@@ -46,27 +46,29 @@ def test_an_error_has_its_unit_and_nothing_is_a_dash() -> None:
 
 
 def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> None:
-    check = {"points": 12, "aligned": 4.0, "fused": 3.0, "propagated": 1.0, "linear": 2.0}
+    at = {"points": 12, "aligned": 4.0, "propagated": 1.0, "result": 1.0, "linear": 2.0}
     record: dict[str, Any] = {
         "method": {"kind": "default", "networks": ["net"]},
         "model": {"name": "net"},
         "unit": "m",
         "stages": None,
         "scores": None,
-        "linear": {"check": check | {"result": 1.0}},
+        "weights": {"net": 1.0},
+        "linear": {"validation": at},
     }
     assert styled(refinement_table(record)) == [
-        [("net aligned", ""), ("4.0000 m", ""), ("+100.0%", "bad")],
-        [("residual propagated", "bold"), ("1.0000 m", "bold"), ("-50.0%", "good")],
-        [("linear interpolation", ""), ("2.0000 m", ""), ("", "")],
+        [("net, aligned with the points", ""), ("4.0000 m", ""), ("+100.0%", "bad")],
+        [("net, residual propagated", "bold"), ("1.0000 m", "bold"), ("-50.0%", "good")],
+        [("linear interpolation of all points", ""), ("2.0000 m", ""), ("", "")],
     ]
     record["method"]["networks"].append("other")
-    record["linear"]["check"]["result"] = 0.5
-    _, fused, _, result, _ = (row[0] for row in refinement_table(record).rows)
-    assert (fused, result) == ("with points, fused", "result")
+    record["weights"] = {"net": 0.15, "other with net": 0.0, "other": 0.85}
+    at |= {"alone": 0.7, "result": 0.5}
+    *_, alone, result, _ = (row[0] for row in refinement_table(record).rows)
+    assert (alone, result) == ("other alone", "fused (net 15%, other 85%)")
 
 
-def test_errors_stand_by_what_they_are_measured_on_and_hidden_points_count_only_alone() -> None:
+def test_errors_stand_by_what_they_are_measured_on_and_validation_points_count_only_alone() -> None:
     after = {"rmse": 1.0, "delta1": 0.75, "pixels": 1200, "coverage": 0.5}
     record: dict[str, Any] = {
         "method": {"kind": "fixed"},
@@ -79,7 +81,7 @@ def test_errors_stand_by_what_they_are_measured_on_and_hidden_points_count_only_
         "linear": {
             "scores": {"rmse": 4.0, "delta1": 0.75},
             "held_out_error": None,
-            "check": {"points": 12, "aligned": 4.0, "result": 1.0, "linear": 2.0},
+            "validation": {"points": 12, "aligned": 4.0, "result": 1.0, "linear": 2.0},
         },
     }
     table = refinement_table(record)
@@ -94,23 +96,23 @@ def test_errors_stand_by_what_they_are_measured_on_and_hidden_points_count_only_
     ]
     table = refinement_table(record | dict.fromkeys(("scores", "held_out_error")))
     assert table.caption == "net cut at middle"
-    hidden = ["error at 12 hidden points, MAE", "4.0000 m", "1.0000 m", "-75.0%"]
-    assert table.rows == [[*hidden, "2.0000 m", "-50.0%"], at_used]
+    validated = ["error at 12 validation points, MAE", "4.0000 m", "1.0000 m", "-75.0%"]
+    assert table.rows == [[*validated, "2.0000 m", "-50.0%"], at_used]
 
 
 def test_baselines_are_sorted_and_have_ground_truth_where_one_of_them_has() -> None:
     baselines: dict[str, Any] = {
-        "nearest": {"held_out_mae": 2.0, "scores": {"mae": 3.0, "rmse": 4.0}},
-        "result": {"held_out_mae": 1.0, "scores": None},
-        "linear": {"held_out_mae": None},
+        "nearest": {"validation_mae": 2.0, "scores": {"mae": 3.0, "rmse": 4.0}},
+        "result": {"validation_mae": 1.0, "scores": None},
+        "linear": {"validation_mae": None},
     }
     table = baselines_table(baselines, "m")
-    assert table.header == ["", "MAE, held-out points", "MAE, ground truth", "RMSE, ground truth"]
+    assert table.header == ["", "MAE, validation points", "MAE, ground truth", "RMSE, ground truth"]
     assert styled(table) == [
         [("result", "bold"), ("1.0000 m", "bold"), ("–", "bold"), ("–", "bold")],
         [("nearest", ""), ("2.0000 m", ""), ("3.0000 m", ""), ("4.0000 m", "")],
     ]
-    unknown = {name: {"held_out_mae": None} for name in ("nearest", "linear")}
+    unknown = {name: {"validation_mae": None} for name in ("nearest", "linear")}
     assert baselines_table(unknown, "m").rows == [["nearest", "–"], ["linear", "–"]]
 
 

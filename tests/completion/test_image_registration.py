@@ -93,13 +93,11 @@ def test_frames_show_together_that_the_image_sees_much_less_or_more(zoom: float)
 
 
 @pytest.mark.parametrize(("count", "frames"), [(100, 6), (500, 5)])
-def test_images_of_other_scenes_are_unrelated_to_the_points(count: int, frames: int) -> None:
+def test_images_of_other_scenes_are_not_moved(count: int, frames: int) -> None:
     pairs = [
         (frame(seed + 20, count=count)[0], frame(seed, count=count)[1]) for seed in range(frames)
     ]
-    assert estimated([evidence(*pair) for pair in pairs]) == "unrelated"
-    if count == 100:  # one frame alone shows too little of that
-        assert not any(estimated([evidence(*pair)]) == "unrelated" for pair in pairs)
+    assert estimated([evidence(*pair) for pair in pairs]) is None
 
 
 def test_points_that_were_found_in_the_image_show_nothing() -> None:

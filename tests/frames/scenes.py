@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.fuse import Member
+from pnpdepth_cli.frames.opened import Member
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
@@ -72,7 +72,7 @@ def member(
     build: type[nn.Module], *, settings: Settings | None = None, **of_definition: Any
 ) -> Member:
     """The network as a member of the default method, by default without updates and alignment."""
-    kind = "rgb" if build is Brightness else "rgb+sparse"
+    kind = "rgb" if issubclass(build, Brightness) else "rgb+sparse"
     definition = ModelDefinition(
         name=build.__name__.lower(),
         build=build,

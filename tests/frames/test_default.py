@@ -1,10 +1,8 @@
-"""The default method for one frame, and its check at hidden points."""
+"""The default method for one frame: its experts, their weights, and what it says of them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,56 +11,297 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
+from pnpdepth_cli.core.split import Split as Cut
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames import default
-from pnpdepth_cli.frames.default import FOLDS, MIN_POINTS, refine_default, split_hidden
-from pnpdepth_cli.frames.frame import Check, Frame, Refined
-from pnpdepth_cli.frames.fuse import Fusion, Member, weighted_mean
+from pnpdepth_cli.frames.default import (
+    FEW_POINTS,
+    FOLDS,
+    MIN_POINTS,
+    OWN_SCANNER,
+    Expert,
+    Split,
+    fitted_weights,
+    refine_default,
+    split_points,
+    trust,
+    weighted_mean,
+    without_outliers,
+)
+from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.opened import Member, OpenNetwork, OpenNetworks
 from pnpdepth_cli.frames.uncertainty import calibration, relative_shape, with_uncertainty
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
+from tests.core.split.test_split import same, state_of
 from tests.frames.scenes import (
     SIZE,
     Brightness,
     Nearest,
-    TwicePrior,
     depth_of_scene,
     frame_in_memory,
     member,
 )
 
 UPDATES = Settings(iterations=3, lr="5%", update="sign", align="scale")
+ALIGNED = Settings(iterations=0, align="affine")
+
+
+class Noise(Brightness):
+    """Depth that has nothing to do with the image."""
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        random = torch.rand(1, 1, *rgb.shape[2:], generator=torch.Generator().manual_seed(4))
+        return self.layer(1 + random)
 
 
 def refined(frame: Frame, *members: Member, seed: int = 0) -> Refined:
     """The frame by the default method with these networks."""
-    with Fusion(members) as fusion:
-        return refine_default(fusion, frame, seed=seed)
+    with OpenNetworks(members) as networks:
+        return refine_default(networks, frame, seed=seed)
 
 
-def test_the_stages_follow_each_other_and_the_last_is_the_result() -> None:
+def with_gt(frame: Frame) -> Frame:
+    """The frame with its ground truth, so that the stages are kept."""
+    return replace(frame, gt=depth_of_scene().numpy())
+
+
+def compact() -> Member:
+    """`compact` without updates of z."""
+    network = load_network("compact", None)
+    return Member(network=network, layer="decoder.s8", settings=Settings(iterations=0))
+
+
+def scan_frame() -> Frame:
+    """The scene with a scanner's lines."""
+    y, x = np.mgrid[2 : SIZE[0] : 8, 0 : SIZE[1] : 2]
+    xy = torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32))
+    every = SparsePoints(xy=xy, depth=torch.ones(len(xy)), size=SIZE)
+    points = replace(every, depth=every.sample(depth_of_scene()))
+    return replace(frame_in_memory(), points=points)
+
+
+def expert(name: str, at: Tensor, weight: float = 1.0) -> Expert:
+    """An expert with these predictions at the validation points."""
+    dense = torch.ones(SIZE)
+    return Expert(name=name, weight=weight, dense=dense, at=at, aligned=dense, updated=at)
+
+
+def split_of(depth: Tensor) -> Split:
+    """A frame with validation points of these depths."""
+    xy = torch.stack([torch.arange(len(depth)) % 128, torch.arange(len(depth)) // 128], 1).float()
+    points = SparsePoints(xy=xy, depth=depth, size=SIZE)
     frame = frame_in_memory(60)
+    return Split(whole=frame, kept=frame, points=points, weights=torch.ones(len(depth)))
+
+
+def test_a_network_alone_is_aligned_updated_and_propagated() -> None:
+    frame = with_gt(frame_in_memory(60))
     result = refined(frame, member(Brightness, settings=UPDATES))
-    assert list(result.stages) == ["aligned", "fused", "updated", "propagated"]
+    assert list(result.stages) == ["aligned", "updated", "propagated"]
     updated = torch.from_numpy(result.stages["updated"])
     expected = propagate(updated, frame.points, frame.rgb, kind="gp").depth
-    assert np.array_equal(result.after, expected.numpy())
+    assert np.allclose(result.after, expected.numpy(), rtol=1e-5)
+    assert np.array_equal(result.after, result.stages["propagated"])
     assert np.array_equal(result.before, result.stages["aligned"])
+    assert result.weights == {"brightness": 1.0}
     errors = [float(np.abs(d - depth_of_scene().numpy()).mean()) for d in result.stages.values()]
     assert errors[-1] < errors[0]
 
 
 def test_the_residual_of_scan_lines_is_propagated_by_lines_through_the_nearest_points() -> None:
-    y, x = np.mgrid[2 : SIZE[0] : 8, 0 : SIZE[1] : 2]
-    xy = torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32))
-    every = SparsePoints(xy=xy, depth=torch.ones(len(xy)), size=SIZE)
-    points = replace(every, depth=every.sample(depth_of_scene()))
-    frame = replace(frame_in_memory(), points=points)
+    frame = with_gt(scan_frame())
     result = refined(frame, member(Brightness, settings=UPDATES))
     updated = torch.from_numpy(result.stages["updated"])
     expected = propagate(updated, result.used, frame.rgb, kind="local").depth
-    assert np.array_equal(result.stages["propagated"], expected.numpy())
+    assert np.allclose(result.after, expected.numpy(), rtol=1e-5)
+
+
+def test_the_dense_depth_is_fused_by_the_weights_that_the_result_names() -> None:
+    frame, own = frame_in_memory(60), member(Brightness, settings=ALIGNED)
+    result = refined(frame, own, compact())
+    assert sum(result.weights.values()) == pytest.approx(1)
+    assert list(result.weights) == ["brightness", "compact with brightness", "compact", "linear"]
+    with OpenNetworks([own, compact()]) as networks:
+        of_own = networks.refine(networks.members[0], frame)
+        prior = replace(frame, prior=torch.from_numpy(of_own.before))
+        depths = [
+            torch.from_numpy(of_own.after),
+            torch.from_numpy(networks.refine(networks.members[1], prior).after),
+            torch.from_numpy(networks.refine(networks.members[1], frame).after),
+            linear(frame.points),
+        ]
+    fused = weighted_mean(list(zip(depths, result.weights.values(), strict=True)))
+    expected = propagate(fused, frame.points, frame.rgb, kind="gp").depth
+    assert np.allclose(result.after, expected.numpy(), rtol=1e-4)
+
+
+def test_a_useless_network_has_no_part_which_is_said() -> None:
+    frame = frame_in_memory(100)
+    useless, alone = (
+        refined(frame, member(Noise, settings=ALIGNED), compact()),
+        refined(frame, compact()),
+    )
+    assert useless.weights["noise"] < 0.01
+    assert np.allclose(useless.after, alone.after, rtol=1e-4)
+    assert [note for note in useless.notes if note.startswith("noise has no part")]
+    assert not [note for note in alone.notes if "no part" in note]
+
+
+def test_a_network_that_explains_the_points_has_a_part_of_which_nothing_is_said() -> None:
+    result = refined(frame_in_memory(100), member(Brightness, settings=ALIGNED), compact())
+    assert result.weights["brightness"] + result.weights["compact with brightness"] > 0.1
+    assert not [note for note in result.notes if "no part" in note]
+
+
+def test_trust_grows_with_what_a_network_explains() -> None:
+    frame = frame_in_memory(200)
+    split = replace(split_of(frame.points.depth), whole=frame, kept=frame)
+    depth, noise = depth_of_scene(), torch.rand(SIZE, generator=torch.Generator().manual_seed(2))
+    found = []
+    for share in (0.0, 0.6, 1.0):  # of noise in the depth
+        predicted = torch.exp(depth.log() * (1 - share) + 0.6 * share * noise)
+        blank = refined(frame, member(Brightness))
+        shown = replace(blank, before=predicted.numpy())
+        one = replace(expert("net", torch.ones(200)), refined=shown)
+        found.append(trust(one, split, expert("compact", torch.ones(200))))
+    assert found[0] == pytest.approx(1)
+    assert found[0] > found[1] > found[2] == 0
+
+
+def test_trust_in_a_network_that_takes_points_falls_with_its_error_at_validation_points() -> None:
+    depth = torch.full((50,), 2.0)
+    frame, split = frame_in_memory(60), split_of(depth)
+    alone, own = expert("compact", depth + 0.1), member(Nearest)
+    found = [
+        trust(
+            replace(expert("own", depth + off), refined=refined(frame, own), network=own),
+            split,
+            alone,
+        )
+        for off in (0.05, 0.1, 0.15, 0.2, 0.4)
+    ]
+    assert found == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-4)
+
+
+def test_the_weights_stay_near_the_prior_weights_where_few_points_speak() -> None:
+    def weight(count: int) -> float:
+        depth = torch.full((count,), 2.0)
+        noise = torch.rand(count, generator=torch.Generator().manual_seed(1)) - 0.5
+        good, poor = expert("good", depth * 1.01), expert("poor", depth * (1 + noise))
+        return fitted_weights([good, poor], split_of(depth))["good"]
+
+    few, many = weight(4), weight(2000)
+    assert 0.5 <= few < 0.6
+    assert many > 0.9
+
+
+def test_weights_are_those_that_predict_the_validation_points_best_beside_the_prior() -> None:
+    rng = np.random.default_rng(3)
+    truth = torch.from_numpy(rng.uniform(1, 4, 300))
+    noisy = [truth * torch.from_numpy(np.exp(s * rng.normal(size=300))) for s in (0.1, 0.2, 0.3)]
+    experts = [
+        expert(str(k), at, w) for k, (at, w) in enumerate(zip(noisy, (0.2, 0.3, 0.5), strict=True))
+    ]
+    split = split_of(truth)
+    found = np.array(list(fitted_weights(experts, split).values()))
+    logs = np.stack([at.log().numpy() for at in noisy], axis=1)
+    prior, y = np.array([0.2, 0.3, 0.5]), truth.log().numpy()
+    first = y - logs @ prior
+    scale = 1.25 * np.abs(first).mean()
+
+    def loss(weights: np.ndarray) -> float:
+        size = np.abs(y - logs @ weights)
+        huber = np.where(size < scale, size**2, 2 * scale * size - scale**2).sum()
+        return float(huber + default.STRENGTH * scale**2 * ((weights - prior) ** 2).sum())
+
+    for _ in range(200):  # no other weights near by, or anywhere, are better
+        other = np.abs(found + rng.choice([0.01, 0.3]) * rng.normal(size=3))
+        assert loss(other / other.sum()) > loss(found) - 1e-6
+
+
+def test_an_expert_without_prior_weight_or_prediction_decides_nothing() -> None:
+    depth = torch.full((50,), 2.0)
+    none, exact = expert("none", depth, weight=0.0), expert("exact", depth * 1.001)
+    weights = fitted_weights([none, exact, expert("poor", depth * 1.2)], split_of(depth))
+    assert weights["none"] == 0
+    blank = fitted_weights([expert("a", depth * 0), expert("b", depth * 0)], split_of(depth))
+    assert blank == {"a": pytest.approx(0.5), "b": pytest.approx(0.5)}
+
+
+def test_the_result_at_a_validation_point_does_not_depend_on_its_depth() -> None:
+    frame = frame_in_memory(60)
+    members = (member(Brightness, settings=ALIGNED), compact())
+    first = refined(frame, *members).validation
+    assert first is not None
+    held = (frame.points.xy[:, None] == first.points.xy[None]).all(dim=2).any(dim=1)
+    numbers = held.nonzero(as_tuple=True)[0]
+    changed = frame.points.depth.clone()
+    changed[numbers[0]] *= 1.01
+    again = refined(frame.with_points(replace(frame.points, depth=changed)), *members).validation
+    assert again is not None
+    assert torch.equal(again.points.xy, first.points.xy)
+    one = (again.points.xy == frame.points.xy[numbers[0]]).all(dim=1)
+    for name in ("aligned", "propagated", "alone", "linear", "result"):
+        assert torch.allclose(again.predicted[name][one], first.predicted[name][one], rtol=1e-3)
+
+
+def test_an_image_that_does_not_belong_to_its_points_gets_a_warning_with_two_errors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("pnpdepth_cli.completion.outliers.FAR", 1.0)
+    frame = frame_in_memory(400)
+    stripes = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(3)).round()
+    right, wrong = refined(frame, compact()), refined(replace(frame, rgb=stripes), compact())
+    assert not any(note.startswith("warning: the image") for note in right.notes)
+    (note,) = [note for note in wrong.notes if note.startswith("warning: the image")]
+    assert "80 validation points" in note
+    assert "compact without the image" in wrong.weights
+
+
+def test_a_completion_network_of_the_scanner_has_most_of_the_result(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frame, own = scan_frame(), member(Nearest)
+    poor = refined(frame, own, compact())
+    assert poor.weights["nearest"] == 0
+    monkeypatch.setattr(
+        Nearest,
+        "forward",
+        lambda self, rgb, _: self.layer(depth_of_scene()[None, None] + 0 * rgb[:, :1]),
+    )
+    result = refined(frame, own, compact())
+    assert result.weights["nearest"] == pytest.approx(OWN_SCANNER)
+    assert sum(result.weights.values()) == pytest.approx(1)
+
+
+def test_a_further_network_that_fails_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, other = frame_in_memory(60), member(Noise)
+
+    def fail(*_: object, **__: object) -> Tensor:
+        raise ModelError("no depth")
+
+    monkeypatch.setattr(other.network.module, "forward", fail)
+    result = refined(frame, member(Brightness), other)
+    alone = refined(frame, member(Brightness))
+    assert np.array_equal(result.after, alone.after)
+    with pytest.raises(ModelError):
+        refined(frame, other, member(Brightness))
+
+
+def test_networks_that_take_no_prior_are_fused_from_equal_prior_weights() -> None:
+    result = refined(frame_in_memory(4), member(Brightness), member(Nearest))
+    assert result.weights == {"brightness": 0.5, "nearest": 0.5}
+
+
+def test_the_weighted_mean_is_geometric_and_skips_unknown_depth() -> None:
+    mean = weighted_mean(
+        [(torch.tensor([4.0, 0.0, 0.0]), 0.25), (torch.tensor([1.0, 3.0, 0.0]), 0.75)]
+    )
+    assert torch.allclose(mean, torch.tensor([4.0**0.25, 3.0, 0.0]))
+    alone = torch.tensor([2.0, 0.0])
+    assert torch.equal(weighted_mean([(alone, 0.3)]), alone)
 
 
 @pytest.mark.parametrize("weighs", [True, False])
@@ -79,7 +318,7 @@ def test_a_wrong_track_is_left_out_where_a_network_gave_it_no_weight(weighs: boo
     assert any("outliers: " in note for note in result.notes) == weighs
 
 
-def test_without_a_check_the_uncertainty_has_the_typical_scale() -> None:
+def test_without_validation_the_uncertainty_has_the_typical_scale() -> None:
     result = refined(frame_in_memory(MIN_POINTS - 1), member(Brightness))
     got = with_uncertainty(result)
     depths = (torch.from_numpy(depth) for depth in (result.before, result.after))
@@ -89,58 +328,32 @@ def test_without_a_check_the_uncertainty_has_the_typical_scale() -> None:
     assert "too few points to calibrate it with" in got.notes[-1]
 
 
-def test_a_network_farther_off_than_the_result_or_without_depth_is_rejected() -> None:
-    points = frame_in_memory(60).points
-    hidden = replace(points, depth=torch.full((60,), 2.0))
-    alone = {
-        name: SimpleNamespace(before=np.full(SIZE, depth, np.float32))
-        for name, depth in (("near", 1.0), ("far", 2.3), ("exact", 2.1))
-    }
-    fused: Any = SimpleNamespace(after=torch.full(SIZE, 2.2), alone=alone)
-    names: list[Any] = [*alone, "failed"]
-    assert default._rejected(fused, names, points, hidden) == ("near", "far", "failed")
-
-
 @pytest.mark.parametrize("fold", [0, 1])
 def test_nothing_is_hidden_where_a_fold_is_everything_or_nothing(
     fold: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(default, "spatial_folds", lambda p, *_, **__: torch.full((len(p),), fold))
-    assert split_hidden(frame_in_memory(60).points, 0) is None
+    assert split_points(frame_in_memory(60).points, 0) is None
 
 
-def test_hidden_points_are_a_fifth_and_the_others_are_kept() -> None:
+def test_validation_points_are_a_fifth_and_the_others_are_kept() -> None:
     points = frame_in_memory(60).points
-    parts = split_hidden(points, 0)
+    parts = split_points(points, 0)
     assert parts is not None
-    kept, hidden = parts
-    assert len(hidden) == 60 // FOLDS
+    kept, points_left_out = parts
+    assert len(points_left_out) == 60 // FOLDS
     rows = {tuple(xy) for xy in points.xy.tolist()}
     assert {tuple(xy) for part in parts for xy in part.xy.tolist()} == rows
-    assert len(kept) + len(hidden) == 60
+    assert len(kept) + len(points_left_out) == 60
 
 
-def test_of_many_hidden_points_a_part_is_predicted_and_none_is_shown(
+def test_of_many_validation_points_a_part_is_predicted_and_none_is_shown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(default, "MOST_HIDDEN", 7)
-    parts = split_hidden(frame_in_memory(60).points, 0)
+    monkeypatch.setattr(default, "MOST_VALIDATION_POINTS", 7)
+    parts = split_points(frame_in_memory(60).points, 0)
     assert parts is not None
     assert [len(part) for part in parts] == [48, 7]
-
-
-def test_hidden_points_have_no_influence_on_their_prediction() -> None:
-    frame = frame_in_memory(60)
-    first = refined(frame, member(Brightness)).check
-    assert first is not None
-    held = (frame.points.xy[:, None] == first.hidden.xy[None]).all(dim=2).any(dim=1)
-    changed = torch.where(held, 1.01 * frame.points.depth, frame.points.depth)
-    other = frame.with_points(replace(frame.points, depth=changed))
-    again = refined(other, member(Brightness)).check
-    assert again is not None
-    assert torch.equal(again.hidden.xy, first.hidden.xy)
-    for name in ("aligned", "fused", "linear"):
-        assert torch.equal(again.predicted[name], first.predicted[name])
 
 
 @pytest.mark.parametrize("count", [1, MIN_POINTS - 1, MIN_POINTS, 7])
@@ -151,156 +364,86 @@ def test_few_points_at_few_positions_are_enough(count: int, positions: int) -> N
     close = frame.points.xy[at] + 0.01 * torch.arange(count)[:, None]
     points = replace(frame.points, xy=close, depth=frame.points.depth[at])
     result = refined(frame.with_points(points), member(Brightness))
-    assert (result.check is None) == (count < MIN_POINTS)
+    assert (result.validation is None) == (count < MIN_POINTS)
     off = (torch.from_numpy(result.after) / depth_of_scene()).log().abs()
     assert float(off.mean()) < 0.5
 
 
-def check_of(predicted: dict[str, Tensor], depth: Tensor) -> Check:
-    """A check of these predictions at as many points of depth 2 m."""
-    xy = torch.stack([torch.arange(len(depth)) % 128, torch.arange(len(depth)) // 128], 1).float()
-    points = SparsePoints(xy=xy, depth=depth, size=SIZE)
-    return Check(
-        hidden=points,
-        kept=points,
-        network=torch.ones(SIZE),
-        weights=torch.ones(len(depth)),
-        predicted=predicted,
-    )
-
-
-def test_the_gain_counts_standard_errors_of_the_log_error() -> None:
-    depth = torch.full((4,), 2.0)
-    off = torch.tensor([0.1, 0.2, 0.3, 0.4])
-    check = check_of({"a": depth * off.exp(), "b": depth * (off + 0.1).exp()}, depth)
-    uneven = check.with_prediction("c", depth * (off + torch.tensor([0.0, 0.2, 0.0, 0.2])).exp())
-    assert uneven.gain("a", "c") == pytest.approx(0.1 / (0.1 / 4**0.5), rel=1e-3)
-    assert uneven.gain("c", "a") == pytest.approx(-2.0, rel=1e-3)
-    assert check.error("a") == pytest.approx(float((2 * off.exp() - 2).mean()))
-
-
-def test_a_point_without_weight_decides_nothing() -> None:
-    depth = torch.full((3,), 2.0)
-    check = check_of({"a": torch.tensor([2.1, 2.1, 90.0])}, depth)
-    check = replace(check, weights=torch.tensor([1.0, 1.0, 0.0]))
-    assert check.error("a") == pytest.approx(0.1, rel=1e-5)
-
-
-def compact() -> Member:
-    """`compact` without updates of z."""
-    network = load_network("compact", None)
-    return Member(network=network, layer="decoder.s8", settings=Settings(iterations=0))
-
-
-def test_an_image_that_does_not_belong_to_its_points_is_used_less(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("pnpdepth_cli.completion.outliers.FAR", 1.0)
-    frame = frame_in_memory(400)  # used in full with either image
-    stripes = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(3)).round()
-    wrong = replace(frame, rgb=stripes)
-    right, moved = refined(frame, compact()), refined(wrong, compact())
-    assert not any("does not seem to belong" in note for note in right.notes)
-    assert np.array_equal(right.after, right.stages["propagated"])
-    (note,) = [note for note in moved.notes if "does not seem to belong" in note]
-    assert note.startswith("warning: ")
-    assert "half of the result leaves the image out" in note
-    grey = refined(replace(frame, rgb=torch.full_like(stripes, 0.5)), compact())
-    kept = torch.from_numpy(moved.stages["propagated"])
-    blind = torch.from_numpy(grey.stages["propagated"])
-    half = weighted_mean([(kept, 1.0), (blind, 1.0)])
-    if "linear" in note.rsplit(";", 2)[1]:
-        half = weighted_mean([(half, 1.0), (linear(frame.points), 1.0)])
-    assert np.allclose(moved.after, half.numpy(), rtol=1e-5)
-
-
-def test_an_image_whose_edges_lie_where_depth_changes_by_chance_is_used_by_half(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    frame = replace(frame_in_memory(400), unrelated=True)
-    assert frame.rgb is not None
-    clear = refined(frame, compact())  # what the hidden points show overrules the edges
-    assert clear.check is not None
-    assert clear.check.gain("propagated", "linear") > default.CLEAR_GAIN
-    assert np.array_equal(clear.after, clear.stages["propagated"])
-    monkeypatch.setattr(default, "CLEAR_GAIN", 1 + clear.check.gain("propagated", "linear"))
-    result = refined(frame, compact())
-    grey = refined(replace(frame, rgb=torch.full_like(frame.rgb, 0.5)), compact())
-    depths = [(torch.from_numpy(r.stages["propagated"]), 1.0) for r in (result, grey)]
-    assert np.allclose(result.after, weighted_mean(depths).numpy(), rtol=1e-5)
-    (note,) = [note for note in result.notes if "does not seem to belong" in note]
-    assert "depth changes at its edges no more often than by chance; half of the result" in note
-
-
-@pytest.mark.parametrize(
-    ("off", "hidden", "half_linear"),
-    [(0.30, 80, True), (0.30, 20, True), (0.30, 19, False), (0.0, 80, False)],
-)
-def test_a_method_that_is_worse_beyond_chance_gives_half_to_linear_interpolation(
-    monkeypatch: pytest.MonkeyPatch, off: float, hidden: int, half_linear: bool
-) -> None:
-    frame, user = frame_in_memory(hidden * 5), member(Brightness)
-    factor = 1 + off * torch.rand(hidden, generator=torch.Generator().manual_seed(0))
-    depth = torch.full((hidden,), 2.0)
-    check = check_of({"propagated": depth * factor, "linear": depth * 1.001}, depth)
-    check = check.with_prediction("result", check.predicted["propagated"])
-    monkeypatch.setattr(default, "_check", lambda *_: check)
-    result = refined(frame, user)
-    kept = torch.from_numpy(result.stages["propagated"])
-    expected = weighted_mean([(kept, 1.0), (linear(frame.points), 1.0)]) if half_linear else kept
-    assert np.allclose(result.after, expected.numpy(), rtol=1e-6)
-    assert any("half is linear interpolation" in note for note in result.notes) == half_linear
-
-
-@pytest.mark.parametrize(("outliers", "moved"), [(20, True), (21, False)])
-def test_a_method_without_gain_uses_the_image_less_unless_many_points_were_outliers(
-    monkeypatch: pytest.MonkeyPatch, outliers: int, moved: bool
-) -> None:
-    hidden = 80
-    depth = torch.full((hidden,), 2.0)
-    check = check_of(dict.fromkeys(("propagated", "linear", "result"), depth * 1.01), depth)
-    monkeypatch.setattr(default, "_check", lambda *_: check)
-    frame = frame_in_memory(5 * hidden)
-    left_out = frame.points.select(torch.arange(5 * hidden) < outliers)
-    result = refined(replace(frame, outliers=left_out), compact())
-    assert any("half of the result leaves the image out" in note for note in result.notes) == moved
-    assert np.array_equal(result.after, result.stages["propagated"]) != moved
-
-
-def test_a_completion_network_is_no_prior_where_the_hidden_points_speak_against_it() -> None:
-    frame = frame_in_memory(60)
-    poor = refined(frame, member(Nearest), compact())
-    alone = refined(frame, compact())
-    assert np.allclose(poor.stages["updated"], alone.stages["updated"], rtol=1e-5)
-
-
-def test_a_completion_network_that_serves_as_a_prior_has_most_of_the_result(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    frame, poor = frame_in_memory(60), member(Nearest)
-    monkeypatch.setattr(default, "_rejected", lambda *_: ())
-    result = refined(frame, poor, compact())
-    updated = torch.from_numpy(result.stages["updated"])
-    rest = propagate(updated, frame.points, frame.rgb, kind="gp").depth
-    expected = weighted_mean([(rest, 0.25), (torch.from_numpy(result.before), 0.75)])
-    assert np.allclose(result.after, expected.numpy(), rtol=1e-6)
-
-
-def test_a_further_network_that_fails_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    frame, other = frame_in_memory(60), member(TwicePrior)
-
-    def fail(*_: object, **__: object) -> Tensor:
-        raise ModelError("no depth")
-
-    monkeypatch.setattr(other.network.module, "forward", fail)
-    result = refined(frame, member(Brightness), other)
-    alone = refined(frame, member(Brightness))
-    assert np.array_equal(result.after, alone.after)
-
-
 def test_the_same_frame_gives_the_same_depth_whatever_was_refined_before() -> None:
     frames = [frame_in_memory(60), frame_in_memory(60, seed=2)]
-    with Fusion([member(Brightness, settings=UPDATES), compact()]) as fusion:
-        first, _, again = (refine_default(fusion, frames[n]) for n in (0, 1, 0))
+    with OpenNetworks([member(Brightness, settings=UPDATES), compact()]) as networks:
+        first, _, again = (refine_default(networks, frames[n]) for n in (0, 1, 0))
     assert np.array_equal(first.after, again.after)
-    assert np.array_equal(first.after, refined(frames[0], *fusion.members).after)
+    assert np.array_equal(first.after, refined(frames[0], *networks.members).after)
+
+
+def test_the_front_runs_once_for_all_sets_of_points_of_an_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frame, fronts, front = frame_in_memory(60), [], Cut.front
+    monkeypatch.setattr(Cut, "front", lambda *args: fronts.append(args) or front(*args))
+    fewer = frame.with_points(frame.points.select(torch.arange(60) < 40))
+    with OpenNetworks([member(Brightness, settings=UPDATES)]) as networks:
+        (one,) = networks.members
+        together = [networks.refine(one, each).after for each in (frame, fewer)]
+        assert len(fronts) == 1
+        networks.next_image()
+        again = networks.refine(one, fewer).after
+        assert len(fronts) == 2
+    assert np.array_equal(together[1], again)
+
+
+def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stays() -> None:
+    network, runs = load_network("compact", None), list[int]()
+    before = state_of(network.module)
+    first = next(network.module.encoder.children())
+    handle = first.register_forward_hook(lambda *_: runs.append(1))
+    frame, settings = frame_in_memory(60), Settings(iterations=1, lr="5%")
+    fewer = frame.with_points(frame.points.select(torch.arange(60) < 55))
+    with OpenNetwork(network, "decoder.s8") as opened:
+        opened.refine(frame, settings)
+        count = len(runs)
+        shared = opened.refine(fewer, settings)
+        plain = opened.refine(fewer, replace(settings, iterations=0))
+        assert len(runs) == count > 0
+        opened.next_image()
+        alone = opened.refine(fewer, settings)
+    handle.remove()
+    assert (shared.after == alone.after).all()
+    assert (plain.after == alone.before).all()
+    assert same(before, state_of(network.module))
+
+
+def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:
+    """The frame with every fifth point 2.5 times as far, and which these are."""
+    bad = torch.arange(len(frame.points)) % 5 == 0
+    depth = torch.where(bad, 2.5 * frame.points.depth, frame.points.depth)
+    return frame.with_points(replace(frame.points, depth=depth)), bad
+
+
+def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
+    frame, bad = spoiled(frame_in_memory(60))
+    with OpenNetworks([member(Brightness)]) as networks:
+        inliers, user = without_outliers(networks, frame)
+        clean, _ = without_outliers(networks, frame_in_memory(60))
+    assert inliers.outliers is not None
+    assert torch.equal(inliers.outliers.xy, frame.points.xy[bad])
+    assert torch.equal(inliers.points.xy, frame.points.xy[~bad])
+    assert torch.equal(user.used.xy, inliers.points.xy)
+    assert clean.outliers is None
+    assert len(clean.points) == 60
+
+
+@pytest.mark.parametrize("count", [FEW_POINTS - 1, FEW_POINTS])
+@pytest.mark.parametrize(("alone", "beside"), [(False, True), (True, False), (True, True)])
+def test_outliers_among_few_points_are_those_beside_the_network_and_else_those_of_either_check(
+    count: int, alone: bool, beside: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame, bad = spoiled(frame_in_memory(count))
+    found = iter([bad & alone, bad & beside])
+    monkeypatch.setattr(default, "outliers", lambda *_: next(found))
+    with OpenNetworks([member(Brightness)]) as networks:
+        inliers, user = without_outliers(networks, frame)
+    expected = frame.points.select(~(bad & (beside or count >= FEW_POINTS)))
+    assert torch.equal(inliers.points.xy, expected.xy)
+    assert torch.equal(user.used.xy, expected.xy)

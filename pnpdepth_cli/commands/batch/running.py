@@ -124,14 +124,9 @@ def opened_network(
     if first.register == "auto":
         refiner.share_registration(readable(references.registering))
         for (height, width), registration in refiner.registrations.items():
-            if registration == "unrelated":
+            if registration is not None:
                 say(
-                    f"warning: images of {width}×{height} do not seem to belong to their points:"
-                    " depth changes at their edges no more often than by chance"
-                )
-            elif registration is not None:
-                say(
-                    f"images of {width}×{height} are moved into the frame of the points by"
+                    f"images of {width}×{height} are moved to the points by"
                     f" {registration}; --registration off leaves them"
                 )
     if refiner.is_default:

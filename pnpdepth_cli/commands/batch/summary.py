@@ -30,7 +30,7 @@ _OF_LINEAR = ("scores", "held_out_error")
 _BASELINE = "baseline"
 _RUN_STAGES = ("read", "refine", "write")
 _CHECKED = ("aligned", "result", "linear")
-"""Stages whose errors at hidden points are averaged."""
+"""Stages whose errors at validation points are averaged."""
 _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 
 
@@ -52,6 +52,7 @@ def row_of(
         "loss": [record["loss"][0], record["loss"][-1]],
         "improved_fraction": record["improved_fraction"],
         **{kind: record[kind] for kind in _MEASURED},
+        "weights": record["weights"],
         "linear": record.get("linear"),
         "baselines": record.get("baselines"),
         "warnings": [note for note in record["notes"] if note.startswith("warning")],
@@ -68,7 +69,7 @@ def failed_row(name: str, inputs: Mapping[str, str], message: str) -> dict[str, 
         "message": message,
         "inputs": dict(inputs),
         "outputs": {},
-        **dict.fromkeys((*_MEASURED, "linear", "baselines")),
+        **dict.fromkeys((*_MEASURED, "weights", "linear", "baselines")),
     }
 
 
@@ -82,6 +83,7 @@ class Tally:
         """What was guessed of the network and may be wrong, each once."""
         self._units: set[str] = set()
         self._compared, self._worse = 0, 0
+        self._weights: defaultdict[str, list[float]] = defaultdict(list)
         # by kind and stage, the total of each measure and the number of frames that have it
         self._sums: defaultdict[tuple[str, str], dict[str, tuple[float, int]]] = defaultdict(dict)
 
@@ -97,6 +99,8 @@ class Tally:
                 total, count = sums.setdefault(name, (0.0, 0))
                 if value is not None and not math.isnan(value):
                     sums[name] = (total + value, count + 1)
+        for name, weight in (row.get("weights") or {}).items():
+            self._weights[name].append(weight)
         worse = (row.get("linear") or {}).get("worse")
         self._compared += worse is not None
         self._worse += bool(worse)
@@ -115,18 +119,19 @@ class Tally:
         """Returns the means of the results, of linear interpolation and of the baselines.
 
         "mean" has {"scores": {"frames": 9, "before": {"rmse": …}, …}, …}, or None without frames;
-        "linear" also how many frames are worse, and the errors of all at the hidden points. A mean
-        is over the frames that have the value; None where none has it.
+        "linear" also how many frames are worse, and the errors of all at the validation points.
+        "weights" has the mean and the range of each expert's. A mean is over the frames that have
+        the value; None where none has it.
         """
         mean: dict[str, Any] = {}
         for kind in _MEASURED:
             frames = max(self._frames(kind, "before"), self._frames(kind, "after"))
             both = {stage: self._mean(kind, stage) for stage in ("before", "after")}
             mean[kind] = {"frames": frames, **both} if frames else None
-        checked = self._frames("check", "")
+        checked = self._frames("validation", "")
         linear = {
             **{kind: self._mean(kind, "linear") for kind in _OF_LINEAR},
-            "check": self._mean("check", "") | {"frames": checked} if checked else None,
+            "validation": self._mean("validation", "") | {"frames": checked} if checked else None,
             "frames": self._compared,
             "worse": self._worse,
         }
@@ -134,7 +139,20 @@ class Tally:
             name: {"frames": self._frames(_BASELINE, name), **self._mean(_BASELINE, name)}
             for name in self.baselines
         }
-        return {"mean": mean, "linear": linear, "baselines": baselines or None}
+        return {
+            "mean": mean,
+            "linear": linear,
+            "weights": self.weights or None,
+            "baselines": baselines or None,
+        }
+
+    @property
+    def weights(self) -> dict[str, dict[str, float]]:
+        """Mean, least and largest weight of each expert of the default method, by name."""
+        return {
+            name: {"mean": sum(all_) / len(all_), "least": min(all_), "largest": max(all_)}
+            for name, all_ in self._weights.items()
+        }
 
     def _mean(self, kind: str, stage: str) -> dict[str, float | None]:
         sums = self._sums.get((kind, stage), {})
@@ -159,12 +177,12 @@ def _measured(row: Row) -> dict[tuple[str, str], dict[str, float | None]]:
         key: {name: (values or {}).get(name) for name in _MEASURED[key[0]]}
         for key, values in errors.items()
     }
-    if check := linear.get("check"):
-        found["check", ""] = {name: check[name] for name in _CHECKED}
+    if check := linear.get("validation"):
+        found["validation", ""] = {name: check[name] for name in _CHECKED}
     for name, entry in (row.get("baselines") or {}).items():
         scores = entry.get("scores") or {}
         of_truth = {measure: scores.get(measure) for measure in _POINT_ERRORS}
-        found[_BASELINE, name] = {"held_out_mae": entry.get("held_out_mae"), **of_truth}
+        found[_BASELINE, name] = {"validation_mae": entry.get("validation_mae"), **of_truth}
     return found
 
 
@@ -226,6 +244,6 @@ def _columns(row: Row, baselines: Sequence[str]) -> dict[str, Any]:
     cells |= {f"seconds_{stage}": seconds.get(stage) for stage in _RUN_STAGES}
     for name in baselines:
         values = measured.get((_BASELINE, name), {})
-        keys = ("held_out_mae", *_POINT_ERRORS)
+        keys = ("validation_mae", *_POINT_ERRORS)
         cells |= {f"baseline_{name}_{key}": values.get(key) for key in keys}
     return cells

@@ -90,7 +90,11 @@ def load_refiner(
     ]
     networks[0] = redefined(networks[0], choice.output_kind, choice.normalise)
     refiner = Refiner(
-        networks, request.method, uncertainty=hold_out.uncertainty, check=hold_out.baselines
+        networks,
+        request.method,
+        uncertainty=hold_out.uncertainty,
+        check=hold_out.baselines,
+        compact=not choice.no_compact,
     )
     return refiner.decide(first, more)
 
@@ -158,15 +162,18 @@ def record_of(refiner: Refiner, inputs: Inputs, frame: Refined) -> dict[str, Any
             "farthest": float(inputs.own.depth.max()),
             **moved,
         },
+        "weights": dict(frame.weights),  # of the experts of the default method
         "loss": list(frame.losses),
         "sparse_error": _before_after(frame, lambda depth: _point_error(depth, frame.used)),
         "held_out_error": _before_after(frame, lambda depth: _point_error(depth, frame.held_out)),
         "scores": _before_after(frame, lambda depth: _scores(depth, gt)),
-        "linear": _compared_with_linear(frame, gt),
+        "linear": _compared_with_linear(frame, inputs.points, gt),
         "stages": [{"stage": n, "scores": _scores(d, gt)} for n, d in stages.items()]
         if stages
         else None,
-        "baselines": _baseline_scores(frame, gt) if request.hold_out.baselines else None,
+        "baselines": _baseline_scores(frame, inputs.points, gt)
+        if request.hold_out.baselines
+        else None,
         "diverged": str(frame.diverged) if frame.diverged else None,
         "notes": [note for note in (*inputs.notes, *of_networks, *frame.notes) if note],
     }
@@ -215,18 +222,20 @@ def _before_after(
     return None if before is None or after is None else {"before": before, "after": after}
 
 
-def _compared_with_linear(frame: Refined, gt: DepthMap | None) -> dict[str, Any]:
-    """The errors of linear interpolation of the same points, where the result is scored.
+def _compared_with_linear(
+    frame: Refined, given: SparsePoints, gt: DepthMap | None
+) -> dict[str, Any]:
+    """The errors of linear interpolation of all given points, where the result is scored.
 
     "scores" on the pixels of the ground truth where the result is known, "held_out_error" at the
-    points of `--holdout`, and "check", the MAE of each stage at the hidden points; each None
-    without such pixels or points. "worse": whether the MAE of the result is above that of linear
-    interpolation, by the first of these that there is; None without any.
+    points of `--holdout`, and "validation", the MAE of each stage at the validation points; each
+    None without such pixels or points. "worse": whether the MAE of the result is above that of
+    linear interpolation, by the first of these that there is; None without any.
     """
-    compared: dict[str, Any] = {"scores": None, "held_out_error": None, "check": None}
+    compared: dict[str, Any] = {"scores": None, "held_out_error": None, "validation": None}
     worse: list[bool] = []
     if gt is not None or len(frame.held_out):
-        dense = linear(frame.used).numpy()
+        dense = linear(given).numpy()
         truth = None if gt is None else np.where(frame.after > 0, gt, np.float32(0))
         own, result = _scores(dense, truth), _scores(frame.after, truth)
         if own is not None and result is not None:
@@ -236,37 +245,36 @@ def _compared_with_linear(frame: Refined, gt: DepthMap | None) -> dict[str, Any]
         if own is not None and result is not None:
             compared["held_out_error"] = own
             worse.append(result["mae"] > own["mae"])
-    if frame.check is not None:
-        errors = {name: frame.check.error(name) for name in frame.check.predicted}
-        compared["check"] = {"points": len(frame.check.hidden), **errors}
+    if frame.validation is not None:
+        errors = {name: frame.validation.error(name) for name in frame.validation.predicted}
+        compared["validation"] = {"points": len(frame.validation.points), **errors}
         worse.append(errors[RESULT] > errors[LINEAR])
     return compared | {"worse": worse[0] if worse else None}
 
 
-def _baseline_scores(frame: Refined, gt: DepthMap | None) -> dict[str, dict[str, Any]]:
-    """The scores of every baseline, of the network and of the result, by name.
+def _baseline_scores(
+    frame: Refined, given: SparsePoints, gt: DepthMap | None
+) -> dict[str, dict[str, Any]]:
+    """The scores of every baseline of all given points, of the network and of the result, by name.
 
-    Each has the MAE at the hidden points, where there are enough points, and all metrics, where
+    Each has the MAE at the validation points, where there are enough points, and all metrics, where
     there is ground truth. A baseline that fails on the frame is left out.
     """
-    check, scores = frame.check, dict[str, dict[str, Any]]()
+    validation, scores = frame.validation, dict[str, dict[str, Any]]()
     before = torch.from_numpy(frame.before)
     for name, baseline in BASELINES.items():
         try:
             error = None
-            if check is not None:
-                at_hidden = baseline.at(check.hidden.xy, check.kept, check.network)
-                error = check.with_prediction(name, at_hidden).error(name)
+            if validation is not None:
+                at = baseline.at(validation.points.xy, validation.kept, validation.network)
+                error = validation.with_prediction(name, at).error(name)
             metrics = None
             if gt is not None:
-                metrics = _scores(baseline.depth(frame.used, before).numpy(), gt)
+                metrics = _scores(baseline.depth(given, before).numpy(), gt)
         except ModelError:  # such as a line through points that are all equally far
             continue
-        scores[name] = {"held_out_mae": error, "scores": metrics}
-    for name, of_check, depth in (
-        ("network", ALIGNED, frame.before),
-        ("result", RESULT, frame.after),
-    ):
-        error = None if check is None else check.error(of_check)
-        scores[name] = {"held_out_mae": error, "scores": _scores(depth, gt)}
+        scores[name] = {"validation_mae": error, "scores": metrics}
+    for name, stage, depth in (("network", ALIGNED, frame.before), ("result", RESULT, frame.after)):
+        error = None if validation is None else validation.error(stage)
+        scores[name] = {"validation_mae": error, "scores": _scores(depth, gt)}
     return scores

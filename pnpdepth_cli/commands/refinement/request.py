@@ -130,6 +130,9 @@ class NetworkChoice:
         metavar="NETWORK",
         show_default=True,
     )
+    no_compact: bool = option(
+        False, "Refine NETWORK alone; the included network `compact` takes no part in the result."
+    )
     more_models: tuple[str, ...] = ()
     """Further networks, with their own weights, which are fused with the first."""
     checkpoint: Path | None = option(

@@ -16,8 +16,8 @@ from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.error_tables import (
     BASES,
     GT,
-    HIDDEN,
     USED,
+    VALIDATION,
     baselines_table,
     change,
     errors_by_basis,
@@ -176,7 +176,7 @@ def _basis(row: Row) -> str | None:
 
 
 def _measures(basis: str) -> tuple[str, ...]:
-    return ("mae",) if basis == HIDDEN else ("rmse", "mae")
+    return ("mae",) if basis == VALIDATION else ("rmse", "mae")
 
 
 def _columns(best: str, unit: str) -> list[dict[str, Any]]:
@@ -193,7 +193,7 @@ def _columns(best: str, unit: str) -> list[dict[str, Any]]:
             column(key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
             for stage in ("before", "after")
         ]
-    if best != HIDDEN:  # the map is then of the points used
+    if best != VALIDATION:  # the map is then of the points used
         columns.append(column(key="improved", title="Improved", higher_is_better=True, **percent))
     return columns
 

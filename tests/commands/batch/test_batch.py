@@ -18,7 +18,7 @@ from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.commands.batch import running as batch_running
 from pnpdepth_cli.commands.batch.batch import plan_batch, run_batch
 from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.batch.summary import _SCORES, Tally
+from pnpdepth_cli.commands.batch.summary import _SCORES, Tally, failed_row
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
 from pnpdepth_cli.commands.report.batch import write_batch_report
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
@@ -303,8 +303,8 @@ def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path
     of_rows = [row["baselines"]["linear"] for row in rows]
     assert baseline["frames"] == 4
     assert baseline["mae"] == pytest.approx(np.mean([each["scores"]["mae"] for each in of_rows]))
-    held_out = [each["held_out_mae"] for each in of_rows]
-    assert baseline["held_out_mae"] == pytest.approx(np.mean(held_out))
+    validated = [each["validation_mae"] for each in of_rows]
+    assert baseline["validation_mae"] == pytest.approx(np.mean(validated))
     row = rows[1]
     assert row["scores"] == json.loads((root / "out/b.json").read_text())["scores"]
     with (root / "out/summary.csv").open(newline="") as file:
@@ -312,8 +312,17 @@ def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path
     assert [line["name"] for line in table] == list(NAMES)
     assert float(table[1]["rmse_after"]) == row["scores"]["after"]["rmse"]
     assert float(table[1]["held_out_error_mae_before"]) == row["held_out_error"]["before"]["mae"]
-    assert [float(line["baseline_linear_held_out_mae"]) for line in table] == held_out
+    assert [float(line["baseline_linear_validation_mae"]) for line in table] == validated
     assert set(_SCORES) == {*(measure.key for measure in MEASURES), "coverage"}
+
+
+def test_the_summary_has_the_mean_and_the_range_of_each_weight() -> None:
+    tally = Tally()
+    for weight in (0.1, 0.4, 0.1):
+        tally.add(failed_row("frame", {}, "") | {"weights": {"net": weight, "other": 1 - weight}})
+    weights = tally.means()["weights"]
+    assert weights["net"] == {"mean": pytest.approx(0.2), "least": 0.1, "largest": 0.4}
+    assert list(weights) == ["net", "other"]
 
 
 def test_a_profile_counts_the_frames_and_seconds_of_the_run(root: Path) -> None:

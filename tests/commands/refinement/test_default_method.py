@@ -40,15 +40,15 @@ def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:
 
 
 @pytest.mark.parametrize("propagate", [None, "none"])
-def test_baselines_are_scored_at_hidden_points_and_against_the_truth(
+def test_baselines_are_scored_at_validation_points_and_against_the_truth(
     frame: FrameOnDisk, propagate: str | None
 ) -> None:
     record = run(frame, baselines=True, gt=frame.gt, propagate=propagate).record
-    baselines, check = record["baselines"], record["linear"]["check"]
+    baselines, at = record["baselines"], record["linear"]["validation"]
     assert set(baselines) == {*BASELINES, "network", "result"}
-    assert baselines["linear"]["held_out_mae"] == pytest.approx(check["linear"], rel=1e-6)
-    assert baselines["result"]["held_out_mae"] == check["result"]
-    assert baselines["network"]["held_out_mae"] == check["aligned"]
+    assert baselines["linear"]["validation_mae"] == pytest.approx(at["linear"], rel=1e-6)
+    assert baselines["result"]["validation_mae"] == at["result"]
+    assert baselines["network"]["validation_mae"] == at["aligned"]
     assert baselines["linear"]["scores"]["mae"] == record["linear"]["scores"]["mae"]
     plain = run(frame, gt=frame.gt, propagate=propagate, output=frame.folder / "plain").record
     assert baselines["result"]["scores"] == plain["scores"]["after"]
