@@ -17,7 +17,7 @@ settings.register_profile("steady", deadline=None, derandomize=True)
 settings.load_profile("steady")
 
 if "PYTEST_XDIST_WORKER" in os.environ:
-    # two workers with a thread each, and in the processes that they start, unless more are asked for
+    # two workers and what they start have a thread each, unless OMP_NUM_THREADS asks for more
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
 
 _SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
