@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pnpdepth_cli.io.dataset import PROTOCOLS, WHOLE, Protocol
+from pnpdepth_cli.protocols import ODOMETRY_PART, WHOLE, FramePart
 from pnpdepth_cli.settings import PAPER
 
 SETTING = PAPER
@@ -41,7 +41,7 @@ class PaperRow:
     """With refinement."""
     gains: Figures
     """Of RMSE and MAE in per cent, as printed; two are 0.1 below those of the printed errors."""
-    cut: Protocol = WHOLE
+    cut: FramePart = WHOLE
     """The crop of a larger frame."""
     missing: str = ""
     """Why there is no such network of ours."""
@@ -104,7 +104,7 @@ def _row(text: str) -> PaperRow:
         before=tuple(values[:6]),
         after=tuple(values[6:12]),
         gains=tuple(values[12:]),
-        cut=PROTOCOLS["kitti-odometry"] if street and family in _ODOMETRY else WHOLE,
+        cut=ODOMETRY_PART if street and family in _ODOMETRY else WHOLE,
         missing=_MISSING if street and family == "eigen" else "",
     )
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
 from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import NoPointsError, UsageError
-from pnpdepth_cli.io.dataset import PROTOCOLS, Protocol
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.protocols import NYU_PART, FramePart
 from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, as_depth_image, simulate_lidar
 
 T = TypeVar("T")
@@ -41,13 +41,13 @@ class TableFrame:
     pool: Depth
     scan: Depth | None = None
 
-    def cut_by(self, protocol: Protocol) -> TableFrame:
-        """What the protocol leaves of the frame."""
+    def cut_by(self, part: FramePart) -> TableFrame:
+        """What a protocol leaves of the frame."""
         return TableFrame(
-            rgb=np.ascontiguousarray(protocol.apply(self.rgb)),
-            gt=np.ascontiguousarray(protocol.apply(self.gt)),
-            pool=protocol.apply(self.pool),
-            scan=None if self.scan is None else protocol.apply(self.scan),
+            rgb=np.ascontiguousarray(part.apply(self.rgb)),
+            gt=np.ascontiguousarray(part.apply(self.gt)),
+            pool=part.apply(self.pool),
+            scan=None if self.scan is None else part.apply(self.scan),
         )
 
     def points(self, count: int | None, seed: int) -> SparsePoints:
@@ -189,6 +189,6 @@ def _evenly(every: Sequence[T], most: int | None) -> list[T]:
 def _shared_frame(frame: EvalFrame) -> TableFrame:
     if frame.sensor is None:
         gt = within(frame.gt, ROOM_LIMIT)
-        return TableFrame(rgb=frame.rgb, gt=gt, pool=gt).cut_by(PROTOCOLS["nyu"])
+        return TableFrame(rgb=frame.rgb, gt=gt, pool=gt).cut_by(NYU_PART)
     gt, scan = (within(depth, STREET_LIMIT) for depth in (frame.gt, frame.sensor))
     return TableFrame(rgb=frame.rgb, gt=gt, pool=scan, scan=scan)

@@ -15,7 +15,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pnpdepth_cli import measures
+from pnpdepth_cli import measures, protocols
 from pnpdepth_cli.errors import UsageError
 
 
@@ -227,8 +227,7 @@ PRECISIONS = ("fp32", "bf16", "fp16")  # of the network's convolutions and matri
 # Files and sensors
 COLORS = ("blue-orange", "paper")  # of better and worse; the paper's are red and green
 PREVIEWS = ("all", "worst", "none")  # which frames get images; worst: worse than linear
-FRAME_PROTOCOLS = ("whole", "nyu", "kitti-odometry", "kitti-depth")  # `io.dataset`
-PATTERNS = ("uniform", "grid", "lines", "features")
+PATTERNS = ("uniform", "shuffle", "grid", "lines", "features")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
 
 SENSORS = (
@@ -241,7 +240,9 @@ LENSES = ("radial-tangential", "fisheye")
 """Lens distortions: `pnpdepth_cli.sensors.lens`."""
 
 # Evaluation
-EVAL_PROTOCOLS = ("paper", "nyu-eigen", "kitti", "kitti-devkit", "eigen", "garg")
+PROTOCOLS = tuple(protocols.PROTOCOLS)
+"""How frames are cut, given points and scored: `pnpdepth_cli.protocols`."""
+
 AVERAGES = ("per-image", "pooled")  # every image, or every pixel, has equal weight
 RESIZES = ("nearest", "bilinear")  # of a prediction to the size of the ground truth
 MISSING = ("skip", "min", "max", "fail")  # empty predictions: unscored, at a bound, or refused

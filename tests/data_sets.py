@@ -159,8 +159,8 @@ def ground_truth(frame: Frame) -> np.ndarray:
     """The ground truth (H, W) of a frame in metres, cut as its protocol says."""
     assert frame.gt is not None
     if isinstance(frame.gt, Hdf5Array):
-        return frame.protocol.apply(depth_of(frame.gt))
-    return frame.protocol.apply(read_depth(frame.gt, scale=frame.gt_scale).values)
+        return frame.part.apply(depth_of(frame.gt))
+    return frame.part.apply(read_depth(frame.gt, scale=frame.gt_scale).values)
 
 
 Maker = Callable[[Path], None]

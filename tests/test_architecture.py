@@ -15,12 +15,13 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
 GROUND_FLOOR = {
     "errors", "choices", "points", "camera", "budget", "scan_pattern", "settings",
-    "measures",
+    "measures", "protocols",
 }  # fmt: skip
 MAY_IMPORT = {
     "errors": set(),
     "measures": {"errors"},
-    "choices": {"errors", "measures"},
+    "protocols": {"errors", "measures", "camera"},
+    "choices": {"errors", "measures", "protocols"},
     "budget": {"errors"},
     "points": {"errors"},
     "camera": {"errors"},

@@ -66,6 +66,8 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
 
     \b
     paper         all known ground truth; mean over images
+    whole, nyu, kitti-odometry, marigold-dc-…, omni-dc-…
+                  the same, of the part of the frames that `batch` refines by this name
     nyu-eigen     0.001–10 m, predictions clipped to it, Eigen's crop of 640×480
     kitti         measures and units of the KITTI depth completion benchmark
     kitti-devkit  figures of KITTI's development kit: missing depth filled in, metres, 1/m
@@ -74,7 +76,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
     from pnpdepth_cli.commands.evaluation import tables
     from pnpdepth_cli.commands.evaluation.evaluate import evaluate as run_evaluation
-    from pnpdepth_cli.commands.evaluation.protocols import choose_protocol
+    from pnpdepth_cli.commands.evaluation.rules import choose_protocol
     from pnpdepth_cli.commands.report import evaluation as report_eval
     from pnpdepth_cli.measures import chosen_measures
 

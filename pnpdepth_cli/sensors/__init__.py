@@ -16,6 +16,7 @@ from pnpdepth_cli.sensors.lidar import simulate_lidar as simulate_lidar
 from pnpdepth_cli.sensors.pixels import Points as Points
 from pnpdepth_cli.sensors.pixels import as_depth_image as as_depth_image
 from pnpdepth_cli.sensors.pixels import describe_dropped as describe_dropped
+from pnpdepth_cli.sensors.projection import behind_foreground as behind_foreground
 from pnpdepth_cli.sensors.projection import edge_agreement as edge_agreement
 from pnpdepth_cli.sensors.projection import occluded_in_map as occluded_in_map
 from pnpdepth_cli.sensors.projection import project_velodyne as project_velodyne

@@ -226,6 +226,28 @@ def occluded_in_map(points: Points) -> Mask | None:
     return hidden_points(xy, depth, points.size, focal_px=focal_px, scanner=np.zeros(3))
 
 
+def behind_foreground(points: Points, window_px: int, metres: float) -> Mask:
+    """Returns (N,) true for points that another point of their window shows to be behind others.
+
+    That is the filter of Conti et al. 2022 as the completion papers of 2023 to 2025 use it: the
+    nearest depth in the window of each point counts for all points in that window, and points
+    farther than it by more than `metres` are behind.
+
+    Args:
+        points: On whole pixels.
+        window_px: Side of the square window, odd.
+        metres: How much farther points may be.
+    """
+    depth, window = as_depth_image(points), np.ones((window_px, window_px), np.uint8)
+    known = depth > 0
+    nearest = np.where(known, depth, np.float32(np.inf))
+    for _ in range(2):  # of the window of a point, and of all windows that a point lies in
+        lowest = cv2.erode(nearest, window, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
+        nearest = np.where(known, lowest, np.float32(np.inf))
+    column, row = points.xy.astype(np.intp).T
+    return np.asarray(points.depth - nearest[row, column] > metres)
+
+
 def interleaved(depth: NDArray[np.float32]) -> Mask:
     """Returns (H, W) true for points of a map, 0 = unknown, between nearer ones on two sides."""
     known = np.where(depth > 0, depth, np.float32(np.inf))

@@ -70,6 +70,7 @@ class Scene:
     size: tuple[int, int]
     image: Image | None
     pattern: SamplePattern
+    seed: int
     rng: np.random.Generator
 
     @property
@@ -109,7 +110,7 @@ def sample_points(
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
     if not known.size:
         raise NoPointsError("the depth map has no pixel with known depth to sample from")
-    scene = Scene(known=known, size=size, image=image, pattern=pattern, rng=rng)
+    scene = Scene(known=known, size=size, image=image, pattern=pattern, seed=seed, rng=rng)
     chosen = np.sort(PATTERNS[pattern.kind](scene))
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
@@ -127,6 +128,13 @@ def _uniform(scene: Scene) -> Pixels:
     if count > scene.known.size:
         raise UsageError(f"{count:,} points of {scene.known.size:,} known pixels; ask for fewer")
     return scene.rng.choice(scene.known, count, replace=False)
+
+
+def _shuffle(scene: Scene) -> Pixels:
+    """The first of the known pixels as numpy's legacy generator shuffles them (Marigold-DC)."""
+    rows = scene.known[:, None].copy()  # rows of an array are shuffled unlike a flat one
+    np.random.RandomState(scene.seed).shuffle(rows)
+    return rows[: scene.wanted, 0]
 
 
 def _grid(scene: Scene) -> Pixels:
@@ -173,7 +181,7 @@ def _features(scene: Scene) -> Pixels:
     return kept
 
 
-_FUNCTIONS = (_uniform, _grid, _lines, _features)
+_FUNCTIONS = (_uniform, _shuffle, _grid, _lines, _features)
 PATTERNS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
 """The patterns by name, as in `choices.PATTERNS`; each returns row-major indices of pixels."""
 

@@ -10,12 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from pnpdepth_cli.choices import FRAME_PROTOCOLS
 from pnpdepth_cli.cli import batch as command
 from pnpdepth_cli.cli import progress
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.progress import BatchProgress
-from pnpdepth_cli.io.dataset import PROTOCOLS
 from tests.commands.batches import add_frame
 
 PROGRAM = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
@@ -164,7 +162,3 @@ def test_on_a_terminal_there_is_a_bar(
     err = capsys.readouterr().err
     assert "failed: x: bad\n" in err
     assert " 2/2" in err
-
-
-def test_the_choices_are_those_that_there_are() -> None:
-    assert list(FRAME_PROTOCOLS) == list(PROTOCOLS)

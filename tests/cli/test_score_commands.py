@@ -13,9 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.choices import EVAL_PROTOCOLS
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS
 from pnpdepth_cli.io.depth import write_depth
 from tests.commands.frames import frame_on_disk
 
@@ -161,10 +159,6 @@ def test_a_name_that_is_no_utf_8_is_scored_and_printed(
     out = capfdbinary.readouterr().out
     assert b"\\udcff" in out
     assert rb"c\nd" in out
-
-
-def test_the_help_names_every_protocol() -> None:
-    assert tuple(PROTOCOLS) == EVAL_PROTOCOLS
 
 
 def test_an_evaluation_replaces_a_report_only_if_asked(

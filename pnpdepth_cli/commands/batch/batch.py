@@ -37,6 +37,7 @@ from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 Result = TypeVar("Result")
 _MAX_LISTED = 5
@@ -184,9 +185,11 @@ class _Batch:
         guessed = " (guessed; --layout names another)" if request.layout is None else ""
         count = _count(len(frames), "frame")
         yield f"layout: {self.found.layout}{guessed}: {count}, {with_gt:,} with ground truth"
-        cut = sorted({f.protocol.name for f in frames if f.protocol.halved or f.protocol.crop})
-        if cut and request.protocol is None:
-            yield f"protocol: {', '.join(cut)} cuts the frames; --protocol whole keeps all of them"
+        cut = sorted({str(frame.part) for frame in frames if frame.part != WHOLE})
+        if request.protocol is not None and (note := find_protocol(request.protocol).note):
+            yield f"protocol {request.protocol}: {note}"
+        elif cut and request.protocol is None:
+            yield f"frames: {', '.join(cut)}; --protocol whole keeps all of them"
         if poses := note_of_poses(frames):
             yield poses
         if request.limit is not None:

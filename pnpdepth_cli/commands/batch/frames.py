@@ -13,7 +13,11 @@ from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.sequence import with_neighbours
 from pnpdepth_cli.commands.batch.summary import CSV, JSON
 from pnpdepth_cli.commands.refinement.output_files import Outputs, outputs_in
-from pnpdepth_cli.commands.refinement.request import FrameFiles, NeighbourFiles, RefineRequest
+from pnpdepth_cli.commands.refinement.request import (
+    FrameFiles,
+    NeighbourFiles,
+    RefineRequest,
+)
 from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.bags import is_bag
@@ -24,12 +28,12 @@ from pnpdepth_cli.io.dataset import (
     Source,
     Unmatched,
     file_of,
-    find_protocol,
     name_problem,
 )
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.io.lock import LOCKS
+from pnpdepth_cli.protocols import find_protocol
 
 _IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"
 
@@ -132,7 +136,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f"{source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
-    if request.refine.files.sample is None and all(frame.sparse is None for frame in found):
+    if request.files.sample is None and all(frame.sparse is None for frame in found):
         raise UsageError(
             f"{source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
@@ -175,9 +179,10 @@ def task_of(request: FrameSelection, frame: Frame) -> Task:
 
 def _files_of(request: FrameSelection, frame: Frame, *, needs_camera: bool) -> FrameFiles:
     """The files of a frame, without its neighbours."""
-    base = request.refine.files
+    base, part = request.files, frame.part
+    if request.protocol is not None:
+        part = find_protocol(request.protocol).part or part
     sparse = frame.sparse if base.sample is None else None
-    protocol = frame.protocol if request.protocol is None else find_protocol(request.protocol)
     gt = frame.gt
     if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
         gt = frame.sparse  # points are sampled from the projected scan
@@ -199,7 +204,7 @@ def _files_of(request: FrameSelection, frame: Frame, *, needs_camera: bool) -> F
         sparse_scale=frame.sparse_scale if base.depth_scale is None else None,
         gt_scale=base.gt_scale or base.depth_scale or frame.gt_scale,
         scan=scan,
-        protocol=protocol,
+        part=part,
     )
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from pnpdepth_cli.choices import FRAME_PROTOCOLS, LAYOUTS
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.choices import LAYOUTS, PROTOCOLS
+from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest, parse_sample
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.settings import option
 
 LOCAL = "local"
@@ -40,10 +41,23 @@ class FrameSelection:
     )
     protocol: str | None = option(
         None,
-        "Crop and depth range of the frames.  [default: the layout's own]",
-        choices=FRAME_PROTOCOLS,
+        "Crop and points of the frames, by which `eval` scores too.  [default: the layout's own]",
+        choices=PROTOCOLS,
     )
     limit: int | None = option(None, "Only the first N frames.", metavar="N", least=1)
+
+    @property
+    def files(self) -> FrameFiles:
+        """How the files of every frame are read, with the points that the protocol has."""
+        files = self.refine.files
+        if self.protocol is None:
+            return files
+        protocol = find_protocol(self.protocol)
+        files = replace(files, foreground=protocol.foreground)
+        if files.sample is not None or protocol.sample is None:
+            return files
+        sample = parse_sample(protocol.sample)
+        return replace(files, sample=sample, sample_seed=protocol.seed)
 
 
 @dataclass(frozen=True, kw_only=True)

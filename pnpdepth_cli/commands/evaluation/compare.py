@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.pairing import some_names
-from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS
+from pnpdepth_cli.commands.evaluation.rules import published
 from pnpdepth_cli.commands.evaluation.statistics import (
     LEVEL,
     MIN_CLUSTERS,
@@ -329,7 +329,7 @@ def _refined(record: Mapping[str, Any], path: Path, stage: str) -> dict[str, Any
         )
     return {
         "measures": tuple(m for m in MEASURES if all(m.key in each for each in values.values())),
-        "scoring": PROTOCOLS["paper"].scoring(),
+        "scoring": published("paper").scoring(),
         "frames": {
             name: {
                 "values": each,

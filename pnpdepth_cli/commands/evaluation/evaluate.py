@@ -12,8 +12,8 @@ import numpy as np
 
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
-from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, choose_protocol
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.commands.evaluation.rules import EvalProtocol, choose_protocol
 from pnpdepth_cli.commands.evaluation.scoring import (
     FrameScores,
     score_pair,
@@ -108,7 +108,6 @@ class Evaluation:
                 "prediction": request.prediction,
                 "truth": request.ground_truth,
                 "sparse": request.sparse,
-                "layout_protocol": request.layout_protocol,
                 "scales": {
                     "prediction": request.pred_scale,
                     "truth": request.gt_scale,
@@ -186,7 +185,7 @@ def evaluate(
         request.ground_truth,
         sparse=request.sparse,
         mask=protocol.mask,
-        layout_protocol=request.layout_protocol,
+        part=protocol.part,
     )
     single = request.prediction.is_file() and len(pairs) == 1
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, load_stacked
-from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol, crop_window
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.commands.evaluation.rules import EvalProtocol, crop_window
 from pnpdepth_cli.errors import InputError, SizeError
 from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image, read_mask
@@ -87,7 +87,7 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
         assert frame.gt is not None
         scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
         whole = _read(frame.gt, scale, request.channel, protocol, pair.index)
-    gt = np.ascontiguousarray(frame.protocol.apply(masked(whole.values, frame.masks)))
+    gt = np.ascontiguousarray(frame.part.apply(masked(whole.values, frame.masks)))
     kinds = {"gt": whole.reading}
     sparse, kind = _known_sparse(pair, protocol, request, gt.shape)
     if kind is not None:
@@ -190,8 +190,8 @@ def _known_sparse(
             sparse, reading = read_sparse(pair.sparse, size=(height, width), scale=protocol.scale)
         xy, source_size = sparse.xy, sparse.size
         if source_size != size:
-            xy = pair.frame.protocol.in_crop(xy, source_size)
-            if pair.frame.protocol.apply(np.zeros(source_size, bool)).shape != size:
+            xy = pair.frame.part.in_crop(xy, source_size)
+            if pair.frame.part.apply(np.zeros(source_size, bool)).shape != size:
                 raise _different(pair, "sparse depth", pair.sparse, source_size, size)
     except InputError:
         if pair.sparse_named or protocol.exclude_sparse:
@@ -213,7 +213,7 @@ def image_of(pair: FramePair, size: Size) -> Depth | None:
         return None
     rgb = read_image(pair.image)
     if rgb.shape[:2] != size:
-        rgb = pair.frame.protocol.apply(rgb)
+        rgb = pair.frame.part.apply(rgb)
     return rgb if rgb.shape[:2] == size else None
 
 

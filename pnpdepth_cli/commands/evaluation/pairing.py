@@ -22,13 +22,13 @@ from pnpdepth_cli.io.dataset import (
     Frame,
     Source,
     find_files,
-    find_protocol,
     groups_by_name,
 )
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, DepthFile, Reading
 from pnpdepth_cli.io.formats.arrays import parse_npy
 from pnpdepth_cli.io.layouts import find_layout, list_frames
+from pnpdepth_cli.protocols import WHOLE, FramePart
 
 _DEPTH_MARKS = ("_depth", ".depth")
 _COMPANIONS = ("_sigma_preview", "_preview", "_improvement", "_sigma", "_valid")
@@ -67,7 +67,7 @@ def pair_frames(
     *,
     sparse: Path | None = None,
     mask: Path | None = None,
-    layout_protocol: str | None = None,
+    part: FramePart | None = None,
 ) -> tuple[list[FramePair], list[str]]:
     """Returns the frames of the ground truth in its order, and notes.
 
@@ -76,11 +76,10 @@ def pair_frames(
         ground_truth: The same, or a data set of a known layout, or a manifest.
         sparse: A file, or a folder with the same names.
         mask: A file, or a folder with the same names.
-        layout_protocol: One of choices.FRAME_PROTOCOLS, by which the frames of a data set are cut;
-            None for the layout's own.
+        part: What is used of the frames of a data set; None for the layout's own.
 
     Raises:
-        UsageError: For a file and a folder, or a layout protocol without a data set.
+        UsageError: For a file and a folder.
         InputError: For a missing path, or folders without a common name.
     """
     for path in filter(None, (prediction, ground_truth, sparse, mask)):
@@ -90,11 +89,6 @@ def pair_frames(
         layout = find_layout(ground_truth)
     except (InputError, OSError):  # files and folders of files
         layout = None
-    if layout is None and layout_protocol is not None:
-        raise UsageError(
-            f"--layout-protocol {layout_protocol} is for data sets, and {ground_truth} is in no"
-            " known layout; leave it out"
-        )
     if layout is None and prediction.is_dir() != ground_truth.is_dir():
         raise UsageError(
             f"give two files or two folders, not one of each: {prediction}, {ground_truth}"
@@ -104,7 +98,7 @@ def pair_frames(
     notes: list[str] = []
     if prediction.is_dir():
         predictions, notes = depth_files(prediction)
-        frames, more_notes = _true_frames(ground_truth, layout, layout_protocol)
+        frames, more_notes = _true_frames(ground_truth, layout, part)
         notes += more_notes
     elif (count := stack_size(prediction)) is not None:
         return _stacked_pairs(prediction, ground_truth, count)
@@ -136,7 +130,7 @@ def pair_frames(
 
 
 def _true_frames(
-    folder: Path, layout: str | None, layout_protocol: str | None
+    folder: Path, layout: str | None, part: FramePart | None
 ) -> tuple[list[Frame], list[str]]:
     """The frames with ground truth of a folder of files or a data set, and notes."""
     if layout is None:
@@ -145,14 +139,11 @@ def _true_frames(
     frames = [frame for frame in list_frames(folder, layout)[1].frames if frame.gt is not None]
     if not frames:
         raise InputError(f"{folder} looks like {layout!r}, and no frame in it has ground truth")
-    if layout_protocol is not None:
-        cut = find_protocol(layout_protocol)
-        frames = [replace(frame, protocol=cut) for frame in frames]
-    cuts = ", ".join(sorted({frame.protocol.name for frame in frames} - {"whole"}))
+    if part is not None:
+        frames = [replace(frame, part=part) for frame in frames]
+    cuts = ", ".join(sorted({str(frame.part) for frame in frames if frame.part != WHOLE}))
     note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
-    return frames, [
-        note + (f", cut by layout protocol {cuts}; --layout-protocol to change" if cuts else "")
-    ]
+    return frames, [note + (f", of which {cuts} is used" if cuts else "")]
 
 
 def _by_frame(

@@ -121,7 +121,7 @@ class EvalRequest(ScoringRules):
     protocol: str = option(
         "paper",
         "Preset of the rules.",
-        choices=choices.EVAL_PROTOCOLS,
+        choices=choices.PROTOCOLS,
         show_default=True,
     )
     pred_scale: float | None = option(None, "Integer predictions hold metres × S.", metavar="S")
@@ -136,11 +136,6 @@ class EvalRequest(ScoringRules):
     )
     channel: str | None = option(
         None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
-    )
-    layout_protocol: str | None = option(
-        None,
-        "Crop of the frames of a data set GT, as in batch.  [default: the layout's own]",
-        choices=choices.FRAME_PROTOCOLS,
     )
     grouped: bool = True
     """False if every frame counts as independent."""

@@ -22,8 +22,8 @@ from scipy.stats import norm
 from pnpdepth_cli.commands.evaluation.frames import Depth, Fit, load_frame
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.commands.evaluation.protocols import EvalProtocol
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.commands.evaluation.rules import EvalProtocol
 from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.formats import Reading

@@ -199,8 +199,8 @@ def interval(
         variance, third = ((deviation**power).sum(axis=0) / count for power in (2, 3))
         error = np.sqrt(variance / (count - 1))
         skew = third / variance**1.5 * np.sqrt(count - 1) / (count - 2)
+        error = np.where(count >= MIN_CLUSTERS, error, math.nan)
         skew = np.where(error > 1e-8 * np.maximum(np.abs(value), 1.0), skew, 0.0)
-    error = np.where(count >= MIN_CLUSTERS, error, math.nan)
     reach = stats.t.ppf((1 + LEVEL) / 2, np.maximum(count - 1, 1))
     below, above = _corrected(reach, skew), -_corrected(-reach, skew)
     return value - np.maximum(below, reach) * error, value + np.maximum(above, reach) * error

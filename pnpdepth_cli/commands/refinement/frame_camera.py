@@ -97,7 +97,7 @@ def camera_of_frame(
                 " in EXIF; give --calib or --fov"
             )
         notes = [describe_pinhole(known)]
-    return None if known is None else files.protocol.camera_in_crop(known, size), notes
+    return None if known is None else files.part.camera_in_crop(known, size), notes
 
 
 def camera_of_file(

@@ -34,7 +34,12 @@ from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import as_depth_image, occluded_in_map, sample_points
+from pnpdepth_cli.sensors import (
+    as_depth_image,
+    behind_foreground,
+    occluded_in_map,
+    sample_points,
+)
 
 ImageArray = NDArray[np.float32]
 
@@ -72,7 +77,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     Raises:
         InputError: A file cannot be used, or the files do not fit together.
     """
-    files, method, crop = request.files, request.method, request.files.protocol.apply
+    files, method, crop = request.files, request.method, request.files.part.apply
     notes, record = list[str](), dict[str, Any]()
     rgb: ImageArray | None = None
     gt: ImageArray | None = None
@@ -172,7 +177,7 @@ def _points_of(request: RefineRequest, files: FrameFiles, size: tuple[int, int])
     """The points of another frame of the sequence, read or sampled as it does itself."""
     if files.sparse is not None:
         return _read_sparse(request, files, size).points
-    crop = files.protocol.apply
+    crop = files.part.apply
     rgb: ImageArray | None = None
     gt: ImageArray | None = None
     if files.image is not None:
@@ -227,6 +232,7 @@ def _sampled(
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
     if gt is None:
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
+    seed = seed if files.sample_seed is None else files.sample_seed
     try:
         points = sample_points(gt, files.sample, seed, image=rgb)
     except UsageError as error:  # the pattern itself is good, this frame is too poor for it
@@ -263,9 +269,9 @@ def _read_sparse(
         sparse = _read_points(files, path, size, keep_occluded=keep)
     points = sparse.points.tensors()
     # an array of the image's size that takes no memory, to find the size of the part
-    part = files.protocol.apply(np.broadcast_to(np.False_, points.size)).shape
+    part = files.part.apply(np.broadcast_to(np.False_, points.size)).shape
     if part != points.size:
-        xy = torch.from_numpy(files.protocol.in_crop(points.xy.numpy(), points.size))
+        xy = torch.from_numpy(files.part.in_crop(points.xy.numpy(), points.size))
         points = _inside(path, SparsePoints(xy=xy, depth=points.depth, size=(part[0], part[1])))
     return replace(sparse, points=points)
 
@@ -286,6 +292,12 @@ def _read_points(
         )
     notes = [f"sparse: {describe_range(depth, reading)}"]
     record = _file_record(path) | {"read_as": str(reading)}
+    if files.foreground is not None:
+        behind = behind_foreground(visible, *files.foreground)
+        visible, count = visible.select(~behind), int(behind.sum())
+        record["dropped"] = {"behind the foreground": count}
+        notes.append(f"sparse: dropped {count:,} points behind others, as the protocol does")
+        keep_occluded = True
     hidden = None if keep_occluded else occluded_in_map(visible)
     if hidden is not None and hidden.any():
         visible, count = visible.select(~hidden), int(hidden.sum())

@@ -11,10 +11,11 @@ import numpy as np
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.request import FrameFiles
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset import Protocol, Source, file_of
+from pnpdepth_cli.io.dataset import Source, file_of
 from pnpdepth_cli.io.dataset.reading import read_image
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors import NeighbourScan, Points, accumulated
 from pnpdepth_cli.sensors.motion import Keypoints, MotionEstimate, keypoints_of, motion_of_images
 
@@ -95,17 +96,17 @@ def _estimated(
     assert here.image is not None
     assert there.image is not None
     return motion_of_images(
-        _keypoints(here.image, here.protocol, fingerprint(file_of(here.image)).sha256),
-        _keypoints(there.image, there.protocol, fingerprint(file_of(there.image)).sha256),
+        _keypoints(here.image, here.part, fingerprint(file_of(here.image)).sha256),
+        _keypoints(there.image, there.part, fingerprint(file_of(there.image)).sha256),
         points,
         camera,
     )
 
 
 @functools.lru_cache(maxsize=_IN_MEMORY)
-def _keypoints(image: Source, protocol: Protocol, digest: str) -> Keypoints:
+def _keypoints(image: Source, part: FramePart, digest: str) -> Keypoints:
     """The keypoints of an image whose file has this digest."""
-    return keypoints_of(np.ascontiguousarray(protocol.apply(read_image(image))))
+    return keypoints_of(np.ascontiguousarray(part.apply(read_image(image))))
 
 
 def _name_of(files: FrameFiles) -> str:

@@ -13,17 +13,12 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import choices
 from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.protocols import WHOLE, ForegroundFilter, FramePart
 from pnpdepth_cli.settings import Settings, option
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.io.dataset import Pose, Protocol, Source
+    from pnpdepth_cli.io.dataset import Pose, Source
     from pnpdepth_cli.sensors import SamplePattern
-
-
-def _whole_frame() -> Protocol:
-    from pnpdepth_cli.io.dataset import WHOLE
-
-    return WHOLE
 
 
 def parse_codes_per_metre(text: str) -> float:
@@ -98,7 +93,12 @@ class FrameFiles:
     gt_size_ok: bool = False
     """Accept ground truth of another size; its known pixels are moved to the image."""
     sample: SamplePattern | None = None
-    protocol: Protocol = field(default_factory=_whole_frame)
+    sample_seed: int | None = None
+    """Random seed of `sample`; None for that of the method."""
+    foreground: ForegroundFilter | None = None
+    """Which points of a depth map are removed; None for the program's own choice."""
+    part: FramePart = WHOLE
+    """The part of the frame that is used."""
 
     @property
     def image_file(self) -> Path | None:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.errors import FileFormatError, SizeError, UsageError
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.protocols import WHOLE, FramePart
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".exr")
 SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
@@ -22,73 +21,6 @@ _LONGEST_PART = 255 - len("_improvement.png")
 """Bytes of a part of a name, so that the longest file name of a result has 255."""
 
 _DRIVE = re.compile(r"[A-Za-z]:")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Protocol:
-    """The part of a frame that the paper's experiments use."""
-
-    name: str
-    halved: bool = False  # every second pixel in both directions (nearest neighbour) is used
-    crop: tuple[int, int] | None = None
-    """(H, W) of the crop after halving; None for the whole image."""
-    anchor: Literal["centre", "bottom"] = "centre"
-    """Vertical position of the crop, which is centred horizontally."""
-
-    def apply(self, image: NDArray[Any]) -> NDArray[Any]:
-        """Returns the part of an image (H, W) or (H, W, C). Raises SizeError if it is too small."""
-        top, left, height, width = self._window((image.shape[0], image.shape[1]))
-        # nearest neighbour at half the size: the pixel whose area holds the new pixel's centre
-        small = image[1::2, 1::2] if self.halved else image
-        return small[top : top + height, left : left + width]
-
-    def in_crop(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
-        """Returns pixel coordinates (N, 2) in that part, from those in the whole image."""
-        top, left, _, _ = self._window(size)
-        moved = (np.asarray(xy, np.float64) + 0.5) / 2 - 0.5 if self.halved else xy
-        return np.asarray(moved - np.array([left, top]), np.float32)
-
-    def camera_in_crop(self, camera: Camera, size: tuple[int, int]) -> Camera:
-        """Returns the camera of that part, from that of the whole image of (H, W)."""
-        top, left, height, width = self._window(size)
-        intrinsics = camera.intrinsics.copy()
-        if self.halved:  # x becomes (x + 0.5) / 2 - 0.5
-            intrinsics[:2] /= 2
-            intrinsics[:2, 2] -= 0.25
-        intrinsics[:2, 2] -= (left, top)
-        return replace(camera, intrinsics=intrinsics, size=(height, width))
-
-    def _window(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
-        """(top, left, height, width) after halving."""
-        height, width = (side // 2 for side in size) if self.halved else size
-        if self.crop is None:
-            return 0, 0, height, width
-        rows, columns = self.crop
-        if rows > height or columns > width:
-            raise SizeError(
-                f"protocol {self.name!r} needs {columns}×{rows} pixels but the frame has"
-                f" {width}×{height}{' after halving' if self.halved else ''}"
-            )
-        top = height - rows if self.anchor == "bottom" else (height - rows) // 2
-        return top, (width - columns) // 2, rows, columns
-
-
-WHOLE = Protocol(name="whole")
-PROTOCOLS = {
-    "whole": WHOLE,
-    "nyu": Protocol(name="nyu", halved=True, crop=(228, 304)),
-    "kitti-odometry": Protocol(name="kitti-odometry", crop=(228, 912), anchor="bottom"),
-    # The benchmark scores all pixels with ground truth; its selection is cropped already.
-    "kitti-depth": Protocol(name="kitti-depth"),
-}
-"""The paper's protocols (Wang et al. 2019, section on data sets), and all of the frame."""
-
-
-def find_protocol(name: str) -> Protocol:
-    """Returns the protocol of this name. Raises UsageError if there is none."""
-    if name not in PROTOCOLS:
-        raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
-    return PROTOCOLS[name]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,7 +77,7 @@ class Frame:
     camera: int | None = None  # which camera of the calibration
     sparse_scale: float | None = None  # codes per metre of integer sparse depth
     gt_scale: float | None = None  # codes per metre of integer ground truth
-    protocol: Protocol = WHOLE
+    part: FramePart = WHOLE
     pose: Pose | None = None
     """x_world = pose · (x, 1) for points in the camera's frame; of KITTI odometry camera 0's."""
     oxts: Path | None = None  # the packet of KITTI's inertial system that gives the pose

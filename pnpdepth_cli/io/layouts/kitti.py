@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset import PROTOCOLS, Unmatched, as_pose
+from pnpdepth_cli.io.dataset import Unmatched, as_pose
 from pnpdepth_cli.io.layouts.layout import Fields, Files, Layout, row
 from pnpdepth_cli.io.poses import PACKETS, read_poses
+from pnpdepth_cli.protocols import ODOMETRY_PART
 
 _CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
 _RAW = ("", "raw/", "kitti_raw/")
@@ -34,7 +35,6 @@ _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 _AS_PUBLISHED: dict[str, Any] = {
     "sparse_scale": 256.0,
     "gt_scale": 256.0,
-    "protocol": PROTOCOLS["kitti-depth"],
 }
 
 
@@ -70,7 +70,7 @@ ODOMETRY = row(
     calib="calib.txt",
     more=_of_sequence,
     camera=2,
-    protocol=PROTOCOLS["kitti-odometry"],
+    part=ODOMETRY_PART,
 )
 
 

@@ -19,9 +19,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
-from pnpdepth_cli.io.dataset import Frame, Unmatched, find_protocol
+from pnpdepth_cli.io.dataset import Frame, Unmatched
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Layout
+from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 _PATHS = ("image", "sparse", "gt", "calib", "mask")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
@@ -40,7 +41,7 @@ _VALUES: dict[str, Callable[[str], Any]] = {
     "gt_size_ok": _flag,
     "name": lambda text: PurePosixPath(text).as_posix(),
     "group": str,
-    "protocol": find_protocol,
+    "protocol": lambda text: find_protocol(text).part or WHOLE,
 }
 """What a text becomes, by column; ValueError and our errors say what is wrong."""
 
@@ -66,6 +67,7 @@ def _frames(root: Path) -> list[Frame | Unmatched]:
                 broken.append(Unmatched(path=path, why=why))
         masks = (files.pop("mask"),) if "mask" in files else ()
         values["gt_other_size"] = values.pop("gt_size_ok", False)
+        values["part"] = values.pop("protocol", WHOLE)
         frames[number] = Frame(**{"name": "", "masks": masks, **files, **values})
     named = _named(list(frames.values()))
     first: dict[str, Frame] = {}

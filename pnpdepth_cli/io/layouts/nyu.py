@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, Hdf5Array
+from pnpdepth_cli.io.dataset import Frame, Hdf5Array
 from pnpdepth_cli.io.dataset.reading import shape_of
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.layouts.layout import Files, Layout, row
+from pnpdepth_cli.protocols import NYU_PART, ODOMETRY_PART
 
 _WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
 _LABELED = "nyu_depth_v2_labeled.mat"
@@ -28,16 +29,16 @@ _MOST_FRAMES = 100_000
 
 def _of_folder(place: Path) -> Callable[[Files], Mapping[str, Any]]:
     """The arrays rgb (3, H, W) and depth (H, W); the protocol for the width of the first file."""
-    protocol = PROTOCOLS["nyu"]
+    part = NYU_PART
     for path in sorted(place.glob("*.h5")):
         with suppress(FileFormatError):  # it is reported when the frame is read
             if shape_of(path, "depth")[-1] > _WIDEST_KINECT:
-                protocol = PROTOCOLS["kitti-odometry"]
+                part = ODOMETRY_PART
             break
     return lambda files: {
         "image": Hdf5Array(path=files["gt"], name="rgb", axes=(1, 2, 0)),
         "gt": Hdf5Array(path=files["gt"], name="depth", axes=(0, 1)),
-        "protocol": protocol,
+        "part": part,
     }
 
 
@@ -65,7 +66,7 @@ def _of_mat(root: Path) -> Iterator[Frame]:
             name=f"{number:04}",
             image=Hdf5Array(path=path, name="images", axes=(2, 1, 0), index=number - 1),
             gt=Hdf5Array(path=path, name="depths", axes=(1, 0), index=number - 1),
-            protocol=PROTOCOLS["nyu"],
+            part=NYU_PART,
         )
 
 

@@ -393,7 +393,7 @@ def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
     options = {"iterations": 0, "depth_scale": 1000.0}
     listener = RecordingListener()
     batch(root, listener, source=root / "list.csv", refine=options)
-    assert any("protocol: nyu cuts the frames" in text for text in listener.messages)
+    assert any("304×228 at the centre of the halved frame" in text for text in listener.messages)
     assert read_depth(root / "out/a_depth.png").values.shape == (228, 304)
     record = json.loads((root / "out/a.json").read_text())
     assert record["size"] == [304, 228]

@@ -404,14 +404,14 @@ def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Pa
     predictions = depths * rng.uniform(0.9, 1.1, depths.shape).astype(np.float32)
     for number, prediction in enumerate(predictions, start=1):
         depth_file(tmp_path / "out" / f"{number:04}_depth.npy", prediction)
-    result = scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole")
+    result = scored(tmp_path, protocol="nyu-eigen")
     error = (predictions - depths)[:, 45:471, 41:601].astype(np.float64)
     expected = np.sqrt((error**2).mean(axis=(1, 2))).mean()
     assert "gt: .mat array" in result.notes
     assert result.mean["rmse"] == pytest.approx(expected, rel=1e-6)
-    assert scored(tmp_path, protocol="nyu-eigen", layout_protocol="whole").mean == result.mean
+    assert scored(tmp_path, protocol="nyu-eigen").mean == result.mean
     with pytest.raises(InputError, match=r"no frame could be scored; the first: .*304×228"):
-        scored(tmp_path, protocol="nyu-eigen")
+        scored(tmp_path, protocol="nyu")
 
 
 def test_predictions_of_kittis_benchmark_crop_are_aligned_with_the_frame(tmp_path: Path) -> None:
@@ -439,7 +439,6 @@ def test_predictions_of_kittis_benchmark_crop_are_aligned_with_the_frame(tmp_pat
 
 
 REFUSED = [
-    ({"layout_protocol": "whole"}, "--layout-protocol whole is for data sets"),
     ({"gt_scale": 0.0}, "--gt-scale"),
     ({"pred_scale": math.nan}, "--pred-scale"),
     ({"more_measures": ("boundary",)}, "unknown measure 'boundary'"),

@@ -19,9 +19,9 @@ from pnpdepth_cli.commands.refinement.frame_camera import (
 )
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.errors import SizeError, UsageError
-from pnpdepth_cli.io.dataset import Protocol
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.point_cloud import depth_edges
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
@@ -111,14 +111,14 @@ def test_a_scan_gives_the_camera_of_its_calibration(tmp_path: Path) -> None:
 
 
 def test_the_camera_of_a_part_sees_the_same_directions(tmp_path: Path) -> None:
-    protocol = Protocol(name="test", halved=True, crop=(20, 30), anchor="bottom")
+    part = FramePart(halved=True, crop=(20, 30), anchor="bottom")
     outputs = {"ply": True, "fov_deg": 70.0}
     frame = frame_on_disk(tmp_path, 60, 80)
-    record = run(frame, protocol=protocol, **outputs).record
-    part, whole = camera_from_json(record["camera"])[0], camera_of_fov(70, (60, 80))
+    record = run(frame, part=part, **outputs).record
+    camera, whole = camera_from_json(record["camera"])[0], camera_of_fov(70, (60, 80))
     xy = np.array([[33.0, 41.0], [50.0, 47.0]])
     rays = unproject(whole, xy, np.ones(2))
-    assert pixels_of(part, rays) == pytest.approx(protocol.in_crop(xy, (60, 80)), abs=1e-4)
+    assert pixels_of(camera, rays) == pytest.approx(part.in_crop(xy, (60, 80)), abs=1e-4)
 
 
 def test_a_record_holds_the_camera_exactly() -> None:

@@ -14,9 +14,10 @@ from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest, sample_pattern
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
-from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, find_protocol
+from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.dataset.reading import masked, moved_to
 from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames
+from pnpdepth_cli.protocols import NYU_PART, ODOMETRY_PART, FramePart, find_protocol
 from tests.data_sets import (
     BENCHMARKS,
     DRIVE,
@@ -363,25 +364,24 @@ def test_an_unknown_folder_names_the_nearest_layout_and_what_it_lacks(
 
 def test_protocols_cut_what_the_paper_says() -> None:
     rows, columns = np.indices((376, 1241))
-    part = PROTOCOLS["kitti-odometry"].apply(np.stack([rows, columns], axis=2))
+    part = ODOMETRY_PART.apply(np.stack([rows, columns], axis=2))
     assert part.shape == (228, 912, 2)
     assert (part[0, 0].tolist(), part[-1, -1].tolist()) == ([148, 164], [375, 1075])
     rows, columns = np.indices((480, 640))
-    part = PROTOCOLS["nyu"].apply(np.stack([rows, columns], axis=2))
+    part = NYU_PART.apply(np.stack([rows, columns], axis=2))
     assert part.shape == (228, 304, 2)
     assert part[0, 0].tolist() == [13, 17]  # row 6 and column 8 of every second pixel from 1 on
     with pytest.raises(SizeError, match=r"\b912×228"):
-        PROTOCOLS["kitti-odometry"].apply(np.zeros((200, 1000)))
-    with pytest.raises(UsageError, match="there are whole, nyu"):
-        find_protocol("eigen")
+        ODOMETRY_PART.apply(np.zeros((200, 1000)))
+    with pytest.raises(UsageError, match="there are paper, whole"):
+        find_protocol("eigenn")
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_pixel_coordinates_move_as_the_image_is_cut(name: str) -> None:
-    protocol = PROTOCOLS[name]
+@pytest.mark.parametrize("part", [NYU_PART, ODOMETRY_PART])
+def test_pixel_coordinates_move_as_the_image_is_cut(part: FramePart) -> None:
     rows, columns = np.indices((480, 1240))
-    part = protocol.apply(np.stack([columns, rows], axis=2))
+    image = part.apply(np.stack([columns, rows], axis=2))
     row, column = 100, 200
-    there = protocol.in_crop(part[row, column][None].astype(np.float32), (480, 1240))
+    there = part.in_crop(image[row, column][None].astype(np.float32), (480, 1240))
     # the kept pixel is one quarter of a new one away from its centre where pixels are halved
     np.testing.assert_allclose(there[0], [column, row], atol=0.26)

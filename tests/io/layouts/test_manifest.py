@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset import PROTOCOLS, Frame, name_problem
+from pnpdepth_cli.io.dataset import Frame, name_problem
+from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.data_sets import read_frames
 from tests.empty_files import touch
 
@@ -51,7 +52,7 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
             calib=tmp_path / "c.txt",
             camera=3,
             gt_scale=1000,
-            protocol=PROTOCOLS["kitti-odometry"],
+            part=ODOMETRY_PART,
             masks=(tmp_path / "m.png",),
             gt_other_size=True,
             group="room",

@@ -11,6 +11,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.dataset import Frame, Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of, read_image, shape_of
 from pnpdepth_cli.io.layouts import list_frames
+from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.data_sets import ground_truth, nyu_h5, nyu_mat, read_frames
 from tests.empty_files import touch
 
@@ -19,7 +20,7 @@ h5py = pytest.importorskip("h5py")
 
 def image_of(frame: Frame) -> np.ndarray:
     assert frame.image is not None
-    return frame.protocol.apply(read_image(frame.image))
+    return frame.part.apply(read_image(frame.image))
 
 
 def test_nyu_frames_come_halved_and_cropped_to_228_by_304(tmp_path: Path) -> None:
@@ -40,7 +41,7 @@ def test_kitti_in_files_of_the_same_kind_is_cut_as_kitti_is(tmp_path: Path) -> N
     with h5py.File(tmp_path / "00001.h5", "w") as file:
         file["rgb"], file["depth"] = np.zeros((3, 376, 1241), np.uint8), depth
     (frame,) = read_frames(tmp_path)
-    assert frame.protocol.name == "kitti-odometry"
+    assert frame.part == ODOMETRY_PART
     assert image_of(frame).shape == (228, 912, 3)
     np.testing.assert_array_equal(ground_truth(frame), depth[148:, 164:1076])
 

@@ -1,18 +1,17 @@
-"""Published evaluation protocols: which pixels are scored, how, and how frames are averaged."""
+"""The rules of an evaluation: a published protocol with what the user changes, and its crops."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.commands.evaluation.kitti_devkit import DEVKIT_MEASURES
 from pnpdepth_cli.errors import SizeError, UsageError
-from pnpdepth_cli.measures import DELTA_THRESHOLDS, MEASURES, Measure, by_depth
-
-KITTI_DEVKIT = "kitti-devkit"
+from pnpdepth_cli.measures import MEASURES, Measure, by_depth
+from pnpdepth_cli.protocols import KITTI_DEVKIT, Protocol, find_protocol
 
 # (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
 # Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by
@@ -31,21 +30,11 @@ _CROPS = ("none", "nyu", *_CROP_FRACTIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalProtocol:
-    """How predictions are scored: `ScoringRules` with nothing open."""
+class EvalProtocol(Protocol):
+    """A protocol with what the user changes, and how the files are read."""
 
-    name: str
-    scale: float = 256.0
-    """Codes per metre of integer files that neither the file nor the user states."""
-    min_depth: float = 0.0
-    max_depth: float | None = None
-    clip: bool = False
-    crop: str = "none"
     mask: Path | None = None
-    average: str = "per-image"
-    thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
     exclude_sparse: bool = False
-    missing: str = "skip"
     prediction_kind: str = "depth"
     scale_by: str = "none"
     prediction_crop: str | None = None
@@ -79,7 +68,7 @@ class EvalProtocol:
     def describe(self) -> str:
         """Returns one line, such as `eigen: ground truth in 0.001–80 m, crop eigen, …`."""
         kept = (*_OF_READING, "exclude_sparse")
-        own = replace(PROTOCOLS[self.name], **{name: getattr(self, name) for name in kept})
+        own = replace(published(self.name), **{name: getattr(self, name) for name in kept})
         bounds = f" above {self.min_depth:g} m" if self.min_depth else ""
         if self.max_depth is not None:
             bounds = f" in {self.min_depth:g}–{self.max_depth:g} m"
@@ -109,7 +98,8 @@ _IN_MILLIMETRES = tuple(
 )
 
 _OF_READING = (
-    *("name", "scale", "resize", "mask", "prediction_kind", "prediction_crop"),
+    *("name", "note", "part", "sample", "seed", "foreground"),
+    *("scale", "resize", "mask", "prediction_kind", "prediction_crop"),
     *("more_measures", "depth_limits"),
 )
 """Fields that say how files are read and what is measured, not which pixels are scored and how."""
@@ -120,27 +110,6 @@ _MISSING_TEXTS = {
     "max": "empty predictions scored as the upper bound",
     "fail": "no empty predictions",
 }
-# The reference codes (monodepth2's evaluate_depth.py, BTS's eval) clamp predictions with
-# `pred[pred < min_depth] = min_depth`, which scores empty ones (0, NaN) as the lower bound.
-_EIGEN = EvalProtocol(
-    name="eigen", crop="eigen", min_depth=1e-3, max_depth=80.0, clip=True, missing="min"
-)
-
-PROTOCOLS = {
-    protocol.name: protocol
-    for protocol in (
-        # Ma and Karaman's evaluation, which the paper's follows: no bounds, no crop.
-        EvalProtocol(name="paper"),
-        # Eigen et al. 2014 with the bounds of later tables (BTS, AdaBins): 0.001 to 10 m.
-        replace(_EIGEN, name="nyu-eigen", scale=1000.0, max_depth=10.0, crop="nyu"),
-        # The completion benchmark's measures in its units, with nothing filled in.
-        EvalProtocol(name="kitti"),
-        EvalProtocol(name=KITTI_DEVKIT),
-        _EIGEN,
-        replace(_EIGEN, name="garg", crop="garg"),
-    )
-}
-
 _NOT_OF_DEVKIT = {
     "average": "--average",
     "thresholds": "--delta",
@@ -148,6 +117,12 @@ _NOT_OF_DEVKIT = {
     "more_measures": "--measures",
     "depth_limits": "--by-depth",
 }
+
+
+def published(name: str) -> EvalProtocol:
+    """Returns the protocol of this name. Raises UsageError if there is none."""
+    row = find_protocol(name)
+    return EvalProtocol(**{f.name: getattr(row, f.name) for f in fields(row)})
 
 
 def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
@@ -158,19 +133,17 @@ def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
     Raises:
         UsageError: For an unknown name or a setting out of its range.
     """
-    if name not in PROTOCOLS:
-        raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
     changed = {field: value for field, value in changes.items() if value is not None}
-    published = PROTOCOLS[name]
-    for field, option in _NOT_OF_DEVKIT.items() if published.is_devkit else ():
-        if changed.get(field, getattr(published, field)) != getattr(published, field):
+    own = published(name)
+    for field, option in _NOT_OF_DEVKIT.items() if own.is_devkit else ():
+        if changed.get(field, getattr(own, field)) != getattr(own, field):
             raise UsageError(
                 f"{option} does not apply to {name}: it has its own measures, no δ, averages"
                 " over the images, and fills in missing predictions"
             )
-    if changed.get("min_depth") == 0 and published.missing == "min":
+    if changed.get("min_depth") == 0 and own.missing == "min":
         changed.setdefault("missing", "skip")  # there is no bound to score empty predictions as
-    protocol = replace(published, **changed)
+    protocol = replace(own, **changed)
     low, high = protocol.min_depth, protocol.max_depth
     for key in protocol.more_measures:
         _ = choices.MEASURES[key]

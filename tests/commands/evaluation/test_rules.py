@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from pnpdepth_cli.commands.evaluation.protocols import PROTOCOLS, choose_protocol, crop_window
+from pnpdepth_cli.commands.evaluation.rules import choose_protocol, crop_window, published
 from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.protocols import PROTOCOLS
 
 # (protocol, frame, (top, bottom, left, right)) as the published evaluations cut them
 WINDOWS = [
@@ -27,12 +28,14 @@ def test_a_protocol_scores_the_window_that_was_published(
     name: str, size: tuple[int, int], window: tuple[int, int, int, int]
 ) -> None:
     top, bottom, left, right = window
-    crop = PROTOCOLS[name].crop
+    crop = published(name).crop
     assert crop_window(crop, size) == (slice(top, bottom), slice(left, right))
 
 
 def test_the_bounds_are_the_published_ones() -> None:
     bounds = {p.name: (p.min_depth, p.max_depth, p.clip) for p in PROTOCOLS.values()}
+    unbounded = {name for name in bounds if "-dc-" in name} | {"whole", "nyu", "kitti-odometry"}
+    assert {bounds.pop(name) for name in unbounded} == {(0.0, None, False)}
     assert bounds == {
         "paper": (0.0, None, False),
         "nyu-eigen": (1e-3, 10.0, True),
@@ -56,7 +59,7 @@ def test_a_crop_that_does_not_fit_the_frame_is_refused() -> None:
 
 
 REFUSED: list[tuple[str, dict[str, Any], str]] = [
-    ("papre", {}, "paper, nyu"),
+    ("papre", {}, "paper, whole"),
     ("paper", {"min_depth": -1.0}, "--min-depth must be metres >= 0, got -1"),
     ("paper", {"min_depth": 5.0, "max_depth": 5.0}, "above --min-depth 5, got 5"),
     ("paper", {"max_depth": float("nan")}, "--max-depth"),
@@ -81,13 +84,13 @@ def test_a_setting_without_sense_is_refused(
 
 def test_unset_fields_stay_as_published() -> None:
     changed = choose_protocol("eigen", max_depth=50.0, crop=None, clip=None)
-    assert changed == replace(PROTOCOLS["eigen"], max_depth=50.0)
+    assert changed == replace(published("eigen"), max_depth=50.0)
 
 
 def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:
-    assert PROTOCOLS["paper"].scoring() == choose_protocol("kitti", resize="nearest").scoring()
+    assert published("paper").scoring() == choose_protocol("kitti", resize="nearest").scoring()
     kinds = ("paper", "nyu-eigen", "kitti-devkit", "eigen", "garg")
-    rules = [PROTOCOLS[name].scoring() for name in kinds]
+    rules = [published(name).scoring() for name in kinds]
     assert all(a != b for i, a in enumerate(rules) for b in rules[:i])
 
 

@@ -1,0 +1,193 @@
+"""Published protocols: the part of a frame, its points, and which pixels are scored, a row each.
+
+`batch --protocol` cuts the frames and draws the points of a row, `eval --protocol` scores by it.
+What is known of each, and from where, is in docs/notes/protocols.md. Importing this module imports
+no library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.measures import DELTA_THRESHOLDS
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pnpdepth_cli.camera import Camera
+
+KITTI_DEVKIT = "kitti-devkit"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramePart:
+    """The part of a frame that is used."""
+
+    halved: bool = False
+    """Whether every second pixel in both directions (nearest neighbour) is used."""
+    crop: tuple[int, int] | None = None
+    """(H, W) of the crop after halving; None for the whole image."""
+    anchor: Literal["centre", "bottom"] = "centre"
+    """Vertical position of the crop, which is centred horizontally."""
+
+    def __str__(self) -> str:
+        size = "all" if self.crop is None else f"{self.crop[1]}×{self.crop[0]} at the {self.anchor}"
+        return f"{size} of the {'halved ' * self.halved}frame"
+
+    def apply(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Returns the part of an image (H, W) or (H, W, C). Raises SizeError if it is too small."""
+        top, left, height, width = self._window((image.shape[0], image.shape[1]))
+        # nearest neighbour at half the size: the pixel whose area holds the new pixel's centre
+        small = image[1::2, 1::2] if self.halved else image
+        return small[top : top + height, left : left + width]
+
+    def in_crop(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
+        """Returns pixel coordinates (N, 2) in that part, from those in the whole image."""
+        import numpy as np
+
+        top, left, _, _ = self._window(size)
+        moved = (np.asarray(xy, np.float64) + 0.5) / 2 - 0.5 if self.halved else xy
+        return np.asarray(moved - np.array([left, top]), np.float32)
+
+    def camera_in_crop(self, camera: Camera, size: tuple[int, int]) -> Camera:
+        """Returns the camera of that part, from that of the whole image of (H, W)."""
+        top, left, height, width = self._window(size)
+        intrinsics = camera.intrinsics.copy()
+        if self.halved:  # x becomes (x + 0.5) / 2 - 0.5
+            intrinsics[:2] /= 2
+            intrinsics[:2, 2] -= 0.25
+        intrinsics[:2, 2] -= (left, top)
+        return replace(camera, intrinsics=intrinsics, size=(height, width))
+
+    def _window(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
+        """(top, left, height, width) after halving."""
+        height, width = (side // 2 for side in size) if self.halved else size
+        if self.crop is None:
+            return 0, 0, height, width
+        rows, columns = self.crop
+        if rows > height or columns > width:
+            raise SizeError(
+                f"the protocol needs {columns}×{rows} pixels but the frame has"
+                f" {width}×{height}{' after halving' if self.halved else ''}"
+            )
+        top = height - rows if self.anchor == "bottom" else (height - rows) // 2
+        return top, (width - columns) // 2, rows, columns
+
+
+WHOLE = FramePart()
+NYU_PART = FramePart(halved=True, crop=(228, 304))
+ODOMETRY_PART = FramePart(crop=(228, 912), anchor="bottom")
+"""Of the seed paper (Wang et al. 2019, section on data sets), and of many after it."""
+
+
+class ForegroundFilter(NamedTuple):
+    """Removes points behind others: LiDAR points that the camera does not see.
+
+    A point goes if another point in its window has, in its own window, a point that is nearer than
+    the first by more than `metres` (Conti et al. 2022).
+    """
+
+    window_px: int
+    metres: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol:
+    """How the frames of a data set are cut, given points, and scored."""
+
+    name: str
+    note: str = ""
+    """What differs from the publication, or what it leaves open."""
+
+    # for `batch`
+    part: FramePart | None = None
+    """None: the data set's own."""
+    sample: str | None = None
+    """Points that are drawn from the ground truth, as `--sample` has them. None: the data set's."""
+    seed: int | None = None
+    """Random seed of the points. None: the user's."""
+    foreground: ForegroundFilter | None = None
+
+    # for `eval`
+    scale: float = 256.0
+    """Codes per metre of integer files that neither the file nor the user states."""
+    min_depth: float = 0.0
+    """Ground truth is scored above this depth, metres."""
+    max_depth: float | None = None
+    """Ground truth is scored below this depth, metres."""
+    clip: bool = False
+    """Whether predictions are clipped to these bounds."""
+    crop: str = "none"
+    """The rectangle of the part that is scored."""
+    average: str = "per-image"
+    thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
+    missing: str = "skip"
+    """What empty predictions are scored as: one of `choices.MISSING`."""
+
+
+# The reference codes (monodepth2's evaluate_depth.py, BTS's eval) clamp predictions with
+# `pred[pred < min_depth] = min_depth`, which scores empty ones (0, NaN) as the lower bound.
+_EIGEN = Protocol(
+    name="eigen",
+    part=WHOLE,
+    crop="eigen",
+    min_depth=1e-3,
+    max_depth=80.0,
+    clip=True,
+    missing="min",
+)
+_RESAMPLED = "the paper halves frames by interpolation; here every second pixel is taken"
+
+PROTOCOLS = {
+    protocol.name: protocol
+    for protocol in (
+        # Ma and Karaman's evaluation, which the seed paper's follows: no bounds, no crop.
+        Protocol(name="paper"),
+        Protocol(name="whole", part=WHOLE),
+        Protocol(name="nyu", part=NYU_PART),
+        Protocol(name="kitti-odometry", part=ODOMETRY_PART),
+        # Eigen et al. 2014 with the bounds of later tables (BTS, AdaBins): 0.001 to 10 m.
+        replace(_EIGEN, name="nyu-eigen", scale=1000.0, max_depth=10.0, crop="nyu"),
+        # The completion benchmark's measures in its units, with nothing filled in.
+        Protocol(name="kitti"),
+        Protocol(name=KITTI_DEVKIT),
+        _EIGEN,
+        replace(_EIGEN, name="garg", crop="garg"),
+        Protocol(
+            name="marigold-dc-nyu",
+            part=NYU_PART,
+            sample="500",
+            seed=2024,
+            note=f"the paper reads its 500 points from a file, others than these; {_RESAMPLED}",
+        ),
+        Protocol(name="marigold-dc-ibims", part=WHOLE, sample="shuffle:1000", seed=2024),
+        Protocol(
+            name="marigold-dc-scannet",
+            part=WHOLE,
+            sample="shuffle:500",
+            seed=2024,
+            note="the paper resizes images to 640×480 and does not say how it draws its points",
+        ),
+        Protocol(name="marigold-dc-void", part=WHOLE),
+        Protocol(name="marigold-dc-lidar", part=WHOLE, foreground=ForegroundFilter(7, 1.5)),
+        Protocol(
+            name="omni-dc-nyu",
+            part=NYU_PART,
+            sample="500",
+            seed=0,
+            note=f"the paper names no seed of its points; {_RESAMPLED}",
+        ),
+        Protocol(name="omni-dc-kitti", part=FramePart(crop=(256, 1216), anchor="bottom")),
+    )
+}
+"""All protocols by name."""
+
+
+def find_protocol(name: str) -> Protocol:
+    """Returns the protocol of this name. Raises UsageError if there is none."""
+    if name not in PROTOCOLS:
+        raise UsageError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]

@@ -1,0 +1,136 @@
+"""Each protocol of the completion papers on a made-up data set: frames, points, scored pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pnpdepth_cli.commands.batch.frames import find_frames, task_of
+from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.evaluation.evaluate import evaluate
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.protocols import PROTOCOLS
+from pnpdepth_cli.sensors import behind_foreground
+from tests.data_sets import SELECTED, image, nyu_h5, void
+
+KITTI = (352, 1216)
+
+
+def ibims(root: Path) -> None:
+    """Two frames of 640×480 in 2 m to 3 m, whose left half is valid."""
+    valid = np.zeros((480, 640), np.uint8)
+    valid[:, :320] = 255
+    depth = np.linspace(2, 3, 640) * np.ones((480, 1)) * 65535 / 50
+    for name in ("corridor_01", "office_02"):
+        image(root / f"rgb/{name}.png", 480, 640)
+        for folder, values in (
+            ("depth", depth.astype(np.uint16)),
+            ("mask_invalid", valid),
+            ("mask_transp", np.full_like(valid, 255)),
+        ):
+            (root / folder).mkdir(exist_ok=True)
+            cv2.imwrite(str(root / folder / f"{name}.png"), values)
+
+
+def scannet(root: Path) -> None:
+    image(root / "scene0707_00/color/0.jpg", 480, 640)
+    (root / "scene0707_00/depth").mkdir()
+    cv2.imwrite(str(root / "scene0707_00/depth/0.png"), np.full((480, 640), 2000, np.uint16))
+    (root / "scene0707_00/intrinsic").mkdir()
+
+
+def kitti(root: Path) -> None:
+    """A frame with points in 20 m on every 4th pixel of every 4th row, and one point in 5 m."""
+    names = {kind: SELECTED.format(kind) for kind in ("image", "velodyne_raw", "groundtruth_depth")}
+    image(root / f"image/{names['image']}.png", *KITTI)
+    truth, points = np.zeros(KITTI, np.uint16), np.zeros(KITTI, np.uint16)
+    truth[100:] = points[100::4, ::4] = 20 * 256
+    points[201, 601] = 5 * 256
+    for folder, values in (("groundtruth_depth", truth), ("velodyne_raw", points)):
+        (root / folder).mkdir()
+        cv2.imwrite(str(root / f"{folder}/{names[folder]}.png"), values)
+    (root / "intrinsics").mkdir()
+    text = " ".join(map(str, (700, 0, 608, 0, 700, 176, 0, 0, 1)))
+    (root / f"intrinsics/{names['image']}.txt").write_text(text)
+
+
+# by protocol: the data set, its frames, the points and the scored pixels of each frame
+BY_HAND: dict[str, tuple[Callable[[Path], None], int, int, int]] = {
+    "marigold-dc-nyu": (nyu_h5, 2, 500, 304 * 228),
+    "omni-dc-nyu": (nyu_h5, 2, 500, 304 * 228),
+    "marigold-dc-ibims": (ibims, 2, 1000, 480 * 320),
+    "marigold-dc-scannet": (scannet, 1, 500, 480 * 640),
+    "marigold-dc-void": (void, 1, 6 * 8, 24 * 32),
+    # the near point stays, and removes the four around it
+    "marigold-dc-lidar": (kitti, 1, 63 * 304 + 1 - 4, 252 * 1216),
+    "omni-dc-kitti": (kitti, 1, 63 * 304 + 1, 252 * 1216),
+}
+
+
+def inputs_of(root: Path, protocol: str) -> list[Inputs]:
+    refine = RefineRequest()
+    request = BatchRequest(source=root, output=root / "out", refine=refine, protocol=protocol)
+    return [read_inputs(task_of(request, frame).request) for frame in find_frames(request).chosen]
+
+
+@pytest.mark.parametrize("name", BY_HAND)
+def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_path: Path) -> None:
+    maker, frames, points, pixels = BY_HAND[name]
+    root = tmp_path / "data"
+    maker(root)
+    request = BatchRequest(
+        source=root, output=tmp_path / "out", refine=RefineRequest(), protocol=name
+    )
+    chosen = find_frames(request).chosen
+    read = [read_inputs(task_of(request, frame).request) for frame in chosen]
+    assert [len(each.points) for each in read] == [points] * frames
+    for frame, each in zip(chosen, read, strict=True):
+        assert each.gt is not None
+        path = tmp_path / "out" / f"{frame.name}_depth.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, np.full(each.gt.shape, 2.0, np.float32))
+    found = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=root, protocol=name))
+    assert [frame.pixels for frame in found.frames] == [pixels] * frames
+    assert found.protocol.scoring()["average"] == "per-image"
+
+
+def test_every_protocol_of_a_completion_paper_is_worked_out() -> None:
+    assert {name for name in PROTOCOLS if "-dc-" in name} == BY_HAND.keys()
+
+
+def test_the_points_of_ibims_are_those_that_marigold_dc_draws(tmp_path: Path) -> None:
+    ibims(tmp_path)
+    first, second = inputs_of(tmp_path, "marigold-dc-ibims")
+    known = np.zeros((480, 640), bool)
+    known[:, :320] = True
+    pixels = np.argwhere(known)
+    np.random.seed(2024)  # as the paper's code draws them
+    np.random.shuffle(pixels)
+    expected = {(x, y) for y, x in pixels[:1000].tolist()}
+    for each in (first, second):
+        assert {(int(x), int(y)) for x, y in each.points.xy.tolist()} == expected
+
+
+def test_points_behind_the_foreground_are_those_of_two_windows() -> None:
+    rng = np.random.default_rng(0)
+    depth = np.where(rng.random((30, 40)) < 0.3, rng.uniform(2, 12, (30, 40)), 0)
+    rows, columns = np.nonzero(depth)
+    values = depth[rows, columns].astype(np.float32)
+    points = SparsePoints(
+        xy=np.stack([columns, rows], axis=1).astype(np.float32), depth=values, size=(30, 40)
+    )
+    expected = []
+    near = (abs(rows[:, None] - rows) <= 3) & (abs(columns[:, None] - columns) <= 3)
+    lowest = np.array([values[window].min() for window in near])
+    for window, own in zip(near, values, strict=True):
+        expected.append(own - lowest[window].min() > 1.5)
+    found = behind_foreground(points, 7, 1.5)
+    assert found.tolist() == expected
+    assert 0 < found.sum() < len(values)
