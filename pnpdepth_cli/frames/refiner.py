@@ -24,7 +24,7 @@ from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, PnpDepthError, UsageError
 from pnpdepth_cli.frames.adapt import Weights, learn, too_little, weights_in_place
-from pnpdepth_cli.frames.default import check_fixed, refine_default, split_points
+from pnpdepth_cli.frames.default import check_fixed, refine_default
 from pnpdepth_cli.frames.frame import (
     METRES,
     Frame,
@@ -41,6 +41,7 @@ from pnpdepth_cli.frames.refine import refine_frames
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
 from pnpdepth_cli.frames.tiles import refine_tiled
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
+from pnpdepth_cli.frames.validation import split_points
 from pnpdepth_cli.models.measure_layers import default_layer
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints

@@ -13,24 +13,20 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.split import Split as Cut
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.frames import default
-from pnpdepth_cli.frames.default import (
+from pnpdepth_cli.frames import default, fuse, validation
+from pnpdepth_cli.frames.default import refine_default, without_outliers
+from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.fuse import (
     FEW_POINTS,
-    FOLDS,
-    MIN_POINTS,
     OWN_SCANNER,
     Expert,
-    Split,
     fitted_weights,
-    refine_default,
-    split_points,
     trust,
     weighted_mean,
-    without_outliers,
 )
-from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.opened import Member, OpenNetwork, OpenNetworks
 from pnpdepth_cli.frames.uncertainty import calibration, relative_shape, with_uncertainty
+from pnpdepth_cli.frames.validation import FOLDS, MIN_POINTS, ValidationSplit, split_points
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -88,12 +84,12 @@ def expert(name: str, at: Tensor, weight: float = 1.0) -> Expert:
     return Expert(name=name, weight=weight, dense=dense, at=at, aligned=dense, updated=at)
 
 
-def split_of(depth: Tensor) -> Split:
+def split_of(depth: Tensor) -> ValidationSplit:
     """A frame with validation points of these depths."""
     xy = torch.stack([torch.arange(len(depth)) % 128, torch.arange(len(depth)) // 128], 1).float()
     points = SparsePoints(xy=xy, depth=depth, size=SIZE)
     frame = frame_in_memory(60)
-    return Split(whole=frame, kept=frame, points=points, weights=torch.ones(len(depth)))
+    return ValidationSplit(whole=frame, kept=frame, points=points, weights=torch.ones(len(depth)))
 
 
 def test_a_network_alone_is_aligned_updated_and_propagated() -> None:
@@ -214,7 +210,7 @@ def test_weights_are_those_that_predict_the_validation_points_best_beside_the_pr
     def loss(weights: np.ndarray) -> float:
         size = np.abs(y - logs @ weights)
         huber = np.where(size < scale, size**2, 2 * scale * size - scale**2).sum()
-        return float(huber + default.STRENGTH * scale**2 * ((weights - prior) ** 2).sum())
+        return float(huber + fuse.STRENGTH * scale**2 * ((weights - prior) ** 2).sum())
 
     for _ in range(200):  # no other weights near by, or anywhere, are better
         other = np.abs(found + rng.choice([0.01, 0.3]) * rng.normal(size=3))
@@ -332,7 +328,9 @@ def test_without_validation_the_uncertainty_has_the_typical_scale() -> None:
 def test_nothing_is_hidden_where_a_fold_is_everything_or_nothing(
     fold: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(default, "spatial_folds", lambda p, *_, **__: torch.full((len(p),), fold))
+    monkeypatch.setattr(
+        validation, "spatial_folds", lambda p, *_, **__: torch.full((len(p),), fold)
+    )
     assert split_points(frame_in_memory(60).points, 0) is None
 
 
@@ -350,7 +348,7 @@ def test_validation_points_are_a_fifth_and_the_others_are_kept() -> None:
 def test_of_many_validation_points_a_part_is_predicted_and_none_is_shown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(default, "MOST_VALIDATION_POINTS", 7)
+    monkeypatch.setattr(validation, "MOST_VALIDATION_POINTS", 7)
     parts = split_points(frame_in_memory(60).points, 0)
     assert parts is not None
     assert [len(part) for part in parts] == [48, 7]

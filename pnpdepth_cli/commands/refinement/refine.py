@@ -21,8 +21,9 @@ from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.errors import DivergedError, ModelError
-from pnpdepth_cli.frames.default import ALIGNED, LINEAR, RESULT
+from pnpdepth_cli.frames.default import ALIGNED, RESULT
 from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
+from pnpdepth_cli.frames.fuse import LINEAR
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.frames.resolve import normalisation_name, redefined
 from pnpdepth_cli.io.atomic import all_or_none

@@ -1,0 +1,363 @@
+"""The experts of the default method, and the one rule that fuses and checks them.
+
+1. The user's networks predict, aligned with the points, z updated.
+2. `compact` predicts with each one's depth as a prior, and without.
+3. Linear interpolation predicts; and, where the image is in doubt, `compact` with a grey image.
+4. Their weights predict the validation points best, close to prior weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.completion.propagation import propagate_at
+from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.frames.frame import Frame, Refined, is_dense
+from pnpdepth_cli.frames.opened import Member, OpenNetworks
+from pnpdepth_cli.frames.validation import MIN_POINTS, ValidationSplit, log_depth
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.scan_pattern import scan_pattern
+
+Floats = NDArray[np.float64]
+LINEAR = "linear"
+"""Name of linear interpolation, as an expert and as a baseline."""
+# Prior weights and the strength were chosen on 7-Scenes, ICL-NUIM, NYU, RealSense, rendered rooms
+# and streets with each set left out in turn (docs/notes/fusion.md has the tables).
+OWN, WITH_PRIOR, WITHOUT_IMAGE = 0.15, 0.45, 0.05
+"""Prior weights: of a network that explains the points, of `compact` with its depth as a prior, and
+of every expert that leaves the image out. `compact` without a prior has the rest."""
+USELESS, USEFUL = 0.25, 0.75
+"""Fractions of the variance of log depth that a network explains at points its alignment was not
+fitted to: up to which it has no prior weight, and from which it has all of it. A network of random
+weights has less than 0.25 in 86 % of the runs with 20 points, 97 % with more."""
+STRENGTH = 60.0
+"""Validation points that the prior weights count as."""
+DOUBT, NO_GAIN = 2.0, 0.5
+"""Standard errors by which the image lowers the error at the validation points: from which it is
+not doubted, and below which there is a warning. 25 frames with their own image and 500 points have
+at least 0.7, and 8 of 9 frames with another one's at most 0.4."""
+ENOUGH_FOR_DOUBT = 50
+"""Fewer validation points do not tell an image that belongs to its points from another one."""
+OWN_SCANNER = 0.75
+"""Weight of a completion network on scan lines, which validation points cannot judge: hidden lines
+are gaps that its scanner does not leave. On even KITTI frames this changes its MAE by −0.9 (pncnn)
+and −2.8 % (nconv)."""
+FEW_POINTS = 50
+"""With fewer points, updates of a network that takes them gain nothing, and one that contradicts
+its neighbours may be all that is seen of a small object."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Expert:
+    """One prediction of the frame, by two sets of points."""
+
+    name: str
+    weight: float  # prior weight; with 0 it has no part
+    dense: Tensor  # (H, W) metres, 0 = unknown: from all points, the residual not propagated
+    at: Tensor  # (M,) metres, 0 = unknown: at the validation points, from the others
+    aligned: Tensor  # (H, W) metres: from the points without the validation points, before updates
+    updated: Tensor  # (M,) metres: `at` before the residual is propagated
+    refined: Refined | None = None  # from all points. None without a network
+    network: Member | None = None  # that predicts. None: linear interpolation
+    user: Member | None = None  # the user's network whose depth it is, or has as a prior
+
+    @property
+    def of_scanner(self) -> bool:
+        """Whether it is a completion network of the user's, given scan lines."""
+        own = self.user is not None and self.user is self.network and self.user.takes_points
+        return own and self.refined is not None and _has_scan_lines(self.refined.used)
+
+
+def predictions(networks: OpenNetworks, split: ValidationSplit, judged: Refined) -> list[Expert]:
+    """Returns the experts, the user's network first.
+
+    Without a network that takes a prior, the networks are the experts, with equal prior weights.
+
+    Raises:
+        PnpDepthError: The user's network gives no depth.
+    """
+    fusing = next((m for m in networks.members if m.takes_prior), None)
+    own = list[Expert]()
+    for member in networks.members:
+        try:
+            if member is not fusing:
+                known = judged if member is judge_of(networks) else None
+                own.append(_expert(networks, member, split, member.name, known=known, user=member))
+        except PnpDepthError:  # a further network that fails is left out
+            if member is networks.members[0]:
+                raise
+    if fusing is None:
+        return [replace(each, weight=1 / len(own)) for each in own]
+    # The network that weighs its points predicts without updates, which take as long as all else.
+    known = judged if fusing is judge_of(networks) else None
+    alone = _expert(networks, fusing, split, fusing.name, known=known)
+    experts, with_prior = list[Expert](), list[Expert]()
+    for each in own:
+        share = trust(each, split, alone) / len(own)
+        experts.append(replace(each, weight=0.0 if each.of_scanner else OWN * share))
+        if share > 0:
+            name = f"{fusing.name} with {each.name}"
+            guided = _expert(networks, fusing, split, name, prior=each, user=each.user)
+            with_prior.append(replace(guided, weight=WITH_PRIOR * share))
+    if known is not None and own and not with_prior:
+        refined = refined_by(networks, fusing, split.whole)  # the only one to update
+        alone = replace(alone, dense=torch.from_numpy(refined.after), refined=refined)
+    rest = 1 - sum(each.weight for each in (*experts, *with_prior))
+    return [*experts, *with_prior, replace(alone, weight=rest), _interpolation(split)]
+
+
+def trust(expert: Expert, split: ValidationSplit, alone: Expert) -> float:
+    """Returns 0…1: how much of the prior weights a network gets, by what it explains.
+
+    The aligned depth of a network that takes the image alone explains a fraction of the variance of
+    log depth: 1 − PRESS / SS, by a line through the other points (Allen, "The relationship between
+    variable selection and data augmentation and a method for prediction", 1974). A network that
+    takes the points has seen them. It has all of the prior weights if its error at the validation
+    points is that of `alone`, and none if it is twice that.
+
+    Args:
+        expert: The network's own depth.
+        split: The frame and its validation points.
+        alone: The network that takes a prior, without one.
+    """
+    assert expert.refined is not None
+    if expert.network is not None and expert.network.takes_points:
+        if not len(split.points):
+            return 0.0
+        ratio = split.error(expert.updated) / max(split.error(alone.at), 1e-9)
+        return min(1.0, max(0.0, 2.0 - ratio))
+    points = split.whole.points
+    at = points.sample(torch.from_numpy(expert.refined.before)).double()
+    x, y = log_depth(at[at > 0]), log_depth(points.depth[at > 0].double())
+    if len(x) < MIN_POINTS:
+        return 0.0
+    x, y, count = x - x.mean(), y - y.mean(), len(x)
+    slope = (x @ y) / (x @ x).clamp_min(1e-12)
+    left_out = (y - slope * x) / (1 - 1 / count - x.square() / (x @ x).clamp_min(1e-12))
+    total = (y / (1 - 1 / count)).square().sum().clamp_min(1e-12)
+    explained = float(1 - left_out.square().sum() / total) if slope > 0 else 0.0
+    return min(1.0, max(0.0, (explained - USELESS) / (USEFUL - USELESS)))
+
+
+def without_doubt(
+    networks: OpenNetworks, split: ValidationSplit, experts: list[Expert]
+) -> tuple[list[Expert], tuple[str, ...]]:
+    """Returns the experts, with one that sees a grey image where the image is in doubt.
+
+    Also a warning where the image does not lower the error at the validation points.
+    """
+    fusing = next((m for m in networks.members if m.takes_prior), None)
+    rgb, count = split.whole.rgb, len(split.points)
+    if fusing is None or rgb is None or count < ENOUGH_FOR_DOUBT:
+        return experts, ()
+    at = {each.name: each.at for each in experts}
+    of_linear = split.gain(at[fusing.name], at[LINEAR])
+    if of_linear >= DOUBT:
+        return experts, ()
+    networks.next_image()
+    grey = torch.full_like(rgb, 0.5)
+    blind = replace(split, whole=replace(split.whole, rgb=grey), kept=replace(split.kept, rgb=grey))
+    expert = _expert(networks, fusing, blind, f"{fusing.name} without the image")
+    experts = [*experts, replace(expert, weight=WITHOUT_IMAGE)]
+    if (of_linear + split.gain(at[fusing.name], expert.at)) / 2 >= NO_GAIN:
+        return experts, ()
+    with_image = split.error(at[fusing.name])
+    without = min(split.error(at[LINEAR]), split.error(expert.at))
+    warning = (
+        f"warning: the image does not lower the error: at {count:,} validation points it is"
+        f" {with_image:.4f} with the image and {without:.4f} without it; see --registration"
+    )
+    return experts, (warning,)
+
+
+def fitted_weights(
+    experts: Sequence[Expert], split: ValidationSplit, chosen: Tensor | None = None
+) -> dict[str, float]:
+    """Returns the weights of the experts by name, >= 0, their sum 1.
+
+    They minimise the squared residuals of log depth at the validation points, large ones linearly
+    (Huber), plus `STRENGTH` times the squared distance from the prior weights. An expert without
+    prior weight has none. Where an expert predicts nothing, the others' mean stands for it.
+
+    Args:
+        experts: The experts.
+        split: The frame and its validation points.
+        chosen: (M,) bool, the validation points to fit. None: all.
+    """
+    having = [expert for expert in experts if expert.weight > 0]
+    prior = np.array([expert.weight for expert in having])
+    prior /= prior.sum()
+    found = prior
+    points = torch.ones(len(split.points), dtype=torch.bool) if chosen is None else chosen
+    if len(having) > 1 and bool(points.any()):
+        at = torch.stack([expert.at for expert in having], dim=1)[points].double()
+        centre = weighted_mean([(at[:, k], float(w)) for k, w in enumerate(prior)])[:, None]
+        offsets = torch.where(at > 0, log_depth(at) - log_depth(centre), 0.0).numpy()
+        residual = (
+            log_depth(split.points.depth.double()[points]) - log_depth(centre[:, 0])
+        ).numpy()
+        found = _nearest_to_prior(offsets, residual, split.weights[points].double().numpy(), prior)
+    by_name = dict.fromkeys((expert.name for expert in experts), 0.0)
+    return by_name | {each.name: float(w) for each, w in zip(having, found, strict=True)}
+
+
+def _nearest_to_prior(offsets: Floats, residual: Floats, weights: Floats, prior: Floats) -> Floats:
+    """The weights (K,) of K experts.
+
+    Args:
+        offsets: (M, K) log predictions, relative to those with the prior weights.
+        residual: (M,) log depths, relative to the same.
+        weights: (M,) of the points.
+        prior: (K,) prior weights.
+    """
+    from scipy.optimize import nnls
+
+    scale = max(1.25 * float(np.average(np.abs(residual), weights=weights)), 1e-3)
+    found = prior
+    # Each pass weighs large residuals down, and solves for non-negative weights whose sum is 1.
+    for _ in range(5):
+        size = np.abs(residual - offsets @ found)
+        root = np.sqrt(weights * np.minimum(1, scale / np.maximum(size, 1e-9)))
+        ridge = np.sqrt(STRENGTH) * scale
+        system = [
+            offsets * root[:, None],
+            ridge * np.eye(len(prior)),
+            np.full((1, len(prior)), 1e4),
+        ]
+        found = nnls(
+            np.concatenate(system), np.concatenate([residual * root, ridge * prior, [1e4]])
+        )[0]
+        found /= found.sum()
+    return found
+
+
+def scanner_shares(
+    experts: Sequence[Expert], split: ValidationSplit, weights: Mapping[str, float]
+) -> dict[str, float]:
+    """Returns the weights of completion networks of the scanner, by name.
+
+    The error of such a network at the points, which it was given, is at most that of the others at
+    the validation points.
+    """
+    own = [each for each in experts if each.of_scanner and len(split.points)]
+    if not own:
+        return {}
+    limit = split.error(weighted_mean([(each.at, weights[each.name]) for each in experts]))
+    points = split.whole.points
+    fit = [e for e in own if float((points.sample(e.dense) - points.depth).abs().mean()) <= limit]
+    return {each.name: OWN_SCANNER / len(fit) for each in fit}
+
+
+def weighted_mean(depths: Sequence[tuple[Tensor, float]]) -> Tensor:
+    """Returns the weighted geometric mean (…) of depths (…) in metres; 0 is unknown.
+
+    Args:
+        depths: Depths of one shape and their weights. A depth has no weight where it is unknown.
+    """
+    depths = [(depth, weight) for depth, weight in depths if weight > 0]
+    if len(depths) == 1:
+        return depths[0][0]
+    logarithm = torch.zeros_like(depths[0][0])
+    total = torch.zeros_like(logarithm)
+    for depth, weight in depths:
+        known = (depth > 0) * weight
+        logarithm += known * depth.clamp_min(torch.finfo(depth.dtype).tiny).log()
+        total += known
+    return torch.where(total > 0, (logarithm / total.clamp_min(1e-6)).exp(), 0.0)
+
+
+def judge_of(networks: OpenNetworks) -> Member:
+    """Returns the network that weighs its points, else the user's."""
+    return next(filter(weighs_points, networks.members), networks.members[0])
+
+
+def weighs_points(member: Member) -> bool:
+    """Returns whether a network weighs its points."""
+    return member.network.definition.weighs_points
+
+
+def refined_by(
+    networks: OpenNetworks, member: Member, frame: Frame, *, updates: bool = True
+) -> Refined:
+    """Returns the frame refined by one network, its residual not propagated.
+
+    Updates of a network that takes the points gain 2 to 3 % with 500 points, 1 % with 100, nothing
+    with 20, and 1 % with a LiDAR's, where they take as long as everything else (even frames).
+    """
+    gains = len(frame.points) >= FEW_POINTS and not is_dense(frame.points)
+    return networks.refine(member, frame, updates=updates and (gains or not member.takes_points))
+
+
+def propagation_of(points: SparsePoints) -> str:
+    """Returns how the residual at these points is propagated, a name in `choices.PROPAGATIONS`.
+
+    Of scan lines by "local": on even KITTI frames its MAE is 1.9 % and its RMSE 1.7 % below those
+    of "gp", which is 0 to 28 % below it with points at random pixels.
+    """
+    return "local" if _has_scan_lines(points) else "gp"
+
+
+def _expert(
+    networks: OpenNetworks,
+    member: Member,
+    split: ValidationSplit,
+    name: str,
+    *,
+    known: Refined | None = None,
+    prior: Expert | None = None,
+    user: Member | None = None,
+) -> Expert:
+    """The predictions of one network, without a prior weight yet.
+
+    Args:
+        networks: The networks, open.
+        member: The network that predicts.
+        split: The frame and its validation points.
+        name: What the expert is called.
+        known: The frame refined from all points, where that was done already.
+        prior: The expert whose depth is the network's prior.
+        user: The user's network whose depth it is, or has as a prior.
+    """
+    whole, kept = split.whole, split.kept
+    if prior is not None:
+        assert prior.refined is not None
+        whole = replace(whole, prior=torch.from_numpy(prior.refined.before))
+        kept = replace(kept, prior=prior.aligned)
+    refined = known or refined_by(networks, member, whole)
+    aligned = torch.from_numpy(refined.before)
+    updated = at = torch.empty(0)
+    if len(split.points):
+        again = refined_by(networks, member, kept, updates=not member.takes_points)
+        aligned, after = (torch.from_numpy(depth) for depth in (again.before, again.after))
+        updated = split.points.sample(after)
+        kind = propagation_of(whole.points)
+        at = propagate_at(after, kept.points, kept.rgb, split.points.xy, kind=kind)
+    return Expert(
+        name=name,
+        weight=0.0,
+        dense=torch.from_numpy(refined.after),
+        at=at,
+        aligned=aligned,
+        updated=updated,
+        refined=refined,
+        network=member,
+        user=user,
+    )
+
+
+def _interpolation(split: ValidationSplit) -> Expert:
+    """Linear interpolation of the inliers."""
+    at = linear(split.kept.points, split.points.xy) if len(split.points) else torch.empty(0)
+    dense = linear(split.whole.points)
+    return Expert(name=LINEAR, weight=WITHOUT_IMAGE, dense=dense, at=at, aligned=dense, updated=at)
+
+
+def _has_scan_lines(points: SparsePoints) -> bool:
+    return scan_pattern(points.xy.cpu().numpy(), points.size).has_scan_lines

@@ -1,0 +1,93 @@
+"""Validation points: a part of the points that predictions from the others are compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.completion.folds import spatial_folds
+from pnpdepth_cli.completion.outliers import inlier_weights
+from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.points import SparsePoints
+
+FOLDS = 5
+"""One of so many folds of the points is for validation."""
+MIN_POINTS = 5
+"""With fewer points none is for validation."""
+MOST_VALIDATION_POINTS = 1000
+"""Of more a random part is predicted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidationSplit:
+    """A frame with all its inliers, and without its validation points."""
+
+    whole: Frame
+    kept: Frame
+    points: SparsePoints  # the M validation points; none of a frame with few points
+    weights: Tensor  # (M,) 0…1, how consistent each is with its neighbours
+
+    def gain(self, at: Tensor, other: Tensor) -> float:
+        """Returns by how many standard errors one prediction (M,) is better than another.
+
+        In log depth; negative where it is worse.
+        """
+        truth, share = log_depth(self.points.depth), self.weights / self.weights.sum()
+        gain = (log_depth(other) - truth).abs() - (log_depth(at) - truth).abs()
+        mean = (share * gain).sum()
+        error = (share.square() * (gain - mean).square()).sum().sqrt()
+        return float(mean / error.clamp_min(1e-12))
+
+    def error(self, at: Tensor) -> float:
+        """Returns the weighted mean absolute error in metres of a prediction (M,)."""
+        error = (at - self.points.depth).abs()
+        return float((error * self.weights).sum() / self.weights.sum())
+
+
+def split_frame(frame: Frame, judged: Refined, seed: int) -> ValidationSplit:
+    """Returns the frame with and without its validation points.
+
+    Args:
+        frame: The frame without its outliers.
+        judged: What the network that judged the outliers gives for it.
+        seed: Random seed of the validation points.
+    """
+    parts = split_points(frame.points, seed)
+    if parts is None:
+        none = frame.points.select(torch.zeros(len(frame.points), dtype=torch.bool))
+        return ValidationSplit(whole=frame, kept=frame, points=none, weights=torch.empty(0))
+    kept, points = parts
+    weights = consistency(points, torch.from_numpy(judged.before))
+    return ValidationSplit(
+        whole=frame, kept=frame.with_points(kept), points=points, weights=weights
+    )
+
+
+def split_points(points: SparsePoints, seed: int) -> tuple[SparsePoints, SparsePoints] | None:
+    """Returns the other points and the validation points; None where they are too few."""
+    if len(points) < MIN_POINTS:
+        return None
+    chosen = spatial_folds(points, FOLDS, seed=seed) == 0
+    if not 0 < int(chosen.sum()) < len(points):
+        return None
+    (numbers,) = chosen.nonzero(as_tuple=True)
+    drawn = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
+    return points.select(~chosen), points.select(numbers[drawn[:MOST_VALIDATION_POINTS]])
+
+
+def consistency(points: SparsePoints, prediction: Tensor) -> Tensor:
+    """Returns (N,) 0…1, how consistent each point is with its neighbours beside a prediction.
+
+    Outliers among the validation points would decide the weights.
+    """
+    at_points = points.sample(prediction)
+    residual = points.depth.double().log() - at_points.clamp_min(1e-6).double().log()
+    weights = torch.where(at_points > 0, inlier_weights(points, residual), 0.0).float()
+    return weights if bool(weights.any()) else torch.ones_like(weights)
+
+
+def log_depth(depth: Tensor) -> Tensor:
+    """Returns the logarithm of depth in metres; unknown depth is that of a micrometre."""
+    return depth.clamp_min(1e-6).log()
