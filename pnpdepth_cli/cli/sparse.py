@@ -105,6 +105,7 @@ def sample(
 
     \b
     uniform    N random known pixels
+    shuffle    the first N known pixels as numpy's legacy generator shuffles them
     grid       square grid with N nodes on a full map
     lines      all known pixels of N evenly spaced rows
     features   the N strongest ORB corners, as in structure from motion

@@ -140,6 +140,7 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -
         "frames": ["1", "2"],
         "clusters": {"count": 2, "unit": "frames"},
         "permutations": 1000,
+        "scoring": {"exclude_sparse": True},
         "exact_p_values": False,
     }
     assert styled(methods_table(comparison)) == [
@@ -152,3 +153,5 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -
     assert gains == [plain, better, worse, plain, worse, ("–", "dim")]
     assert comparison_table(comparison).rows[1][4:] == ["–", "+1.00", "0.0009"]
     assert "from 1,000 random swaps, over 2 frames" in comparison_table(comparison).caption
+    for table in (comparison_table(comparison), methods_table(comparison)):
+        assert table.caption.endswith("; without the pixels of sparse points")

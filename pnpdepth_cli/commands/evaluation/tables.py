@@ -39,6 +39,7 @@ def means_by_measure(evaluation: Evaluation, columns: Sequence[str] | None) -> T
     if has_interval:
         header.append("95 %")
         caption += f"; 95 % interval over {evaluation.clusters.describe()}"
+    caption += _without_sparse(evaluation.protocol.exclude_sparse)
     rows = []
     for measure in chosen_measures(evaluation.protocol.measures, columns):
         interval = [_interval(evaluation, measure)] if has_interval else []
@@ -92,8 +93,9 @@ def frames_table(evaluation: Evaluation, columns: Sequence[str] | None) -> Table
     measures = measures if columns else measures[:_FRAME_COLUMNS]
     everything = len(evaluation.frames) <= _FRAMES_SHOWN
     frames = evaluation.frames if everything else worst(evaluation, "rmse")[:_FRAMES_SHOWN]
+    caption = "Frames" if everything else f"The {len(frames)} worst by RMSE; --csv has all"
     return Table(
-        caption="Frames" if everything else f"The {len(frames)} worst by RMSE; --csv has all",
+        caption=caption + _without_sparse(evaluation.protocol.exclude_sparse),
         header=["frame", *(m.heading for m in measures), "coverage"],
         rows=[
             [frame.name, *(m.text(frame.values.get(m.key)) for m in measures),
@@ -173,7 +175,12 @@ def _tested(comparison: Mapping[str, Any]) -> str:
     clusters, runs = comparison["clusters"], len(comparison["gains"])
     over = f"{clusters['count']:,} {clusters['unit']}"
     tests = f"{len(comparison['measures'])} measures" + (f" of {runs} runs" if runs > 1 else "")
-    return f"over {over}, p adjusted for {tests} (Holm)"
+    tested = f"over {over}, p adjusted for {tests} (Holm)"
+    return tested + _without_sparse(comparison["scoring"].get("exclude_sparse", False))
+
+
+def _without_sparse(excluded: bool) -> str:
+    return "; without the pixels of sparse points" if excluded else ""
 
 
 def _signed(value: float | None) -> str:
