@@ -100,16 +100,15 @@ def without_outliers(networks: OpenNetworks, frame: Frame) -> tuple[Frame, Refin
     suspected = outliers(torch.ones(points.size), points, frame.rgb)
     any_suspected = bool(suspected.any())
     consistent = frame.with_points(points.select(~suspected)) if any_suspected else frame
-    only = judge is networks.members[0]  # its updates are not in vain
     weighs = any_suspected and weighs_points(judge)
-    judged = refined_by(networks, judge, consistent, updates=only and not weighs)
+    judged = refined_by(networks, judge, consistent, updates=not weighs)
     outlying = outliers(torch.from_numpy(judged.before), points, frame.rgb)
     if len(points) >= FEW_POINTS:
         outlying = outlying | suspected
     inliers = frame.without(outlying)
     # A network that weighs its points is given the outliers too, now that they are known.
     if weighs or not torch.equal(outlying, suspected):
-        judged = refined_by(networks, judge, inliers, updates=only)
+        judged = refined_by(networks, judge, inliers)
     return inliers, judged
 
 

@@ -95,7 +95,6 @@ def predictions(networks: OpenNetworks, split: ValidationSplit, judged: Refined)
                 raise
     if fusing is None:
         return [replace(each, weight=1 / len(own)) for each in own]
-    # The network that weighs its points predicts without updates, which take as long as all else.
     known = judged if fusing is judge_of(networks) else None
     alone = _expert(networks, fusing, split, fusing.name, known=known)
     experts, with_prior = list[Expert](), list[Expert]()
@@ -106,9 +105,6 @@ def predictions(networks: OpenNetworks, split: ValidationSplit, judged: Refined)
             name = f"{fusing.name} with {each.name}"
             guided = _expert(networks, fusing, split, name, prior=each, user=each.user)
             with_prior.append(replace(guided, weight=WITH_PRIOR * share))
-    if known is not None and own and not with_prior:
-        refined = refined_by(networks, fusing, split.whole)  # the only one to update
-        alone = replace(alone, dense=torch.from_numpy(refined.after), refined=refined)
     rest = 1 - sum(each.weight for each in (*experts, *with_prior))
     return [*experts, *with_prior, replace(alone, weight=rest), _interpolation(split)]
 
@@ -330,7 +326,8 @@ def _expert(
         assert prior.refined is not None
         whole = replace(whole, prior=torch.from_numpy(prior.refined.before))
         kept = replace(kept, prior=prior.aligned)
-    refined = known or refined_by(networks, member, whole)
+    # Updates with a prior too would take as long as everything else.
+    refined = known or refined_by(networks, member, whole, updates=prior is None)
     aligned = torch.from_numpy(refined.before)
     updated = at = torch.empty(0)
     if len(split.points):
