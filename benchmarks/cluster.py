@@ -2,7 +2,7 @@
 
 `python -m benchmarks.cluster entries --count 1000000` makes a list of so many frames, a record for
 each that says it is done, and hard links for its other results, and prints CPU seconds and peak
-memory of planning, and of a run that has nothing to do, with its summary.
+memory of a run that has nothing to do, with its summary.
 """
 
 from __future__ import annotations
@@ -114,12 +114,6 @@ def measured(program: str, *arguments: str) -> dict[str, float]:
     }
 
 
-PLAN = """
-import sys; from pathlib import Path
-from benchmarks.cluster import request_of
-from pnpdepth_cli.commands.batch.batch import plan_batch
-assert not plan_batch(request_of(Path(sys.argv[1])), lambda text: None)
-"""
 RESUME = """
 import sys; from pathlib import Path
 from benchmarks.cluster import Quiet, request_of
@@ -135,7 +129,6 @@ def entries(count: int, folder: Path | None) -> dict[str, Any]:
         make_entries(root, count)
         return {
             "entries": count,
-            "plan": measured(PLAN, temporary),
             "resume and summary": measured(RESUME, temporary),
         }
 

@@ -225,8 +225,7 @@ NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mea
 PRECISIONS = ("fp32", "bf16", "fp16")  # of the network's convolutions and matrix products
 
 # Files and sensors
-COLORS = ("blue-orange", "paper")  # of better and worse; the paper's are red and green
-PREVIEWS = ("all", "worst", "none")  # which frames get images; worst: worse than linear
+REGISTRATIONS = ("auto", "off")  # whether the image is moved into the frame of the points
 PATTERNS = ("uniform", "shuffle", "grid", "lines", "features")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
 

@@ -26,8 +26,6 @@ class Option:
     help: str
     flag: str | None = None
     """None: the field's name with dashes."""
-    within: str | None = None
-    """Flag of the option that takes this field as NAME=VALUE. None: it has an option of its own."""
     choices: Collection[str] | None = None
     metavar: str | None = None
     least: int | None = None
@@ -51,15 +49,8 @@ class OptionField:
 
     @property
     def flag(self) -> str:
-        """Spelling on the command line, such as `--lr` or `--set precision`."""
-        if self.option.within is not None:
-            return f"{self.option.within} {self.name_within}"
-        return self.option.flag or f"--{self.name_within}"
-
-    @property
-    def name_within(self) -> str:
-        """The field's name with dashes, as another option takes it."""
-        return self.name.replace("_", "-")
+        """Spelling on the command line, such as `--lr`."""
+        return self.option.flag or f"--{self.name.replace('_', '-')}"
 
 
 def option(default: Any, help: str, **details: Any) -> Any:
@@ -139,12 +130,6 @@ class Settings:
         " method]",
         choices=("none", *choices.PROPAGATIONS),
     )
-    tile: int | None = option(
-        None,
-        "Refine larger frames in overlapping tiles of this side length, to save memory.",
-        metavar="PIXELS",
-        least=64,
-    )
     seed: int = option(
         0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
     )
@@ -217,7 +202,6 @@ _CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
     "iterations": (_is_whole, "a whole number >= 0"),
     "lr": (_is_step, "a step size above 0, or a text such as '3%'"),
     "blur": (lambda value: _is_number(value) and value >= 0, ">= 0"),
-    "tile": (lambda value: _is_whole(value) and value >= 64, "a whole number >= 64"),
     "seed": (_is_whole, "a whole number >= 0"),
 }
 """Whether a value of the field is valid, and what it must be."""

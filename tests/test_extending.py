@@ -49,9 +49,13 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
     network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--align", "none"]
     method = ["--loss", "charbonnier", "--update", "rmsprop", "--lr", "1%"]
-    more = ["--propagate", "median", "--baselines", "--fov", "60"]
-    output = ["--format", "raw", "-o", "out", "--json"]
-    record = json.loads(run(["refine", *files, *network, *method, *more, *output], package))
+    more = ["--propagate", "median", "--baselines", "--format", "raw"]
+    (package / "list.csv").write_text(
+        "image,sparse,calib\nindoor/rgb.png,indoor/sparse.png,k.txt\n"
+    )
+    (package / "k.txt").write_text("K: [550, 0, 320, 0, 550, 240, 0, 0, 1]")
+    run(["batch", "list.csv", *network, *method, *more, "-o", "out"], package)
+    record = json.loads((package / "out" / "rgb.json").read_text())
     assert record["model"]["name"] == "my-net"
     assert record["settings"]["loss"] == "charbonnier"
     assert record["settings"]["update"] == "rmsprop"
@@ -60,9 +64,8 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     assert record["loss"][-1] < record["loss"][0]
     files_of = [f"my_package/{name}.py" for name in ("charbonnier", "rmsprop")]
     by_file = ["--loss", files_of[0], "--update", files_of[1], "--lr", "1%"]
-    by_file += ["--propagate", "median"]
-    output[-2] = "by_file"
-    again = json.loads(run(["refine", *files, *network, *by_file, *output], package))
+    by_file += ["--propagate", "median", "-o", "by_file.raw", "--json"]
+    again = json.loads(run(["refine", *files, *network, *by_file], package))
     assert again["loss"] == record["loss"]
     measures = ["--measures", "median_error", "--json"]
     scores = json.loads(run(["eval", "out/rgb_depth.raw", "indoor/gt.png", *measures], package))
@@ -79,5 +82,5 @@ def test_the_layout_of_the_page_lists_frames(package: Path) -> None:
     data.mkdir()
     shutil.copy(package / "indoor" / "rgb.png", data / "a_image.png")
     shutil.copy(package / "indoor" / "sparse.png", data / "a_lidar.png")
-    listed = json.loads(run(["batch", "data", "-o", "planned", "--dry-run", "--json"], package))
-    assert [frame["name"] for frame in listed] == ["a"]
+    run(["batch", "data", "-o", "out", "--iterations", "0"], package)
+    assert (package / "out" / "a.json").is_file()

@@ -35,7 +35,6 @@ def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
         (Settings(), ""),
         (Settings(seed=3), ""),
         (Settings(iterations=2, blur=1.0), "--iterations blur"),
-        (Settings(tile=128), "--tile"),
         (Settings(preset="paper", iterations=2), "--preset paper --iterations"),
     ],
 )

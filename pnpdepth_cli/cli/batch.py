@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from types import FrameType
@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.streams import INTERRUPTED, print_json, printable, say
+from pnpdepth_cli.cli.streams import INTERRUPTED, say
 from pnpdepth_cli.cli.vary import Combination, combinations_of
 from pnpdepth_cli.commands.batch.request import (
     BatchRequest,
@@ -30,7 +30,7 @@ from pnpdepth_cli.commands.refinement.request import (
     OutputOptions,
     parse_sample,
 )
-from pnpdepth_cli.commands.sparse.options import BagOptions, ColmapOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.settings import Settings
 
@@ -41,23 +41,22 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     short_help="Refine all frames of a folder or a list.",
     cls=grouped_help.GroupedCommand,
     common=grouped_help.COMMON - {"--sparse", "--gt"}
-    | {"--layout", "--sample", "--limit", "--shard", "--html", "--workers", "--dry-run", "--vary"},
+    | {"--layout", "--sample", "--limit", "--shard", "--html", "--vary"},
     groups={
-        "Frames": ("--sample", FrameSelection, "--shard", BagOptions),
+        "Frames": ("--sample", FrameSelection, "--shard"),
         "Sequences": (SequenceOptions, "--adapt"),
-        "Input": (ScanOptions, ColmapOptions, FrameFiles),
+        "Input": (ScanOptions, FrameFiles),
         "Network": (NetworkChoice,),
-        "Method": (Settings, "--set", HoldOut),
+        "Method": (Settings, HoldOut),
         "Study": ("--vary",),
-        "Output": ("--output", OutputOptions, "--json", "--html", "--html-3d"),
-        "Run": (BatchRequest, "--dry-run"),
+        "Output": ("--output", OutputOptions, BatchRequest),
         "Cluster": (ClusterOptions,),
     },
 )
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST|BAG")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @options.sample
-@options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions, BagOptions)
+@options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions)
 @click.option(
     "--vary",
     multiple=True,
@@ -65,19 +64,14 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     help="Refine with each value of an option of the method, network or points, or without it:"
     " default. Several --vary make all combinations, each in a folder of OUTPUT.",
 )
-@click.option("--dry-run", is_flag=True, help="List the frames that would be refined, and exit.")
-@options.scan
-@options.refinement
-@options.as_json
+@options.refinement(without=["camera"])
 @click.pass_context
-def batch(
-    context: click.Context, /, vary: tuple[str, ...], dry_run: bool, as_json: bool, **values: Any
-) -> None:
+def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> None:
     """Refine all frames of FOLDER, of a LIST of them (CSV or JSON lines), or of a ROS BAG.
 
     \b
     pnpdepth batch drive_0001/ -o out/
-    pnpdepth batch frames.csv -o out/ --workers 4 --model net.onnx
+    pnpdepth batch frames.csv -o out/ --model net.onnx
     pnpdepth batch kitchen/ -o out/ --sample 500          # sparse depth from the ground truth
     pnpdepth batch drive_0001/ -o out/ --shard 1/4        # one of four processes
     pnpdepth batch drive_0001/ -o out/ --ray              # all devices of this machine
@@ -94,21 +88,16 @@ def batch(
     all frames; the record NAME.json beside a result says how it was made.
     """
     requests = [
-        _request_of(values | combination.values, combination, not dry_run)
+        _request_of(values | combination.values, combination)
         for combination in combinations_of(context, vary)
     ]
-    if dry_run:
-        _print_plans(requests, as_json)
-        return
     summaries = []
     with _finishing_on_interrupt() as pressed:
         for request in requests:
-            summary, stopped = _run(request, as_json, pressed)
+            summary, stopped = _run(request, pressed)
             summaries.append(summary)
             if stopped or pressed():
                 break
-    if as_json:
-        print_json(summaries if vary else summaries[0])
     if stopped or len(summaries) < len(requests):
         raise click.exceptions.Exit(INTERRUPTED)
     counts = sum((Counter(summary["counts"]) for summary in summaries), Counter[str]())
@@ -121,7 +110,7 @@ def batch(
         )
 
 
-def _request_of(values: dict[str, Any], combination: Combination, may_write: bool) -> BatchRequest:
+def _request_of(values: dict[str, Any], combination: Combination) -> BatchRequest:
     """Returns the request of these options, with the frames of a bag unpacked.
 
     The results of a combination of varied options lie in a folder of its own.
@@ -131,12 +120,11 @@ def _request_of(values: dict[str, Any], combination: Combination, may_write: boo
     values = dict(values)
     own = options.taken(BatchRequest, values)
     own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, values))
-    bag_options = BagOptions(**options.taken(BagOptions, values))
     own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, values))
     own |= {name: values.pop(name) for name in ("source", "output")}
     sample = parse_sample(values.pop("sample"))
     request = BatchRequest(refine=options.request_of(values, sample=sample), **own)
-    request = unpacked(request, bag_options, say, may_write=may_write)
+    request = unpacked(request, say)
     if not combination.texts:
         return request
     return replace(
@@ -147,28 +135,10 @@ def _request_of(values: dict[str, Any], combination: Combination, may_write: boo
     )
 
 
-def _print_plans(requests: Sequence[BatchRequest], as_json: bool) -> None:
-    """Prints the frames that would be refined, and why."""
-    from pnpdepth_cli.commands.batch.batch import plan_batch
-
-    planned = [
-        {"name": f"{request.output.name}/{name}" if request.varied else name, "why": why}
-        for request in requests
-        for name, why in plan_batch(request, say)
-    ]
-    if as_json:
-        print_json(planned)
-        return
-    for frame in planned:
-        click.echo(f"{printable(frame['name'])}  ({printable(frame['why'])})")
-
-
-def _run(
-    request: BatchRequest, as_json: bool, pressed: Callable[[], bool]
-) -> tuple[dict[str, Any], bool]:
-    """Returns the batch's summary, printed unless wanted as JSON, and whether it was stopped."""
+def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[dict[str, Any], bool]:
+    """Returns the batch's summary, which it prints, and whether the batch was stopped."""
     from pnpdepth_cli.cli.progress import BatchProgress
-    from pnpdepth_cli.cli.tables import print_batch, print_profile
+    from pnpdepth_cli.cli.tables import print_batch
     from pnpdepth_cli.commands.batch.batch import run_batch
 
     with BatchProgress() as progress:
@@ -179,10 +149,7 @@ def _run(
         except KeyboardInterrupt:
             click.echo("stopped; run the same command to continue", err=True)
             raise click.exceptions.Exit(INTERRUPTED) from None
-    if not as_json:
-        print_batch(outcome.summary)
-    if request.profile:
-        print_profile(outcome.summary["profile"])
+    print_batch(outcome.summary)
     if request.html is not None:
         say(f"wrote {request.html / 'index.html'}")
     if outcome.stopped:

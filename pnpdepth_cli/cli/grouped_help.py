@@ -21,7 +21,7 @@ COMMON = frozenset(
         *("--sparse", "--gt", "--calib", "--output", "--overwrite"),
         *("--json", "--model", "--checkpoint", "--layer", "--align", "--preset"),
         *("--iterations", "--lr", "--loss", "--update", "--holdout"),
-        *("--uncertainty", "--ply"),
+        "--uncertainty",
     }
 )
 """The options of a refinement that `--help` shows."""
@@ -55,8 +55,7 @@ class GroupedCommand(click.Command):
                 if isinstance(member, str):
                     flags.append(member)
                     continue
-                own = (field.option.within or field.flag for field in options_of(member))
-                names = dict.fromkeys(flag.partition("/")[0] for flag in own)
+                names = [field.flag.partition("/")[0] for field in options_of(member)]
                 flags += [name for name in names if name not in grouped]
                 grouped |= {*names}
             self.groups[title] = tuple(flags)

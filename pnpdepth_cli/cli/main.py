@@ -30,7 +30,7 @@ _COMPLETION = "_PNPDEPTH_COMPLETE"
 _MEMORY_MESSAGES = ("allocate memory", "failed to map segment", "bad_alloc")
 """Parts of the messages of torch and of the loader when memory is exhausted."""
 
-_NO_MEMORY = "memory is exhausted; use a smaller image, or --tile"
+_NO_MEMORY = "memory is exhausted; use a smaller image"
 
 _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """What the operating system says of a disk that takes no more; anything else is of an input."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from pnpdepth_cli.commands.refinement.request import (
     OutputOptions,
     RefineRequest,
 )
-from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import LARGEST_SEED, OptionField, Settings, options_of
 
@@ -41,50 +40,6 @@ def click_option(declared: OptionField) -> Callable[[Any], Any]:
         show_default=option.show_default,
         **details,
     )
-
-
-_ASSIGNED = "_assigned"
-"""Ending of the parameters of options that take several fields."""
-_HELP_OF_GROUPS = {
-    "--set": "Less common options, as in precision=bf16,sparse-size-ok.",
-    "--scan": "How a LiDAR scan is read.",
-    "--colmap": "Which points of a COLMAP model are used, and their unit.",
-}
-
-
-def _assigning(flag: str, members: Sequence[OptionField]) -> Callable[[Any], Any]:
-    """The click option that takes values of these fields, as in `precision=bf16,sparse-size-ok`."""
-    by_name = {member.name_within: member for member in members}
-    forms = {name: _form(member) for name, member in by_name.items()}
-
-    def parse(text: str) -> dict[str, Any]:
-        chosen: dict[str, Any] = {}
-        for part in text.split(","):
-            name, equals, value = part.strip().partition("=")
-            if name not in by_name:
-                raise UsageError(f"{flag} {name}: choose from {', '.join(by_name)}")
-            member = by_name[name]
-            if (member.type == "bool") == bool(equals):
-                raise UsageError(f"{flag} {part} must be {forms[name]}")
-            chosen[member.name] = click.types.convert_type(_type_of(member))(value or "true")
-        return chosen
-
-    described = " · ".join(f"{forms[name]}: {by_name[name].option.help}" for name in by_name)
-    return click.option(
-        flag,
-        flag.strip("-") + _ASSIGNED,
-        type=parse,
-        multiple=True,
-        metavar="NAME=VALUE,…",
-        help=f"{_HELP_OF_GROUPS[flag]}  {described}",
-    )
-
-
-def _form(member: OptionField) -> str:
-    """How a field is given: NAME, or NAME=VALUE."""
-    names = member.option.choices
-    value = member.option.metavar or ("|".join(names) if names else member.type.upper())
-    return member.name_within if member.type == "bool" else f"{member.name_within}={value}"
 
 
 class _Names(click.Choice):  # type: ignore[type-arg]
@@ -121,33 +76,32 @@ def options_of_groups(
         without: Names of fields that are left out.
     """
     wanted = [each for group in groups for each in options_of(group) if each.name not in without]
-    within: dict[str, list[OptionField]] = {}
-    for each in wanted:
-        if each.option.within is not None:
-            within.setdefault(each.option.within, []).append(each)
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        for flag, members in within.items():
-            command = _assigning(flag, members)(command)
         for each in reversed(wanted):
-            if each.option.within is None:
-                command = click_option(each)(command)
+            command = click_option(each)(command)
         return command
 
     return decorate
 
 
-def refinement(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the options of how a frame is refined, named as the fields of a `RefineRequest`."""
-    groups = (FrameFiles, ColmapOptions, NetworkChoice, Settings, HoldOut, OutputOptions)
-    return models(options_of_groups(*groups, without=["model"])(command))
+def refinement(*, without: Collection[str] = ()) -> Callable[[Any], Any]:
+    """Returns a decorator that adds the options of how a frame is refined.
+
+    Args:
+        without: Names of fields of a `RefineRequest` that are left out.
+    """
+    groups = (ScanOptions, FrameFiles, NetworkChoice, Settings, HoldOut, OutputOptions)
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        return models(options_of_groups(*groups, without=["model", *without])(command))
+
+    return decorate
 
 
-def _only(group: type, name: str, flag: str | None = None) -> Callable[[Any], Any]:
-    """The option of one field, on its own also where another option takes it with others."""
-    each = next(each for each in options_of(group) if each.name == name)
-    own = replace(each.option, within=None, flag=flag or each.option.flag)
-    return click_option(replace(each, option=own))
+def _only(group: type, name: str) -> Callable[[Any], Any]:
+    """The option of one field."""
+    return click_option(next(each for each in options_of(group) if each.name == name))
 
 
 _MODEL = next(each for each in options_of(NetworkChoice) if each.name == "model")
@@ -161,13 +115,9 @@ models = click.option(
     help=f"{_MODEL.option.help} Given several times, all are fused.  [default: {_MODEL.default}]",
 )
 checkpoint = _only(NetworkChoice, "checkpoint")
-precision = _only(NetworkChoice, "precision")
 device = _only(NetworkChoice, "device")
 layer = _only(Settings, "layer")
-output_kind = _only(NetworkChoice, "output_kind")
-normalise = _only(NetworkChoice, "normalise")
 depth_scale = _only(FrameFiles, "depth_scale")
-channel = _only(FrameFiles, "channel")
 seed = _only(Settings, "seed")
 overwrite = _only(OutputOptions, "overwrite")
 camera = _only(ScanOptions, "camera")
@@ -212,9 +162,6 @@ no_groups = click.option(
 
 def taken(group: type, values: dict[str, Any]) -> dict[str, Any]:
     """Returns the options of this group by name; they are removed from `values`."""
-    for name in [name for name in values if name.endswith(_ASSIGNED)]:
-        for chosen in values.pop(name):
-            values |= chosen
     names = [each.name for each in options_of(group)]
     return {name: values.pop(name) for name in names if name in values}
 
@@ -223,11 +170,10 @@ def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
     """Returns the request that these options of a command make.
 
     Args:
-        values: Of the options of `scan` and `options_of_groups`, by their names.
+        values: Of the options of `refinement`, by their names.
         **others: Other fields of the request.
     """
     scan_options = ScanOptions(**taken(ScanOptions, values))
-    others |= {"colmap": ColmapOptions(**taken(ColmapOptions, values))}
     if isinstance(values.get("model"), tuple):  # of the commands that take several
         first, *more = values["model"]
         others |= {"model": first, "more_models": tuple(more)}

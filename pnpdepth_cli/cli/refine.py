@@ -15,7 +15,7 @@ from pnpdepth_cli.commands.refinement.request import (
     NetworkChoice,
     OutputOptions,
 )
-from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.settings import Settings
 
 
@@ -24,9 +24,9 @@ from pnpdepth_cli.settings import Settings
     cls=grouped_help.GroupedCommand,
     common=grouped_help.COMMON,
     groups={
-        "Input": ("--sparse", "--gt", ScanOptions, ColmapOptions, FrameFiles),
+        "Input": ("--sparse", "--gt", ScanOptions, FrameFiles),
         "Network": (NetworkChoice,),
-        "Method": (Settings, "--set", HoldOut),
+        "Method": (Settings, HoldOut),
         "Output": ("--output", OutputOptions, "--json"),
     },
 )
@@ -38,7 +38,6 @@ from pnpdepth_cli.settings import Settings
     help="Sparse depth: a map (16-bit PNG, EXR, NPY, …), points x y depth (NPY, CSV), a LiDAR scan"
     " with --calib (BIN, NPY, PCD, PLY), or the folder of a COLMAP model.",
 )
-@options.scan
 @click.option("--gt", type=options.FILE, help="Ground truth depth to score against.")
 @click.option(
     "-o",
@@ -46,7 +45,7 @@ from pnpdepth_cli.settings import Settings
     type=options.FILE,
     help="Output folder, or one depth file such as depth.exr.  [default: ./IMAGE_refined/]",
 )
-@options.refinement
+@options.refinement(without=["seed", "baselines", "format"])
 @options.as_json
 def refine(as_json: bool, **values: Any) -> None:
     """Refine a depth network's prediction for IMAGE with sparse depth.

@@ -12,7 +12,7 @@ from pnpdepth_cli.choices import PATTERNS, SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.streams import print_json, say
 from pnpdepth_cli.commands.refinement.request import sample_pattern
-from pnpdepth_cli.commands.sparse.options import BagOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.options import ScanOptions
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
@@ -188,7 +188,22 @@ def simulate(
 @click.command(short_help="Write the frames of a ROS bag as files.")
 @click.argument("bag", type=options.FILE)
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
-@options.options_of_groups(BagOptions)
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="TOPIC",
+    help="Topic of the images, of the points (PointCloud2), or of the poses; may be given for each."
+    "  [default: the only one]",
+)
+@click.option(
+    "--tolerance",
+    type=float,
+    default=0.05,
+    show_default=True,
+    metavar="SECONDS",
+    help="Largest time between an image and its scan.",
+)
 @click.option(
     "--calib",
     type=options.FILE,
@@ -204,7 +219,7 @@ def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
 
     \b
     pnpdepth frames drive.mcap -o drive/
-    pnpdepth frames drive.bag -o drive/ --topics /front/image_raw,/velodyne
+    pnpdepth frames drive.bag -o drive/ --topic /front/image_raw --topic /velodyne
     pnpdepth batch drive/ -o refined/
 
     BAG is a file of ROS 1 (.bag) or ROS 2 (.mcap, .db3), or a folder that ROS 2 recorded. OUTPUT
@@ -212,8 +227,7 @@ def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
     """
     from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, write_frames
 
-    bag_options = BagOptions(**options.taken(BagOptions, values))
-    request = FramesRequest(bag=bag, output=output, options=bag_options, **values)
+    request = FramesRequest(bag=bag, output=output, **values)
     record = write_frames(request, say)
     if as_json:
         print_json(record)

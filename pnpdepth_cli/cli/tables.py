@@ -118,14 +118,6 @@ def print_notes(notes: Sequence[str]) -> None:
         console.print(escape(printable(note)), style=style, soft_wrap=True)
 
 
-_STAGES = {
-    "read": "reading and decoding, beside the network",
-    "refine": "network",
-    "write": "scoring, encoding and writing, beside the network",
-    "wall": "wall",
-}
-
-
 def print_refinement(record: Mapping[str, Any]) -> None:
     """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
     print_notes(record["notes"])
@@ -183,23 +175,6 @@ def print_batch(summary: Mapping[str, Any]) -> None:
         console.print(escape(f"mean weights in the result: {', '.join(spans)}"), soft_wrap=True)
     output = summary["output"]
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
-
-
-def print_profile(profile: Mapping[str, Any]) -> None:
-    """Prints the time of each stage of a batch."""
-    seconds, frames = profile["seconds"], profile["frames"]
-    if not frames:
-        print_notes(["no frame was refined; there are no times"])
-        return
-    rows = [
-        [_STAGES[stage], f"{spent:.2f}", f"{1000 * spent / frames:.1f}",
-         f"{spent / seconds['wall']:.1%}"]
-        for stage, spent in seconds.items()
-    ]  # fmt: skip
-    pace = f"{frames:,} frames, {profile['frames_per_second']:.2f} a second"
-    header = ["", "seconds", "ms a frame", "of the time"]
-    table = Table(caption=f"where the time went; {pace}", header=header, rows=rows)
-    print_table(table, err=True)
 
 
 def print_sparse(record: Mapping[str, Any]) -> None:

@@ -7,6 +7,9 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
+THREADS = 2
+"""Threads that read beside the computation, and that write."""
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
-from torch import Tensor
 
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.refine import OnIteration, Refinement, refine_from
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import BatchError, DivergedError, PnpDepthError
+from pnpdepth_cli.errors import DivergedError, PnpDepthError
 from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined, no_points
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.models.aligned import AlignedDepth
@@ -39,48 +36,21 @@ def refine_frame(
     Raises:
         PnpDepthError: The frame cannot be refined.
     """
-    (refined,) = refine_frames(
-        network, split, settings, (frame,), propagation=propagation, on_iteration=on_iteration
-    )
+    settings = settings.complete()
+    with out_of_memory_is_a_device_error(network.device):
+        prepared = prepare(network, frame)
+        if not len(prepared.points):
+            raise prepared.no_points_error()
+        reader = prepared.depth_reader(settings.align)
+        with torch.no_grad():
+            z = split.front(*prepared.arguments)
+        (result,) = refine_from(
+            split, z, [prepared.points], settings, depth_of=[reader], on_iteration=on_iteration
+        )
+    refined = to_refined_frame(prepared, reader, result, propagation=propagation)
     if isinstance(refined, PnpDepthError):
         raise refined
     return refined
-
-
-def refine_frames(
-    network: Network,
-    split: Split,
-    settings: Settings,
-    frames: Sequence[Frame],
-    *,
-    propagation: str = "none",
-    on_iteration: OnIteration = lambda done, loss: None,
-) -> list[Refined | PnpDepthError]:
-    """Returns frames refined in one pass of the network; an error in place of a failed frame.
-
-    Arguments as of `refine_frame`; `on_iteration` gets the mean loss.
-
-    Raises:
-        BatchError: The network does not take these frames together, or they differ in size.
-    """
-    settings = settings.complete()
-    with out_of_memory_is_a_device_error(network.device):
-        prepared = [prepare(network, frame) for frame in frames]
-        seen = [frame for frame in prepared if len(frame.points)]
-        readers = [frame.depth_reader(settings.align) for frame in seen]
-        results: list[Refinement | PnpDepthError] = []
-        if seen:
-            with torch.no_grad():
-                z = split.front(*_stacked([frame.arguments for frame in seen]))
-            points = [frame.points for frame in seen]
-            results = refine_from(
-                split, z, points, settings, depth_of=readers, on_iteration=on_iteration
-            )
-    refined = iter(
-        to_refined_frame(*each, propagation=propagation)
-        for each in zip(seen, readers, results, strict=True)
-    )
-    return [next(refined) if len(each.points) else each.no_points_error() for each in prepared]
 
 
 def to_refined_frame(
@@ -120,17 +90,3 @@ def with_propagation(frame: Frame, depth: DepthMap, kind: str) -> DepthMap:
     if kind == "none":
         return depth
     return propagate(torch.from_numpy(depth), frame.points, frame.rgb, kind=kind).depth.numpy()
-
-
-def _stacked(arguments: Sequence[tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-    """Returns the arguments of all frames as those of one call."""
-    if len(arguments) == 1:
-        return arguments[0]
-    for each in zip(*arguments, strict=True):
-        shapes = {tuple(argument.shape) for argument in each}
-        if len(shapes) > 1 or shapes.pop()[:1] != (1,):
-            raise BatchError(
-                f"the network's arguments of shapes {[tuple(a.shape) for a in each]} cannot be"
-                " stacked; refine the frames one at a time"
-            )
-    return tuple(torch.cat(each) for each in zip(*arguments, strict=True))

@@ -37,9 +37,8 @@ from pnpdepth_cli.frames.frame import (
     registration_to_make,
 )
 from pnpdepth_cli.frames.opened import Member, OpenNetworks
-from pnpdepth_cli.frames.refine import refine_frames
+from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_layer, resolve_settings
-from pnpdepth_cli.frames.tiles import refine_tiled
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.frames.validation import split_points
 from pnpdepth_cli.models.measure_layers import default_layer
@@ -184,40 +183,15 @@ class Refiner:
             refined = refine_default(opened, frame, seed=self.asked.seed)
         else:
             settings, propagation = self.settings, self.settings.propagate
-            if settings.tile is None:
-                (result,) = refine_frames(
-                    self.network, opened, settings, (frame,),
-                    propagation=propagation, on_iteration=on_iteration,
-                )  # fmt: skip
-                if isinstance(result, PnpDepthError):
-                    raise result
-                refined = result
-            else:
-                refined = refine_tiled(
-                    self.network, opened, settings, frame,
-                    propagation=propagation, on_iteration=on_iteration,
-                )  # fmt: skip
+            refined = refine_frame(
+                self.network, opened, settings, frame,
+                propagation=propagation, on_iteration=on_iteration,
+            )  # fmt: skip
             if self._check:
                 refined = self._checked(frame, refined)
         if self._uncertainty:
             refined = with_uncertainty(refined)
         return _finished(refined, frame)
-
-    def refine_together(self, group: Sequence[Frame]) -> list[Refined | PnpDepthError]:
-        """Returns frames of one size refined in one pass; an error in place of a failed frame.
-
-        Raises:
-            BatchError: The network does not take them together.
-        """
-        frames, split = [self._begun(frame)[0] for frame in group], self.split
-        assert split is not None
-        refined = refine_frames(
-            self.network, split, self.settings, frames, propagation=self.settings.propagate
-        )
-        return [
-            _finished(result, frame) if isinstance(result, Refined) else result
-            for result, frame in zip(refined, frames, strict=True)
-        ]
 
     def decide(self, frame: Frame, more: Callable[[], Sequence[Frame]] = tuple) -> Refiner:
         """Decides once what definitions leave open, and returns this refiner.

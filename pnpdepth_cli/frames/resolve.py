@@ -36,21 +36,17 @@ FastDepth, whose range is 0…1, has ratios down to 0.61 in 13 frames of 7-Scene
 """
 
 
-def redefined(network: Network, output_kind: str | None, normalise: str | None) -> Network:
-    """Returns the network with the user's output kind and input range, where they are given.
+def with_input_range(network: Network, name: str | None) -> Network:
+    """Returns the network with the input range of this name; None leaves its own.
 
     Raises:
-        UsageError: One of them is not one of the possible values.
+        UsageError: There is no such range.
     """
-    definition = network.definition
-    if output_kind is not None:
-        if output_kind not in SPACES:
-            raise UsageError(f"output kind {output_kind!r} is not one of {SPACES}")
-        definition = replace(definition, output_kind=output_kind)
-    if normalise is not None:
-        if normalise not in NORMALISATIONS:
-            raise UsageError(f"normalise {normalise!r} is none of {list(NORMALISATIONS)}")
-        definition = replace(definition, normalisation=NORMALISATIONS[normalise])
+    if name is None:
+        return network
+    if name not in NORMALISATIONS:
+        raise UsageError(f"normalise {name!r} is none of {list(NORMALISATIONS)}")
+    definition = replace(network.definition, normalisation=NORMALISATIONS[name])
     return replace(network, definition=definition)
 
 
@@ -146,9 +142,9 @@ def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[N
     listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
     if len(frames) > 1:
         listed += f", mean of {len(frames)} frames"
-    unsure, hint = "", "--set normalise=NAME changes it"
+    unsure, hint = "", "--normalise changes it"
     if rival is not None:
-        hint = f"--set normalise={chosen} confirms it, normalise={rival} is the next likely"
+        hint = f"--normalise {chosen} confirms it, {rival} is the next likely"
         unsure = ", unsure"
     note = f"input: rgb range {chosen!r}{unsure} (error after alignment: {listed}); {hint}"
     return candidates[chosen], note

@@ -15,12 +15,11 @@ UNKNOWN = 70
 """The grey of a pixel without depth: turbo has no such colour."""
 
 _SIGNED = {
-    "blue-orange": ((25, 90, 190), (220, 105, 0)),
-    "paper": ((214, 26, 30), (16, 140, 52)),
+    "gain": ((25, 90, 190), (220, 105, 0)),
     "error": ((220, 105, 0), (25, 90, 190)),
     "change": ((1, 102, 94), (118, 42, 131)),
 }
-"""Colours of 1 and -1: better and worse (`choices.COLORS`), too far and too near, farther and
+"""Colours of 1 and -1: better and worse, too far and too near, farther and
 nearer. Blue and orange are told apart by colour-blind eyes."""
 
 LOGARITHMIC_FROM = 8.0

@@ -129,7 +129,6 @@ def save_gain_figure(
     *,
     amount: str,
     noun: str,
-    colors: str,
     unknown: str = "",
 ) -> tuple[float, Content]:
     """Writes a PNG of one map of N gains with a colour bar; returns the fraction above 0 first.
@@ -144,7 +143,7 @@ def save_gain_figure(
     worse = 100 * float((gain < 0).mean())
     footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {worse:.1f} % worse"
     ends = (f"worse by {amount} or more", f"better by {amount} or more")
-    bar = np.repeat(signed_bar(colors, 220)[None], 18, axis=0)
+    bar = np.repeat(signed_bar("gain", 220)[None], 18, axis=0)
     font, small = _font(_FONT_SIZE), _font(_SMALL_FONT_SIZE)
     x, y = float(MARGIN), figure.height - MARGIN - 56
     draw.text((x, y), ends[0], font=small, fill=_INK, anchor="lm")

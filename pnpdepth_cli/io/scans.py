@@ -50,12 +50,11 @@ class ScanFile:
     source: str  # what was read, for a person
 
 
-def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
+def read_scan(path: Path) -> ScanFile:
     """Returns the points of a KITTI or nuScenes .bin, .npy (N, 3 or more columns), .pcd or .ply.
 
     Args:
         path: The file; its suffix says the format.
-        point_fields: Float32 numbers of a point in a .bin; None: recognised from name and content.
 
     Raises:
         FileFormatError: The file is damaged, ambiguous, or holds points that are no numbers.
@@ -69,7 +68,7 @@ def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
     if kind not in (None, "NPY"):
         raise FileFormatError(f"{path} is a {kind} file, not a scan; check what is given as scan")
     if suffix == ".bin":
-        points, source = _parse_bin(path, data, point_fields)
+        points, source = _parse_bin(path, data)
     else:
         points, source = _READERS[suffix](path, data)
     if not len(points):
@@ -88,8 +87,8 @@ def read_scan(path: Path, point_fields: int | None = None) -> ScanFile:
     return ScanFile(points=points, source=source)
 
 
-def _parse_bin(path: Path, data: bytes, point_fields: int | None) -> tuple[Points, str]:
-    fields = point_fields or _fields_of_bin(path, data)
+def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
+    fields = _fields_of_bin(path, data)
     if len(data) % (4 * fields):
         raise FileFormatError(
             f"{path}: {len(data):,} bytes are not a multiple of {4 * fields} ({fields} float32"
@@ -118,8 +117,7 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
             " as float32) nor of 20 (nuScenes); it is cut short or no such scan"
         )
     raise FileFormatError(
-        f"{path} may hold 4 numbers a point (KITTI) or 5 (nuScenes); say which with"
-        " --scan point-fields"
+        f"{path} may hold 4 numbers a point (KITTI) or 5 (nuScenes); save its x, y, z as NPY (N, 3)"
     )
 
 

@@ -175,7 +175,6 @@ def improvement(
     path: Path,
     *,
     rgb: NDArray[np.float32] | None = None,
-    colors: str = "blue-orange",
 ) -> tuple[float, Content]:
     """Writes a PNG of where |depth - gt| fell and rose, as figure 4(d) of the paper.
 
@@ -195,14 +194,12 @@ def improvement(
     if not known.any():
         raise InputError("the ground truth has no pixel with known depth; give another file")
     gain = _gain(before[known], after[known], gt[known])
-    pixels, strongest = _painted(gain, known, None if rgb is None else grey_of(rgb), colors)
+    pixels, strongest = _painted(gain, known, None if rgb is None else grey_of(rgb), "gain")
     factor = magnification(gt.shape, columns=1, legend=False)
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
     unknown = "" if known.all() else "no ground truth"
     amount = f"{strongest:.3g} m"
-    return save_gain_figure(
-        path, panel, gain, amount=amount, noun="pixels", colors=colors, unknown=unknown
-    )
+    return save_gain_figure(path, panel, gain, amount=amount, noun="pixels", unknown=unknown)
 
 
 def improvement_at_points(
@@ -214,7 +211,6 @@ def improvement_at_points(
     held_out: bool,
     path: Path,
     unit: str = "m",
-    colors: str = "blue-orange",
 ) -> tuple[float, Content]:
     """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
 
@@ -238,14 +234,14 @@ def improvement_at_points(
     strongest = _strongest(gain)
     grey = grey_of(rgb_or_grey)
     factor = magnification(grey.shape, columns=1, legend=False)
-    colours = paint_signed(gain / strongest, np.full(len(gain), 0.92), colors)
+    colours = paint_signed(gain / strongest, np.full(len(gain), 0.92), "gain")
     weakest_first = np.argsort(np.abs(gain), kind="stable")
     discs = draw_discs(0.8 * grey, xy, colours, factor, weakest_first)
     noun = "held-out points" if held_out else "points used"
     remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
     panel = Panel(title="Change of error", pixels=discs, remark=remark)
     amount = f"{strongest:.3g} {unit}"
-    return save_gain_figure(path, panel, gain, amount=amount, noun=noun, colors=colors)
+    return save_gain_figure(path, panel, gain, amount=amount, noun=noun)
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:

@@ -63,13 +63,13 @@ class AlignedDepth:
         if stated and fit.scale < 0:
             notes.append(
                 "warning: the network's output falls where its kind says it should rise; is it"
-                f" {fit.space!r}? --set output-kind says otherwise"
+                f" {fit.space!r}? its definition can say otherwise"
             )
         if len(self._points) >= _ENOUGH and fit.misfit > _NO_BETTER * self._misfit_of_median():
             notes.append(
                 f"warning: network {self._network.definition.name!r} says nothing about this scene:"
                 f" aligned, it is off by {fit.misfit:.1%} at the points, their median depth by"
-                f" {self._misfit_of_median():.1%}; check the network, --set normalise and the image"
+                f" {self._misfit_of_median():.1%}; check the network, --normalise and the image"
             )
         return tuple(notes)
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Extrinsics
-from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.pixels import (
@@ -62,8 +62,6 @@ def project_velodyne(
     scanner: Extrinsics,
     size: tuple[int, int],
     *,
-    euclidean: bool = False,
-    limits: tuple[float, float] = (0.0, np.inf),
     keep_occluded: bool = False,
 ) -> Points:
     """Returns the scan as sparse depth in an image, in the scan's order.
@@ -73,23 +71,14 @@ def project_velodyne(
         camera: The camera of the image.
         scanner: The scanner's pose.
         size: (H, W) of the image.
-        euclidean: Whether depth is the distance from the camera's centre instead of z.
-        limits: Smallest and largest distance from the scanner, metres.
         keep_occluded: Whether points behind the foreground stay.
 
     Raises:
         NoPointsError: No point is visible in the image.
-        UsageError: The limits are empty.
     """
-    if not 0 <= limits[0] < limits[1]:
-        raise UsageError(
-            f"range {limits[0]:g} to {limits[1]:g} m is empty; give 0 ≤ minimum < maximum"
-        )
     xyz = np.asarray(points)[:, :3]
     drops = DropCounter()
-    distance = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
-    in_range = (distance >= limits[0]) & (distance <= limits[1])
-    seen = scanner.moved(xyz[drops.keep(in_range, "out of range")])
+    seen = scanner.moved(xyz)
     seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
     seen, xy = drops.keep_seen(seen, pixels_of(camera, seen), size)
     if not keep_occluded:
@@ -103,10 +92,9 @@ def project_velodyne(
             f"none of the scan's {len(xyz):,} points lies in the image ({drops}); check that"
             " scan and calibration belong to this camera"
         )
-    depth = np.linalg.norm(seen, axis=1) if euclidean else seen[:, 2]
     return Points(
         xy=xy.astype(np.float32),
-        depth=depth.astype(np.float32),
+        depth=seen[:, 2].astype(np.float32),
         size=size,
         dropped=drops.dropped,
     )

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -25,14 +24,6 @@ def arguments(*more: str, source: str = "drive") -> list[str]:
         "batch", source, "-o", "out", *model,
         "--checkpoint", "drive/net/my_net.safetensors", "--propagate", "none", *more,
     ]  # fmt: skip
-
-
-def test_a_profile_without_a_refined_frame_has_no_times(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for text in ("where the time went", "no frame was refined; there are no times"):
-        assert run(arguments("--profile")) == 0
-        assert text in capsys.readouterr().err
 
 
 def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
@@ -60,23 +51,12 @@ def test_ray_without_an_address_is_this_machine(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)  # it would be imported only to run
-    assert run(arguments("--dry-run", "--ray")) == 0
-    assert run(arguments("--ray", "--workers", "1")) == 2
-
-
-def test_a_dry_run_lists_as_json_what_would_be_done(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
     assert run(arguments()) == 0
-    capsys.readouterr()
-    assert run(arguments("--dry-run", "--json")) == 0
-    assert json.loads(capsys.readouterr().out) == []
-    assert run(arguments("--dry-run", "--json", "--seed", "1")) == 0
-    planned = json.loads(capsys.readouterr().out)
-    assert planned[0] == {"name": "a", "why": "other settings"}
+    assert run(arguments("--ray")) == 0
+    assert run(arguments("--ray", "--seed", "1")) == 2
 
 
-def test_neither_a_dry_run_nor_one_with_nothing_to_do_needs_torch(root: Path) -> None:
+def test_a_run_with_nothing_to_do_needs_no_torch(root: Path) -> None:
     assert run(arguments()) == 0
     code = (
         "import sys\n"
@@ -85,15 +65,11 @@ def test_neither_a_dry_run_nor_one_with_nothing_to_do_needs_torch(root: Path) ->
         "except SystemExit as stop:\n    assert not stop.code, stop.code\n"
         "assert 'torch' not in sys.modules\n"
     )
-    for more in ([], ["--dry-run"]):
-        done = subprocess.run(
-            [sys.executable, "-c", code, *arguments(*more)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        assert "all of them done already" in done.stderr
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments()], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "all of them done already" in done.stderr
 
 
 @pytest.mark.slow

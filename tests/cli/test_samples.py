@@ -46,7 +46,6 @@ def result(capsys: pytest.CaptureFixture[str], line: str) -> Any:
         ("--model fcrn-tiny --preset paper", 1.386, 1.317, set()),
         ("--model fcrn-tiny --preset paper --loss l2", 1.386, 1.318, set()),
         ("--model fcrn-tiny --preset paper --iterations 10", 1.386, 1.256, set()),
-        ("--model fcrn-tiny --preset paper --ply --fov 60", 1.386, 1.317, {"rgb.ply"}),
         ("--model sparse2dense-tiny --preset paper --update sgd --lr 0.1", 0.451, 0.450, set()),
     ],
 )
@@ -64,7 +63,7 @@ def test_refine_takes_a_scan_with_its_calibration(capsys: pytest.CaptureFixture[
     record = result(
         capsys,
         f"refine {street}/rgb.png --sparse {street}/000000.bin --calib {street}/calib.txt"
-        f" --gt {street}/gt.png -o out --model fcrn-tiny --preset paper",
+        f" --gt {street}/gt.png -o out --model fcrn-tiny --propagate none",
     )
     assert record["points"]["used"] == pytest.approx(16007, abs=5)
     assert {path.name for path in Path("out").iterdir()} == FILES
@@ -74,7 +73,6 @@ def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     line = f"batch {SAMPLES}/frames.csv -o out --model fcrn-tiny --preset paper"
-    assert "indoor" in output(capsys, f"{line} --dry-run")
     output(capsys, line)
     frames = json.loads(Path("out/summary.json").read_text())["frames"]
     mae = {frame["name"]: frame["scores"]["after"]["mae"] for frame in frames}

@@ -15,7 +15,6 @@ import pytest
 from pnpdepth_cli.commands.exports import export_results
 from pnpdepth_cli.commands.refinement.frame_camera import camera_to_json
 from pnpdepth_cli.commands.sparse.colmap_points import read_colmap_points
-from pnpdepth_cli.commands.sparse.options import ColmapOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import write_depth
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
@@ -38,10 +37,9 @@ def results(root: Path, depth: np.ndarray = DEPTH, unit_scale: float | None = No
     """What `batch` writes for the project that the exports read."""
     folder = root / "out"
     folder.mkdir()
-    options = ColmapOptions(unit_scale=unit_scale)
     for name in NAMES:
         image = root / "images" / f"{name}.png"
-        seen = read_colmap_points(root, options, image, (HEIGHT, WIDTH), any_size=False)
+        seen = read_colmap_points(root, image, (HEIGHT, WIDTH), unit_scale=unit_scale)
         write_depth(folder / f"{name}_depth.exr", depth * np.float32(unit_scale or 1))
         record = {
             "unit": seen.unit,

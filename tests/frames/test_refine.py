@@ -1,4 +1,4 @@
-"""Frames refined in one pass of the network, against one at a time."""
+"""One frame refined in memory: what it is an error of, and what a divergence leaves."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import BatchError, DivergedError, ModelError, NoPointsError, PnpDepthError
+from pnpdepth_cli.errors import DivergedError, ModelError, NoPointsError
 from pnpdepth_cli.frames.frame import Frame, Refined
-from pnpdepth_cli.frames.refine import refine_frame, refine_frames
+from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
@@ -40,68 +40,30 @@ def frame_of(seed: int, height: int = 46, width: int = 62, depth: float = 2.0) -
     return Frame(rgb=torch.from_numpy(rgb).permute(2, 0, 1).contiguous(), points=points)
 
 
-def alone(network: Network, settings: Settings, one: Frame) -> Refined:
-    with Split(network.module, "middle") as split:
-        return refine_frame(network, split, settings, one)
-
-
-def together(
-    network: Network, settings: Settings, frames: list[Frame], layer: str = "middle"
-) -> list[Refined | PnpDepthError]:
+def refined(network: Network, settings: Settings, frame: Frame, layer: str = "middle") -> Refined:
     with Split(network.module, layer) as split:
-        return refine_frames(network, split, settings, frames)
+        return refine_frame(network, split, settings, frame)
 
 
-@pytest.mark.parametrize("align", ["none", "scale", "auto"])
-def test_frames_at_once_are_those_of_one_at_a_time(network: Network, align: str) -> None:
-    settings = replace(SETTINGS, align=align)
-    frames = [frame_of(seed, depth=seed + 1) for seed in range(3)]
-    for one, frame in zip(frames, together(network, settings, frames), strict=True):
-        assert isinstance(frame, Refined)
-        expected = alone(network, settings, one)
-        np.testing.assert_allclose(frame.before, expected.before, rtol=1e-5)
-        np.testing.assert_allclose(frame.after, expected.after, rtol=1e-4)
-        assert frame.notes == expected.notes
-        assert (frame.alignment is None) == (expected.alignment is None)
-        assert frame.used is one.points
-        assert len(frame.held_out) == 0
-
-
-def test_a_frame_that_fails_does_not_lose_the_others(network: Network) -> None:
+def test_a_frame_without_a_point_in_the_networks_view_is_an_error(network: Network) -> None:
     network = replace(
         network, definition=replace(network.definition, size=Fixed(32, 32, fit="crop"))
     )
     xy = torch.tensor([[1.0, 20.0]])  # left of the square crop
     outside = SparsePoints(xy=xy, depth=torch.ones(1), size=(46, 62))
-    frames = [frame_of(0), frame_of(1).with_points(outside), frame_of(2)]
-    first, failed, last = together(network, SETTINGS, frames)
-    assert isinstance(failed, NoPointsError)
-    assert isinstance(first, Refined)
-    assert isinstance(last, Refined)
-    np.testing.assert_allclose(last.after, alone(network, SETTINGS, frames[2]).after, rtol=1e-4)
-    (nothing,) = together(network, SETTINGS, frames[1:2])
-    assert isinstance(nothing, NoPointsError)
     with pytest.raises(NoPointsError):
-        alone(network, SETTINGS, frames[1])
+        refined(network, SETTINGS, frame_of(1).with_points(outside))
 
 
-def test_a_frame_whose_prediction_is_not_finite_is_an_error_of_its_own(network: Network) -> None:
+def test_a_frame_whose_prediction_is_not_finite_is_an_error(network: Network) -> None:
     unknown = replace(frame_of(1), rgb=torch.full((3, 46, 62), float("nan")))
-    good, failed = together(network, SETTINGS, [frame_of(0), unknown])
-    assert isinstance(good, Refined)
-    assert isinstance(failed, ModelError)
-    assert "not finite at 20 of 20 sparse points" in str(failed)
+    with pytest.raises(ModelError, match="not finite at 20 of 20 sparse points"):
+        refined(network, SETTINGS, unknown)
 
 
 def test_a_divergence_comes_with_its_last_good_depth(network: Network) -> None:
     settings = replace(SETTINGS, lr=1e38, update="sgd", loss="l2")
-    for frame in together(network, settings, [frame_of(0), frame_of(1)], "decode"):
-        assert isinstance(frame, Refined)
-        assert isinstance(frame.diverged, DivergedError)
-        assert "after 1 update" in str(frame.diverged)
-        np.testing.assert_array_equal(frame.after, frame.before)
-
-
-def test_frames_of_two_sizes_are_not_refined_at_once(network: Network) -> None:
-    with pytest.raises(BatchError, match="one at a time"):
-        together(network, SETTINGS, [frame_of(0), frame_of(1, height=54)])
+    frame = refined(network, settings, frame_of(0), "decode")
+    assert isinstance(frame.diverged, DivergedError)
+    assert "after 1 update" in str(frame.diverged)
+    np.testing.assert_array_equal(frame.after, frame.before)

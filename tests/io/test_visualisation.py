@@ -22,7 +22,6 @@ from pnpdepth_cli.io.visualisation import (
     sigma_preview,
 )
 
-RED, GREEN = [214, 26, 30], [16, 140, 52]
 BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
 TITLES = ["Image", "Sparse depth", "Depth before", "Depth after", "Change"]
 
@@ -147,9 +146,7 @@ def test_better_worse_equal_and_unknown_have_their_own_colours(tmp_path: Path) -
     assert content["ends"] == ("worse by 1 m or more", "better by 1 m or more")
     assert content["footer"] == "33.3 % of 3 pixels improved, 33.3 % worse"
     assert content["unknown"] == "no ground truth"
-    _, colours, content = improved(tmp_path, [5, 5], [6, 5], [5, 6], colors="paper")
-    assert colours == [RED, GREEN]
-    assert content["unknown"] is None
+    assert improved(tmp_path, [5, 5], [6, 5], [5, 6])[2]["unknown"] is None
 
 
 def test_only_known_ground_truth_counts_and_a_depth_that_becomes_finite_is_better(
@@ -254,7 +251,7 @@ def test_near_is_warm_far_is_cold_and_unknown_is_grey() -> None:
 
 def test_stronger_change_is_stronger_colour() -> None:
     strength = np.array([0, 0.3, 1, 7, -0.3, -1])
-    colours = paint_signed(strength, np.full(6, 0.9), "blue-orange").astype(int)
+    colours = paint_signed(strength, np.full(6, 0.9), "gain").astype(int)
     assert colours[2].tolist() == colours[3].tolist() == BLUE
     assert colours[5].tolist() == ORANGE
     spread = np.ptp(colours, axis=1)

@@ -95,7 +95,7 @@ def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: 
     read = read_inputs(RefineRequest(files=files))
     count = read.record["sparse"]["dropped"]["hidden by foreground"]
     assert len(read.points) == len(points) - count < len(points)
-    assert sum("--scan keep-occluded" in note for note in read.notes) == 1
+    assert sum("--preset paper" in note for note in read.notes) == 1
     kept = read_inputs(RefineRequest(files=replace(files, scan=ScanOptions(keep_occluded=True))))
     assert len(kept.points) == len(points)
     assert not any("occluded" in note for note in kept.notes)

@@ -30,18 +30,10 @@ def test_a_scan_projects_as_computed_by_hand() -> None:
     np.testing.assert_allclose(got.xy, [[45, 30], [65, 50], [52, 41.5]], atol=1e-5)
     np.testing.assert_allclose(got.depth, [10, 5, 4], rtol=1e-6)
     assert got.dropped == {
-        "out of range": 0,
         "behind the camera": 1,
         "outside the image": 1,
         "behind another in their pixel": 0,
     }
-
-
-def test_range_is_the_distance_from_the_camera_instead_of_z() -> None:
-    scan = np.array([[4.0, 0.0, -3.0]])  # 3 m below the axis, 4 m ahead
-    wide = Camera(intrinsics=np.array([[40.0, 0, 50], [0, 40, 40], [0, 0, 1]]))
-    assert project_velodyne(scan, wide, HERE, SIZE).depth.tolist() == [4]
-    assert project_velodyne(scan, wide, HERE, SIZE, euclidean=True).depth.tolist() == [5]
 
 
 def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_position() -> None:
@@ -51,14 +43,6 @@ def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_positio
     np.testing.assert_allclose(got.xy[0], [49.7, 40], atol=1e-5)
     assert got.dropped["behind another in their pixel"] == 1
     assert as_depth_image(got)[40, 50] == 10
-
-
-def test_minimum_and_maximum_range_are_distances_from_the_scanner() -> None:
-    scan = np.array([[3.0, 0, 0], [5.0, 0.5, 0], [9.0, 2.0, 0], [4.0, 0, 0], [8.0, 4.0, 1.0]])
-    ahead = Extrinsics(FORWARD_LEFT_UP, np.array([0, 0, 1.0]))
-    got = project_velodyne(scan, CAMERA, ahead, SIZE, limits=(4, 9), keep_occluded=True)
-    assert got.depth.tolist() == [6, 5, 9]  # the third is 9.2 m away
-    assert got.dropped["out of range"] == 2
 
 
 def test_the_outermost_half_pixels_belong_to_the_image_and_no_more() -> None:

@@ -6,7 +6,6 @@ import functools
 import itertools
 import json
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
@@ -29,7 +28,6 @@ from pnpdepth_cli.commands.batch.summary import (
     Row,
     Tally,
     failed_row,
-    profile_of,
     write_summaries,
 )
 from pnpdepth_cli.commands.ordered_pool import in_order
@@ -90,28 +88,17 @@ def run_batch(
         batch.open_output(stack)
         batch.adapt(stopped)
         to_do = [frame for frame, _ in batch.to_do()]
-        began, refined, start = 0, 0, time.perf_counter()
-        seconds = Counter[str]()
+        began = 0
         if to_do:
             with closing(batch.rows(to_do, listener, stopped)) as rows:
                 for row in rows:
                     listener.frame(row)
                     began += 1
-                    refined += row["status"] != "failed"
-                    seconds.update(row.get("seconds") or {})
-        profile = profile_of(seconds, refined, time.perf_counter() - start)
         with in_turn(request.output):  # so the summary of the shard that ends last stays
-            summary = batch.summarise(profile)
+            summary = batch.summarise()
     for note in summary.get("unsure", ()):
         listener.say(f"warning: {note}")
     return BatchOutcome(summary=summary, stopped=began < len(to_do))
-
-
-def plan_batch(request: BatchRequest, say: Callable[[str], None]) -> list[tuple[str, str]]:
-    """Returns the names of the frames that `run_batch` would do, and why; nothing is written."""
-    batch = _Batch(request, say)
-    batch.adapt(None)
-    return [(frame.name, why) for frame, why in batch.to_do()]
 
 
 class _Part(NamedTuple):
@@ -256,11 +243,11 @@ class _Batch:
                     settings_worked=worked, say=listener.say, stopped=stopped,
                 )  # fmt: skip
             else:
-                with running.opened_network(request, references, listener.say) as network:
+                with running.opened_network(request, references, listener.say) as refiner:
                     begin()
                     yield from running.refine_tasks(
-                        map(self._task, wanted), network, records,
-                        threads=request.workers, settings_worked=worked, stopped=stopped,
+                        map(self._task, wanted), refiner, records,
+                        settings_worked=worked, stopped=stopped,
                     )  # fmt: skip
 
     def _by_part(self, to_do: list[Frame]) -> list[tuple[_Part, list[Frame]]]:
@@ -271,7 +258,7 @@ class _Batch:
             parts.setdefault(id(part.records), (part, []))[1].append(frame)
         return list(parts.values())
 
-    def summarise(self, profile: dict[str, Any]) -> dict[str, Any]:
+    def summarise(self) -> dict[str, Any]:
         """Writes the summaries and the report; returns the summary without its frames."""
         request, tally = self.request, Tally()
         refused = (failed_row(frame.name, {}, why) for frame, why in self.found.refused)
@@ -287,8 +274,6 @@ class _Batch:
                         raise damaged(request.output / f"{row['name']}.json") from error
                     file.write(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n")
             summary = self._head(tally)
-            if request.profile:
-                summary["profile"] = profile
 
             def rows() -> Iterator[Row]:
                 file.seek(0)

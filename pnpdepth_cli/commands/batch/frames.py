@@ -13,12 +13,7 @@ from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.sequence import with_neighbours
 from pnpdepth_cli.commands.batch.summary import CSV, JSON
 from pnpdepth_cli.commands.refinement.output_files import Outputs, outputs_in
-from pnpdepth_cli.commands.refinement.request import (
-    FrameFiles,
-    NeighbourFiles,
-    RefineRequest,
-)
-from pnpdepth_cli.commands.sparse.options import BagOptions
+from pnpdepth_cli.commands.refinement.request import FrameFiles, NeighbourFiles, RefineRequest
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.io.colmap_model import model_files
@@ -70,25 +65,13 @@ class Task:
         return self.outputs["record"]
 
 
-def unpacked(
-    request: BatchRequest,
-    options: BagOptions,
-    say: Callable[[str], None],
-    *,
-    may_write: bool = True,
-) -> BatchRequest:
+def unpacked(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     """Returns the request with the frames of its bag as source; any other request as it is.
 
     The frames are written to OUTPUT_frames, and stay there for the next run. Their poses are used
     where points are accumulated and no others are given.
-
-    Raises:
-        UsageError: Options of a bag are given for another source, or the frames are not written
-            yet and may not be.
     """
     if not is_bag(request.source):
-        if options != BagOptions():
-            raise UsageError(f"{request.source} is no bag; leave out --topics and --tolerance")
         return request
     from pnpdepth_cli.commands.sparse.bag_frames import (
         POSES_FILE,
@@ -98,12 +81,8 @@ def unpacked(
     )
 
     folder = request.output.with_name(f"{request.output.name}_frames")
-    frames = FramesRequest(
-        bag=request.source, output=folder, options=options, limit=request.limit, overwrite=True
-    )
+    frames = FramesRequest(bag=request.source, output=folder, limit=request.limit, overwrite=True)
     if not written_before(frames):
-        if not may_write:
-            raise UsageError(f"--dry-run writes nothing; run `pnpdepth frames {request.source}`")
         record = write_frames(frames, say)
         say(f"bag: wrote {record['frames']:,} frames to {folder}")
     sequence, poses = request.sequence, folder / POSES_FILE
@@ -156,11 +135,10 @@ def find_frames(request: BatchRequest) -> BatchFrames:
 def task_of(request: FrameSelection, frame: Frame) -> Task:
     """Returns the frame's task; options of the user go before what the data set states."""
     refine = request.refine
-    needs_camera = refine.outputs.needs_camera or bool(frame.neighbours)
-    files = _files_of(request, frame, needs_camera=needs_camera)
+    files = _files_of(request, frame)
     neighbours = (
         NeighbourFiles(
-            files=_files_of(request, each.frame, needs_camera=True),
+            files=_files_of(request, each.frame),
             motion=each.motion,
             poses=each.poses,
             apart=each.apart,
@@ -177,7 +155,7 @@ def task_of(request: FrameSelection, frame: Frame) -> Task:
     )
 
 
-def _files_of(request: FrameSelection, frame: Frame, *, needs_camera: bool) -> FrameFiles:
+def _files_of(request: FrameSelection, frame: Frame) -> FrameFiles:
     """The files of a frame, without its neighbours."""
     base, part = request.files, frame.part
     if request.protocol is not None:
@@ -196,13 +174,12 @@ def _files_of(request: FrameSelection, frame: Frame, *, needs_camera: bool) -> F
         image=frame.image,
         sparse=sparse,
         gt=gt,
-        camera_file=frame.calib if needs_camera and not is_scan else None,
+        camera_file=None if is_scan else frame.calib,
         camera_number=frame.camera if scan.camera is None else scan.camera,
         gt_masks=frame.masks,
         gt_size_ok=frame.gt_other_size,
-        sparse_size_ok=base.sparse_size_ok or frame.sparse_other_size,
         sparse_scale=frame.sparse_scale if base.depth_scale is None else None,
-        gt_scale=base.gt_scale or base.depth_scale or frame.gt_scale,
+        gt_scale=base.depth_scale or frame.gt_scale,
         scan=scan,
         part=part,
     )

@@ -25,13 +25,16 @@ from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.lock import LOCKS
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.commands.batch.running import OpenNetwork, References
+    from pnpdepth_cli.commands.batch.running import References
+    from pnpdepth_cli.frames.refiner import Refiner
 
 _CONNECT_S = 5.0
 _FRAMES_OF_A_CALL = 8
 """So many are read and written beside the network; fewer where that leaves workers idle."""
 _NO_WORKER_S = 300.0
 """How long a cluster may take to start a worker, such as on a machine that it starts first."""
+_RETRIES = 2
+"""How often a frame is tried again whose worker died."""
 _RESTARTS = 100
 """How often Ray starts a worker again that dies."""
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -66,7 +69,7 @@ class Worker:
         self._versions, self._shared = versions, shared
         self._records = Records(request.output, model)
         self._open = ExitStack()  # until the process ends
-        self._network: OpenNetwork | None = None
+        self._network: Refiner | None = None
         self._notes: list[str] = []
 
     def ready(self) -> None:
@@ -83,11 +86,8 @@ class Worker:
             self._network = self._open.enter_context(opened)
         tasks = (task_of(request, frame) for frame in frames)
         rows = list(
-            refine_tasks(
-                tasks, self._network, self._records,
-                threads=request.workers, settings_worked=settings_worked,
-            )
-        )  # fmt: skip
+            refine_tasks(tasks, self._network, self._records, settings_worked=settings_worked)
+        )
         notes, self._notes = self._notes, []
         return rows, notes
 
@@ -140,7 +140,7 @@ def rows_of_workers(
         actors = [actor.remote(*job) for _ in range(count)]
         try:
             yield from rows_of_actors(
-                ray, actors, to_do, retries=workers.options.retries, worked=settings_worked,
+                ray, actors, to_do, worked=settings_worked,
                 lost=lambda frame, why: records.fail(task_of(request, frame), why), say=say,
                 stopped=stopped,
             )  # fmt: skip
@@ -156,7 +156,6 @@ def rows_of_actors(
     actors: Sequence[Any],
     to_do: Sequence[Frame],
     *,
-    retries: int,
     worked: bool,
     lost: Callable[[Frame, str], Row],
     say: Callable[[str], None],
@@ -164,8 +163,8 @@ def rows_of_actors(
 ) -> Iterator[Row]:
     """Hands out frames, a call at a time for each worker; yields the rows as they are done.
 
-    The frames of a worker that dies go to any worker again, one by one, and each so many times as
-    `retries` says; then `lost` gives its row from the frame and the reason. `worked` says whether
+    The frames of a worker that dies go to any worker again, one by one, and each `_RETRIES`
+    times; then `lost` gives its row from the frame and the reason. `worked` says whether
     a frame was refined with these settings before.
     """
     size = max(1, min(_FRAMES_OF_A_CALL, len(to_do) // (4 * len(actors))))
@@ -209,7 +208,7 @@ def rows_of_actors(
                 raise ClusterError(f"a worker died {_RESTARTS} times: {reason}") from None
             say(f"warning: a worker died ({reason}); Ray starts another one")
             start(actor)
-            if deaths > retries:
+            if deaths > _RETRIES:
                 yield lost(frames[0], f"its worker died {deaths} times: {reason}")
             else:
                 waiting.extend(([frame], deaths) for frame in frames)
@@ -283,11 +282,11 @@ def _planned(ray: ModuleType, workers: RayWorkers) -> tuple[int, dict[str, Any]]
     else:
         nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
         there = sum(int(count) // options.cpus_per_worker for count in nodes)
-    wanted = options.ray_workers or len(workers.indices) or there
+    wanted = len(workers.indices) or there
     if wanted > there or not there:
         where = "this machine" if workers.address == LOCAL else f"Ray cluster {workers.address!r}"
         raise ClusterError(
             f"{where} has devices for {there} Ray workers with {workers.each} each, and"
-            f" {max(1, wanted)} asked for; change --device, --ray-workers or --cpus-per-worker"
+            f" {max(1, wanted)} asked for; change --device or --cpus-per-worker"
         )
     return wanted, resources

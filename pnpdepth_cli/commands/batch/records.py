@@ -87,10 +87,8 @@ class Records:
             for part, path in task.inputs.items():
                 if not is_unchanged(path, Fingerprint(**entry["inputs"][part])):
                     return f"input changed: {part}"
-            may_lack = IMAGES if task.request.outputs.previews != "all" else ()
             for kind, path in files.items():
-                wanted = kind in entry["outputs"] or kind not in may_lack
-                if wanted and path.name not in names:
+                if kind not in IMAGES and path.name not in names:
                     return f"result missing: {path.name}"
         except DAMAGED:
             return "record damaged"

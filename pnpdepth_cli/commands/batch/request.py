@@ -105,21 +105,8 @@ class ClusterOptions:
         parse=parse_address,
         value_if_bare=LOCAL,
     )
-    ray_workers: int | None = option(
-        None,
-        "Number of Ray workers.  [default: one per GPU, or per --cpus-per-worker cores]",
-        metavar="N",
-        least=1,
-    )
     cpus_per_worker: int = option(
         1, "CPU cores, and threads, of a Ray worker.", metavar="N", least=1, show_default=True
-    )
-    retries: int = option(
-        2,
-        "How often a frame is tried again whose Ray worker died.",
-        metavar="N",
-        least=0,
-        show_default=True,
     )
 
 
@@ -127,13 +114,6 @@ class ClusterOptions:
 class BatchRequest(FrameSelection):
     """Which frames to refine, and how."""
 
-    workers: int = option(
-        2,
-        "Number of threads that read, and of threads that write.",
-        metavar="N",
-        least=1,
-        show_default=True,
-    )
     html: Path | None = option(
         None,
         "Write an HTML report: every frame before and after, the worst first.",
@@ -144,14 +124,6 @@ class BatchRequest(FrameSelection):
         "With --html: also show every frame as a point cloud, before, after and ground truth; adds"
         " up to 2.5 MB a frame.",
     )
-    batch_size: int = option(
-        1,
-        "Frames of one size that go through a fixed network together; more than 1 changes the last"
-        " bits of the results.",
-        metavar="N",
-        least=1,
-        show_default=True,
-    )
     shard: tuple[int, int] | None = option(
         None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
     )
@@ -161,7 +133,6 @@ class BatchRequest(FrameSelection):
         " frames are refined with them if they are better. The network must take points.",
     )
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
-    profile: bool = option(False, "Print the time spent in each stage.")
     varied: Mapping[str, str] = field(default_factory=dict)
     """Options that a study varies, and their values here, as the user wrote them."""
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
@@ -204,9 +175,7 @@ def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
     names = device.split(",")
     if options.ray is None and len(names) == 1 and device != "all":
         if options != ClusterOptions():
-            raise UsageError(
-                "--ray-workers, --cpus-per-worker and --retries are of Ray workers; add --ray"
-            )
+            raise UsageError("--cpus-per-worker is of Ray workers; add --ray")
         return None
     kinds = {"cuda" if name == "all" else name.partition(":")[0] for name in names}
     kind = kinds.pop()
@@ -218,7 +187,6 @@ def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
     address = options.ray or LOCAL
     if indices and address != LOCAL:
         raise UsageError(
-            f"device {device!r}: GPUs of a cluster have no numbers; take --device cuda, and"
-            f" --ray-workers {len(indices)}"
+            f"device {device!r}: GPUs of a cluster have no numbers; take --device cuda"
         )
     return RayWorkers(address, kind, indices, options)

@@ -7,26 +7,22 @@ the threads are bounded, so memory does not grow with the number of frames.
 from __future__ import annotations
 
 import functools
-import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, TypeVar
-
-import numpy as np
 
 from pnpdepth_cli.commands.batch.frames import Task, task_of
 from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import Row
-from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.refine import load_refiner, write_refined
 from pnpdepth_cli.commands.stopwatch import Stopwatch
 from pnpdepth_cli.errors import (
-    BatchError,
     InputError,
     ModelError,
     PnpDepthError,
@@ -41,8 +37,6 @@ from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
 Item = TypeVar("Item")
 REGISTERING = 16
 """Frames that decide together how images are moved into the frame of the points."""
-_ROUNDING = 1e-3
-"""A larger relative difference of plain predictions is more than rounding."""
 
 
 def read_frame(task: Task, known: dict[str, Fingerprint] | None = None) -> Inputs:
@@ -100,7 +94,7 @@ def registering(frames: Sequence[Item], first: int) -> list[Item]:
 @contextmanager
 def opened_network(
     request: BatchRequest, references: References, say: Callable[[str], None]
-) -> Iterator[OpenNetwork]:
+) -> Iterator[Refiner]:
     """Yields the network, resolved on the frames that decide, open for any number of frames.
 
     Args:
@@ -139,7 +133,7 @@ def opened_network(
             f" updates of z ({s.update}, {s.loss}, step {s.lr})"
         )
     with refiner:
-        yield OpenNetwork(refiner, request.batch_size, say)
+        yield refiner
 
 
 def _readable(task: Task) -> Inputs | None:
@@ -169,10 +163,9 @@ class FrameInMemory:
 
 def refine_tasks(
     tasks: Iterable[Task],
-    network: OpenNetwork,
+    refiner: Refiner,
     records: Records,
     *,
-    threads: int,
     settings_worked: bool,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Generator[Row, None, None]:
@@ -180,9 +173,8 @@ def refine_tasks(
 
     Args:
         tasks: The frames to refine.
-        network: The network.
+        refiner: The network, open.
         records: Writes the results.
-        threads: Number of threads that read, and of threads that write.
         settings_worked: True if a frame was refined with these settings before.
         stopped: True if no further frame is to be begun.
 
@@ -194,23 +186,22 @@ def refine_tasks(
 
     def refined(reading: Iterable[FrameInMemory]) -> Iterator[FrameInMemory]:
         worked = settings_worked
-        for group in _groups(reading, network):
+        for frame in reading:
             if stopped():
                 return
-            _refine(group, network)
-            for frame in group:
-                worked |= isinstance(frame.result, Refined)
-                fatal = StorageError if worked else (StorageError, ModelError, UsageError)
-                if isinstance(frame.result, fatal):
-                    raise frame.result
-                yield frame
+            _refine(frame, refiner)
+            worked |= isinstance(frame.result, Refined)
+            fatal = StorageError if worked else (StorageError, ModelError, UsageError)
+            if isinstance(frame.result, fatal):
+                raise frame.result
+            yield frame
 
     def written(frame: FrameInMemory) -> Row:
-        return _write(frame, network.refiner, records)
+        return _write(frame, refiner, records)
 
     with (
-        closing(in_order(_read, tasks, threads)) as reading,
-        closing(in_order(written, refined(reading), threads)) as rows,
+        closing(in_order(_read, tasks, THREADS)) as reading,
+        closing(in_order(written, refined(reading), THREADS)) as rows,
     ):
         yield from rows
 
@@ -223,79 +214,15 @@ def rows_of_unreadable(tasks: Iterable[Task], records: Records) -> Iterator[Row]
         yield records.fail(task, _message(result if isinstance(result, Exception) else later))
 
 
-def _groups(frames: Iterable[FrameInMemory], network: OpenNetwork) -> Iterator[list[FrameInMemory]]:
-    """The frames in their order, in groups of those that go through the network together.
-
-    A frame that could not be read is in the group of those before it.
-    """
-    group: list[FrameInMemory] = []
-    for frame in frames:
-        sizes = {each.inputs.size for each in (*group, frame) if each.inputs is not None}
-        if len(sizes) > 1:
-            yield group
-            group = []
-        group.append(frame)
-        if len(group) >= network.batch_size:
-            yield group
-            group = []
-    if group:
-        yield group
-
-
-def _refine(group: Sequence[FrameInMemory], network: OpenNetwork) -> None:
-    """Sets the results of the frames that were read."""
-    frames = [frame for frame in group if frame.inputs is not None]
-    start = time.perf_counter()
-    results = network.refine([frame.inputs for frame in frames if frame.inputs is not None])
-    for frame, result in zip(frames, results, strict=True):
-        frame.watch.add("refine", (time.perf_counter() - start) / len(frames))
-        frame.result = result
-
-
-class OpenNetwork:
-    """Refines frames of one size, several together where the user asks for it."""
-
-    def __init__(self, refiner: Refiner, batch_size: int, say: Callable[[str], None]) -> None:
-        self.refiner, self._say = refiner, say
-        fixed = not refiner.is_default and refiner.settings.tile is None
-        if batch_size > 1 and not fixed:
-            say("batch size: 1; only frames of a fixed network without tiles go together")
-        self.batch_size = batch_size if fixed else 1
-        self._checked = False
-
-    def refine(self, group: Sequence[Inputs]) -> Sequence[Refined | Exception]:
-        """Returns the refined frames, all of one size; for one that fails, its error."""
-        if len(group) > 1:
-            try:
-                return self._together(group)
-            except PnpDepthError as error:
-                self._say(f"{len(group)} frames are refined one at a time; together: {error}")
-                if isinstance(error, BatchError):
-                    self.batch_size = 1
-        return [self._alone(inputs) for inputs in group]
-
-    def _together(self, group: Sequence[Inputs]) -> list[Refined | Exception]:
-        """The frames refined in one pass. PnpDepthError if the network does not take them so."""
-        frames = self.refiner.refine_together(group)
-        first, alone = frames[0], None if self._checked else self._alone(group[0])
-        if isinstance(alone, Refined) and isinstance(first, Refined):
-            self._checked = True
-            split = self.refiner.split
-            if split is None or not split.static_graph:
-                raise BatchError("the network's control flow depends on image values")
-            if not np.allclose(alone.before, first.before, rtol=_ROUNDING, atol=0):
-                raise BatchError("frames that go together influence each other")
-        note = f"refined together with {len(group) - 1} others, which alters the last bits"
-        return [
-            replace(frame, notes=(*frame.notes, note)) if isinstance(frame, Refined) else frame
-            for frame in frames
-        ]
-
-    def _alone(self, inputs: Inputs) -> Refined | Exception:
+def _refine(frame: FrameInMemory, refiner: Refiner) -> None:
+    """Sets the result of a frame that was read."""
+    if frame.inputs is None:
+        return
+    with frame.watch("refine"):
         try:
-            return self.refiner.refine_frame(inputs)
+            frame.result = refiner.refine_frame(frame.inputs)
         except Exception as error:  # concerns this frame only
-            return error
+            frame.result = error
 
 
 def _read(task: Task) -> FrameInMemory:

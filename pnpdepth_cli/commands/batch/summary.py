@@ -186,20 +186,6 @@ def _measured(row: Row) -> dict[tuple[str, str], dict[str, float | None]]:
     return found
 
 
-def profile_of(seconds: Mapping[str, float], frames: int, wall_s: float) -> dict[str, Any]:
-    """Returns where the time of a run went: {"frames": 24, "seconds": {"read": …, "wall": …}, …}.
-
-    Reading and writing run beside the network, so their seconds do not add up to the wall time.
-    """
-    stages = {stage: round(seconds.get(stage, 0.0), 4) for stage in _RUN_STAGES}
-    return {
-        "frames": frames,
-        "seconds": stages | {"wall": round(wall_s, 4)},
-        "frames_per_second": round(frames / wall_s, 4),
-        "network_busy": round(stages["refine"] / wall_s, 4),
-    }
-
-
 def write_summaries(
     folder: Path, head: Mapping[str, Any], rows: IO[str], baselines: Sequence[str]
 ) -> None:

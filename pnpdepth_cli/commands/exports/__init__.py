@@ -136,7 +136,7 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     if camera is None or image is None:
         lacks = "its image; run this in the folder where it was refined, or refine it again"
         if camera is None:
-            lacks = "a record with its camera; refine it with a COLMAP model, --calib or --fov"
+            lacks = "a record with its camera; refine it with a COLMAP model or --calib"
         raise InputError(f"{result.depth} lacks {lacks}")
     if export.needs_pose and pose is None:
         raise InputError(

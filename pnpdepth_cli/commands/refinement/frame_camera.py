@@ -69,32 +69,26 @@ def camera_of_frame(
     The camera is None if it is unknown.
 
     Args:
-        request: What is asked for. EXIF is read only where an output needs the camera.
+        request: What is asked for. EXIF is read only for a 3D view.
         sparse: The sparse depth, with the camera of the whole image if it came with one.
         size: (H, W) of the whole image.
 
     Raises:
-        UsageError: An output needs the camera, and nothing gives it; or --fov repeats it.
+        UsageError: A 3D view needs the camera, and nothing gives it.
         SizeError: The calibration is of another image.
     """
-    files, outputs, image = request.files, request.outputs, request.files.image_file
+    files, image = request.files, request.files.image_file
     known, notes = sparse.camera, list[str]()
     if known is None and files.scan.calib is not None:
         known, notes = camera_of_file(files.scan.calib, files.scan.camera, size, image)
     elif known is None and files.camera_file is not None:
         known, notes = camera_of_file(files.camera_file, files.camera_number, size, image)
-    if outputs.fov_deg is not None:
-        if known is not None:
-            raise UsageError(f"the camera is known ({known.source}); leave out --fov")
-        known = camera_of_fov(outputs.fov_deg, size)
-        notes = [describe_pinhole(known)]
-    if known is None and outputs.needs_camera:
+    if known is None and request.outputs.view_3d:
         known = None if image is None else camera_of_exif(image, size)
         if known is None:
-            flag, named = "--ply" if outputs.ply else "--html-3d", image or files.sparse
             raise UsageError(
-                f"{flag} needs the camera, and {named} has neither a calibration nor a focal length"
-                " in EXIF; give --calib or --fov"
+                f"--html-3d needs the camera, and {image or files.sparse} has neither a calibration"
+                " nor a focal length in EXIF; give --calib"
             )
         notes = [describe_pinhole(known)]
     return None if known is None else files.part.camera_in_crop(known, size), notes

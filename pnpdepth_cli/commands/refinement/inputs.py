@@ -16,12 +16,19 @@ from pnpdepth_cli.commands.refinement.frame_camera import Pose, camera_of_frame
 from pnpdepth_cli.commands.refinement.neighbours import read_neighbours
 from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
 from pnpdepth_cli.commands.sparse.colmap_points import read_colmap_points
-from pnpdepth_cli.commands.sparse.options import METRES, ColmapOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.options import METRES, ScanOptions
 from pnpdepth_cli.commands.sparse.scan_points import SparseDepth, read_scan_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame, Register, registration_to_make, tensor_of
 from pnpdepth_cli.io.dataset import SCAN_ONLY_SUFFIXES, Hdf5Array, Source, file_of
-from pnpdepth_cli.io.dataset.reading import check_same_view, depth_of, masked, moved_to, rgb_of
+from pnpdepth_cli.io.dataset.reading import (
+    check_same_view,
+    depth_of,
+    masked,
+    moved_note,
+    moved_to,
+    rgb_of,
+)
 from pnpdepth_cli.io.depth import (
     describe_range,
     implausible,
@@ -90,7 +97,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
         notes += [f"image: {note}"] if note else []
     truth_notes: list[str] = []
     if files.gt is not None:
-        truth, of_truth, truth_notes = _read_ground_truth(files, files.gt, whole)
+        truth, of_truth, truth_notes = _read_ground_truth(request, files, files.gt, whole)
         gt, gt_scale = np.ascontiguousarray(crop(truth.values)), truth.reading.scale
         if whole not in (None, truth.values.shape):
             raise _size_error(files, truth.values.shape, whole)
@@ -104,7 +111,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     if gt is not None and sparse.unit != METRES:
         raise UsageError(
             f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
-            " --colmap unit-scale, or leave out --gt"
+            " --unit-scale, or leave out --gt"
         )
     if gt is not None and gt.shape != own.size:
         raise _size_error(files, gt.shape, own.size)
@@ -124,7 +131,7 @@ def read_inputs(request: RefineRequest) -> Inputs:
     if gt is not None and files.sparse is not None:
         depth = own.scatter()[0, 0].numpy()
         notes += _leak_warning(depth, gt)
-        by_option = {"--depth-scale": readings["sparse"], "--gt-scale": readings["gt"]}
+        by_option = {"--depth-scale": readings["sparse"], "gt_scale of a list": readings["gt"]}
         notes += _scale_warning(depth, gt, by_option)
     notes += (*of_camera, *lost)
     if neighbours:
@@ -183,7 +190,8 @@ def _points_of(request: RefineRequest, files: FrameFiles, size: tuple[int, int])
     if files.image is not None:
         rgb = np.ascontiguousarray(crop(_read_image(files, files.image)[0]))
     if files.gt is not None:
-        gt = np.ascontiguousarray(crop(_read_ground_truth(files, files.gt, size)[0].values))
+        truth, _, _ = _read_ground_truth(request, files, files.gt, size)
+        gt = np.ascontiguousarray(crop(truth.values))
     return _sampled(files, rgb, gt, None, request.method.seed).points
 
 
@@ -196,24 +204,31 @@ def _read_image(files: FrameFiles, source: Source) -> tuple[ImageArray, str | No
 
 
 def _read_ground_truth(
-    files: FrameFiles, source: Source, size: tuple[int, int] | None
+    request: RefineRequest, files: FrameFiles, source: Source, size: tuple[int, int] | None
 ) -> tuple[DepthFile, dict[str, Any], list[str]]:
     """The ground truth of an image (H, W), what a record keeps of it, and lines for a person."""
     if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
-        scan = read_scan_points(source, files.scan, size, files.image_file)
+        options = _scan_options(request, files)
+        scan = read_scan_points(source, options, size, files.image_file)
         truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
         return truth, scan.record, [note.replace("sparse:", "gt:", 1) for note in scan.notes]
     if isinstance(source, Hdf5Array):
         truth = DepthFile(values=depth_of(source), reading=Reading("HDF5"))
     else:
         scale = files.gt_scale or files.depth_scale
-        truth = read_depth(source, scale=scale, channel=files.channel)
+        truth = read_depth(source, scale=scale)
     values = masked(truth.values, files.gt_masks)
     if files.gt_size_ok and size is not None and values.shape != size:
         values = moved_to(file_of(source), values, size)
-    described = describe_range(values, truth.reading, noun="pixels", option="--gt-scale")
+    described = describe_range(values, truth.reading, noun="pixels", option="gt_scale of a list")
     record = _file_record(source) | {"read_as": str(truth.reading)}
     return replace(truth, values=values), record, [f"gt: {described}"]
+
+
+def _scan_options(request: RefineRequest, files: FrameFiles) -> ScanOptions:
+    """How a scan of these files is read; the paper's setting keeps occluded points."""
+    keep = files.scan.keep_occluded or request.method.preset is not None
+    return replace(files.scan, keep_occluded=keep)
 
 
 def _file_record(source: Source) -> dict[str, Any]:
@@ -259,13 +274,13 @@ def _read_sparse(
             raise UsageError(
                 f"{path} is a COLMAP model, so the options of a LiDAR scan do not apply"
             )
-        sparse = read_colmap_points(path, files.colmap, image, size, any_size=files.sparse_size_ok)
-    elif files.colmap != ColmapOptions():
-        raise UsageError(f"{path} is no COLMAP model, so --colmap does not apply")
+        sparse = read_colmap_points(path, image, size, unit_scale=files.unit_scale)
+    elif files.unit_scale is not None:
+        raise UsageError(f"{path} is no COLMAP model, so --unit-scale does not apply")
     elif files.scan.describes(path):
-        sparse = read_scan_points(path, files.scan, size, image)
+        sparse = read_scan_points(path, _scan_options(request, files), size, image)
     else:
-        keep = files.scan.keep_occluded or request.method.preset is not None
+        keep = _scan_options(request, files).keep_occluded
         sparse = _read_points(files, path, size, keep_occluded=keep)
     points = sparse.points.tensors()
     # an array of the image's size that takes no memory, to find the size of the part
@@ -281,17 +296,14 @@ def _read_points(
 ) -> SparseDepth:
     """The points of a depth map or a list, in the image."""
     scale = files.sparse_scale or files.depth_scale
-    visible, reading = read_sparse(path, size=image_size, scale=scale, channel=files.channel)
+    visible, reading = read_sparse(path, size=image_size, scale=scale)
     depth = visible.depth
     size = image_size or visible.size
     check_same_view(str(path), visible.size, size)
-    if visible.size != size and not files.sparse_size_ok:
-        raise SizeError(
-            f"{path} is {visible.size[1]}×{visible.size[0]} but {files.image} is"
-            f" {size[1]}×{size[0]}; --set sparse-size-ok maps the points if both show the same view"
-        )
     notes = [f"sparse: {describe_range(depth, reading)}"]
     record = _file_record(path) | {"read_as": str(reading)}
+    if visible.size != size:
+        notes.append(f"sparse: {moved_note(visible.size, size)}")
     if files.foreground is not None:
         behind = behind_foreground(visible, *files.foreground)
         visible, count = visible.select(~behind), int(behind.sum())
@@ -304,7 +316,7 @@ def _read_points(
         record["dropped"] = {"hidden by foreground": count}
         notes.append(
             f"sparse: a projected LiDAR scan; dropped {count:,} points occluded from the camera by"
-            " nearer ones; --scan keep-occluded keeps them"
+            " nearer ones; --preset paper keeps them"
         )
     points = _inside(path, visible.tensors().resized(*size))
     if len(points) < len(visible):
@@ -365,8 +377,8 @@ def _scale_warning(
     scale_warning("sparse points", 1 / ratio, readings)
     return [
         f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
-        f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give --gt-scale"
-        " or --depth-scale"
+        f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give"
+        " --depth-scale, or a list with gt_scale"
     ]
 
 

@@ -20,7 +20,7 @@ _FILE_SUFFIXES = {
 Outputs = Mapping[str, Path]
 """The files of a result by kind: depth, sigma, preview, …, and last its record."""
 IMAGES = frozenset({"preview", "improvement", "sigma_preview"})
-"""Kinds that not every result has, if the user says so."""
+"""Kinds for a person, which may be deleted."""
 
 
 def outputs_in(folder: Path, name: str, request: RefineRequest) -> dict[str, Path]:
@@ -33,7 +33,6 @@ def outputs_in(folder: Path, name: str, request: RefineRequest) -> dict[str, Pat
         "valid": "_valid.png" if sigma else "",  # mask of the pixels whose depth is valid
         "preview": "_preview.png",
         "improvement": "_improvement.png",
-        "cloud": ".ply" if options.ply else "",
         "view": "_view.json" if options.view_3d else "",  # 3D view for a report
         "record": ".json",
     }
@@ -54,14 +53,10 @@ def plan_outputs(request: RefineRequest) -> dict[str, Path]:
     if f".{options.format}" not in DEPTH_SUFFIXES:
         raise UsageError(f"format {options.format!r} is not one of {formats}")
     if suffix in DEPTH_SUFFIXES:
-        for flag, asked in (
-            ("--uncertainty", request.hold_out.uncertainty),
-            ("--ply", options.ply),
-        ):
-            if asked:
-                raise UsageError(
-                    f"{flag} writes a second file; name a folder, not {output}, with -o"
-                )
+        if request.hold_out.uncertainty:
+            raise UsageError(
+                f"--uncertainty writes a second file; name a folder, not {output}, with -o"
+            )
         outputs = {"depth": output}
     elif suffix in _FILE_SUFFIXES and not output.is_dir():
         raise OutputError(f"{output}: depth is written as {formats}, or into a folder")

@@ -18,7 +18,6 @@ from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.refinement.output_files import Outputs
 from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.colours import depth_scale
 from pnpdepth_cli.io.depth import metres, write_depth
 from pnpdepth_cli.io.figure import Content
@@ -32,7 +31,7 @@ from pnpdepth_cli.io.visualisation import (
     write_mask,
 )
 from pnpdepth_cli.sensors.lens import rays_of
-from pnpdepth_cli.sensors.point_cloud import cloud_from_depth, kept_pixels
+from pnpdepth_cli.sensors.point_cloud import kept_pixels
 
 Image = NDArray[np.float32]
 
@@ -54,12 +53,8 @@ _RAY_NODES = 64
 def output_scale(inputs: Inputs) -> float:
     """Returns the codes per metre of an integer depth file for this frame.
 
-    What the user asks for, else the sparse depth file's own, else 256 unless the points do not fit;
-    known before refinement.
+    The sparse depth file's own, else 256 unless the points do not fit; known before refinement.
     """
-    asked = inputs.request.outputs.output_scale
-    if asked is not None:
-        return asked
     if inputs.sparse_scale is not None:
         return inputs.sparse_scale
     nearest, farthest = float(inputs.own.depth.min()), float(inputs.own.depth.max())
@@ -121,16 +116,9 @@ def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str,
         record["improved_fraction"], record["figures"]["improvement"] = _write_improvement(
             outputs["improvement"], image, inputs, frame
         )
-    if "cloud" in outputs:
-        assert inputs.camera is not None
-        pose = inputs.pose  # known, it moves the cloud into the world's frame
-        parts = cloud_from_depth(frame.after, inputs.camera, rgb=image, keep=frame.valid)
-        moved = (part if pose is None else part.transformed(pose) for part in parts)
-        points = write_cloud(outputs["cloud"], moved)
-        record["cloud"] = {"points": points, "frame": "camera" if pose is None else "world"}
     if "view" in outputs:
         _write_view(outputs["view"], image, inputs, frame)
-    kinds = ("depth", "sigma", "valid", "preview", "improvement", "cloud", "view")
+    kinds = ("depth", "sigma", "valid", "preview", "improvement", "view")
     record["outputs"] = {kind: str(outputs[kind]) if kind in outputs else None for kind in kinds}
     return record
 
@@ -148,9 +136,8 @@ def _write_sigma(path: Path, sigma: Image) -> None:
 def _write_improvement(
     path: Path, image: Image | None, inputs: Inputs, frame: Refined
 ) -> tuple[float, Content]:
-    colors = inputs.request.outputs.colors
     if inputs.gt is not None:
-        return improvement(frame.before, frame.after, inputs.gt, path, rgb=image, colors=colors)
+        return improvement(frame.before, frame.after, inputs.gt, path, rgb=image)
     points = frame.held_out if len(frame.held_out) else frame.used
     return improvement_at_points(
         image if image is not None else frame.before,
@@ -161,7 +148,6 @@ def _write_improvement(
         held_out=bool(len(frame.held_out)),
         path=path,
         unit=inputs.unit,
-        colors=colors,
     )
 
 

@@ -14,7 +14,7 @@ import torch
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.refinement.frame_camera import camera_to_json
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs, plan_outputs
+from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs
 from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
@@ -25,7 +25,7 @@ from pnpdepth_cli.frames.default import ALIGNED, RESULT
 from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
 from pnpdepth_cli.frames.fuse import LINEAR
 from pnpdepth_cli.frames.refiner import Refiner
-from pnpdepth_cli.frames.resolve import normalisation_name, redefined
+from pnpdepth_cli.frames.resolve import normalisation_name, with_input_range
 from pnpdepth_cli.io.atomic import all_or_none
 from pnpdepth_cli.io.record import sha256_of, write_json
 from pnpdepth_cli.models.network import Network, load_network
@@ -85,11 +85,8 @@ def load_refiner(
     """
     choice, hold_out = request.network, request.hold_out
     chosen = [(choice.model, choice.checkpoint), *((spec, None) for spec in choice.more_models)]
-    networks = [
-        load_network(spec, checkpoint, choice.device, precision=choice.precision)
-        for spec, checkpoint in chosen
-    ]
-    networks[0] = redefined(networks[0], choice.output_kind, choice.normalise)
+    networks = [load_network(spec, checkpoint, choice.device) for spec, checkpoint in chosen]
+    networks[0] = with_input_range(networks[0], choice.normalise)
     refiner = Refiner(
         networks,
         request.method,
@@ -109,9 +106,6 @@ def write_refined(
     """
     frame = within_range(outputs, inputs, frame)
     record = record_of(refiner, inputs, frame)
-    planned, previews = outputs, inputs.request.outputs.previews
-    if previews == "none" or (previews == "worst" and not record["linear"]["worse"]):
-        outputs = {kind: path for kind, path in planned.items() if kind not in IMAGES}
     with all_or_none(outputs.values()):
         with watch("write"):
             record |= write_outputs(outputs, inputs, frame)
@@ -119,8 +113,6 @@ def write_refined(
         record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
         if "record" in outputs:
             write_json(outputs["record"], record)
-    for kind in planned.keys() - outputs.keys():
-        planned[kind].unlink(missing_ok=True)  # of an earlier result
     return RefineOutcome(record=record, outputs=outputs, diverged=frame.diverged)
 
 

@@ -6,12 +6,13 @@ Command line options and batch cache keys are derived from these declarations
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import choices
-from pnpdepth_cli.commands.sparse.options import ColmapOptions, ScanOptions
+from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.protocols import WHOLE, ForegroundFilter, FramePart
 from pnpdepth_cli.settings import Settings, option
@@ -19,32 +20,6 @@ from pnpdepth_cli.settings import Settings, option
 if TYPE_CHECKING:
     from pnpdepth_cli.io.dataset import Pose, Source
     from pnpdepth_cli.sensors import SamplePattern
-
-
-def parse_codes_per_metre(text: str) -> float:
-    """Returns the codes per metre of `256` or `mm`. Raises UsageError for any other text."""
-    try:
-        scale = 1000.0 if text == "mm" else float(text)
-    except ValueError:
-        scale = -1.0
-    if not 0 < scale < float("inf"):
-        raise UsageError(f"output-scale {text!r} is neither mm nor codes per metre such as 256")
-    return scale
-
-
-def parse_registration(text: str) -> str | tuple[float, float, float]:
-    """Returns `auto` or `off`, or the three numbers of `0.9,-5,0`. Raises UsageError otherwise."""
-    if text in ("auto", "off"):
-        return text
-    try:
-        zoom, right, down = (float(part) for part in text.split(","))
-        if 0.1 <= zoom <= 10 and abs(right) < float("inf") and abs(down) < float("inf"):
-            return zoom, right, down
-    except ValueError:
-        pass
-    raise UsageError(
-        f"--registration {text!r} is neither auto, off, nor ZOOM,RIGHT,DOWN such as 0.9,-5,0"
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,24 +39,20 @@ class FrameFiles:
     )
     sparse_scale: float | None = None
     """Of the sparse depth, over `depth_scale`."""
-    gt_scale: float | None = option(None, "--depth-scale of the ground truth.", metavar="S")
-    channel: str | None = option(
-        None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
+    gt_scale: float | None = None
+    """Of the ground truth, over `depth_scale`."""
+    unit_scale: float | None = option(
+        None,
+        "Metres per unit of a COLMAP model.  [default: depth is in model units]",
+        metavar="M",
     )
-    sparse_size_ok: bool = option(
-        False,
-        "Accept a sparse depth map of another size; its points are moved to the image.",
-        within="--set",
-    )
-    registration: str | tuple[float, float, float] = option(
+    registration: str = option(
         "auto",
         "Whether the image is moved into the frame of the points: auto, if their depth edges show"
-        " that it is not registered; off; or by ZOOM,RIGHT,DOWN in pixels.",
-        metavar="auto|off|Z,R,D",
-        parse=parse_registration,
+        " that it is not registered; or off.",
+        choices=choices.REGISTRATIONS,
         show_default=True,
     )
-    colmap: ColmapOptions = field(default_factory=ColmapOptions)
     scan: ScanOptions = field(default_factory=ScanOptions)
     camera_file: Path | None = None
     """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
@@ -99,6 +70,12 @@ class FrameFiles:
     """Which points of a depth map are removed; None for the program's own choice."""
     part: FramePart = WHOLE
     """The part of the frame that is used."""
+
+    def __post_init__(self) -> None:
+        if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
+            raise UsageError(
+                f"--unit-scale must be above 0 metres per unit, got {self.unit_scale:g}"
+            )
 
     @property
     def image_file(self) -> Path | None:
@@ -140,24 +117,11 @@ class NetworkChoice:
         "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder. No code in"
         " it is run.",
     )
-    output_kind: str | None = option(
-        None,
-        "Meaning of the network's output, replacing what its definition says.",
-        choices=choices.SPACES,
-        within="--set",
-    )
     normalise: str | None = option(
         None,
-        "RGB range of the network's input: 0…1, ImageNet's mean and std, −1…1, 0…255.",
+        "RGB range of the network's input: 0…1, ImageNet's mean and std, −1…1, 0…255."
+        "  [default: the network's, else the one that fits best]",
         choices=choices.NORMALISATIONS,
-        within="--set",
-    )
-    precision: str = option(
-        "fp32",
-        "Precision of convolutions and matrix products; z, loss and updates stay in fp32.",
-        choices=choices.PRECISIONS,
-        show_default=True,
-        within="--set",
     )
     device: str = option(
         "cpu",
@@ -190,49 +154,14 @@ class OutputOptions:
         choices=choices.FORMATS,
         show_default=True,
     )
-    output_scale: float | None = option(
-        None,
-        "Codes per metre of a 16-bit PNG; mm is 1000.  [default: as the sparse depth file, else 256"
-        " or what fits]",
-        metavar="mm|S",
-        parse=parse_codes_per_metre,
-        within="--set",
-    )
-    ply: bool = option(False, "Also write a coloured point cloud, NAME.ply.")
-    fov_deg: float | None = option(
-        None,
-        "Horizontal field of view, for --ply without --calib, COLMAP model or EXIF.",
-        flag="--fov",
-        metavar="DEG",
-    )
     view_3d: bool = False
-    colors: str = option(
-        "blue-orange",
-        "Colours of better and worse: blue and orange, or the paper's red and green.",
-        choices=choices.COLORS,
-        show_default=True,
-        within="--set",
-    )
-    previews: str = option(
-        "all",
-        "Which frames get preview and improvement images: all, worst (those worse than linear"
-        " interpolation), or none.",
-        choices=choices.PREVIEWS,
-        show_default=True,
-        within="--set",
-    )
     overwrite: bool = option(False, "Replace existing results.")
-
-    @property
-    def needs_camera(self) -> bool:
-        """Whether an output cannot be written without the camera."""
-        return self.ply or self.view_3d
 
 
 _NOT_IN_DIGEST = frozenset(
     {
         *("image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"),
-        *("camera_file", "camera_number", "ply", "view_3d"),
+        *("camera_file", "camera_number", "view_3d"),
     }
 )
 """Fields that say where something lies, whose content is compared instead, or that add a file."""

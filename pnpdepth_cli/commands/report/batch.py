@@ -103,7 +103,7 @@ def write_batch_report(
         else:
             failed.append((row["name"], row["message"]))
     mixed = len(bases - {None}) > 1
-    head = _head(summary, first, failed, request.refine.outputs.colors)
+    head = _head(summary, first, failed)
     with whole_report(folder) as temporary:
         begin_report(temporary, _source(request, folder))
         entries = (
@@ -137,7 +137,7 @@ def _entry(row: Row, columns: Sequence[Mapping[str, Any]], mixed: bool) -> dict[
 def _views(row: Row, request: BatchRequest, folder: Path) -> dict[str, Any]:
     """Links the images of the row's frame; returns the page's entry of them.
 
-    There are none of a result that has gone or changed; the next run refines it again.
+    There are none of a result whose images were deleted.
     """
     files = {kind: request.output / path for kind, path in row["outputs"].items()}
     key, views = image_key(row["name"]), dict[str, Any]()
@@ -221,9 +221,7 @@ def _notes(row: Row, basis: str | None) -> list[str]:
     return [*notes, *row["warnings"]]
 
 
-def _head(
-    summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str, str]], colors: str
-) -> Head:
+def _head(summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str, str]]) -> Head:
     unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), []
     means = summary["mean"] | {"linear": summary["linear"]}
     best = next(iter(errors_by_basis(means)), USED)
@@ -248,7 +246,7 @@ def _head(
         sort_by="rmse_after" if best == USED else columns[0]["key"],
         labels=_LABELS,
         thumb="second",
-        map_colours=hex_colours(signed_bar(colors, 9)),
+        map_colours=hex_colours(signed_bar("gain", 9)),
         unit=unit,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.commands.sparse.scan_points import chosen_camera
-from pnpdepth_cli.errors import InputError, OutputError
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.bags import (
     CLOUDS,
@@ -68,11 +67,18 @@ class FramesRequest:
     bag: Path
     output: Path
     """The folder for rgb/, sparse/, calib.txt, poses.txt and frames.json."""
-    options: BagOptions = field(default_factory=BagOptions)
+    topics: tuple[str, ...] = ()
+    """Of images, of points (PointCloud2) and of poses; else the only one of its kind."""
+    tolerance: float = 0.05
+    """Largest time between an image and its scan, seconds."""
     limit: int | None = None
     overwrite: bool = False
     calib: Path | None = None
     camera: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.tolerance >= 0:
+            raise UsageError(f"--tolerance must be >= 0, got {self.tolerance:g}")
 
     def identity(self) -> dict[str, Any]:
         """Returns what the record of the same frames begins with."""
@@ -81,7 +87,8 @@ class FramesRequest:
             "command": "frames",
             "bag": str(self.bag),
             "bag_files": {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths},
-            "options": asdict(self.options),
+            "topics": list(self.topics),
+            "tolerance": self.tolerance,
             "limit": self.limit,
             "calib": None if self.calib is None else str(self.calib),
             "camera": self.camera,
@@ -98,7 +105,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         UsageError: Topics are ambiguous.
         OutputError: The folder holds files that may not be replaced.
     """
-    folder, wanted, tolerance = request.output, request.options.wanted, request.options.tolerance
+    folder, wanted, tolerance = request.output, request.topics, request.tolerance
     ours = (folder / RECORD).is_file()
     if ours and not request.overwrite:
         raise OutputError(f"{folder} holds the frames of a bag; --overwrite replaces them")
@@ -200,7 +207,7 @@ def _write_calibration(
     if calibration.scanner is None:
         say(
             f"warning: {bag.path} has no static transform from {names[0]} to {names[1]}; refine"
-            " with --scan extrinsics=FILE"
+            " with --extrinsics FILE"
         )
     else:
         say(f"calibration: {source}")
@@ -242,10 +249,10 @@ def _write_poses(
     request: FramesRequest, bag: Bag, camera: str, times: Sequence[float], say: Say
 ) -> str | None:
     """Writes poses.txt if the bag has a pose for every frame; returns the topic, else None."""
-    topics = poses_topics(bag, request.options.wanted)
+    topics = poses_topics(bag, request.topics)
     if len(topics) != 1:
         if topics:
-            say(f"poses: none, as several topics give some; --topics {' | '.join(topics)}")
+            say(f"poses: none, as several topics give some; --topic {' | '.join(topics)}")
         return None
     (topic,) = topics
     trajectory = camera_trajectory(bag, topic, camera)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.commands.sparse.options import METRES, MODEL_UNITS, ColmapOptions
+from pnpdepth_cli.commands.sparse.options import METRES, MODEL_UNITS
 from pnpdepth_cli.commands.sparse.scan_points import SparseDepth
-from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
+from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.io.colmap_model import (
     ColmapModel,
     find_model,
@@ -17,7 +17,7 @@ from pnpdepth_cli.io.colmap_model import (
     name_in_model,
     read_model,
 )
-from pnpdepth_cli.io.dataset.reading import check_same_view
+from pnpdepth_cli.io.dataset.reading import check_same_view, moved_note
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.formats import Reading
@@ -30,9 +30,15 @@ _SIZES_IN_RANGE = 8.0
 
 _LARGEST_CODE = 65535
 
+_LEAST_TRACK = 3
+"""Points that fewer images observe are dropped: two rays meet anywhere along one of them."""
+
+_MOST_REPROJECTION_PX = 2.0
+"""Points with a larger mean reprojection error are dropped; COLMAP itself keeps up to 4 pixels."""
+
 
 def read_colmap_points(
-    path: Path, options: ColmapOptions, image: Path, size: tuple[int, int], *, any_size: bool
+    path: Path, image: Path, size: tuple[int, int], *, unit_scale: float | None = None
 ) -> SparseDepth:
     """Returns the points that COLMAP matched in an image, projected into it.
 
@@ -40,45 +46,40 @@ def read_colmap_points(
 
     Args:
         path: Folder of the model.
-        options: Limits and unit.
         image: The photo.
         size: (H, W) of the photo.
-        any_size: Whether a photo of another size than the model's camera is accepted.
+        unit_scale: Metres per unit of the model. None: depth is in its units.
 
     Raises:
         InputError: The model cannot be read, or lacks the image.
-        SizeError: The photo is not of the camera's size.
+        SizeError: The photo does not show the camera's view.
         NoPointsError: No point is left.
     """
     model = read_model(path)
     name = name_in_model(model, image)
     camera = model.cameras[model.images[name].camera]
     assert camera.size is not None  # of every camera of a model
-    if camera.size != size and not any_size:
-        raise SizeError(
-            f"{image} is {size[1]}×{size[0]} but its camera in {model.folder} is"
-            f" {camera.size[1]}×{camera.size[0]}; give the photo that COLMAP was given, unrotated,"
-            " or --set sparse-size-ok if it was only resized"
-        )
     check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
-    points = _observed(model, name, options)
+    points = _observed(model, name, unit_scale or 1.0)
     turn, shift = model.images[name].rotation.T, model.images[name].translation
-    unit = MODEL_UNITS if options.unit_scale is None else METRES
+    unit = MODEL_UNITS if unit_scale is None else METRES
     reading = Reading(
         f"COLMAP model, image {name}, {camera.source}",
         scale=_output_scale(model) if unit == MODEL_UNITS else None,
     )
     notes = [f"sparse: {describe_range(points.depth, reading, unit=unit)}"]
+    if camera.size != size:
+        notes.append(f"sparse: {moved_note(camera.size, size)}")
     if camera.has_lens:
         notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
     lost = describe_dropped(points.dropped)
     notes += [f"sparse: dropped {lost}"] if lost else []
     if unit == MODEL_UNITS:
-        notes.append("unit: depth is in model units; --colmap unit-scale=M gives metres per unit")
+        notes.append("unit: depth is in model units; --unit-scale M gives metres per unit")
     return SparseDepth(
         points=points.resized(*size),
         camera=replace(camera.resized(*size), source=f"COLMAP model {path}"),
-        pose=np.column_stack([turn, -turn @ shift * (options.unit_scale or 1.0)]),
+        pose=np.column_stack([turn, -turn @ shift * (unit_scale or 1.0)]),
         unit=unit,
         reading=reading,
         record={
@@ -88,16 +89,14 @@ def read_colmap_points(
             "image": name,
             "lens": camera.lens,
             "distortion": list(camera.distortion),
-            "unit_scale": options.unit_scale,
-            "min_track": options.min_track,
-            "max_reprojection": options.max_reprojection,
+            "unit_scale": unit_scale,
             "dropped": dict(points.dropped),
         },
         notes=tuple(notes),
     )
 
 
-def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
+def _observed(model: ColmapModel, name: str, unit_scale: float) -> Points:
     """The points in the image's tracks that pass the filters, in the frame of its camera's size."""
     image, points = model.images[name], model.points
     camera = model.cameras[image.camera]
@@ -109,10 +108,10 @@ def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
     if not len(row):
         raise NoPointsError(f"{model.folder} has no points in {name!r}; register it with matches")
     drops = DropCounter()
-    least = min(options.min_track, len(model.images))
+    least = min(_LEAST_TRACK, len(model.images))
     row = row[drops.keep(points.track[row] >= least, f"seen in fewer than {least} images")]
-    why = f"with a reprojection error above {options.max_reprojection:g} px"
-    row = row[drops.keep(points.error[row] <= options.max_reprojection, why)]
+    why = f"with a reprojection error above {_MOST_REPROJECTION_PX:g} px"
+    row = row[drops.keep(points.error[row] <= _MOST_REPROJECTION_PX, why)]
     seen = points.xyz[row] @ image.rotation.T + image.translation
     front = drops.keep(seen[:, 2] > 0, "behind the camera")
     if len(row) and not front.any():
@@ -122,11 +121,11 @@ def _observed(model: ColmapModel, name: str, options: ColmapOptions) -> Points:
         )
     seen = seen[front]
     seen, xy = drops.keep_seen(seen, pixels_of(camera, seen), camera.size)
-    depth = seen[:, 2] * (options.unit_scale or 1.0)
+    depth = seen[:, 2] * unit_scale
     if not len(depth):
         raise NoPointsError(
             f"none of the {len(known):,} points of {name!r} in {model.folder} is left ({drops});"
-            " relax --colmap min-track or max-reprojection"
+            " register it with more matches"
         )
     return Points(
         xy=xy.astype(np.float32),

@@ -137,7 +137,7 @@ def project_scan(
 
     Args:
         scan: Its file.
-        options: Calibration and limits.
+        options: The calibration.
         target: Files to write.
         image: The camera's image, which gives the size and the ground of an overlay.
         size: (H, W) of the image, where there is no file of it.
@@ -152,8 +152,6 @@ def project_scan(
         size = (rgb.shape[0], rgb.shape[1])
     projected = read_scan_points(scan, options, size, image)
     settings = plain(asdict(options))
-    if options.point_fields is None:
-        del settings["point_fields"]
     inputs, notes = {"image": image, "scan": projected.record}, projected.notes
     return target.write("project", projected.points, settings, inputs=inputs, notes=notes, rgb=rgb)
 

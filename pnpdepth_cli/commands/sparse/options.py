@@ -1,8 +1,7 @@
-"""Options of a LiDAR scan, a COLMAP model and a bag. Imports neither numpy nor torch."""
+"""Options of a LiDAR scan. Imports neither numpy nor torch."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,35 +23,13 @@ class ScanOptions:
     extrinsics: Path | None = option(
         None,
         "Pose of the scanner in the camera's frame: matrix, quaternion or tf.",
-        within="--scan",
         metavar="FILE",
-    )
-    inverse_extrinsics: bool = option(
-        False, "The pose maps the camera to the scanner.", within="--scan"
     )
     camera: int | None = option(
         None, "Camera number of KITTI (0 to 3) or Kalibr.  [default: 2; 0]", metavar="N"
     )
-    euclidean: bool = option(
-        False, "Depth is the distance from the camera, not z.", within="--scan"
-    )
-    keep_occluded: bool = option(
-        False, "Keep LiDAR points that are occluded from the camera.", within="--scan"
-    )
-    min_range: float = option(
-        0.0, "Drop points nearer than M metres.", within="--scan", metavar="M"
-    )
-    max_range: float | None = option(
-        None, "Drop points farther than M metres.", within="--scan", metavar="M"
-    )
-    point_fields: int | None = option(
-        None,
-        "Float32 numbers of a point in a .bin: KITTI 4, nuScenes 5.  [default: recognised]",
-        within="--scan",
-        metavar="N",
-        least=3,
-        most=64,
-    )
+    keep_occluded: bool = False
+    """Whether points that are occluded from the camera stay."""
 
     def describes(self, sparse: Path) -> bool:
         """Returns whether the sparse depth is a scan: by its suffix, or a .npy with a calibration.
@@ -76,64 +53,3 @@ class ScanOptions:
                 " scan needs --calib"
             )
         return False
-
-
-@dataclass(frozen=True, kw_only=True)
-class ColmapOptions:
-    """Which points of a COLMAP model are used, and their unit."""
-
-    unit_scale: float | None = option(
-        None,
-        "Metres per unit of a COLMAP model.  [default: depth is in model units]",
-        within="--colmap",
-        metavar="M",
-    )
-    min_track: int = option(
-        3,
-        "Drop points of a COLMAP model that fewer images observe.",
-        within="--colmap",
-        metavar="N",
-        show_default=True,
-    )
-    max_reprojection: float = option(
-        2.0,
-        "Drop points of a COLMAP model with a larger mean reprojection error.",
-        within="--colmap",
-        metavar="PIXELS",
-        show_default=True,
-    )
-
-    def __post_init__(self) -> None:
-        if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
-            raise UsageError(f"unit-scale must be above 0 metres per unit, got {self.unit_scale:g}")
-        if self.min_track < 1:
-            raise UsageError(f"min-track must be >= 1, got {self.min_track}")
-        if not self.max_reprojection > 0:
-            raise UsageError(f"max-reprojection must be above 0, got {self.max_reprojection:g}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class BagOptions:
-    """Which messages of a ROS bag make a frame."""
-
-    topics: str | None = option(
-        None,
-        "Topics of a bag, separated by commas: of images, points (PointCloud2), and poses."
-        "  [default: the only ones]",
-        metavar="TOPIC,...",
-    )
-    tolerance: float = option(
-        0.05,
-        "Largest time between an image of a bag and its scan.",
-        metavar="SECONDS",
-        show_default=True,
-    )
-
-    def __post_init__(self) -> None:
-        if not self.tolerance >= 0:
-            raise UsageError(f"--tolerance must be >= 0, got {self.tolerance:g}")
-
-    @property
-    def wanted(self) -> list[str]:
-        """The names of the topics."""
-        return [name for name in (self.topics or "").split(",") if name]

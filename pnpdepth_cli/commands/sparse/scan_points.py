@@ -61,7 +61,7 @@ def read_scan_points(
 
     Args:
         path: The scan.
-        options: Calibration and limits.
+        options: The calibration, and whether occluded points stay.
         size: (H, W) of the image; None for the calibration's.
         image: Its file; tells whether it is rectified, where the calibration leaves that open.
 
@@ -81,15 +81,13 @@ def read_scan_points(
     if calibration.scanner is None:
         raise UsageError(
             f"{named} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or"
-            " give --scan extrinsics=FILE"
+            " give --extrinsics FILE"
         )
-    if options.inverse_extrinsics:
-        calibration = replace(calibration, scanner=calibration.scanner.inverse())
     size = size or calibration.camera.size
     if size is None:
         raise SizeError(f"{named} does not give the image's size; give --image or --size")
     warnings = check_size(named, calibration.camera, size, image)
-    scan = read_scan(path, options.point_fields)
+    scan = read_scan(path)
     if calibration.rectified:
         frames = [] if image is None else [(read_rgb(image).values, scan.points)]
         calibration, note = chosen_camera(calibration, frames)
@@ -103,8 +101,6 @@ def read_scan_points(
         camera,
         scanner,
         size,
-        euclidean=options.euclidean,
-        limits=(options.min_range, np.inf if options.max_range is None else options.max_range),
         keep_occluded=options.keep_occluded,
     )
     warnings += _outside_warning(scanner.moved(scan.points), camera, size)
@@ -122,10 +118,6 @@ def read_scan_points(
             "calibration": str(named),
             "camera": options.camera,
             "extrinsics": None if options.extrinsics is None else str(options.extrinsics),
-            "inverse_extrinsics": options.inverse_extrinsics,
-            "depth_is": "range" if options.euclidean else "z",
-            "min_range": options.min_range,
-            "max_range": options.max_range,
             "keep_occluded": options.keep_occluded,
             "dropped": dict(points.dropped),
         },
@@ -218,7 +210,7 @@ def check_direction(
         return []
     text = (
         f"the extrinsics put {inside:,} of {len(scan):,} scan points into the image, their inverse"
-        f" {inverted:,}; if they map the camera to the scanner, add --scan inverse-extrinsics"
+        f" {inverted:,}; if they map the camera to the scanner, give their inverse"
     )
     if inside < _NEXT_TO_NONE * inverted:
         raise UsageError(text)

@@ -121,7 +121,9 @@ def topic_of(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> str:
     if len(names) != 1:
         listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
         what = f"several topics of {kinds[0]}" if names else f"no topic of {kinds[0]}"
-        raise UsageError(f"{bag.path} has {what}; choose with --topics: {listing or 'none'}")
+        raise UsageError(
+            f"{bag.path} has {what}; choose with --topic of `pnpdepth frames`: {listing or 'none'}"
+        )
     return names[0]
 
 

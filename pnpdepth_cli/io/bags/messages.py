@@ -49,7 +49,7 @@ def image_file(message: Any, topic: str) -> tuple[str, bytes]:
         if suffix is None:
             raise FileFormatError(
                 f"{topic}: a compressed image ({one_line(message.format)[:30]}) is neither JPEG nor"
-                " PNG; name another topic with --topics"
+                " PNG; name another topic with --topic"
             )
         return suffix, data
     done, encoded = cv2.imencode(".png", _pixels(message, topic), [cv2.IMWRITE_PNG_COMPRESSION, 1])

@@ -86,7 +86,6 @@ class Frame:
     """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""
     gt_other_size: bool = False
     """Whether the ground truth may have another size than the image, of the same view."""
-    sparse_other_size: bool = False
     group: str | None = None  # the sequence it belongs to; None derives it from the name
 
     def __post_init__(self) -> None:

@@ -69,6 +69,11 @@ def check_same_view(what: str, own: tuple[int, ...], size: tuple[int, int]) -> N
         )
 
 
+def moved_note(own: tuple[int, ...], size: tuple[int, int]) -> str:
+    """Returns what a person should know of points of the size `own` (H, W) in an image (H, W)."""
+    return f"points of {own[1]}×{own[0]} are moved to the image of {size[1]}×{size[0]}"
+
+
 def moved_to(path: Path, depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
     """Returns the known depths (H, W) at the pixels of an image of the same view; the nearest wins.
 

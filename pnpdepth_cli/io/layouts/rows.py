@@ -63,7 +63,6 @@ ROWS: dict[str, Layout] = {
         below="|*/|*/*/",
         name=_joined("/"),
         sparse_scale=1000.0,
-        sparse_other_size=True,
         gt_scale=1000.0,
         gt_other_size=True,
     ),

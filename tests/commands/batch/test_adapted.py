@@ -34,8 +34,6 @@ def test_better_weights_are_used_for_every_frame_and_found_again(
     drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(adapting.Learnt, "is_better", True)
-    assert batch(drive, "--dry-run") == 0
-    assert not (drive.parent / "out").exists()
     assert batch(drive) == 0
     weights = drive.parent / "out/adapted/drive.safetensors"
     for number in range(8):
@@ -45,8 +43,6 @@ def test_better_weights_are_used_for_every_frame_and_found_again(
     capsys.readouterr()
     assert batch(drive) == 0
     assert "8 frames, all of them done already" in capsys.readouterr().err
-    assert batch(drive, "--dry-run") == 0
-    assert capsys.readouterr().out == ""
     assert weights.stat().st_mtime_ns == before
 
 

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import threading
-import time
 import weakref
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import pytest
 
 from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.commands.batch import running as batch_running
-from pnpdepth_cli.commands.batch.batch import plan_batch, run_batch
+from pnpdepth_cli.commands.batch.batch import run_batch
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import _SCORES, Tally, failed_row
 from pnpdepth_cli.commands.refinement.inputs import read_inputs
@@ -52,7 +51,7 @@ def summary(root: Path) -> dict[str, Any]:
 
 
 def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> None:
-    batch(root, workers=3, refine={"holdout": 0.3, "seed": 5})
+    batch(root, refine={"holdout": 0.3, "seed": 5})
     together = results(root / "out")
     shutil.rmtree(root / "out")
     refine_one_by_one(root, NAMES, holdout=0.3, seed=5)
@@ -76,7 +75,7 @@ def test_a_second_run_does_nothing_also_where_files_were_touched_or_moved(root: 
 @pytest.mark.parametrize(
     ("source", "changed", "why"),
     [
-        (None, "out/b_preview.png", "result missing: b_preview.png"),
+        (None, "out/b_depth.png", "result missing: b_depth.png"),
         ("rgb/c.png", "rgb/b.png", "input changed: image"),
         ("gt/a.png", "gt/b.png", "other input files"),
         ("rgb/c.png", "out/b.json", "record damaged"),
@@ -92,8 +91,10 @@ def test_only_what_is_missing_or_changed_is_done_again(
     if source:
         shutil.copy(root / source, root / changed)
     request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
-    assert plan_batch(request, lambda text: None) == [("b", why)]
-    assert done(root) == ["b"]
+    listener = RecordingListener()
+    run_batch(request, listener)
+    assert any(f"1 to do (1 {why.partition(':')[0]})" in text for text in listener.messages)
+    assert listener.names == ["b"]
     redone = results(root / "out")
     shutil.rmtree(root / "out")
     batch(root)
@@ -106,7 +107,7 @@ def test_other_settings_or_other_code_in_the_same_file_do_all_again(root: Path) 
         "def loss(predicted, measured):\n    return (predicted - measured).abs().mean()"
     )
     batch(root, limit=2)
-    for settings in ({"precision": "bf16"}, {"format": "exr"}, {"loss": str(loss)}):
+    for settings in ({"normalise": "bytes"}, {"format": "exr"}, {"loss": str(loss)}):
         listener = RecordingListener()
         batch(root, listener, limit=2, refine=settings)
         assert listener.names == ["a", "b"]
@@ -257,11 +258,10 @@ def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
         output=root / "out",
         refine=refinement(root, uncertainty=True, iterations=0),
     )
-    said: list[str] = []
-    assert plan_batch(request, said.append) == [("ok", "new"), ("fin\u00e9", "new")]
-    assert sum(f"{why}; rename it" in line for line in said) == 1
     listener = RecordingListener()
     counts = run_batch(request, listener).summary["counts"]
+    assert listener.names == ["ok", "fin\u00e9"]
+    assert sum(f"{why}; rename it" in line for line in listener.messages) == 1
     assert (counts["frames"], counts["done"], counts["failed"], counts["pending"]) == (3, 2, 1, 0)
     assert [row["status"] for row in listener.rows] == ["done", "done"]
     assert not (root / "up_depth.png").exists()
@@ -323,16 +323,6 @@ def test_the_summary_has_the_mean_and_the_range_of_each_weight() -> None:
     weights = tally.means()["weights"]
     assert weights["net"] == {"mean": pytest.approx(0.2), "least": 0.1, "largest": 0.4}
     assert list(weights) == ["net", "other"]
-
-
-def test_a_profile_counts_the_frames_and_seconds_of_the_run(root: Path) -> None:
-    start = time.perf_counter()
-    profile = batch(root, profile=True).summary["profile"]
-    elapsed, seconds = time.perf_counter() - start, profile["seconds"]
-    assert profile["frames"] == len(NAMES)
-    assert 0 < seconds["refine"] < seconds["wall"] < elapsed
-    assert profile["frames_per_second"] == pytest.approx(len(NAMES) / seconds["wall"], rel=1e-2)
-    assert profile["network_busy"] == pytest.approx(seconds["refine"] / seconds["wall"], rel=1e-2)
 
 
 def test_a_record_that_lacks_what_the_summary_needs_is_an_error_that_names_it(root: Path) -> None:
@@ -410,9 +400,8 @@ def test_empty_folders_are_an_error_that_names_the_layouts(tmp_path: Path) -> No
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("batch_size", "most_allowed"), [(1, 6), (2, 6 + 2 * 2)])
 def test_only_a_few_frames_are_in_memory_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch_size: int, most_allowed: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = pairs_on_disk(tmp_path / "drive", tuple(f"{i:02}" for i in range(12)), gt=False)
     alive: weakref.WeakSet[Any] = weakref.WeakSet()
@@ -426,8 +415,9 @@ def test_only_a_few_frames_are_in_memory_at_once(
         return inputs
 
     monkeypatch.setattr(batch_running, "read_inputs", watched)
-    batch(root, workers=1, batch_size=batch_size, refine={"iterations": 0, "previews": "none"})
-    assert most <= most_allowed
+    monkeypatch.setattr(batch_running, "THREADS", 1)
+    batch(root, refine={"iterations": 0})
+    assert most <= 6
 
 
 def test_reading_and_writing_go_on_while_the_network_runs(
@@ -460,7 +450,8 @@ def test_reading_and_writing_go_on_while_the_network_runs(
     monkeypatch.setattr(batch_running, "read_inputs", reading)
     monkeypatch.setattr(batch_running, "write_refined", writing)
     monkeypatch.setattr(Refiner, "refine_frame", refining)
-    assert batch(root, workers=1).summary["counts"]["done"] == 4
+    monkeypatch.setattr(batch_running, "THREADS", 1)
+    assert batch(root).summary["counts"]["done"] == 4
 
 
 def test_a_plain_prediction_without_scores_ends_no_batch(

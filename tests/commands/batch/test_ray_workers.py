@@ -73,7 +73,7 @@ def results(
     rows = list(
         rows_of_actors(
             Calls(), [SimpleNamespace(ready=ready, refine=refining) for _ in range(3)], to_do,
-            retries=2, worked=worked, say=messages.append, stopped=stopped,
+            worked=worked, say=messages.append, stopped=stopped,
             lost=lambda frame, why: {"name": frame, "status": "failed", "message": why},
         )
     )  # fmt: skip
@@ -184,12 +184,12 @@ def test_addresses_of_clusters_and_what_is_none() -> None:
         ("cuda:0,cuda:2", {}, (LOCAL, "cuda", (0, 2))),
         ("all", {}, (LOCAL, "cuda", ())),
         ("cpu", {"ray": "auto"}, ("auto", "cpu", ())),
-        ("cuda:1", {"ray_workers": 2}, "are of Ray workers; add --ray"),
+        ("cuda:1", {"cpus_per_worker": 2}, "is of Ray workers; add --ray"),
         ("cuda:0,cuda:0", {}, "name each GPU once"),
         ("cuda,cuda", {}, "name each GPU once"),
         ("cpu,cuda:0", {}, "workers run on cpu, cuda"),
         ("mps,mps", {}, "workers run on cpu, cuda"),
-        ("cuda:0,cuda:1", {"ray": "auto"}, "take --device cuda, and --ray-workers 2"),
+        ("cuda:0,cuda:1", {"ray": "auto"}, "take --device cuda"),
     ],
 )
 def test_which_devices_are_workers(device: str, options: dict[str, Any], expected: Any) -> None:

@@ -9,13 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.refinement.outputs import output_scale, within_range
-from pnpdepth_cli.commands.refinement.request import parse_codes_per_metre
 from pnpdepth_cli.core.refine import Refinement
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.frame import Refined, no_points
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.points import SparsePoints
@@ -80,18 +77,3 @@ def test_a_refinement_beyond_the_format_is_written_with_a_note(tmp_path: Path) -
     assert any("pixels clipped to 65.5 m" in note for note in record["notes"])
     assert read_depth(tmp_path / "out" / "img_depth.png").values.max() == np.float32(65.534)
     assert json.loads((tmp_path / "out" / "img.json").read_text())["notes"] == record["notes"]
-
-
-def test_an_output_scale_is_mm_or_a_number() -> None:
-    assert [parse_codes_per_metre(text) for text in ("mm", "5", "0.5")] == [1000, 5, 0.5]
-    for text in ("cm", "0", "-1", "inf", "nan", ""):
-        with pytest.raises(UsageError, match="neither mm nor codes per metre"):
-            parse_codes_per_metre(text)
-
-
-def test_a_file_in_millimetres_holds_depth_times_a_thousand(tmp_path: Path) -> None:
-    record = run(frame_on_disk(tmp_path), output_scale=1000.0).record
-    written = read_depth(tmp_path / "out" / "img_depth.png")
-    assert written.reading.scale == 1000
-    codes = np.asarray(Image.open(record["outputs"]["depth"]))
-    assert (np.rint(written.values * 1000) == codes).all()

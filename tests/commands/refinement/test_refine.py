@@ -63,7 +63,9 @@ def test_ground_truth_whose_assumed_scale_is_another_one_in_use_stops_and_names_
 ) -> None:
     codes = np.rint(read_depth(frame.gt).values * scale).astype(np.uint16)
     Image.fromarray(codes).save(frame.folder / "codes.png")  # 256 is assumed
-    with pytest.raises(InputError, match=r"a scale is probably wrong; --gt-scale [\d.]+ \(now 256"):
+    with pytest.raises(
+        InputError, match=r"a scale is probably wrong; gt_scale of a list [\d.]+ \(now"
+    ):
         run(frame, gt=frame.folder / "codes.png")
     assert not (frame.folder / "out").exists()
     if scale > 1:
@@ -137,18 +139,23 @@ def test_of_a_result_that_cannot_be_written_whole_nothing_stays(
 
 def test_the_record_has_every_setting_that_changes_the_depth(frame: FrameOnDisk) -> None:
     plain = run(frame, iterations=0).record["settings"]
-    for name, value in (("propagate", "gp"), ("output_kind", "inverse"), ("normalise", "bytes")):
+    for name, value in (("propagate", "gp"), ("normalise", "bytes")):
         other = run(frame, iterations=0, overwrite=True, **{name: value}).record["settings"]
         assert {key for key in other if other[key] != plain[key]} == {name}
         assert other[name] == value
 
 
-def test_sparse_depth_of_another_size_is_mapped_only_when_asked_for(frame: FrameOnDisk) -> None:
-    half = frame.folder / "half.npy"
+def test_sparse_depth_of_another_size_is_moved_if_it_shows_the_same_view(
+    frame: FrameOnDisk,
+) -> None:
+    half, part = frame.folder / "half.npy", frame.folder / "part.npy"
     write_depth(half, frame.depth[::2, ::2])
-    with pytest.raises(SizeError, match=r"\b31×23 but .* is 62×46; --set sparse-size-ok"):
-        run(frame, sparse=half)
-    assert run(frame, sparse=half, sparse_size_ok=True).record["points"]["used"] == 23 * 31
+    write_depth(part, frame.depth[:, :40])
+    record = run(frame, sparse=half).record
+    assert record["points"]["used"] == 23 * 31
+    assert any("31×23" in note and "62×46" in note for note in record["notes"])
+    with pytest.raises(SizeError, match=r"40×46"):
+        run(frame, sparse=part, overwrite=True)
 
 
 def test_a_point_between_pixels_is_enough_and_points_outside_are_counted(
@@ -202,14 +209,11 @@ BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"gt": "empty.npy"}, InputError, "no pixel with known depth"),
     ({"sparse": None}, InputError, "has no sparse depth; add it, or sample the ground truth"),
     ({"sparse": None, "sample": SamplePattern(count=9)}, InputError, "no ground truth to sample"),
-    ({"sparse": ".", "scan": ScanOptions(max_range=9.0)}, UsageError, "of a LiDAR scan do not app"),
+    ({"sparse": ".", "scan": ScanOptions(camera=1)}, UsageError, "of a LiDAR scan do not app"),
     ({"sparse": "far.csv"}, NoPointsError, "none of its 1 points lies in the image"),
-    ({"output_kind": "metric"}, UsageError, "output kind 'metric' is not one of"),
     ({"normalise": "grey"}, UsageError, "normalise 'grey' is none of"),
     ({"sparse": "one.csv", "holdout": 0.5}, UsageError, "at least two sparse points"),
-    ({"ply": True}, UsageError, r"--ply needs the camera, .* give --calib or --fov"),
-    ({"ply": True, "fov_deg": 180.0}, UsageError, "--fov is 180 degrees"),
-    ({"ply": True, "fov_deg": 60.0, "output": Path("a.exr")}, UsageError, "--ply writes a second"),
+    ({"view_3d": True}, UsageError, r"--html-3d needs the camera, .* give --calib"),
     ({"uncertainty": True, "output": Path("a.exr")}, UsageError, "--uncertainty writes a second"),
 ]
 

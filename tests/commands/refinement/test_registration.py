@@ -14,9 +14,8 @@ import torch
 from pnpdepth_cli import Refiner, load_network
 from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.refine import load_refiner
-from pnpdepth_cli.commands.refinement.request import RefineRequest, parse_registration
+from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.completion.image_registration import estimated, evidence
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.settings import Settings
@@ -144,11 +143,3 @@ def test_arrays_in_memory_are_registered_too() -> None:
     with Refiner(network, fixed) as auto, Refiner(network, fixed, registration="off") as off:
         assert any("moved into the frame" in note for note in auto.refine(rgb, points).notes)
         assert not any("moved into" in note for note in off.refine(rgb, points).notes)
-
-
-def test_a_registration_is_auto_off_or_zoom_and_shift() -> None:
-    assert parse_registration("0.9,-5,0") == (0.9, -5.0, 0.0)
-    assert parse_registration("auto") == "auto"
-    for text in ("", "on", "1,2", "0,0,0", "nan,0,0", "1,inf,0", "1,2,3,4", "a,b,c"):
-        with pytest.raises(UsageError, match="neither auto, off, nor ZOOM,RIGHT,DOWN"):
-            parse_registration(text)

@@ -26,10 +26,17 @@ def unpacked(text: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), kind).reshape(shape)
 
 
+def calib_in(folder: Path) -> Path:
+    path = folder / "k.txt"
+    path.write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]")
+    return path
+
+
 @pytest.fixture
 def view(tmp_path: Path) -> dict[str, Any]:
     frame = frame_on_disk(tmp_path)
-    run(frame, view_3d=True, fov_deg=60.0, format="npy", gt=frame.gt)
+    scan = ScanOptions(calib=calib_in(tmp_path))
+    run(frame, view_3d=True, scan=scan, format="npy", gt=frame.gt)
     content: dict[str, Any] = json.loads((tmp_path / "out" / "img_view.json").read_text())
     return content
 
@@ -48,7 +55,7 @@ def test_depths_are_those_of_the_cloud_to_a_ten_thousandth(
         assert depth[kept] == pytest.approx(expected[kept], rel=1e-4)
     assert view["depths"]["before"] != view["depths"]["after"]
     assert (view["stride"], view["whole"], view["farthest"]) == (1, view["size"], far)
-    assert view["spacing"] == pytest.approx(2 * math.tan(math.radians(30)) / width)
+    assert view["spacing"] == pytest.approx(1 / 50)
 
 
 def test_points_have_a_spacing_where_the_lens_shows_nothing_in_a_corner(tmp_path: Path) -> None:
@@ -63,7 +70,8 @@ def test_points_have_a_spacing_where_the_lens_shows_nothing_in_a_corner(tmp_path
 def test_a_depth_that_is_the_same_everywhere_has_a_range(tmp_path: Path) -> None:
     frame = frame_on_disk(tmp_path)
     frame.model.write_text(frame.model.read_text().replace("2 + 3 *", "2 + 0 *"))
-    run(frame, view_3d=True, fov_deg=60.0, iterations=0, align="none")
+    scan = ScanOptions(calib=calib_in(tmp_path))
+    run(frame, view_3d=True, scan=scan, iterations=0, align="none")
     view = json.loads((tmp_path / "out" / "img_view.json").read_text())
     assert view["range"] == pytest.approx([2, 2.002])
     assert {*unpacked(view["depths"]["after"], "<u2", (46 * 62,))} == {1}

@@ -13,7 +13,6 @@ from pnpdepth_cli.commands.batch.frames import unpacked
 from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.sparse import bag_frames
-from pnpdepth_cli.commands.sparse.options import BagOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.bags.transforms import camera_trajectory
@@ -76,7 +75,7 @@ def test_poses_that_are_missing_for_some_images_are_not_written(
 def test_a_topic_without_poses_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "drive.mcap", poses="odometry")
     with pytest.raises(UsageError, match=r"no topic /gps of .*/odom"):
-        written(bag, tmp_path / "frames", options=BagOptions(topics="/gps"))
+        written(bag, tmp_path / "frames", topics=("/gps",))
 
 
 def test_a_fixed_transform_that_is_repeated_is_no_motion(tmp_path: Path) -> None:
@@ -95,5 +94,5 @@ def test_a_batch_of_a_bag_accumulates_with_its_poses(tmp_path: Path) -> None:
         refine=RefineRequest(),
         sequence=SequenceOptions(accumulate=1),
     )
-    poses = unpacked(request, BagOptions(), lambda text: None).sequence.poses
+    poses = unpacked(request, lambda text: None).sequence.poses
     assert poses == tmp_path / "out_frames/poses.txt"

@@ -12,8 +12,9 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.cli.main import run as run_command
+from pnpdepth_cli.commands.refinement.request import FrameFiles
+from pnpdepth_cli.commands.sparse import colmap_points
 from pnpdepth_cli.commands.sparse.colmap_points import read_colmap_points
-from pnpdepth_cli.commands.sparse.options import ColmapOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.layouts import list_frames
@@ -37,13 +38,7 @@ def project(tmp_path: Path) -> Path:
 
 
 def read(project: Path, name: str = "a.png", **options: Any) -> Any:
-    return read_colmap_points(
-        project,
-        ColmapOptions(**options),
-        project / "images" / name,
-        (HEIGHT, WIDTH),
-        any_size=False,
-    )
+    return read_colmap_points(project, project / "images" / name, (HEIGHT, WIDTH), **options)
 
 
 def change(project: Path, file: str, old: str, new: str) -> None:
@@ -56,13 +51,10 @@ def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> dict[str, Any]:
     return run(frame, **(files | changes)).record
 
 
-@pytest.mark.parametrize(
-    ("name", "wrong"),
-    [("min_track", 0), ("max_reprojection", 0.0), ("unit_scale", 0.0), ("unit_scale", np.inf)],
-)
-def test_options_out_of_range_are_refused(name: str, wrong: float) -> None:
-    with pytest.raises(UsageError, match=f"{name.replace('_', '-')} must be"):
-        ColmapOptions(**{name: wrong})  # type: ignore[arg-type]
+@pytest.mark.parametrize("wrong", [0.0, -1.0, np.inf, np.nan])
+def test_a_unit_out_of_range_is_refused(wrong: float) -> None:
+    with pytest.raises(UsageError, match="--unit-scale must be"):
+        FrameFiles(unit_scale=wrong)
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -81,20 +73,17 @@ def test_a_photo_with_exif_rotation_is_read_as_colmap_reads_it(
     assert "image: EXIF rotation not applied, as COLMAP reads the photo" in turned["notes"]
 
 
-def test_a_photo_of_another_view_is_refused_whatever_size_is_allowed(project: Path) -> None:
+def test_a_photo_of_another_view_is_refused_whatever_its_size(project: Path) -> None:
     for size, why in (((WIDTH, HEIGHT), "turned by 90°"), ((WIDTH, 3 * WIDTH), "same view")):
         with pytest.raises(SizeError, match=why):
-            read_colmap_points(
-                project, ColmapOptions(), project / "images/a.png", size, any_size=True
-            )
+            read_colmap_points(project, project / "images/a.png", size)
 
 
 @pytest.mark.parametrize("name", ["03", "04"])
 def test_a_real_model_agrees_with_the_ground_truth_up_to_one_scale(name: str) -> None:
     truth = read_depth(PHOTOS / "gt" / f"{name}.png").values
     image = PHOTOS / "images" / f"{name}.jpg"
-    options = ColmapOptions(unit_scale=METRES_PER_UNIT)
-    points = read_colmap_points(PHOTOS, options, image, truth.shape, any_size=False).points
+    points = read_colmap_points(PHOTOS, image, truth.shape, unit_scale=METRES_PER_UNIT).points
     assert len(points) > 100
     column, row = np.rint(points.xy).astype(int).T
     known = truth[row, column] > 0
@@ -103,13 +92,16 @@ def test_a_real_model_agrees_with_the_ground_truth_up_to_one_scale(name: str) ->
     assert np.mean(np.abs(ratio - 1) < 0.05) > 0.7
 
 
-def test_points_of_a_real_model_project_onto_their_keypoints() -> None:
+def test_points_of_a_real_model_project_onto_their_keypoints(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     theirs = pycolmap.Reconstruction(str(PHOTOS / "sparse" / "0"))
-    options = ColmapOptions(min_track=1, max_reprojection=1e9)
+    monkeypatch.setattr(colmap_points, "_LEAST_TRACK", 1)
+    monkeypatch.setattr(colmap_points, "_MOST_REPROJECTION_PX", 1e9)
     for image in theirs.images.values():
         path = PHOTOS / "images" / image.name
-        points = read_colmap_points(PHOTOS, options, path, (360, 480), any_size=False).points
+        points = read_colmap_points(PHOTOS, path, (360, 480)).points
         keypoints = [p for p in image.points2D if p.has_point3D()]
         world = np.array([theirs.points3D[p.point3D_id].xyz for p in keypoints])
         expected = image.camera.img_from_cam(image.cam_from_world() * world) - 0.5
@@ -124,8 +116,7 @@ def test_points_of_a_real_model_project_onto_their_keypoints() -> None:
 def test_depth_is_in_model_units_or_with_a_scale_in_metres(
     unit_scale: float | None, unit: str, factor: float, align: str, tmp_path: Path, project: Path
 ) -> None:
-    colmap = ColmapOptions(unit_scale=unit_scale)
-    record = refine(frame_on_disk(tmp_path), project, colmap=colmap)
+    record = refine(frame_on_disk(tmp_path), project, unit_scale=unit_scale)
     assert (record["unit"], record["settings"]["align"]) == (unit, align)
     nearest, farthest = (record["points"][name] / factor for name in ("nearest", "farthest"))
     assert 3.4 < nearest < farthest < 4.6
@@ -148,10 +139,11 @@ def test_what_does_not_fit_a_model_is_refused(tmp_path: Path, project: Path) -> 
     frame = frame_on_disk(tmp_path, HEIGHT, WIDTH)
     with pytest.raises(UsageError, match="in metres but the sparse depth in model units; give"):
         refine(frame, project, gt=frame.gt)
-    with pytest.raises(UsageError, match=r"s\.png is no COLMAP model, so --colmap"):
-        run(frame, colmap=ColmapOptions(unit_scale=1.0))
-    with pytest.raises(NoPointsError, match="relax --colmap min-track or max-reprojection"):
-        read(project, max_reprojection=0.1)
+    with pytest.raises(UsageError, match=r"s\.png is no COLMAP model, so --unit-scale"):
+        run(frame, unit_scale=1.0)
+    change(project, "points3D.txt", " 9 9 9 0.5 ", " 9 9 9 5 ")
+    with pytest.raises(NoPointsError, match="with more matches"):
+        read(project)
 
 
 def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) -> None:
@@ -162,14 +154,9 @@ def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) ->
     points = read(project).points
     assert points.dropped["seen in fewer than 3 images"] == 1
     assert points.dropped["with a reprojection error above 2 px"] == 1
-    kept = read(project, min_track=2, max_reprojection=3).points
-    assert kept.dropped["seen in fewer than 2 images"] == 0
-    assert len(kept) >= len(points)
     write_text_model(project / "two", names=("a.png", "b.png"))  # not asked for tracks of three
     size = (HEIGHT, WIDTH)
-    pair = read_colmap_points(
-        project / "two", ColmapOptions(), Path("a.png"), size, any_size=False
-    ).points
+    pair = read_colmap_points(project / "two", Path("a.png"), size).points
     assert pair.dropped["seen in fewer than 2 images"] == 0
 
 
@@ -205,12 +192,9 @@ def test_images_of_mixed_cameras_have_each_their_own(project: Path) -> None:
     cameras.write_text(f"{cameras.read_text()}2 SIMPLE_PINHOLE 32 24 25 16.25 11.5\n")
     change(project, "images.txt", "2 1 0 0 0 0.1 0 0 1 b.png", "2 1 0 0 0 0.1 0 0 2 b.png")
     whole = read(project).points
-    with pytest.raises(SizeError, match=r"b\.png is 64×48 but its camera .* is 32×24"):
-        read(project, "b.png")
-    small = read_colmap_points(
-        project, ColmapOptions(), project / "images" / "b.png", (HEIGHT, WIDTH), any_size=True
-    ).points
-    assert small.size == whole.size
+    small = read(project, "b.png")
+    assert small.points.size == whole.size
+    assert any("32×24" in note and "64×48" in note for note in small.notes)
 
 
 def test_a_batch_takes_each_registered_photo(

@@ -126,7 +126,7 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
     assert ScanOptions(calib=frame.calib).describes(Path("scan.npy"))
     assert not ScanOptions().describes(Path("sparse.npy"))
     with pytest.raises(UsageError, match="is no scan"):
-        ScanOptions(max_range=9.0).describes(frame.gt)
+        ScanOptions(extrinsics=frame.calib).describes(frame.gt)
     assert not ScanOptions(keep_occluded=True).describes(frame.gt)
 
 

@@ -39,7 +39,7 @@ def scene(tmp_path: Path) -> ScanOnDisk:
 
 def test_extrinsics_of_a_file_complete_a_calibration(scene: ScanOnDisk) -> None:
     options = ScanOptions(calib=scene.calib)
-    with pytest.raises(UsageError, match=r"has no pose of the scanner; .* or give --scan ext"):
+    with pytest.raises(UsageError, match=r"has no pose of the scanner; .* or give --ext"):
         read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
     options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
     read = read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
@@ -63,9 +63,9 @@ def test_projecting_with_extrinsics_records_their_path_and_never_replaces_them(
 
 def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> None:
     wrong = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "inverse.txt")
-    with pytest.raises(UsageError, match=r"put 0 of 150 scan .* add --scan inverse-extrinsics"):
+    with pytest.raises(UsageError, match=r"put 0 of 150 scan .* give their inverse"):
         read_scan_points(scene.scan, wrong, (HEIGHT, WIDTH))
-    right = replace(wrong, inverse_extrinsics=True)
+    right = replace(wrong, extrinsics=scene.folder / "pose.txt")
     read = read_scan_points(scene.scan, right, (HEIGHT, WIDTH))
     assert cKDTree(scene.xy).query(read.points.xy)[0].max() < 2e-3
     assert not [note for note in read.notes if "extrinsics" in note]
@@ -82,7 +82,7 @@ def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> 
         assert check_direction(scan, camera, right, (375, 1242)) == []
         assert check_direction(scan, portrait, right, (1242, 375)) == []
         (warning,) = check_direction(scan, camera, right.inverse(), (375, 1242))
-        assert "if they map the camera to the scanner, add --scan inverse-extrinsics" in warning
+        assert "if they map the camera to the scanner, give their inverse" in warning
 
 
 @pytest.mark.parametrize(("turns", "upright"), [(0, True), (1, False), (2, True)])

@@ -55,7 +55,7 @@ def _calibrations(folder: Path) -> list[Seed]:
             for name in ("kitti.txt", "own.txt", "fisheye.txt", "kalibr.yaml")
         ),
         *(
-            Seed(file=name, command=_project("--calib", name, "--scan", "extrinsics=pose.txt"))
+            Seed(file=name, command=_project("--calib", name, "--extrinsics", "pose.txt"))
             for name in ("ros.yaml", "opencv.yml")
         ),
     ]
@@ -75,6 +75,6 @@ def _extrinsics(folder: Path) -> list[Seed]:
     for number, text in enumerate(POSES.values()):
         name = f"pose{number}.yaml"
         (folder / name).write_text(text)
-        options = _project("--calib", "ros.yaml", "--scan", f"extrinsics={name}")
+        options = _project("--calib", "ros.yaml", "--extrinsics", name)
         seeds.append(Seed(file=name, command=options))
     return seeds

@@ -10,7 +10,7 @@ import numpy as np
 from pnpdepth_cli.io.depth import write_depth
 from tests.colmap_models import write_binary_model, write_text_model
 from tests.data_sets import tum, void
-from tests.fuzz.seeds.seed import DRY_RUN, Seed
+from tests.fuzz.seeds.seed import LISTING, Seed
 
 _SAMPLED = ("--sample", "20")
 """For layouts without sparse depth."""
@@ -30,7 +30,7 @@ def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> li
 
 def _indices(*files: str, options: tuple[str, ...] = ()) -> list[Seed]:
     """Files that listing the frames of their uppermost folder reads."""
-    return [Seed(file=f, command=("batch", f.split("/")[0], *DRY_RUN, *options)) for f in files]
+    return [Seed(file=f, command=("batch", f.split("/")[0], *LISTING, *options)) for f in files]
 
 
 def _write_all(folder: Path, content: bytes, *files: str) -> None:
@@ -57,7 +57,7 @@ def _colmap(folder: Path, image: bytes) -> list[Seed]:
         for suffix in ("txt", "bin")
     )
     network = "--model fcrn-tiny --propagate none --iterations 1"
-    refine = f"refine photos/images/a.png --sparse model --set sparse-size-ok {network}".split()
+    refine = f"refine photos/images/a.png --sparse model {network}".split()
     return [
         *_indices(*(f"photos/{name}" for name in text), *(f"binary/{name}" for name in binary)),
         *(

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 HEIGHT, WIDTH = 24, 32
 SIZE = ("--size", f"{HEIGHT}x{WIDTH}")
 OUT = ("-o", "out.png", "--overwrite")
-DRY_RUN = ("-o", "batch", "--dry-run")
+LISTING = ("-o", "batch", "--limit", "1", "--shard", "2/2")
+"""Of a batch that lists its frames and refines none."""
 
 
 @dataclass(frozen=True, kw_only=True)
