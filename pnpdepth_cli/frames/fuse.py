@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 LINEAR = "linear"
 """Name of linear interpolation, as an expert and as a baseline."""
 # Prior weights and the strength were chosen on 7-Scenes, ICL-NUIM, NYU, RealSense, rendered rooms
-# and streets with each set left out in turn (docs/notes/fusion.md has the tables).
+# and streets with each set left out in turn (docs/notes/fusion.md).
 OWN, WITH_PRIOR, WITHOUT_IMAGE = 0.15, 0.45, 0.05
 """Prior weights: of a network that explains the points, of `compact` with its depth as a prior, and
 of every expert that leaves the image out. `compact` without a prior has the rest."""
@@ -41,8 +41,8 @@ STRENGTH = 60.0
 """Validation points that the prior weights count as."""
 DOUBT, NO_GAIN = 2.0, 0.5
 """Standard errors by which the image lowers the error at the validation points: from which it is
-not doubted, and below which there is a warning. 25 frames with their own image and 500 points have
-at least 0.7, and 8 of 9 frames with another one's at most 0.4."""
+not doubted, and below which there is a warning. 25 even frames with their own image and 500 points
+have at least 0.7, but 2 of 18 odd ones less than 0.5; 8 of 9 with another image have at most 0.4."""
 ENOUGH_FOR_DOUBT = 50
 """Fewer validation points do not tell an image that belongs to its points from another one."""
 OWN_SCANNER = 0.75
