@@ -1,4 +1,4 @@
-"""The default method for one frame: a few experts, fused by how well each predicts points it did not get.
+"""The default method for one frame: experts, fused by how well each predicts points it did not get.
 
 A fifth of the points, whole scan lines of a LiDAR, are validation points. Every expert predicts
 the frame twice, from all points and from the others (`frames.fuse`). The weights with which they

@@ -41,8 +41,9 @@ STRENGTH = 60.0
 """Validation points that the prior weights count as."""
 DOUBT, NO_GAIN = 2.0, 0.5
 """Standard errors by which the image lowers the error at the validation points: from which it is
-not doubted, and below which there is a warning. 25 even frames with their own image and 500 points
-have at least 0.7, but 2 of 18 odd ones less than 0.5; 8 of 9 with another image have at most 0.4."""
+not doubted, and below which there is a warning. With 500 points, 25 even frames with their own
+image have at least 0.7, but 2 of 18 odd ones less than 0.5; 8 of 9 with another image have at most
+0.4."""
 ENOUGH_FOR_DOUBT = 50
 """Fewer validation points do not tell an image that belongs to its points from another one."""
 OWN_SCANNER = 0.75
