@@ -185,7 +185,7 @@ def test_every_unambiguous_form_of_an_image_is_read_alike(
         (lambda: pnp.load_network(3), "spec must be a name or a path, not int"),  # type: ignore[arg-type]
         (lambda: pnp.Refiner("compact"), "must be from load_network"),  # type: ignore[arg-type]
         (lambda: pnp.Refiner([]), "must be from load_network"),
-        (lambda: pnp.Settings(tile=7), "tile must be a whole number >= 64"),
+        (lambda: pnp.Settings(iterations=-1), "iterations must be a whole number >= 0"),
         (lambda: LOSSES["no_such.py"], "loss file no_such.py cannot be run: FileNotFoundError"),
     ],
 )

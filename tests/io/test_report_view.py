@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.report import VIEWER
 from tests.commands.batches import batch, pairs_on_disk
@@ -26,12 +27,22 @@ from selenium.webdriver.support.ui import WebDriverWait
 BACKGROUND = (0x1B, 0x1D, 0x21)
 
 
+def with_camera(root: Path) -> dict[str, ScanOptions]:
+    """Options of a batch whose images see 60°."""
+    with Image.open(root / "rgb/a.png") as image:
+        width, height = image.size
+    focal = width / 2 / np.tan(np.deg2rad(30))
+    path = root / "k.txt"
+    path.write_text(f"{focal} 0 {(width - 1) / 2} 0 {focal} {(height - 1) / 2} 0 0 1\n")
+    return {"scan": ScanOptions(calib=path)}
+
+
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A batch of two frames, one of them without ground truth, with a report."""
     root = pairs_on_disk(tmp_path_factory.mktemp("batch"), ("a", "b"))
     (root / "gt/b.png").unlink()
-    batch(root, html=root / "out" / "report", html_3d=True, refine={"fov_deg": 60.0})
+    batch(root, html=root / "out" / "report", html_3d=True, refine=with_camera(root))
     return root
 
 
@@ -166,11 +177,11 @@ def test_a_report_without_views_holds_no_other_script_and_views_need_report_and_
     tmp_path: Path,
 ) -> None:
     root = pairs_on_disk(tmp_path, ("a",))
-    report = root / "out" / "report"
-    batch(root, html=report, html_3d=True, refine={"fov_deg": 60.0})
+    report, camera = root / "out" / "report", with_camera(root)
+    batch(root, html=report, html_3d=True, refine=camera)
     assert (report / VIEWER).stat().st_size > 500_000
     assert len(list((report / "images").glob("*_view.js"))) == 1
-    batch(root, html=report, refine={"fov_deg": 60.0})
+    batch(root, html=report, refine=camera)
     assert not (report / VIEWER).exists()
     assert list((report / "images").glob("*_view.js")) == []
     text = (report / "index.html").read_text()
