@@ -84,7 +84,7 @@ def predictions(networks: OpenNetworks, split: ValidationSplit, judged: Refined)
     Raises:
         PnpDepthError: The user's network gives no depth.
     """
-    fusing = next((m for m in networks.members if m.takes_prior), None)
+    fusing = _fusing(networks)
     own = list[Expert]()
     for member in networks.members:
         try:
@@ -150,7 +150,7 @@ def without_doubt(
 
     Also a warning where the image does not lower the error at the validation points.
     """
-    fusing = next((m for m in networks.members if m.takes_prior), None)
+    fusing = _fusing(networks)
     rgb, count = split.whole.rgb, len(split.points)
     if fusing is None or rgb is None or count < ENOUGH_FOR_DOUBT:
         return experts, ()
@@ -273,6 +273,11 @@ def weighted_mean(depths: Sequence[tuple[Tensor, float]]) -> Tensor:
 def judge_of(networks: OpenNetworks) -> Member:
     """Returns the network that weighs its points, else the user's."""
     return next(filter(weighs_points, networks.members), networks.members[0])
+
+
+def _fusing(networks: OpenNetworks) -> Member | None:
+    """The network that takes another one's depth as a prior. None without one."""
+    return next((member for member in networks.members if member.takes_prior), None)
 
 
 def weighs_points(member: Member) -> bool:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.folds import spatial_folds
 from pnpdepth_cli.completion.outliers import inlier_weights
-from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.frame import Frame, Refined, no_points
 from pnpdepth_cli.points import SparsePoints
 
 FOLDS = 5
@@ -56,7 +56,7 @@ def split_frame(frame: Frame, judged: Refined, seed: int) -> ValidationSplit:
     """
     parts = split_points(frame.points, seed)
     if parts is None:
-        none = frame.points.select(torch.zeros(len(frame.points), dtype=torch.bool))
+        none = no_points(frame.points)
         return ValidationSplit(whole=frame, kept=frame, points=none, weights=torch.empty(0))
     kept, points = parts
     weights = consistency(points, torch.from_numpy(judged.before))
