@@ -242,8 +242,6 @@ LENSES = ("radial-tangential", "fisheye")
 PROTOCOLS = tuple(protocols.PROTOCOLS)
 """How frames are cut, given points and scored: `pnpdepth_cli.protocols`."""
 
-AVERAGES = ("per-image", "pooled")  # every image, or every pixel, has equal weight
 RESIZES = ("nearest", "bilinear")  # of a prediction to the size of the ground truth
-MISSING = ("skip", "min", "max", "fail")  # empty predictions: unscored, at a bound, or refused
 SCALINGS = ("none", "median", "affine", "affine-disparity", "log")  # of each image to its truth
 PREDICTION_KINDS = ("depth", "disparity")

@@ -122,10 +122,9 @@ class Protocol:
     """Whether predictions are clipped to these bounds."""
     crop: str = "none"
     """The rectangle of the part that is scored."""
-    average: str = "per-image"
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
     missing: str = "skip"
-    """What empty predictions are scored as: one of `choices.MISSING`."""
+    """Empty predictions: "skip", or "min", scored as the lower bound."""
 
 
 # The reference codes (monodepth2's evaluate_depth.py, BTS's eval) clamp predictions with

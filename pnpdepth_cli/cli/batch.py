@@ -40,8 +40,12 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 @click.command(
     short_help="Refine all frames of a folder or a list.",
     cls=grouped_help.GroupedCommand,
-    common=grouped_help.COMMON - {"--sparse", "--gt"}
-    | {"--layout", "--sample", "--limit", "--shard", "--html", "--vary"},
+    common=frozenset(
+        {
+            *("--layout", "--sample", "--limit", "--shard", "--model", "--checkpoint", "--preset"),
+            *("--holdout", "--uncertainty", "--output", "--html", "--vary"),
+        }
+    ),
     groups={
         "Frames": ("--sample", FrameSelection, "--shard"),
         "Sequences": (SequenceOptions, "--adapt"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any
 
@@ -21,7 +20,6 @@ from pnpdepth_cli.cli import options
     help="Calibration of the camera: a file with K, or a KITTI file or raw folder.  [default: the"
     " record's, else EXIF]",
 )
-@options.camera
 @click.option(
     "--fov", "fov_deg", type=float, metavar="DEG", help="Horizontal field of view, without --calib."
 )
@@ -40,14 +38,6 @@ from pnpdepth_cli.cli import options
     help="Drop pixels whose standard deviation is above this fraction of their depth.",
 )
 @click.option(
-    "--edge",
-    type=float,
-    default=0.05,
-    metavar="F",
-    show_default=True,
-    help="Cut where depth jumps by this fraction; 0 never cuts.",
-)
-@click.option(
     "--min-views",
     type=click.IntRange(1),
     default=1,
@@ -63,8 +53,7 @@ from pnpdepth_cli.cli import options
 )
 @click.option("-o", "--output", type=options.FILE, required=True, help="PLY file.")
 @options.overwrite
-@options.as_json
-def cloud(as_json: bool, **values: Any) -> None:
+def cloud(**values: Any) -> None:
     """Write DEPTH, a depth file or the results of a batch, as a coloured point cloud.
 
     \b
@@ -78,9 +67,6 @@ def cloud(as_json: bool, **values: Any) -> None:
     from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
 
     record = write_depth_cloud(CloudRequest(**values))
-    if as_json:
-        click.echo(json.dumps(record, indent=2))
-        return
     for note in record["notes"]:
         click.echo(note, err=True)
     colours = "coloured" if record["coloured"] else "without colours (no image is known)"

@@ -26,25 +26,10 @@ columns = click.option(
 @click.command(short_help="Compare runs that eval or batch scored.")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN RUN…")
 @click.option(
-    "--permutations",
-    type=int,
-    default=10_000,
-    show_default=True,
-    metavar="N",
-    help="Most permutations of the test; all are tried where there are no more.",
+    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
 )
-@click.option(
-    "--seed",
-    type=options.SEED,
-    default=0,
-    show_default=True,
-    metavar="N",
-    help="Random seed of the permutations.",
-)
-@options.no_groups
 @options.table_files(
     csv="Write the table as CSV.",
-    markdown="Write the table as Markdown.",
     latex="Write a tabular of runs × measures: the best in bold, * where p < 0.05.",
 )
 @columns
@@ -55,18 +40,9 @@ columns = click.option(
     help="Plot results of `batch --vary` over the varied values: PNG, SVG or PDF. Needs the extra"
     " plot.",
 )
-@click.option(
-    "--all",
-    "all_measures",
-    is_flag=True,
-    help="Compare all measures, not only RMSE, MAE, MRE and δ1, or --columns.",
-)
 def compare(
     runs: tuple[str, ...],
-    permutations: int,
-    seed: int,
     no_groups: bool,
-    all_measures: bool,
     columns: tuple[str, ...] | None,
     plot: Path | None,
     **table_files: Any,
@@ -83,7 +59,7 @@ def compare(
     are in per cent of the first run and positive if the other run is better. p is the p-value of a
     paired permutation test over groups of frames (manifest column group, sequence or folder), in a
     single sequence over blocks as long as its errors are correlated, adjusted for the number of
-    measures and runs (Holm); it is exact for few groups, else with N random permutations.
+    measures and runs (Holm); it is exact for few groups, else with random permutations.
     """
     from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
     from pnpdepth_cli.commands.evaluation.compare import compare as compare_runs
@@ -92,19 +68,12 @@ def compare(
 
     files = TableFiles(**table_files)
     files.check([Path(run) for run in runs])
-    comparison = compare_runs(
-        runs,
-        permutations=permutations,
-        seed=seed,
-        grouped=not no_groups,
-        all_measures=all_measures,
-        columns=columns,
-    )
+    comparison = compare_runs(runs, grouped=not no_groups, columns=columns)
     if plot is not None:
         plot_comparison(comparison, plot, overwrite=files.overwrite)
     print_notes(comparison["notes"])
     table = comparison_table(comparison)
-    to_stdout = files.write(csv=table, markdown=table, latex=methods_table(comparison))
+    to_stdout = files.write(csv=table, latex=methods_table(comparison))
     if files.as_json:
         print_json(comparison)
     elif not to_stdout:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import click
 
-from pnpdepth_cli.cli.streams import print_json
-
 
 @click.command(short_help="Show versions, devices and extras, and test the installation.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def doctor(as_json: bool) -> None:
+def doctor() -> None:
     """Show versions, devices, memory and extras, and refine a small frame.
 
     Paste the output into a bug report. It contains no names of files or users.
@@ -17,11 +14,8 @@ def doctor(as_json: bool) -> None:
     from pnpdepth_cli.commands.doctor import examine
 
     report = examine()
-    if as_json:
-        print_json(report)
-    else:
-        for name, value in report.items():
-            for number, line in enumerate(value if isinstance(value, list) else [value]):
-                click.echo(f"{'' if number else name:<12}{line}")
+    for name, value in report.items():
+        for number, line in enumerate(value if isinstance(value, list) else [value]):
+            click.echo(f"{'' if number else name:<12}{line}")
     if str(report["self-test"]).startswith("FAILED"):
         click.get_current_context().exit(1)

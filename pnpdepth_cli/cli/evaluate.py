@@ -15,7 +15,7 @@ from pnpdepth_cli.cli.streams import print_json, say
 from pnpdepth_cli.commands.evaluation.request import EvalRequest, ScoringRules
 from pnpdepth_cli.errors import FramesFailedError
 
-_OUTPUT = ("--csv", "--markdown", "--latex", "--columns", "--html", "--overwrite", "--json")
+_OUTPUT = ("--csv", "--latex", "--columns", "--html", "--overwrite", "--json")
 
 
 @click.command(
@@ -23,14 +23,11 @@ _OUTPUT = ("--csv", "--markdown", "--latex", "--columns", "--html", "--overwrite
     short_help="Score depth files against ground truth.",
     cls=grouped_help.GroupedCommand,
     common=frozenset(
-        {
-            *("--protocol", "--min-depth", "--max-depth", "--crop", "--average", "--gt-scale"),
-            *("--pred-scale", "--sparse", "--resize", *_OUTPUT),
-        }
-    )
-    - {"--columns"},
+        {"--protocol", "--max-depth", "--scale-by", "--gt-scale", "--pred-scale", "--resize"}
+        | {*_OUTPUT}
+    ),
     groups={
-        "Protocol": ("--protocol", ScoringRules, "--no-groups"),
+        "Protocol": ("--protocol", ScoringRules),
         "Input": (EvalRequest,),
         "Output": _OUTPUT,
     },
@@ -38,10 +35,8 @@ _OUTPUT = ("--csv", "--markdown", "--latex", "--columns", "--html", "--overwrite
 @click.argument("prediction", type=options.FILE, metavar="PRED")
 @click.argument("ground_truth", type=options.FILE, metavar="GT")
 @options.options_of_groups(EvalRequest)
-@options.no_groups
 @options.table_files(
     csv="Write a row per frame.",
-    markdown="Write a table of the means.",
     latex="Write a tabular of the means.",
 )
 @columns
@@ -57,8 +52,8 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     \b
     pnpdepth eval pred.png gt.png
     pnpdepth eval out/ gt/ --protocol kitti --csv scores.csv --html report/
-    pnpdepth eval out/ gt/ --sparse sparse/ --json > runs/a.json
-    pnpdepth eval out/ gt/ --protocol eigen --max-depth 50 --average pooled
+    pnpdepth eval out/ gt/ --json > runs/a.json
+    pnpdepth eval out/ gt/ --protocol eigen --max-depth 50
 
     Files in folders are matched by name; x_depth.png belongs to x.png. GT can also be a data set in
     a known layout. Frames of GT without a prediction are counted, and the exit code is 7. Options
@@ -84,23 +79,15 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     files.check((prediction, ground_truth))
     keys = values.pop("columns")
     if html is not None:
-        inputs = [prediction, ground_truth, values["sparse"], values["mask"]]
-        report_eval.check_eval_report(
-            html, [path for path in inputs if path is not None], overwrite=files.overwrite
-        )
-    request = EvalRequest(
-        prediction=prediction,
-        ground_truth=ground_truth,
-        grouped=not values.pop("no_groups"),
-        **values,
-    )
+        report_eval.check_eval_report(html, [prediction, ground_truth], overwrite=files.overwrite)
+    request = EvalRequest(prediction=prediction, ground_truth=ground_truth, **values)
     chosen_measures(choose_protocol(request.protocol, **request.changes()).measures, keys)
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
     print_notes([f"protocol {evaluation.protocol.describe()}", *evaluation.notes])
     name = prediction.stem if prediction.is_file() else prediction.resolve().name
     means = tables.means_row(evaluation, name, keys)
-    to_stdout = files.write(csv=tables.frames_csv(evaluation, keys), markdown=means, latex=means)
+    to_stdout = files.write(csv=tables.frames_csv(evaluation, keys), latex=means)
     if files.as_json:
         print_json(evaluation.as_record())
     elif not to_stdout:

@@ -8,7 +8,6 @@ import click
 
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.streams import print_json
 
 
 @click.command(short_help="Write depth for COLMAP, Nerfstudio or 3DGS.")
@@ -16,8 +15,7 @@ from pnpdepth_cli.cli.streams import print_json
 @click.option("--to", type=click.Choice(list(EXPORTS)), required=True, help="The program.")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @options.overwrite
-@options.as_json
-def export(as_json: bool, **values: Any) -> None:
+def export(**values: Any) -> None:
     """Write RESULTS, a folder of `batch` or `refine`, for a reconstruction program.
 
     \b
@@ -36,9 +34,6 @@ def export(as_json: bool, **values: Any) -> None:
     from pnpdepth_cli.commands.exports import export_results
 
     record = export_results(**values)
-    if as_json:
-        print_json(record)
-        return
     for note in record["notes"]:
         click.echo(note, err=True)
     frames = f"{record['frames']:,} frame{'' if record['frames'] == 1 else 's'}"

@@ -18,10 +18,8 @@ OTHER = "Other"
 
 COMMON = frozenset(
     {
-        *("--sparse", "--gt", "--calib", "--output", "--overwrite"),
-        *("--json", "--model", "--checkpoint", "--layer", "--align", "--preset"),
-        *("--iterations", "--lr", "--loss", "--update", "--holdout"),
-        "--uncertainty",
+        *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--preset", "--layer"),
+        *("--holdout", "--uncertainty", "--output", "--overwrite", "--json"),
     }
 )
 """The options of a refinement that `--help` shows."""

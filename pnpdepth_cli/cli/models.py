@@ -68,18 +68,15 @@ def list_command(as_json: bool) -> None:
 @click.argument("network", metavar="NAME|FILE|FOLDER")
 @click.option("--image", type=options.FILE, help="Image to run the network on.")
 @options.checkpoint
-@options.device
 @options.as_json
-def check(
-    network: str, image: Path | None, checkpoint: Path | None, device: str, as_json: bool
-) -> None:
+def check(network: str, image: Path | None, checkpoint: Path | None, as_json: bool) -> None:
     """Load a network, run it, and cut it at its layers.
 
     A .py file is Python code and is run.
     """
     from pnpdepth_cli.commands.networks.describe import check_model
 
-    _print(check_model(network, checkpoint, image, device), as_json)
+    _print(check_model(network, checkpoint, image), as_json)
 
 
 def _print(record: Mapping[str, Any], as_json: bool) -> None:
@@ -107,10 +104,8 @@ def _print(record: Mapping[str, Any], as_json: bool) -> None:
 @click.option(
     "--all", "every", is_flag=True, help="List every submodule, not only the definition's."
 )
-@click.option("--size", metavar="HxW", help="Size of the frame to measure with.")
-@options.device
 @options.as_json
-def layers(size: str | None, every: bool, as_json: bool, **values: Any) -> None:
+def layers(every: bool, as_json: bool, **values: Any) -> None:
     """List the layers a network can be cut at.
 
     For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
@@ -123,7 +118,6 @@ def layers(size: str | None, every: bool, as_json: bool, **values: Any) -> None:
         rows = list_layers(
             choice,
             every=every,
-            size=options.height_and_width(size) if size else None,
             on_layer=show,
         )
     if as_json:

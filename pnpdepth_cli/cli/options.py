@@ -16,7 +16,6 @@ from pnpdepth_cli.commands.refinement.request import (
     RefineRequest,
 )
 from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import LARGEST_SEED, OptionField, Settings, options_of
 
 FILE = click.Path(path_type=Path)
@@ -63,6 +62,8 @@ def _type_of(declared: OptionField) -> Any:
         return option.parse
     if option.least is not None or option.most is not None:
         return click.IntRange(option.least, option.most)
+    if declared.type == "tuple[float, float]":
+        return (float, float)
     return {"int": int, "float": float, "str": str, "bool": bool, "Path": FILE}[declared.type]
 
 
@@ -137,27 +138,21 @@ sparse_output = click.option(
 )
 
 
-def table_files(*, csv: str, markdown: str, latex: str) -> Callable[[Any], Any]:
+def table_files(*, csv: str, latex: str) -> Callable[[Any], Any]:
     """Returns a decorator that adds the options of `tables.TableFiles`.
 
     Args:
         csv: Help text of `--csv`.
-        markdown: Help text of `--markdown`.
         latex: Help text of `--latex`.
     """
 
     def decorate(command: Any) -> Any:
         command = overwrite(as_json(command))
-        for name, text in (("--latex", latex), ("--markdown", markdown), ("--csv", csv)):
+        for name, text in (("--latex", latex), ("--csv", csv)):
             command = click.option(name, type=FILE, metavar="FILE|-", help=text)(command)
         return command
 
     return decorate
-
-
-no_groups = click.option(
-    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
-)
 
 
 def taken(group: type, values: dict[str, Any]) -> dict[str, Any]:
@@ -179,11 +174,3 @@ def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
         others |= {"model": first, "more_models": tuple(more)}
         values = {name: value for name, value in values.items() if name != "model"}
     return RefineRequest.from_fields(scan=scan_options, **values, **others)
-
-
-def height_and_width(text: str) -> tuple[int, int]:
-    """Returns (H, W) from a text such as 480x640. Raises UsageError for any other text."""
-    height, x, width = text.lower().partition("x")
-    if not (x and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
-        raise UsageError(f"size {text!r} is not of the form HxW, such as 480x640")
-    return int(height), int(width)

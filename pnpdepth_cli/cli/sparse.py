@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import click
 
 from pnpdepth_cli.choices import PATTERNS, SENSORS
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.streams import print_json, say
+from pnpdepth_cli.cli.streams import say
 from pnpdepth_cli.commands.refinement.request import sample_pattern
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 
@@ -18,20 +17,21 @@ from pnpdepth_cli.commands.sparse.options import ScanOptions
 @click.command(short_help="Project a LiDAR scan into a camera image.")
 @click.argument("scan", type=options.FILE)
 @options.scan
-@click.option("--image", type=options.FILE, help="Camera image: gives the size, and is drawn on.")
-@click.option("--size", metavar="HxW", help="Size of the image, instead of --image.")
+@click.option(
+    "--image",
+    type=options.FILE,
+    required=True,
+    help="Camera image: gives the size, and is drawn on.",
+)
 @options.sparse_output
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on the image.")
 @options.overwrite
-@options.as_json
 def project(
     scan: Path,
-    image: Path | None,
-    size: str | None,
+    image: Path,
     output: Path,
     overlay: Path | None,
     overwrite: bool,
-    as_json: bool,
     **values: Any,
 ) -> None:
     """Project a LiDAR SCAN (KITTI's BIN, NPY, PCD or PLY) to a sparse depth map.
@@ -43,12 +43,12 @@ def project(
     Points behind the camera, outside the image, behind another point in their pixel, or occluded by
     the foreground are dropped and counted. A JSON file beside the output records the settings.
     """
+    from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 
     target = SparseTarget(output=output, overlay=overlay, overwrite=overwrite)
     of_scan = ScanOptions(**options.taken(ScanOptions, values))
-    shape = options.height_and_width(size) if size else None
-    _print(project_scan(scan, of_scan, target, image=image, size=shape), as_json=as_json)
+    print_sparse(project_scan(scan, of_scan, target, image))
 
 
 @click.command(short_help="Sample sparse depth from dense depth.")
@@ -73,27 +73,17 @@ def project(
 @click.option(
     "--outliers", metavar="P%", help="Points whose depth is random, between the least and the most."
 )
-@click.option(
-    "--jitter",
-    type=float,
-    default=0.0,
-    metavar="PX",
-    help="Standard deviation of the noise of the pixel coordinates.",
-)
 @options.depth_scale
 @options.sparse_output
 @options.overwrite
-@options.as_json
 def sample(
     depth: Path,
     pattern: str,
     count: str | None,
     noise: str | None,
     outliers: str | None,
-    jitter: float,
     output: Path,
     overwrite: bool,
-    as_json: bool,
     **values: Any,
 ) -> None:
     """Sample sparse depth from the dense DEPTH.
@@ -112,12 +102,13 @@ def sample(
 
     The settings, with the seed, are stored in the file (PNG, CSV) and in a JSON file beside it.
     """
+    from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.commands.sparse import make
 
     values["scale"] = values.pop("depth_scale")
     target = make.SparseTarget(output=output, overwrite=overwrite)
-    added, chosen = make.read_noise(noise, outliers, jitter), sample_pattern(pattern, count)
-    _print(make.sample_depth(depth, target, chosen, noise=added, **values), as_json=as_json)
+    added, chosen = make.read_noise(noise, outliers), sample_pattern(pattern, count)
+    print_sparse(make.sample_depth(depth, target, chosen, noise=added, **values))
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
@@ -147,18 +138,10 @@ def sample(
     metavar="FILE|FOLDER",
     help="Intrinsics: a file with nine numbers or K, or a KITTI calibration.",
 )
-@options.camera
-@click.option(
-    "--position",
-    metavar="X,Y,Z|calib",
-    help="Of the scanner: metres right of, below and in front of the camera, or as in the"
-    " calibration.",
-)
 @options.seed
 @options.depth_scale
 @options.sparse_output
 @options.overwrite
-@options.as_json
 def simulate(
     depth: Path,
     sensor: str | None,
@@ -167,22 +150,22 @@ def simulate(
     calib: Path,
     output: Path,
     overwrite: bool,
-    as_json: bool,
     **values: Any,
 ) -> None:
     """Simulate the sparse depth of a LiDAR in the scene of the dense DEPTH.
 
     \b
     pnpdepth simulate gt.exr --sensor hdl-64e --calib intrinsics.txt --seed 1 -o sparse.png
-    pnpdepth simulate gt.png --sensor vlp-16 --calib calib.txt --position calib -o sparse.exr
+    pnpdepth simulate gt.png --sensor vlp-16 --calib calib.txt -o sparse.exr
     pnpdepth simulate gt.png --beams 40 --vertical-fov 15 -25 --calib calib.txt -o sparse.exr
     """
+    from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.commands.sparse.make import SparseTarget, find_sensor, simulate_scan
 
     scanner = find_sensor(sensor, beams, vertical_fov)
     values["scale"] = values.pop("depth_scale")
     target = SparseTarget(output=output, overwrite=overwrite)
-    _print(simulate_scan(depth, target, scanner, calib, **values), as_json=as_json)
+    print_sparse(simulate_scan(depth, target, scanner, calib, **values))
 
 
 @click.command(short_help="Write the frames of a ROS bag as files.")
@@ -204,17 +187,9 @@ def simulate(
     metavar="SECONDS",
     help="Largest time between an image and its scan.",
 )
-@click.option(
-    "--calib",
-    type=options.FILE,
-    metavar="FILE|FOLDER",
-    help="Calibration of the camera, instead of camera_info.",
-)
-@options.camera
 @click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first N frames.")
 @options.overwrite
-@options.as_json
-def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
+def frames(bag: Path, output: Path, **values: Any) -> None:
     """Write the images of a BAG and the scans nearest in time as files.
 
     \b
@@ -229,16 +204,4 @@ def frames(bag: Path, output: Path, as_json: bool, **values: Any) -> None:
 
     request = FramesRequest(bag=bag, output=output, **values)
     record = write_frames(request, say)
-    if as_json:
-        print_json(record)
-    else:
-        say(f"wrote {record['frames']:,} frames to {output}")
-
-
-def _print(record: Mapping[str, Any], *, as_json: bool) -> None:
-    from pnpdepth_cli.cli.tables import print_sparse
-
-    if as_json:
-        print_json(record)
-    else:
-        print_sparse(record)
+    say(f"wrote {record['frames']:,} frames to {output}")

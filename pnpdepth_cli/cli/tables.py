@@ -26,7 +26,6 @@ class TableFiles:
     """Where the tables of a command are written; `-` is stdout."""
 
     csv: Path | None
-    markdown: Path | None
     latex: Path | None
     overwrite: bool
     as_json: bool
@@ -38,11 +37,9 @@ class TableFiles:
             UsageError: Two outputs go to one file or to stdout.
             OutputError: A file is an input, or exists and is not to be replaced.
         """
-        named = {"--csv": self.csv, "--markdown": self.markdown, "--latex": self.latex}
+        named = {"--csv": self.csv, "--latex": self.latex}
         if sum(str(path) == "-" for path in named.values()) + self.as_json > 1:
-            raise UsageError(
-                "only one of --json, --csv -, --markdown - and --latex - can go to stdout"
-            )
+            raise UsageError("only one of --json, --csv - and --latex - can go to stdout")
         options: dict[Path, str] = {}
         for option, path in named.items():
             if path is None or str(path) == "-":
@@ -57,11 +54,10 @@ class TableFiles:
             if not path.parent.is_dir():
                 raise OutputError(f"{path}: its folder does not exist; create it first")
 
-    def write(self, *, csv: Table, markdown: Table, latex: Table) -> bool:
+    def write(self, *, csv: Table, latex: Table) -> bool:
         """Writes the files that were named. Returns whether a text went to stdout."""
         targets = (
             (self.csv, csv.csv),
-            (self.markdown, markdown.markdown),
             (self.latex, latex.latex),
         )
         for path, text in targets:

@@ -29,7 +29,6 @@ from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.point_cloud import (
-    EDGE,
     PointCloud,
     View,
     VoxelGrid,
@@ -54,8 +53,6 @@ class CloudRequest:
     """The colours. None: the image that the record NAME.json beside the depth names, if any."""
     calib: Path | None = None
     """Calibration of the camera. None: `fov_deg`, else the record's camera, else EXIF."""
-    camera: int | None = None
-    """KITTI's camera number."""
     fov_deg: float | None = None
     """Horizontal field of view of a camera without distortion, instead of `calib`."""
     poses: Path | None = None
@@ -66,8 +63,6 @@ class CloudRequest:
     max_depth: float = math.inf
     max_sigma: float | None = None
     """Largest standard deviation of a pixel, as a fraction of its depth."""
-    edge: float = EDGE
-    """Jump of depth at which the cloud is cut, see `cloud_from_depth`."""
     min_views: int = 1
     """Views that have to agree on a pixel, its own included; see `consistent_depth`."""
     voxel: float | None = None
@@ -94,7 +89,7 @@ def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
     parts = _parts(request, frames, poses, coloured, notes)
     make_folder(request.output.parent)
     points = write_cloud(request.output, _merged(request, parts, coloured))
-    inputs = ("depth", "output", "image", "overwrite", "camera", "calib", "poses")
+    inputs = ("depth", "output", "image", "overwrite", "calib", "poses")
     settings = {name: value for name, value in asdict(request).items() if name not in inputs}
     record = {
         "command": "cloud",
@@ -133,8 +128,6 @@ def _check(request: CloudRequest) -> None:
         raise UsageError("--image is for one depth file; records name the images of a folder")
     if request.voxel is not None and not 0 < request.voxel < math.inf:
         raise UsageError(f"--voxel must be a length above 0, got {request.voxel:g}")
-    if not 0 <= request.edge < math.inf:
-        raise UsageError(f"--edge must be a fraction such as {EDGE}, got {request.edge:g}")
 
 
 def _poses(request: CloudRequest, frames: list[ResultFrame]) -> list[Pose | None]:
@@ -176,7 +169,7 @@ def _parts(
             others = (view(other) for other in neighbouring_views(known, index))
             depth = consistent_depth(here, others, request.min_views)
         rgb = _colours(request, frame, here.depth) if coloured else None
-        for part in cloud_from_depth(depth, here.camera, rgb=rgb, edge=request.edge):
+        for part in cloud_from_depth(depth, here.camera, rgb=rgb):
             yield part if pose is None else part.transformed(pose)
 
 
@@ -236,7 +229,7 @@ def _camera(
     It is the one that is given, else that of the record, else that of EXIF.
     """
     if request.calib is not None:
-        return camera_of_file(request.calib, request.camera, size, frame.depth)
+        return camera_of_file(request.calib, None, size, frame.depth)
     if request.fov_deg is not None:
         camera = camera_of_fov(request.fov_deg, size)
         return camera, [describe_pinhole(camera)]

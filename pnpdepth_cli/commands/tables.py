@@ -53,13 +53,6 @@ class Table:
         write_csv(buffer, self.header, self.rows)
         return buffer.getvalue()
 
-    def markdown(self) -> str:
-        """Returns the table in GitHub's Markdown, and its caption below."""
-        rule = ["---", *["---:"] * (len(self.header) - 1)]
-        lines = [self.header, rule, *self.rows]
-        body = "".join(f"| {' | '.join(map(_in_markdown, line))} |\n" for line in lines)
-        return f"{body}\n{self.caption}\n"
-
     def latex(self) -> str:
         """Returns a tabular with rules of the package booktabs; its caption is a comment above."""
         header, *rows = (
@@ -78,11 +71,6 @@ class Table:
                 "",
             )
         )
-
-
-def _in_markdown(cell: str) -> str:
-    text = " ".join(cell.split()).replace("|", r"\|")
-    return f"**{text}**" if getattr(cell, "style", "") == "bold" else text
 
 
 def _in_latex(cell: str) -> str:

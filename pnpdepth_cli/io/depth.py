@@ -40,25 +40,22 @@ _SCALE_QUOTIENTS = (1000.0, 256.0, 100.0, 10.0, 1000.0 / 256.0, 5.0, 5000.0 / 25
 _QUOTIENT_TOLERANCE = math.log(1.1)
 
 
-def read_depth(path: Path, *, scale: float | None = None, channel: str | None = None) -> DepthFile:
+def read_depth(path: Path, *, scale: float | None = None) -> DepthFile:
     """Returns the depth image in a file of any of `choices.FORMATS`.
 
     Zero, NaN, infinite and negative values are unknown, and so is the largest 16-bit code. The
     content tells the format. `scale` is in codes per metre; float files hold metres and ignore it.
-    `channel` is the EXR channel or NPZ array to read; other formats ignore it.
 
     Raises:
         InputError: The file is missing, damaged, beyond the budget, or not a depth image.
-        UsageError: The scale is not above 0, or there is no such channel.
+        UsageError: The scale is not above 0.
     """
     check_scale(scale)
-    return depth_from_stored(path, load_stored(path, channel), scale)
+    return depth_from_stored(path, load_stored(path), scale)
 
 
-def load_stored(path: Path, channel: str | None) -> DepthFile:
+def load_stored(path: Path) -> DepthFile:
     """Returns the one array of numbers in the file that can be depth, of whatever shape.
-
-    The EXR channel or NPZ array is `channel`; None if there is one candidate.
 
     Raises:
         InputError: The file is missing, damaged, beyond the budget, or not a depth file.
@@ -66,7 +63,7 @@ def load_stored(path: Path, channel: str | None) -> DepthFile:
     data = read_bytes(path)
     depth_format = format_of_content(data)
     if depth_format is not None:
-        return depth_format.read(path, data, channel)
+        return depth_format.read(path, data)
     kind = kind_of(data)
     if kind is not None:
         raise eight_bits(path, kind)

@@ -40,7 +40,6 @@ def read_sparse(
     *,
     size: tuple[int, int] | None = None,
     scale: float | None = None,
-    channel: str | None = None,
 ) -> tuple[Points, Reading]:
     """Returns the points with known depth of a depth image or a point list, and how it was read.
 
@@ -50,7 +49,6 @@ def read_sparse(
     Args:
         size: (H, W) of the frame that a list belongs to; an image has its own.
         scale: Codes per metre of an integer image.
-        channel: Name of an EXR channel or NPZ array.
 
     Raises:
         NoPointsError: No depth is known.
@@ -61,7 +59,7 @@ def read_sparse(
         data = read_bytes(path)
         if kind_of(data) is None:
             return _from_rows(path, _parse_text(path, data), "point list", size)
-    stored = load_stored(path, channel)
+    stored = load_stored(path)
     if not stored.is_image and stored.values.ndim == 2 and stored.values.shape[1] == 3:
         if stored.values.dtype.kind != "f":
             raise FileFormatError(

@@ -52,10 +52,9 @@ class SampleNoise:
     relative: float = 0.0  # standard deviation of the depth as a fraction of it
     outliers: float = 0.0
     """Fraction of points whose depth is redrawn between the smallest and the largest."""
-    jitter_px: float = 0.0  # standard deviation of the pixel coordinates, in x and in y
 
     def __post_init__(self) -> None:
-        sizes = (self.metres, self.relative, self.jitter_px)
+        sizes = (self.metres, self.relative)
         if not all(0 <= size < np.inf for size in sizes) or not 0 <= self.outliers <= 1:
             raise UsageError(
                 "give noise that is not negative, and a fraction of outliers from 0 to 1"
@@ -202,8 +201,6 @@ def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> 
     if noise.outliers > 0:
         outliers = rng.permutation(len(values))[: round(noise.outliers * len(values))]
         values[outliers] = rng.uniform(low, high, len(outliers))
-    if noise.jitter_px > 0:
-        xy = xy + rng.normal(0, noise.jitter_px, xy.shape)
     drops = DropCounter()
     if noise.metres > 0 or noise.relative > 0:
         near = drops.keep(np.abs(values) < FARTHEST_M, "noise put it too far")

@@ -71,3 +71,52 @@ def test_every_default_that_is_a_number_or_a_name_is_in_the_help() -> None:
         and not option.show_default
     ]
     assert silent == []
+
+
+MOST_OPTIONS = {"refine": 30, "batch": 45}
+MOST_IN_ALL = 150
+MOST_COMMON = 12
+
+
+def options_of(command: click.Command) -> list[click.Option]:
+    """The options of a command itself, without those that print help."""
+    found = (each for each in command.params if isinstance(each, click.Option))
+    return [each for each in found if long_name(each) not in ("--help", "--help-all")]
+
+
+def test_no_command_has_too_many_options() -> None:
+    counts = {each.name: len(options_of(each)) for each in commands_of(cli)}
+    for name, most in MOST_OPTIONS.items():
+        assert counts[name] <= most
+    assert sum(counts.values()) + len(options_of(cli)) <= MOST_IN_ALL
+
+
+@pytest.mark.parametrize("name", GROUPED)
+def test_the_short_help_shows_the_options_that_matter(name: str) -> None:
+    grouped = command(name)
+    names = {long_name(option) for option in options_of(grouped)}
+    assert grouped.common is not None
+    assert grouped.common <= names
+    assert len(grouped.common) <= MOST_COMMON
+
+
+def test_no_option_holds_others_in_its_value() -> None:
+    listing = [
+        (each.name, long_name(option))
+        for each in commands_of(cli)
+        for option in options_of(each)
+        if "NAME=VALUE" in f"{option.metavar} {option.help}"
+    ]
+    assert listing == [("batch", "--vary")]
+
+
+def test_options_of_one_name_say_the_same_thing_in_every_command() -> None:
+    texts: dict[str, set[str | None]] = {}
+    for each in commands_of(cli):
+        for option in options_of(each):
+            texts.setdefault(long_name(option), set()).add(option.help)
+    own = {
+        *("--output", "--image", "--calib", "--poses", "--html", "--csv", "--latex", "--protocol"),
+        *("--model", "--max-depth"),
+    }
+    assert {name for name, helps in texts.items() if len(helps) > 1} <= own

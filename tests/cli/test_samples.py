@@ -93,7 +93,8 @@ def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
     rows = [row.split(",") for row in Path("table.csv").read_text().splitlines()]
     assert [row[3] for row in rows if "MAE" in row[0]][1] == "+0.00"
 
-    cloud = result(capsys, "cloud out/indoor_depth.png --fov 60 -o cloud.ply")
+    output(capsys, "cloud out/indoor_depth.png --fov 60 -o cloud.ply")
+    cloud = json.loads(Path("cloud.ply.json").read_text())
     assert (cloud["points"], cloud["coloured"]) == (307200, True)
     assert Path("cloud.ply").is_file()
     assert output(capsys, "export out --to colmap -o model", 3) == ""
@@ -118,7 +119,8 @@ def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
 def test_sparse_depth_is_made_and_its_points_are_counted(
     line: str, count: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    record = result(capsys, f"{line} -o sparse.png")
+    output(capsys, f"{line} -o sparse.png")
+    record = json.loads(Path("sparse.json").read_text())
     assert record["points"]["count"] == pytest.approx(count, rel=1e-3)
     assert {"sparse.png", "sparse.json"} <= {path.name for path in Path().iterdir()}
 

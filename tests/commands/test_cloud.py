@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ def frame(folder: Path, name: str, depth: float = 2.0) -> Path:
 
 
 def written(path: Path, output: Path, **values: Any) -> dict[str, Any]:
-    request = {"fov_deg": 60.0, "edge": 0.05} | values
+    request = {"fov_deg": 60.0} | values
     return write_depth_cloud(CloudRequest(depth=path, output=output, **request))
 
 
@@ -104,7 +103,7 @@ def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path
 def test_pixels_beyond_the_limits_are_left_out(tmp_path: Path) -> None:
     depth = np.linspace(1, 5, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.float32)
     write_depth(tmp_path / "d.exr", depth)
-    record = written(tmp_path / "d.exr", tmp_path / "d.ply", edge=0, max_depth=3)
+    record = written(tmp_path / "d.exr", tmp_path / "d.ply", max_depth=3)
     assert record["points"] == int((depth <= 3).sum())
     assert not record["coloured"]
 
@@ -162,7 +161,6 @@ def test_pixels_that_too_few_views_agree_on_are_left_out(tmp_path: Path) -> None
         ({"calib": Path("k.txt")}, UsageError, "--calib and --fov both"),
         ({"fov_deg": 0.0}, UsageError, "--fov is 0"),
         ({"voxel": 0.0}, UsageError, "--voxel"),
-        ({"edge": math.inf}, UsageError, "--edge"),
         ({"max_depth": 0.5}, InputError, "no pixel is left"),
         ({"min_views": 2}, UsageError, "--min-views 2 needs"),
         ({"max_sigma": 0.1}, InputError, "--uncertainty"),

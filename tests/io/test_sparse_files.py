@@ -122,8 +122,8 @@ def test_an_image_is_one_whatever_its_suffix_or_width(tmp_path: Path) -> None:
     assert read_sparse(tmp_path / "s.pfm")[0].size == (4, 3)
 
 
-def test_scale_and_channel_reach_images(tmp_path: Path) -> None:
-    np.savez(tmp_path / "s.npz", a=np.full((2, 2), 500, np.uint16), b=np.ones((2, 2), np.uint16))
-    sparse, reading = read_sparse(tmp_path / "s.npz", scale=1000, channel="a")
+def test_a_scale_reaches_images(tmp_path: Path) -> None:
+    np.savez(tmp_path / "s.npz", a=np.full((2, 2), 500, np.uint16))
+    sparse, reading = read_sparse(tmp_path / "s.npz", scale=1000)
     assert sparse.depth.tolist() == [0.5] * 4
     assert reading.scale == 1000

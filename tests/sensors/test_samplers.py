@@ -86,16 +86,6 @@ def test_noise_has_the_requested_size() -> None:
     assert np.ptp(redrawn) > 0.95 * np.ptp(clean.depth)
 
 
-def test_jitter_moves_positions_and_keeps_depths() -> None:
-    clean = sample_points(DEPTH, SamplePattern(count=500), 3)
-    moved = sample_points(DEPTH, SamplePattern(count=500), 3, noise=SampleNoise(jitter_px=0.7))
-    lost = moved.dropped.get("outside the image", 0)
-    assert len(moved.depth) == 500 - lost
-    assert np.isin(moved.depth, clean.depth).all()
-    if not lost:
-        assert (moved.xy - clean.xy).std() == pytest.approx(0.7, rel=0.1)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -129,7 +119,7 @@ def test_what_the_depth_map_cannot_give_is_refused() -> None:
 
 
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
-@pytest.mark.parametrize("name", ["metres", "relative", "outliers", "jitter_px"])
+@pytest.mark.parametrize("name", ["metres", "relative", "outliers"])
 def test_noise_that_makes_no_sense_is_refused(name: str, value: float) -> None:
     with pytest.raises(UsageError):
         SampleNoise(**{name: value})
@@ -141,6 +131,6 @@ def test_depths_that_noise_puts_too_far_are_dropped_and_no_others() -> None:
     for noise in (SampleNoise(metres=1e300), SampleNoise(relative=1e308), SampleNoise(metres=1)):
         with pytest.raises(NoPointsError, match="noise put it too far"):
             sample_points(depth, SamplePattern(count=100), 0, noise=noise)
-    noise = SampleNoise(jitter_px=0.1, outliers=0.5)
+    noise = SampleNoise(outliers=0.5)
     kept = sample_points(depth, SamplePattern(count=100), 0, noise=noise)
     assert (kept.depth == 2e9).all()

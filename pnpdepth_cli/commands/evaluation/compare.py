@@ -23,7 +23,6 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     interval,
     swap_p_values,
 )
-from pnpdepth_cli.core.metrics import sum_count
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.dataset import groups_by_name
 from pnpdepth_cli.io.file_bytes import one_line
@@ -31,6 +30,8 @@ from pnpdepth_cli.io.record import plain, read_json
 from pnpdepth_cli.measures import MEASURES, Measure, chosen_measures
 
 ALPHA = 0.05
+PERMUTATIONS, SEED = 10_000, 0
+"""Most swaps of the permutation test, and their seed where not all are tried."""
 _STAGES = ("before", "after")
 _GAIN = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
 
@@ -45,8 +46,8 @@ class Run(NamedTuple):
     scoring: dict[str, Any]
     frames: dict[str, dict[str, Any]]
     """`values` by measure (NaN for null), those `before` refinement (empty for an evaluation),
-    scored `pixels`, `known` pixels of the ground truth (None where the file does not say), `group`,
-    and `sums` of a pooled run."""
+    scored `pixels`, `known` pixels of the ground truth (None where the file does not say), and
+    `group`."""
     varied: dict[str, str]
     """Options that `batch --vary` varied, with their values; empty for other runs."""
 
@@ -61,10 +62,7 @@ class Run(NamedTuple):
 def compare(
     paths: Sequence[str],
     *,
-    permutations: int = 10_000,
-    seed: int = 0,
     grouped: bool = True,
-    all_measures: bool = False,
     columns: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Returns the runs on the frames that all of them scored, compared with the first.
@@ -78,11 +76,8 @@ def compare(
 
     Args:
         paths: Files as `read_run` takes them; the first is the reference.
-        permutations: Most swaps of the permutation test.
-        seed: Random seed of the swaps, where not all are tried.
         grouped: False if every frame counts as independent.
-        all_measures: Whether every measure that all runs have is compared, not the main ones.
-        columns: Keys of the measures to compare by, instead.
+        columns: Keys of the measures to compare by, instead of the main ones.
 
     Raises:
         UsageError: For fewer than two runs.
@@ -90,8 +85,6 @@ def compare(
     """
     if len(paths) < 2:
         raise UsageError("two runs at least are needed to compare")
-    if permutations < 1:
-        raise UsageError(f"--permutations must be >= 1, got {permutations}")
     runs = [read_run(path) for path in paths]
     for run in runs[1:]:
         _check_rules(runs[0], run)
@@ -101,14 +94,8 @@ def compare(
         raise InputError(f"the runs have no scored frame in common: {first}; and {other}")
     shared = set.intersection(*({m.key for m in run.measures} for run in runs))
     measures = tuple(measure for measure in runs[0].measures if measure.key in shared)
-    pooled = runs[0].scoring.get("average") == "pooled"
-    if pooled:  # others' sums depend on the options of eval
-        measures = tuple(measure for measure in MEASURES if measure.key in shared)
     main = tuple(measure for measure in measures if measure.main)
-    if columns is not None or all_measures or not main:
-        measures = chosen_measures(measures, columns)
-    else:
-        measures = main
+    measures = main if columns is None and main else chosen_measures(measures, columns)
     keys = [measure.key for measure in measures]
     values = np.array(
         [[[run.frames[n]["values"].get(k, math.nan) for k in keys] for n in names] for run in runs]
@@ -117,17 +104,12 @@ def compare(
     differences = np.concatenate(list(values[1:] - values[0]), axis=1)
     groups = [runs[0].frames[name]["group"] for name in names]
     clusters = find_clusters(groups, differences, grouped=grouped)
-    if pooled:
-        count = sum_count(MEASURES)
-        sums = (np.array([run.frames[name]["sums"][:count] for name in names]) for run in runs)
-        tables = [FrameTable.of_pixels(of_run, keys) for of_run in sums]
-    else:
-        tables = [FrameTable.of_frames(np.where(known, of_run, math.nan)) for of_run in values]
+    tables = [FrameTable.of_frames(np.where(known, of_run, math.nan)) for of_run in values]
     better = np.array([measure.sign for measure in measures], np.float64)
     means, found, exact = [table.mean() for table in tables], [], True
     for table, mean in zip(tables[1:], means[1:], strict=True):
         ends = interval(lambda a, b: gain(a, b, better), (tables[0], table), clusters)
-        p_values, exact = swap_p_values(tables[0], table, clusters, permutations, seed)
+        p_values, exact = swap_p_values(tables[0], table, clusters, PERMUTATIONS, SEED)
         found.append([gain(means[0], mean, better), *ends, mean - means[0], p_values])
     of_runs = np.array(found)  # (runs − 1, 5, measures)
     of_runs = np.concatenate([of_runs, holm(of_runs[:, 4:])], axis=1)
@@ -155,12 +137,12 @@ def compare(
         "level": LEVEL,
         "clusters": {"count": clusters.count, "unit": clusters.unit},
         "exact_p_values": exact,
-        "permutations": permutations,
-        "seed": seed,
+        "permutations": PERMUTATIONS,
+        "seed": SEED,
         "tests": of_runs[:, 0].size,
         "notes": [
             *_notes(runs, names),
-            *([] if pooled else _lacking(names, measures, known)),
+            *_lacking(names, measures, known),
             *_cluster_notes(clusters, len(names), of_runs[:, 0].size),
         ],
     }
@@ -222,7 +204,7 @@ def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
             shares.append(f"{text} in {run.path}")
         lines.append(
             f"warning: coverage differs ({', '.join(shares)}), and a run that leaves hard pixels"
-            " empty looks better; this is no ranking. Score with --missing max, or with one --mask"
+            " empty looks better; this is no ranking"
         )
     return lines
 
@@ -304,7 +286,6 @@ def _evaluated(record: Mapping[str, Any]) -> dict[str, Any]:
                 "pixels": int(frame["pixels"]),
                 "group": str(frame["group"]),
                 "known": None if frame["known"] is None else int(frame["known"]),
-                "sums": [float(value) for value in frame.get("sums", ())],
             }
             for frame in record["frames"]
             if frame["error"] is None

@@ -27,7 +27,7 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     find_clusters,
     interval,
 )
-from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.errors import InputError, PnpDepthError
@@ -38,7 +38,7 @@ from pnpdepth_cli.io.record import plain
 
 _LEAK_WARNING_FRACTION = 0.01
 _LISTED = 3
-_OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale", "sparse": "--sparse-scale"}
+_OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,13 +107,7 @@ class Evaluation:
             "inputs": {
                 "prediction": request.prediction,
                 "truth": request.ground_truth,
-                "sparse": request.sparse,
-                "scales": {
-                    "prediction": request.pred_scale,
-                    "truth": request.gt_scale,
-                    "sparse": request.sparse_scale,
-                    "channel": request.channel,
-                },
+                "scales": {"prediction": request.pred_scale, "truth": request.gt_scale},
             },
             "protocol": {
                 "name": protocol.name,
@@ -133,10 +127,7 @@ class Evaluation:
             "mean": self.mean,
             "interval": bounds,
             "uncertainty": self.uncertainty,
-            "frames": [
-                frame_record(frame) | ({"sums": frame.sums} if protocol.average == "pooled" else {})
-                for frame in self.frames
-            ],
+            "frames": [frame_record(frame) for frame in self.frames],
             "notes": self.notes,
         }
         result: dict[str, Any] = plain(record)
@@ -183,8 +174,6 @@ def evaluate(
     pairs, notes = pair_frames(
         request.prediction,
         request.ground_truth,
-        sparse=request.sparse,
-        mask=protocol.mask,
         part=protocol.part,
     )
     single = request.prediction.is_file() and len(pairs) == 1
@@ -201,7 +190,7 @@ def evaluate(
         return row
 
     rows: list[FrameScores] = []
-    for row in in_order(score, pairs, request.workers):
+    for row in in_order(score, pairs, THREADS):
         rows.append(row)
         on_frame(len(rows), len(pairs))
     scored = [row for row in rows if row.scored]
@@ -210,12 +199,8 @@ def evaluate(
     keys = [measure.key for measure in protocol.measures]
     values = np.array([[row.values[key] for key in keys] for row in scored])
     groups = [row.pair.group for row in scored]
-    clusters = find_clusters(groups, values, grouped=request.grouped)
-    if protocol.average == "pooled":
-        sums = np.array([row.sums for row in scored])
-        table = FrameTable.of_pixels(sums, keys, protocol.measures)
-    else:  # a measure that a frame lacks is averaged over the other frames
-        table = FrameTable.of_frames(values)
+    clusters = find_clusters(groups, values)
+    table = FrameTable.of_frames(values)  # a measure that a frame lacks is averaged over the others
     mean = devkit_mean(values) if protocol.is_devkit else table.mean()
     bounds, no_interval = None, []
     if clusters.count >= MIN_CLUSTERS:
@@ -291,7 +276,6 @@ def _warnings(rows: Sequence[FrameScores], protocol: EvalProtocol) -> list[str]:
         treatment = {
             "skip": "lowers the coverage and is in no error",
             "min": f"is scored as {protocol.min_depth:g} m",
-            "max": f"is scored as {protocol.max_depth or 0:g} m",
         }.get(protocol.missing, "")
         if protocol.is_devkit:
             treatment = "was filled in from its neighbours before scoring"
@@ -318,13 +302,9 @@ def _warnings(rows: Sequence[FrameScores], protocol: EvalProtocol) -> list[str]:
             " so errors against the ground truth show nothing; --scale-by median scales each image"
         )
     kinds = {side: found[0][0] for side, found in kinds_of(rows).items() if found}
-    for side, what, ratios in (
-        ("prediction", "predictions", [row.ratio for row in scored]),
-        ("sparse", "sparse points", [row.sparse_ratio for row in scored]),
-    ):
-        compared = [ratio for ratio in ratios if math.isfinite(ratio)] or [math.nan]
-        by_option = {_OPTIONS[name]: kinds.get(name) for name in (side, "gt")}
-        lines += filter(None, [scale_warning(what, float(np.median(compared)), by_option)])
+    ratios = [row.ratio for row in scored if math.isfinite(row.ratio)] or [math.nan]
+    by_option = {_OPTIONS[name]: kinds.get(name) for name in ("prediction", "gt")}
+    lines += filter(None, [scale_warning("predictions", float(np.median(ratios)), by_option)])
     leaked = sum(row.leaked or 0 for row in scored)
     if leaked and not protocol.exclude_sparse:
         fraction = leaked / sum(row.pixels for row in scored if row.leaked is not None)

@@ -18,7 +18,7 @@ from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.rules import EvalProtocol, crop_window
 from pnpdepth_cli.errors import InputError, SizeError
 from pnpdepth_cli.io.dataset import Hdf5Array
-from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image, read_mask
+from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image
 from pnpdepth_cli.io.depth import (
     depth_from_stored,
     known_metres,
@@ -32,7 +32,6 @@ from pnpdepth_cli.sensors.pixels import as_depth_image
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Size = tuple[int, ...]
-Window = tuple[slice, slice]
 
 
 class Fit(NamedTuple):
@@ -86,18 +85,18 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
     else:
         assert frame.gt is not None
         scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
-        whole = _read(frame.gt, scale, request.channel, protocol, pair.index)
+        whole = _read(frame.gt, scale, protocol, pair.index)
     gt = np.ascontiguousarray(frame.part.apply(masked(whole.values, frame.masks)))
     kinds = {"gt": whole.reading}
-    sparse, kind = _known_sparse(pair, protocol, request, gt.shape)
+    sparse, kind = _known_sparse(pair, protocol, gt.shape)
     if kind is not None:
         kinds["sparse"] = kind
-    mask = _scored_mask(pair, gt, protocol)
+    mask = _scored_mask(gt, protocol)
     if protocol.exclude_sparse:
         if sparse is None:
             raise InputError(
-                f"frame {pair.name} has no sparse depth file to exclude; give it with --sparse"
-                + ("; `pnpdepth sample` draws the same points again" if pair.sampled else "")
+                f"frame {pair.name} has no sparse depth file to exclude: neither the record beside"
+                " the prediction nor the data set names one"
             )
         mask &= sparse == 0
     loaded = LoadedFrame(
@@ -115,22 +114,15 @@ def _with_prediction(
     """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
     assert pair.prediction is not None
     size = frame.gt.shape
-    image = _read(pair.prediction, request.pred_scale, request.channel, protocol, pair.index)
-    window = crop_window(protocol.prediction_crop or "none", size, "--pred-crop")
-    values = _to_size(pair, image.values, size, window, protocol.resize)
+    image = _read(pair.prediction, request.pred_scale, protocol, pair.index)
+    values = _to_size(pair, image.values, size, protocol.resize)
     depth, fit = scaled(values, frame.gt, protocol.prediction_kind, protocol.scale_by)
     if protocol.clip:
         clipped = np.clip(depth, protocol.min_depth, protocol.max_depth)
         depth = np.where(depth > 0, clipped, 0).astype(np.float32)
     empty = ~(depth > 0)
-    if protocol.missing == "fail" and (holes := int(np.count_nonzero(empty & (frame.gt > 0)))):
-        raise InputError(
-            f"{pair.prediction} has no depth at {holes:,} pixels of the ground truth, which"
-            " --missing fail refuses"
-        )
-    bounds = {"min": protocol.min_depth, "max": protocol.max_depth}
-    if (bound := bounds.get(protocol.missing)) is not None:
-        depth = np.where(empty, np.float32(bound), depth)
+    if protocol.missing == "min":
+        depth = np.where(empty, np.float32(protocol.min_depth), depth)
     has_sigma = fit is None and protocol.prediction_kind == "depth"
     return replace(
         frame,
@@ -138,30 +130,24 @@ def _with_prediction(
         kinds={"prediction": image.reading, **frame.kinds},
         predicted=values > 0,
         fit=fit,
-        sigma=_read_sigma(pair.sigma, size, window) if has_sigma else None,
+        sigma=_read_sigma(pair.sigma, size) if has_sigma else None,
     )
 
 
-def _read_sigma(path: Path | None, size: Size, window: Window) -> Depth | None:
+def _read_sigma(path: Path | None, size: Size) -> Depth | None:
     """(H, W) the standard deviation in metres, 0 where unknown; None where it is not known."""
     if path is None:
         return None
     try:
-        values = depth_from_stored(path, load_stored(path, None), None).values
+        values = depth_from_stored(path, load_stored(path), None).values
     except InputError:
         return None
-    placed = np.zeros(size, np.float32)
-    if placed[window].shape != values.shape:
-        return None
-    placed[window] = values
-    return placed
+    return values if values.shape == size else None
 
 
-def _read(
-    path: Path, scale: float | None, channel: str | None, protocol: EvalProtocol, index: int | None
-) -> DepthFile:
+def _read(path: Path, scale: float | None, protocol: EvalProtocol, index: int | None) -> DepthFile:
     """The depth image; codes are metres × the scale, else the file's own, else the protocol's."""
-    stored = load_stored(path, channel) if index is None else load_stacked(path, index)
+    stored = load_stored(path) if index is None else load_stacked(path, index)
     assumed = scale is None and stored.reading.scale is None and stored.values.dtype.kind != "f"
     image = depth_from_stored(path, stored, protocol.scale if assumed else scale)
     if protocol.is_devkit and image.reading.scale is not None and stored.values.ndim == 2:
@@ -171,19 +157,17 @@ def _read(
 
 
 def _known_sparse(
-    pair: FramePair, protocol: EvalProtocol, request: EvalRequest, size: Size
+    pair: FramePair, protocol: EvalProtocol, size: Size
 ) -> tuple[Depth | None, Reading | None]:
     """(H, W) metres of the points on their pixels, 0 elsewhere, and the kind of file.
 
-    (None, None) for an unusable file that the user did not name.
+    (None, None) for an unusable file.
     """
     if pair.sparse is None:
         return None, None
     height, width = size
     try:
-        scale = (
-            request.sparse_scale if request.sparse_scale is not None else pair.frame.sparse_scale
-        )
+        scale = pair.frame.sparse_scale
         sparse, reading = read_sparse(pair.sparse, size=(height, width), scale=scale)
         assumed = reading.assumed
         if assumed and protocol.scale != reading.scale:
@@ -194,7 +178,7 @@ def _known_sparse(
             if pair.frame.part.apply(np.zeros(source_size, bool)).shape != size:
                 raise _different(pair, "sparse depth", pair.sparse, source_size, size)
     except InputError:
-        if pair.sparse_named or protocol.exclude_sparse:
+        if protocol.exclude_sparse:
             raise
         return None, None
     inside = in_frame(xy, (height, width))
@@ -217,37 +201,24 @@ def image_of(pair: FramePair, size: Size) -> Depth | None:
     return rgb if rgb.shape[:2] == size else None
 
 
-def _scored_mask(pair: FramePair, ground_truth: Depth, protocol: EvalProtocol) -> Mask:
+def _scored_mask(ground_truth: Depth, protocol: EvalProtocol) -> Mask:
     """(H, W) true where the protocol scores known ground truth."""
     scored = np.zeros(ground_truth.shape, bool)
     scored[crop_window(protocol.crop, ground_truth.shape)] = True
     scored &= ground_truth > protocol.min_depth
     if protocol.max_depth is not None:
         scored &= ground_truth < protocol.max_depth
-    if pair.mask is not None:
-        mask = read_mask(pair.mask)
-        if mask.shape != ground_truth.shape:
-            raise _different(pair, "mask", pair.mask, mask.shape, ground_truth.shape)
-        scored &= mask
-    elif protocol.mask is not None:
-        raise InputError(f"frame {pair.name} has no mask in {protocol.mask}; add it")
     return scored
 
 
-def _to_size(
-    pair: FramePair, depth: Depth, size: Size, window: Window, resize: str | None
-) -> Depth:
-    """The depth map at the ground truth's size: as it is, in its crop, or resized if allowed."""
-    placed = np.zeros(size, np.float32)
-    view = placed[window].shape
-    if depth.shape != view and resize is None:
+def _to_size(pair: FramePair, depth: Depth, size: Size, resize: str | None) -> Depth:
+    """The depth map at the ground truth's size: as it is, or resized if allowed."""
+    if depth.shape != size and resize is None:
         raise _different(
-            pair, "prediction", pair.prediction, depth.shape, view,
-            advice="; --resize nearest or bilinear scales predictions if both show the same"
-            " view, --pred-crop kb puts those of KITTI's benchmark crop in their place",
+            pair, "prediction", pair.prediction, depth.shape, size,
+            advice="; --resize nearest or bilinear scales predictions if both show the same view",
         )  # fmt: skip
-    placed[window] = depth if depth.shape == view else _resized(depth, view, resize)
-    return placed
+    return depth if depth.shape == size else _resized(depth, size, resize)
 
 
 def _resized(depth: Depth, size: Size, method: str | None) -> Depth:

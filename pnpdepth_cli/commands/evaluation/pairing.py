@@ -18,7 +18,6 @@ from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.dataset import (
-    IMAGE_SUFFIXES,
     Frame,
     Source,
     find_files,
@@ -49,8 +48,7 @@ class FramePair:
     group: str = ""
     """The sequence of the frame: the data set's, the manifest's, or what its name says."""
     sparse: Path | None = None
-    """The network's sparse input: the user's, the run's record's or the data set's."""
-    sparse_named: bool = False
+    """The network's sparse input, of the run's record or the data set."""
     sigma: Path | None = None
     index: int | None = None
     """Of the frame, in files of several frames."""
@@ -58,15 +56,12 @@ class FramePair:
     """Points of the ground truth that were the sparse input, by the run's record."""
     unit: str = METRES
     image: Source | None = None
-    mask: Path | None = None
 
 
 def pair_frames(
     prediction: Path,
     ground_truth: Path,
     *,
-    sparse: Path | None = None,
-    mask: Path | None = None,
     part: FramePart | None = None,
 ) -> tuple[list[FramePair], list[str]]:
     """Returns the frames of the ground truth in its order, and notes.
@@ -74,15 +69,13 @@ def pair_frames(
     Args:
         prediction: A depth file, or a folder of them.
         ground_truth: The same, or a data set of a known layout, or a manifest.
-        sparse: A file, or a folder with the same names.
-        mask: A file, or a folder with the same names.
         part: What is used of the frames of a data set; None for the layout's own.
 
     Raises:
         UsageError: For a file and a folder.
         InputError: For a missing path, or folders without a common name.
     """
-    for path in filter(None, (prediction, ground_truth, sparse, mask)):
+    for path in filter(None, (prediction, ground_truth)):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
     try:
@@ -116,14 +109,11 @@ def pair_frames(
             f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
             f" and are not scored: {some_names(extra)}"
         )
-    points = _by_frame(sparse, (*DEPTH_SUFFIXES, ".csv", ".txt"), names)
-    masks = _by_frame(mask, (*DEPTH_SUFFIXES, *IMAGE_SUFFIXES), names)
     groups = groups_by_name([frame.name for frame in frames])
     return [
         replace(
-            _pair(frame, predictions.get(frame.name), points.get(frame.name)),
+            _pair(frame, predictions.get(frame.name)),
             group=group if frame.group is None else frame.group,
-            mask=masks.get(frame.name),
         )
         for frame, group in zip(frames, groups, strict=True)
     ], notes
@@ -146,16 +136,7 @@ def _true_frames(
     return frames, [note + (f", of which {cuts} is used" if cuts else "")]
 
 
-def _by_frame(
-    path: Path | None, suffixes: tuple[str, ...], names: Iterable[str]
-) -> dict[str, Path]:
-    """The file of each frame: the one for all, or those of the folder."""
-    if path is None:
-        return {}
-    return _files(path, suffixes)[0] if path.is_dir() else dict.fromkeys(names, path)
-
-
-def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePair:
+def _pair(frame: Frame, prediction: Path | None) -> FramePair:
     """The frame with what the record of a refinement, beside its depth, says of its inputs."""
     record: Mapping[str, Any] = {}
     sigma: Path | None = None
@@ -173,8 +154,7 @@ def _pair(frame: Frame, prediction: Path | None, sparse: Path | None) -> FramePa
         name=frame.name,
         prediction=prediction,
         frame=frame,
-        sparse=sparse or _input(inputs, "sparse") or known,
-        sparse_named=sparse is not None,
+        sparse=_input(inputs, "sparse") or known,
         sigma=sigma,
         sampled=used if is_sampled and isinstance(used, int) else 0,
         image=_input(inputs, "image") or frame.image,

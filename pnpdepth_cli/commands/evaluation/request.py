@@ -13,15 +13,12 @@ from pnpdepth_cli.settings import option
 
 
 def parse_thresholds(text: str) -> tuple[float, float, float]:
-    """Returns the thresholds of δ1…δ3 from one number, which is raised to powers, or from three."""
+    """Returns the thresholds of δ1…δ3: a number and its powers. Raises UsageError for a text."""
     try:
-        first, *others = (float(word) for word in text.split(","))
-        second, third = others or (first**2, first**3)
+        first = float(text)
+        return first, first**2, first**3
     except (ValueError, OverflowError):
-        raise UsageError(
-            f"--delta {text!r} is neither one number such as 1.25 nor three numbers"
-        ) from None
-    return first, second, third
+        raise UsageError(f"--delta {text!r} is no number such as 1.25") from None
 
 
 def parse_names(text: str) -> tuple[str, ...]:
@@ -29,44 +26,17 @@ def parse_names(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(text.split(",")))
 
 
-def parse_depth_limits(text: str) -> tuple[float, float]:
-    """Returns the two depths of a text such as `10,30`."""
-    try:
-        near, far = (float(word) for word in text.split(","))
-    except ValueError:
-        raise UsageError(f"--by-depth {text!r} is not two depths such as 10,30") from None
-    return near, far
-
-
 @dataclass(frozen=True, kw_only=True)
 class ScoringRules:
     """Fields of the protocol that the user sets otherwise; None leaves the protocol's."""
 
-    min_depth: float | None = option(None, "Score ground truth above M metres.", metavar="M")
     max_depth: float | None = option(None, "Score ground truth below M metres.", metavar="M")
-    clip: bool | None = option(None, "Clip predictions to these bounds.", flag="--clip/--no-clip")
-    crop: str | None = option(
-        None, "none, nyu, eigen, garg, or a rectangle.", metavar="NAME|X,Y,W,H"
-    )
-    mask: Path | None = option(None, "Mask image, or folder with a mask per frame.")
-    average: str | None = option(
-        None,
-        "Mean over images, or over all pixels of all images.",
-        choices=choices.AVERAGES,
-    )
     thresholds: tuple[float, float, float] | None = option(
         None,
-        "Thresholds of δ1…δ3: D, D², D³, or D1, D2, D3. The paper's KITTI rows use 1.01."
-        "  [default: 1.25]",
+        "Thresholds of δ1…δ3 are D, D², D³. The paper's KITTI rows use 1.01.  [default: 1.25]",
         flag="--delta",
-        metavar="D|D1,D2,D3",
+        metavar="D",
         parse=parse_thresholds,
-    )
-    missing: str | None = option(
-        None,
-        "Empty predictions: not scored, scored as --min-depth or --max-depth, or an error."
-        "  [default: the protocol's]",
-        choices=choices.MISSING,
     )
     scale_by: str | None = option(
         None,
@@ -91,18 +61,12 @@ class ScoringRules:
         "Also errors of pixels nearer than NEAR metres, farther than FAR, and between, by their"
         " true depth.",
         flag="--by-depth",
-        metavar="NEAR,FAR",
-        parse=parse_depth_limits,
+        metavar="NEAR FAR",
     )
     resize: str | None = option(
         None, "Resize predictions to the size of the ground truth.", choices=choices.RESIZES
     )
-    prediction_crop: str | None = option(
-        None,
-        "Part of the frame that predictions show, such as the 1216×352 of KITTI's benchmark.",
-        flag="--pred-crop",
-        metavar="kb|X,Y,W,H",
-    )
+
     exclude_sparse: bool | None = option(None, "Leave out pixels with a sparse point.")
 
     def changes(self) -> dict[str, Any]:
@@ -126,25 +90,9 @@ class EvalRequest(ScoringRules):
     )
     pred_scale: float | None = option(None, "Integer predictions hold metres × S.", metavar="S")
     gt_scale: float | None = option(None, "Integer ground truth holds metres × S.", metavar="S")
-    sparse: Path | None = option(
-        None,
-        "Sparse depth the networks had: points that are part of the ground truth are reported.",
-        metavar="FILE|FOLDER",
-    )
-    sparse_scale: float | None = option(
-        None, "Integer --sparse files hold metres × S.", metavar="S"
-    )
-    channel: str | None = option(
-        None, "EXR channel or NPZ array that holds the depth.", metavar="NAME"
-    )
-    grouped: bool = True
-    """False if every frame counts as independent."""
-    workers: int = option(
-        2, "Number of frames read at once.", metavar="N", least=1, show_default=True
-    )
 
     def __post_init__(self) -> None:
-        for name in ("pred_scale", "gt_scale", "sparse_scale"):
+        for name in ("pred_scale", "gt_scale"):
             scale = getattr(self, name)
             if scale is not None and not (math.isfinite(scale) and scale > 0):
                 flag = f"--{name.replace('_', '-')}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli import choices
@@ -23,21 +22,15 @@ _CROP_FRACTIONS = {
 # Eigen et al. 2014 for NYU Depth v2: rows 45 to 470, columns 41 to 600 of 480x640 pixels.
 _NYU_SIZE = (480, 640)
 _NYU_WINDOW = (41, 45, 560, 426)
-# What networks for KITTI's benchmark see of a frame: 352x1216 pixels at the bottom, centred (BTS,
-# Lee et al. 2019, `do_kb_crop`).
-_KB_SIZE = (352, 1216)
-_CROPS = ("none", "nyu", *_CROP_FRACTIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvalProtocol(Protocol):
     """A protocol with what the user changes, and how the files are read."""
 
-    mask: Path | None = None
     exclude_sparse: bool = False
     prediction_kind: str = "depth"
     scale_by: str = "none"
-    prediction_crop: str | None = None
     more_measures: tuple[str, ...] = ()
     depth_limits: tuple[float, float] | None = None
     resize: str | None = None
@@ -62,32 +55,28 @@ class EvalProtocol(Protocol):
         return rules | {
             "thresholds": list(self.thresholds),
             "definitions": KITTI_DEVKIT if self.is_devkit else "usual",
-            "mask": None if self.mask is None else str(self.mask),
         }
 
     def describe(self) -> str:
         """Returns one line, such as `eigen: ground truth in 0.001–80 m, crop eigen, …`."""
-        kept = (*_OF_READING, "exclude_sparse")
-        own = replace(published(self.name), **{name: getattr(self, name) for name in kept})
+        reading = {name: getattr(self, name) for name in (*_OF_READING, "exclude_sparse")}
+        own = replace(published(self.name), **reading)
         bounds = f" above {self.min_depth:g} m" if self.min_depth else ""
         if self.max_depth is not None:
             bounds = f" in {self.min_depth:g}–{self.max_depth:g} m"
         limits = ", ".join(f"{limit:.6g}" for limit in self.thresholds)
-        averaged = "the images" if self.average == "per-image" else "all pixels together"
         parts = {
             f"{self.name}{'' if self == own else ' (changed)'}: all known ground truth{bounds}": 1,
             "no crop" if self.crop == "none" else f"crop {self.crop}": True,
             "predictions clipped to the same range": self.clip,
-            f"mask {self.mask}": self.mask,
             "without the pixels of sparse points": self.exclude_sparse,
             f"predictions resized ({self.resize})": self.resize,
-            f"predictions of crop {self.prediction_crop}": self.prediction_crop,
             "predictions are disparity": self.prediction_kind == "disparity",
             f"each image scaled by {self.scale_by}": self.scale_by != "none",
-            _MISSING_TEXTS[self.missing]: self.missing != "skip",
+            "empty predictions scored as the lower bound": self.missing == "min",
             "missing predictions filled in, errors as its program prints them": self.is_devkit,
             f"δ below {limits}": not self.is_devkit,
-            f"mean over {averaged}": True,
+            "mean over the images": True,
         }
         return ", ".join(text for text, applies in parts.items() if applies)
 
@@ -99,21 +88,13 @@ _IN_MILLIMETRES = tuple(
 
 _OF_READING = (
     *("name", "note", "part", "sample", "seed", "foreground"),
-    *("scale", "resize", "mask", "prediction_kind", "prediction_crop"),
+    *("scale", "resize", "prediction_kind"),
     *("more_measures", "depth_limits"),
 )
 """Fields that say how files are read and what is measured, not which pixels are scored and how."""
 
-_MISSING_TEXTS = {
-    "skip": "",
-    "min": "empty predictions scored as the lower bound",
-    "max": "empty predictions scored as the upper bound",
-    "fail": "no empty predictions",
-}
 _NOT_OF_DEVKIT = {
-    "average": "--average",
     "thresholds": "--delta",
-    "missing": "--missing",
     "more_measures": "--measures",
     "depth_limits": "--by-depth",
 }
@@ -138,38 +119,23 @@ def choose_protocol(name: str, **changes: Any) -> EvalProtocol:
     for field, option in _NOT_OF_DEVKIT.items() if own.is_devkit else ():
         if changed.get(field, getattr(own, field)) != getattr(own, field):
             raise UsageError(
-                f"{option} does not apply to {name}: it has its own measures, no δ, averages"
-                " over the images, and fills in missing predictions"
+                f"{option} does not apply to {name}: it has its own measures, and no δ"
             )
-    if changed.get("min_depth") == 0 and own.missing == "min":
-        changed.setdefault("missing", "skip")  # there is no bound to score empty predictions as
     protocol = replace(own, **changed)
     low, high = protocol.min_depth, protocol.max_depth
     for key in protocol.more_measures:
         _ = choices.MEASURES[key]
     near, far = protocol.depth_limits or (1.0, 2.0)
     if not (0 < near < far and math.isfinite(far)):
-        raise UsageError(f"--by-depth must be two rising depths in metres, got {near:g},{far:g}")
-    if not (math.isfinite(low) and low >= 0):
-        raise UsageError(f"--min-depth must be metres >= 0, got {low:g}")
+        raise UsageError(f"--by-depth must be two rising depths in metres, got {near:g} {far:g}")
     if high is not None and not (math.isfinite(high) and high > low):
-        raise UsageError(f"--max-depth must be metres above --min-depth {low:g}, got {high:g}")
+        raise UsageError(f"--max-depth must be metres above {low:g}, got {high:g}")
     if not all(math.isfinite(limit) and limit > 1 for limit in protocol.thresholds):
         raise UsageError("--delta must be above 1: δ counts ratios below it")
-    if protocol.more_measures and protocol.average == "pooled":
-        raise UsageError("--measures are of each image; --average pooled does not apply to them")
-    if protocol.missing == "min" and low == 0:
-        raise UsageError("--missing min scores empty predictions as --min-depth; set it above 0")
-    if protocol.missing == "max" and high is None:
-        raise UsageError("--missing max scores empty predictions as --max-depth; set it")
-    if protocol.crop not in _CROPS:
-        _rectangle(protocol.crop, names=_CROPS)
-    if protocol.prediction_crop not in (None, "kb"):
-        _rectangle(protocol.prediction_crop or "", names=("kb",))
     return protocol
 
 
-def crop_window(crop: str, size: tuple[int, ...], called: str = "crop") -> tuple[slice, slice]:
+def crop_window(crop: str, size: tuple[int, ...]) -> tuple[slice, slice]:
     """Returns the rows and columns of a frame of `size` (H, W) pixels that lie in a crop.
 
     Raises:
@@ -183,29 +149,12 @@ def crop_window(crop: str, size: tuple[int, ...], called: str = "crop") -> tuple
             (int(left * width), int(right * width)),
         )
         return slice(*rows), slice(*columns)
-    if crop == "nyu" and size != _NYU_SIZE:
+    if crop == "none":
+        return slice(0, height), slice(0, width)
+    if size != _NYU_SIZE:
         raise SizeError(
-            f"crop nyu is for frames of 640×480 but this one is {width}×{height};"
-            " --crop none, or give X,Y,WIDTH,HEIGHT"
+            f"crop nyu is for frames of 640×480 but this one is {width}×{height}; --protocol paper"
+            " scores any size"
         )
-    if crop in ("none", "nyu", "kb"):
-        x, y, w, h = {
-            "none": (0, 0, width, height),
-            "nyu": _NYU_WINDOW,
-            "kb": ((width - _KB_SIZE[1]) // 2, height - _KB_SIZE[0], *_KB_SIZE[::-1]),
-        }[crop]
-    else:
-        x, y, w, h = _rectangle(crop)
-    if min(x, y) < 0 or x + w > width or y + h > height:
-        raise SizeError(f"{called} {crop} does not lie in a frame of {width}×{height}")
+    x, y, w, h = _NYU_WINDOW
     return slice(y, y + h), slice(x, x + w)
-
-
-def _rectangle(text: str, names: tuple[str, ...] = ()) -> tuple[int, int, int, int]:
-    try:
-        x, y, width, height = (int(word) for word in text.split(","))
-    except ValueError:
-        x, y, width, height = -1, -1, 0, 0
-    if min(x, y) < 0 or min(width, height) < 1:
-        raise UsageError(f"crop {text!r} is neither X,Y,WIDTH,HEIGHT nor one of {', '.join(names)}")
-    return x, y, width, height

@@ -66,12 +66,8 @@ class FrameScores:
     fit: Fit | None = None
     ratio: float = math.nan
     """Median of prediction / ground truth."""
-    sparse_ratio: float = math.nan
-    """Median of sparse depth / ground truth, if the user named sparse depth."""
     leaked: int | None = None
     """Scored pixels whose ground truth is a value of the sparse input; None if that is unknown."""
-    sums: tuple[float, ...] = ()
-    """Over the pixels, in the order of core.metrics.error_sums."""
     kinds: dict[str, Reading] = field(default_factory=dict)
     """Of the files by "prediction", "gt" and "sparse"."""
     uncertainty: FrameUncertainty | None = field(default=None, compare=False)
@@ -122,7 +118,6 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
         pixels=pixels,
         predicted=int(np.count_nonzero(frame.predicted & (gt > 0))),
         fit=frame.fit,
-        sums=tuple(sums.tolist()),
     )
     if protocol.is_devkit:
         values = devkit_errors(depth, gt)
@@ -133,17 +128,14 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
         of_pixels = measures_of(sums, summed).tolist()
         values = {m.key: value for m, value in zip(summed, of_pixels, strict=True)}
         values |= {m.key: m.value(depth, gt) for m in protocol.measures if m.key not in values}
-    leaked, sparse_ratio = min(pair.sampled, pixels) or None, math.nan
+    leaked = min(pair.sampled, pixels) or None
     if frame.sparse is not None:
         equal = np.abs(frame.sparse - gt) <= frame.tolerance + 1e-6 * gt
         leaked = int(np.count_nonzero(both & (frame.sparse > 0) & equal))
-        if pair.sparse_named:
-            sparse_ratio = _median_ratio(frame.sparse, gt)
     return replace(
         row,
         values=values,
         ratio=_median_ratio(depth, gt),
-        sparse_ratio=sparse_ratio,
         leaked=leaked,
         uncertainty=None if frame.sigma is None else frame_uncertainty(depth, gt, frame.sigma),
     )

@@ -13,11 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-
-from pnpdepth_cli.core.metrics import measures_of
-from pnpdepth_cli.measures import MEASURES, Measure
 
 Floats = NDArray[np.float64]
 
@@ -124,25 +120,6 @@ class FrameTable:
         known = np.isfinite(values)
         sums = np.stack([np.where(known, values, 0.0), known.astype(np.float64)], axis=1)
         return cls(sums=sums, mean_of=mean_of)
-
-    @classmethod
-    def of_pixels(
-        cls, sums: Floats, keys: Sequence[str], measures: Sequence[Measure] = MEASURES
-    ) -> FrameTable:
-        """Every pixel counts alike.
-
-        Args:
-            sums: (N, S) as `error_sums` has them.
-            keys: Of the measures that are meant.
-            measures: Those that the sums are of.
-        """
-        kept = [number for number, measure in enumerate(measures) if measure.key in keys]
-
-        def mean_of(sums: Floats) -> Floats:
-            found = measures_of(torch.from_numpy(sums[..., 0]), measures)
-            return np.asarray(found.numpy()[..., kept])
-
-        return cls(sums=sums[..., None], mean_of=mean_of)
 
     def mean(self) -> Floats:
         """Returns (M,) the means over all frames; NaN for a measure that none has."""

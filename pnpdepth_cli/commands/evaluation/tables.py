@@ -33,8 +33,7 @@ def means_by_measure(evaluation: Evaluation, columns: Sequence[str] | None) -> T
     count = len(evaluation.scored)
     pixels = sum(frame.pixels for frame in evaluation.frames)
     of = f"{count:,} frame{'' if count == 1 else 's'}, {pixels:,} pixels"
-    pooled = evaluation.protocol.average == "pooled"
-    caption = f"Over the pixels of {of}, together" if pooled else f"Means over {of}"
+    caption = f"Means over {of}"
     header, has_interval = ["", "mean"], evaluation.interval is not None
     if has_interval:
         header.append("95 %")

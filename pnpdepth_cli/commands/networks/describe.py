@@ -24,7 +24,7 @@ from pnpdepth_cli.models.registry import families
 from pnpdepth_cli.points import SparsePoints
 
 DEFAULT_SIZE = (240, 320)
-"""Rows and columns of the synthetic frame where no size is given."""
+"""Rows and columns of the synthetic frame of a network without a size of its own."""
 
 
 def list_models() -> list[dict[str, Any]]:
@@ -72,9 +72,7 @@ def _size(size: Fixed | Multiple | Near) -> str:
     return "any" if size.longest is None else f"any, shrunk to {size.longest}"
 
 
-def check_model(
-    model: str, checkpoint: Path | None, image: Path | None, device: str = "cpu"
-) -> dict[str, Any]:
+def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict[str, Any]:
     """Loads a network, runs it once, and cuts it at every layer of its definition.
 
     At each layer the cut network must return what the whole one does, bit for bit, and a gradient
@@ -97,7 +95,7 @@ def check_model(
         DeviceError: The device is missing or too small.
         InputError: The image cannot be read.
     """
-    network = load_network(model, checkpoint, device)
+    network = load_network(model, checkpoint)
     definition = network.definition
     with out_of_memory_is_a_device_error(network.device):
         prepared = prepare(
@@ -160,7 +158,6 @@ def list_layers(
     choice: NetworkChoice,
     *,
     every: bool,
-    size: tuple[int, int] | None = None,
     on_layer: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[MeasuredLayer]:
     """Returns the layers that a network can be cut at, measured on a synthetic frame.
@@ -170,7 +167,6 @@ def list_layers(
     Args:
         choice: The network, its weights and device.
         every: Whether all submodules are listed, not only the layers of the definition.
-        size: Rows and columns of the frame; None takes the network's own, or `DEFAULT_SIZE`.
         on_layer: Called after each layer with the number of layers done and of all.
 
     Raises:
@@ -186,5 +182,5 @@ def list_layers(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
     with out_of_memory_is_a_device_error(network.device):
-        prepared = prepare(network, _synthetic(size or _own_size(network)))
+        prepared = prepare(network, _synthetic(_own_size(network)))
         return measure_layers(network, names, prepared.arguments, prepared.map.network, on_layer)

@@ -12,7 +12,7 @@ from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
 from pnpdepth_cli.commands.evaluation.frames import image_of, load_frame
 from pnpdepth_cli.commands.evaluation.scoring import FrameScores, filled
 from pnpdepth_cli.commands.evaluation.tables import calibration_tables, means_by_measure
-from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
@@ -61,7 +61,7 @@ def write_eval_report(
         drawn = in_order(
             lambda frame: _entry(frame, evaluation, columns, images),
             scored,
-            evaluation.request.workers,
+            THREADS,
         )
         for done, entry in enumerate(drawn, start=1):
             yield entry
@@ -109,7 +109,6 @@ def _head(
         facts=[
             ("Prediction", str(request.prediction)),
             ("Ground truth", str(request.ground_truth)),
-            *([("Sparse depth", str(request.sparse))] if request.sparse else []),
             ("Protocol", evaluation.protocol.describe()),
             ("Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"),
         ],

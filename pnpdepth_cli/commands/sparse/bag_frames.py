@@ -41,7 +41,7 @@ from pnpdepth_cli.io.bags.transforms import (
     poses_topics,
     static_pose,
 )
-from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.cloud_files import write_points
 from pnpdepth_cli.io.poses import Trajectory
 from pnpdepth_cli.io.record import plain, read_json, write_json
@@ -73,8 +73,6 @@ class FramesRequest:
     """Largest time between an image and its scan, seconds."""
     limit: int | None = None
     overwrite: bool = False
-    calib: Path | None = None
-    camera: int | None = None
 
     def __post_init__(self) -> None:
         if not self.tolerance >= 0:
@@ -90,8 +88,6 @@ class FramesRequest:
             "topics": list(self.topics),
             "tolerance": self.tolerance,
             "limit": self.limit,
-            "calib": None if self.calib is None else str(self.calib),
-            "camera": self.camera,
         }
 
 
@@ -193,13 +189,10 @@ def _write_calibration(
     topic = camera_info_topic(bag, image_topic)
     of_bag = None if topic is None else camera_of_bag(bag, topic)
     names = (of_bag[1] if of_bag else "") or frames[0], frames[1]
-    if request.calib is not None:
-        calibration, source = read_calibration(request.calib, request.camera), str(request.calib)
-    elif of_bag is None:
+    if of_bag is None:
         say(f"warning: {bag.path} has no camera_info of {image_topic}; refine with --calib")
         return frames[0]
-    else:
-        calibration, source = of_bag[0], str(topic)
+    calibration, source = of_bag[0], str(topic)
     scanner = None if calibration.scanner else static_pose(bag, *names)
     if scanner is not None:
         source += f", and /tf_static from {names[0]} to {names[1]}"
@@ -211,7 +204,7 @@ def _write_calibration(
         )
     else:
         say(f"calibration: {source}")
-    if request.calib is None and calibration.rectified:
+    if calibration.rectified:
         pairs = _some_frames(request.output)
         calibration, note = chosen_camera(calibration, pairs, image_topic)
         say(note)

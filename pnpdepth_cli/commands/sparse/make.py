@@ -14,9 +14,9 @@ from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.commands.sparse.options import ScanOptions
 from pnpdepth_cli.commands.sparse.scan_points import check_size, read_scan_points
-from pnpdepth_cli.errors import OutputError, SizeError, UsageError
+from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
@@ -35,9 +35,6 @@ from pnpdepth_cli.sensors import (
     sample_points,
     simulate_lidar,
 )
-
-AT_CALIBRATION = "calib"
-"""Position of a simulated scanner: the pose that the calibration gives."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,9 +126,7 @@ def project_scan(
     scan: Path,
     options: ScanOptions,
     target: SparseTarget,
-    *,
-    image: Path | None = None,
-    size: tuple[int, int] | None = None,
+    image: Path,
 ) -> dict[str, Any]:
     """Writes the scan's points that the camera sees, and returns the record.
 
@@ -140,17 +135,10 @@ def project_scan(
         options: The calibration.
         target: Files to write.
         image: The camera's image, which gives the size and the ground of an overlay.
-        size: (H, W) of the image, where there is no file of it.
     """
     target.check((scan, image, options.calib, options.extrinsics))
-    if target.overlay is not None and image is None:
-        raise UsageError("an overlay needs the image; give --image")
-    rgb = None if image is None else read_rgb(image).values
-    if rgb is not None:
-        if size not in (None, rgb.shape[:2]):
-            raise SizeError(f"{image} is {rgb.shape[1]}×{rgb.shape[0]}, not of the size given")
-        size = (rgb.shape[0], rgb.shape[1])
-    projected = read_scan_points(scan, options, size, image)
+    rgb = read_rgb(image).values
+    projected = read_scan_points(scan, options, (rgb.shape[0], rgb.shape[1]), image)
     settings = plain(asdict(options))
     inputs, notes = {"image": image, "scan": projected.record}, projected.notes
     return target.write("project", projected.points, settings, inputs=inputs, notes=notes, rgb=rgb)
@@ -198,29 +186,24 @@ def simulate_scan(
     sensor: Lidar,
     calib: Path,
     *,
-    camera: int | None = None,
-    position: str | None = None,
     seed: int = 0,
     **reading: Any,
 ) -> dict[str, Any]:
-    """Writes the points of a simulated sensor in a dense depth map, and returns the record.
+    """Writes the points of a sensor at the camera's place in a dense depth map; returns the record.
 
     Args:
         depth: The file of the map.
         target: Files to write.
         sensor: The scanner.
         calib: Calibration of the camera.
-        camera: Which camera of it.
-        position: Of the scanner: metres right of, below and in front of the camera as X,Y,Z, or
-            `AT_CALIBRATION`. None: at the camera.
         seed: Of all noise.
         **reading: Options of `read_depth`.
     """
     target.check((depth, calib))
     dense, notes = _dense(depth, **reading)
-    calibration = read_calibration(calib, camera)
+    calibration = read_calibration(calib)
     notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
-    scanner = _placed(calib, calibration, position)
+    scanner = Extrinsics(FORWARD_LEFT_UP, np.zeros(3))
     points = simulate_lidar(dense, calibration.camera, scanner, sensor, seed)
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{sensor.name}, seed {seed}'))}")
     settings = {
@@ -242,8 +225,8 @@ def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
     return dense.values, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
 
 
-def read_noise(noise: str | None, outliers: str | None, jitter_px: float) -> SampleNoise:
-    """Returns the noise of the depth, `0.05` metres or `2%`, of `5%` outliers, and of the pixels.
+def read_noise(noise: str | None, outliers: str | None) -> SampleNoise:
+    """Returns the noise of the depth, `0.05` metres or `2%`, and of `5%` outliers.
 
     Raises:
         UsageError: One of the texts is of another form.
@@ -252,7 +235,7 @@ def read_noise(noise: str | None, outliers: str | None, jitter_px: float) -> Sam
     if outliers is not None and not outliers.endswith("%"):
         raise UsageError(f"--outliers {outliers} is not a percentage such as 5%")
     _, redrawn = _metres_or_fraction("--outliers", outliers or "0%")
-    return SampleNoise(metres=metres, relative=relative, outliers=redrawn, jitter_px=jitter_px)
+    return SampleNoise(metres=metres, relative=relative, outliers=redrawn)
 
 
 def _metres_or_fraction(option: str, text: str) -> tuple[float, float]:
@@ -277,18 +260,3 @@ def find_sensor(
     if name is not None or beams is None or vertical_fov is None:
         raise UsageError("give --sensor, or --beams and --vertical-fov")
     return ideal_lidar(beams, *vertical_fov)
-
-
-def _placed(path: Path, calibration: Calibration, position: str | None) -> Extrinsics:
-    """The pose of the scanner that is asked for."""
-    if position == AT_CALIBRATION:
-        if calibration.scanner is None:
-            raise UsageError(f"{path} has no pose of the scanner; add R and t")
-        return calibration.scanner
-    try:
-        metres = np.array((position or "0,0,0").split(","), np.float64)
-    except ValueError:
-        metres = np.empty(0)
-    if metres.shape != (3,) or not np.isfinite(metres).all():
-        raise UsageError(f"--position must be X,Y,Z in metres or calib, got {position!r}")
-    return Extrinsics(FORWARD_LEFT_UP, metres)

@@ -85,7 +85,7 @@ def read_scan_points(
         )
     size = size or calibration.camera.size
     if size is None:
-        raise SizeError(f"{named} does not give the image's size; give --image or --size")
+        raise SizeError(f"{named} does not give the image's size; give --image")
     warnings = check_size(named, calibration.camera, size, image)
     scan = read_scan(path)
     if calibration.rectified:

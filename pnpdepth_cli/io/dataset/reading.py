@@ -34,7 +34,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     """
     if path.suffix.lower() in IMAGE_SUFFIXES:
         return np.asarray(read_rgb(path).values.max(axis=2) > 0)
-    values = load_stored(path, None).values
+    values = load_stored(path).values
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[:, :, 0]
     if values.ndim != 2:

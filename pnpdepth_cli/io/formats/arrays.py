@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.decoding import silence
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged, one_line
 from pnpdepth_cli.io.formats.depth_format import DepthFile, DepthFormat, Reading
@@ -76,7 +76,7 @@ def _npy_header(
     return shape, "F" if is_fortran else "C", dtype, stream.tell()
 
 
-def _read_npy(path: Path, data: bytes, channel: str | None) -> DepthFile:
+def _read_npy(path: Path, data: bytes) -> DepthFile:
     array = parse_npy(path, data)
     check_value_count(path, array.size)
     return DepthFile(values=array, reading=Reading(f"{array.dtype} NPY"), is_image=False)
@@ -96,18 +96,17 @@ COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Those that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
 
 
-def parse_npz(path: Path, data: bytes, key: str | None) -> tuple[str, NDArray[Any]]:
-    """Returns the name and content of the array called `key`, or of the only one.
+def parse_npz(path: Path, data: bytes) -> tuple[str, NDArray[Any]]:
+    """Returns the name and content of the only array.
 
     Raises:
-        FileFormatError: The archive is damaged or holds no such array of numbers, or sizes in it
+        FileFormatError: The archive is damaged, does not hold one array of numbers, or sizes in it
             are false or too large.
-        UsageError: There is no array `key`.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            name = _choose(path, list(members), key)
+            name = _only(path, list(members))
             if members[name].compress_type not in COMPRESSIONS:
                 raise FileFormatError(
                     f"{path}: array {name} has a compression that numpy does not write;"
@@ -132,23 +131,17 @@ def _array(path: Path, name: str, member: IO[bytes], file_bytes: int) -> NDArray
     return parse_npy(path, content, "NPZ")
 
 
-def _choose(path: Path, keys: list[str], key: str | None) -> str:
-    listing = one_line(", ".join(keys))
+def _only(path: Path, keys: list[str]) -> str:
     if not keys:
         raise FileFormatError(f"{path} holds no array; save one with numpy.savez")
-    if key is not None:
-        if key not in keys:
-            raise UsageError(f"{path} has no array {key!r}; --channel can be one of: {listing}")
-        return key
     if len(keys) > 1:
-        raise FileFormatError(
-            f"{path} holds {len(keys)} arrays ({listing}); choose one with --channel"
-        )
+        listing = one_line(", ".join(keys))
+        raise FileFormatError(f"{path} holds {len(keys)} arrays ({listing}); save the depth alone")
     return keys[0]
 
 
-def _read_npz(path: Path, data: bytes, channel: str | None) -> DepthFile:
-    name, array = parse_npz(path, data, channel)
+def _read_npz(path: Path, data: bytes) -> DepthFile:
+    name, array = parse_npz(path, data)
     reading = Reading(f"{array.dtype} NPZ array {name}")
     return DepthFile(values=array, reading=reading, is_image=False)
 
@@ -199,7 +192,7 @@ def parse_pfm(path: Path, data: bytes) -> tuple[NDArray[np.float32], float]:
     return np.ascontiguousarray(values[::-1], dtype=np.float32), abs(factor)
 
 
-def _read_pfm(path: Path, data: bytes, channel: str | None) -> DepthFile:
+def _read_pfm(path: Path, data: bytes) -> DepthFile:
     values, factor = parse_pfm(path, data)
     unused = "" if factor == 1 else f", scale factor {factor:g} of its header not applied"
     return DepthFile(values=values, reading=Reading(f"PFM{unused}"))

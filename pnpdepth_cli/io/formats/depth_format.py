@@ -64,8 +64,8 @@ class DepthFormat:
     """Of its files, in lower case; "." and the name in `choices.FORMATS` is one of them."""
     magic: tuple[bytes, ...]
     """What the content begins with; files are recognised by content, never by suffix."""
-    read: Callable[[Path, bytes, str | None], DepthFile]
-    """From path (for messages), content and `--channel`. Raises FileFormatError."""
+    read: Callable[[Path, bytes], DepthFile]
+    """From path (for messages) and content. Raises FileFormatError."""
     write: Callable[[Path, NDArray[Any], Mapping[str, str]], None]
     """(H, W) float32 metres or uint16 codes, 0 where unknown, into an existing empty file, with
     texts by key where the format has room for them."""

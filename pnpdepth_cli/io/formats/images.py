@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.decoding import (
     IMAGE_ERRORS,
     check_tags,
@@ -33,7 +33,7 @@ from pnpdepth_cli.io.formats.depth_format import (
 _COMPRESSION_LEVEL = 4  # of zlib: a third of the time of its default 6, files 4 per cent larger
 
 
-def _read_png(path: Path, data: bytes, channel: str | None) -> DepthFile:
+def _read_png(path: Path, data: bytes) -> DepthFile:
     with opened_image(path, data, "PNG") as image:
         mode, palette = raw_mode(image), image.mode == "P"
         if not palette and ";16" not in mode:
@@ -123,7 +123,7 @@ def read_tiff_facts(path: Path, data: bytes) -> TiffFacts:
     return TiffFacts(int(bits), _NUMBERS.get(number, "uint"), int(samples), description)
 
 
-def _read_tiff(path: Path, data: bytes, channel: str | None) -> DepthFile:
+def _read_tiff(path: Path, data: bytes) -> DepthFile:
     facts = read_tiff_facts(path, data)
     if facts.samples != 1:
         raise FileFormatError(
@@ -256,12 +256,9 @@ def _part_channels(part: Any) -> dict[str, NDArray[Any]]:
     return placed
 
 
-def _read_exr(path: Path, data: bytes, channel: str | None) -> DepthFile:
+def _read_exr(path: Path, data: bytes) -> DepthFile:
     channels = read_exr_channels(path, data)
-    name = channel if channel is not None else _depth_channel(path, channels)
-    if name not in channels:
-        listing = ", ".join(channels)
-        raise UsageError(f"{path} has no channel {name!r}; --channel can be one of: {listing}")
+    name = _depth_channel(path, channels)
     return DepthFile(values=channels[name], reading=Reading(f"EXR channel {name}"))
 
 
@@ -278,7 +275,7 @@ def _depth_channel(path: Path, channels: dict[str, NDArray[Any]]) -> str:
         if all(np.array_equal(first, channels[k], equal_nan=True) for k in "GB"):
             return "R"
     raise FileFormatError(
-        f"{path} has several channels ({', '.join(channels)}); choose one with --channel"
+        f"{path} has several channels ({', '.join(channels)}); export the depth alone"
     )
 
 

@@ -15,6 +15,7 @@ from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.measures import MEASURES
 
 
 def run(root: Path, name: str, errors: dict[str, list[float]], **frames: Any) -> str:
@@ -77,16 +78,6 @@ def test_one_frame_has_a_gain_but_nothing_to_resample(tmp_path: Path) -> None:
     assert gain["low_percent"] is gain["high_percent"] is gain["p_value"] is None
 
 
-def test_pooled_runs_are_compared_over_their_pixels(tmp_path: Path) -> None:
-    pooled: dict[str, Any] = {"average": "pooled"}
-    one = run(tmp_path, "one", {"a": [2.0], "b": [4.0, 4.0, 4.0]}, **pooled)
-    two = run(tmp_path, "two", {"a": [1.0], "b": [4.0, 4.0, 4.0]}, **pooled)
-    comparison = compare([one, two])
-    assert comparison["runs"][0]["mean"]["mae"] == pytest.approx(14 / 4)
-    assert comparison["gains"][0]["mae"]["percent"] == pytest.approx(100 / 14)
-    assert comparison["gains"][0]["mae"]["p_value"] == 1  # only a differs: any swap is as large
-
-
 SIX = {f"{n:04}": [error] for n, error in enumerate((2.0, 5.0, 1.0, 4.0, 1.5, 3.0))}
 
 
@@ -98,8 +89,10 @@ def scaled(errors: dict[str, list[float]], factors: list[float]) -> dict[str, li
 def test_six_frames_have_an_interval_around_the_gain_and_p_is_adjusted(tmp_path: Path) -> None:
     better = scaled(SIX, [0.5, 0.8, 0.6, 0.7, 0.9, 0.55])
     paths = [run(tmp_path, "one", SIX), run(tmp_path, "two", better)]
-    main, everything = compare(paths), compare(paths, all_measures=True)
-    for comparison, count in ((main, 4), (everything, 12)):
+    main = compare(paths)
+    every = [measure.key for measure in MEASURES]
+    everything = compare(paths, columns=every)
+    for comparison, count in ((main, 4), (everything, len(every))):
         (gains,) = comparison["gains"]
         assert len(comparison["measures"]) == len(gains) == count
         smallest = min(gains.values(), key=lambda gain: gain["p_value"])
@@ -131,7 +124,7 @@ def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path
         record["frames"][0]["values"]["imae"] = None
         values += [frame["values"]["imae"] for frame in record["frames"][1:]]
         Path(path).write_text(json.dumps(record))
-    comparison = compare(paths, all_measures=True, grouped=False)
+    comparison = compare(paths, columns=("mae", "imae"), grouped=False)
     gain = comparison["gains"][0]["imae"]
     assert comparison["runs"][0]["mean"]["imae"] == pytest.approx(np.mean(one))
     assert gain["percent"] == pytest.approx(100 * (1 - np.mean(two) / np.mean(one)))
@@ -232,12 +225,10 @@ def test_a_file_without_scores_is_refused(tmp_path: Path, text: str, message: st
         compare([one, str(tmp_path / "broken.json")])
 
 
-def test_before_is_only_for_what_has_one_and_permutations_are_needed(tmp_path: Path) -> None:
+def test_before_is_only_for_what_has_one(tmp_path: Path) -> None:
     one = run(tmp_path, "one", FIRST)
     with pytest.raises(UsageError, match="leave out :before"):
         compare([one, f"{one}:before"])
-    with pytest.raises(UsageError, match="--permutations must be >= 1, got 0"):
-        compare([one, one], permutations=0)
 
 
 def test_runs_are_named_by_the_shortest_ends_of_their_paths(tmp_path: Path) -> None:

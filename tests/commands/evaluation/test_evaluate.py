@@ -40,15 +40,12 @@ def two(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_each_image_counts_alike_or_each_pixel(two: Path) -> None:
-    per_image, pooled = scored(two), scored(two, average="pooled")
+def test_each_image_counts_alike(two: Path) -> None:
+    per_image = scored(two)
     assert per_image.mean["rmse"] == (1 + 3) / 2
     assert per_image.mean["mre"] == (0.625 + 0.6) / 2
-    assert pooled.mean["rmse"] == pytest.approx(math.sqrt((1 + 1 + 9) / 3))
-    assert pooled.mean["mae"] == pytest.approx(5 / 3)
-    assert per_image.frames[0].values == pooled.frames[0].values
-    assert [(f.pixels, f.known, f.coverage) for f in pooled.frames] == [(2, 2, 1.0), (1, 2, 0.5)]
-    assert any(" 1 pixels (25.00%) of the ground truth have no pred" in n for n in pooled.notes)
+    assert [(f.pixels, f.known, f.coverage) for f in per_image.frames] == [(2, 2, 1.0), (1, 2, 0.5)]
+    assert any(" 1 pixels (25.00%) of the ground truth have no pred" in n for n in per_image.notes)
 
 
 def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path) -> None:
@@ -141,43 +138,29 @@ def test_a_published_protocol_is_what_plain_numpy_makes_of_its_definition(
         return means([brute(p, g, inside & (g > 1e-3) & (g < 10)) for p, g in pairs])
 
     assert scored(root, protocol="nyu-eigen").mean == expected(clipped)
-    skipped = scored(root, protocol="nyu-eigen", missing="skip")
-    assert skipped.mean == expected(np.where(prediction > 0, clipped, 0))
-    assert skipped.coverage == scored(root, protocol="nyu-eigen").coverage < 1
+    assert scored(root, protocol="nyu-eigen").coverage < 1
 
 
-def test_crop_bounds_and_mask_can_each_be_set_alone(
-    random_frames: tuple[Path, np.ndarray, np.ndarray], tmp_path: Path
+def test_the_largest_depth_can_be_set_alone(
+    random_frames: tuple[Path, np.ndarray, np.ndarray],
 ) -> None:
     root, prediction, gt = random_frames
-    everything = np.ones(gt.shape[1:], bool)
-    crop = np.zeros_like(everything)
-    crop[20:60, 10:110] = True
-    frames = list(zip(prediction, gt, strict=True))
-    assert scored(root, crop="10,20,100,40").mean == means([brute(p, g, crop) for p, g in frames])
-    far = scored(root, min_depth=2.0, max_depth=5.0)
-    assert far.mean == means([brute(p, g, (g > 2) & (g < 5)) for p, g in frames])
-    mask = np.random.default_rng(1).random(everything.shape) < 0.5
-    cv2.imwrite(str(tmp_path / "mask.png"), mask.astype(np.uint8) * 255)
-    np.save(tmp_path / "mask.npy", mask.astype(np.uint8))
-    expected = means([brute(p, g, mask) for p, g in frames])
-    assert scored(root, mask=tmp_path / "mask.png").mean == expected
-    assert scored(root, mask=tmp_path / "mask.npy").mean == expected
+    near = scored(root, max_depth=5.0)
+    pairs = zip(prediction, gt, strict=True)
+    assert near.mean == means([brute(p, g, g < 5) for p, g in pairs])
 
 
-def test_missing_pixels_are_skipped_clamped_or_refused(two: Path) -> None:
-    bounds = {"min_depth": 0.5, "max_depth": 10.0}
-    skipped = scored(two, **bounds)
-    lowest, highest = (scored(two, missing=name, **bounds) for name in ("min", "max"))
-    assert skipped.frames[1].values["mae"] == 3
-    assert lowest.frames[1].values["mae"] == (3 + 4.5) / 2
-    assert highest.frames[1].values["mae"] == (3 + 5) / 2
-    assert [e.coverage for e in (skipped, lowest, highest)] == [0.75, 0.75, 0.75]
-    assert (lowest.frames[1].pixels, lowest.frames[1].predicted) == (2, 1)
-    assert any("what is missing is scored as 0.5 m" in note for note in lowest.notes)
-    refused = scored(two, missing="fail", **bounds)
-    assert [frame.name for frame in refused.failed] == ["ü b"]
-    assert "--missing fail refuses" in (refused.frames[1].error or "")
+def test_empty_predictions_are_skipped_or_scored_as_the_lower_bound(tmp_path: Path) -> None:
+    prediction = np.zeros((20, 30))
+    prediction[:, :15] = 8
+    depth_file(tmp_path / "out" / "a.npy", prediction)
+    depth_file(tmp_path / "gt" / "a.npy", np.full((20, 30), 5))
+    skipped, lowest = scored(tmp_path), scored(tmp_path, protocol="garg")
+    assert (skipped.mean["mae"], skipped.coverage) == (3, 0.5)
+    # the crop has columns 1 to 27, of which the prediction has 14
+    assert lowest.mean["mae"] == pytest.approx((14 * 3 + 13 * (5 - 0.001)) / 27)
+    assert lowest.coverage == 14 / 27
+    assert any("what is missing is scored as 0.001 m" in note for note in lowest.notes)
 
 
 def test_an_interval_ends_at_what_the_measure_can_be(tmp_path: Path) -> None:
@@ -198,7 +181,6 @@ def test_few_groups_of_frames_have_no_interval_but_a_note(tmp_path: Path) -> Non
     assert result.interval is None
     assert "no interval: 2 groups of frames are too few" in result.notes[-1]
     assert [frame["group"] for frame in result.as_record()["frames"]] == ["a"] * 4 + ["b"] * 4
-    assert scored(tmp_path, grouped=False).interval is not None
 
 
 def test_the_group_of_a_manifest_goes_before_the_name(tmp_path: Path) -> None:
@@ -218,7 +200,6 @@ def test_the_group_of_a_manifest_goes_before_the_name(tmp_path: Path) -> None:
     [
         ("out/a.npy", "gt/a.npy,", {}, "data set but .* one file; give a folder"),
         ("out", ",gt/a.npy", {}, "looks like 'manifest', and no frame in it has ground truth"),
-        ("out", "gt/a.npy,scan.ply", {"exclude_sparse": True}, "has no sparse depth file to excl"),
     ],
 )
 def test_a_data_set_that_cannot_be_scored_so_is_refused(
@@ -237,20 +218,10 @@ def test_a_data_set_that_cannot_be_scored_so_is_refused(
         )
 
 
-def test_a_mask_of_another_size_or_missing_for_a_frame_is_a_fault(two: Path) -> None:
-    depth_file(two / "masks" / "a.npy", [[1, 0, 1]])
-    with pytest.raises(InputError, match=r"mask .*a\.npy is 3×1 but the ground truth"):
-        scored(two, mask=two / "masks")
-    depth_file(two / "masks" / "a.npy", [[1, 0]])
-    result = scored(two, mask=two / "masks")
-    assert result.frames[0].pixels == 1
-    assert "has no mask in" in (result.frames[1].error or "")
-
-
 def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
     tmp_path: Path,
 ) -> None:
-    codes = np.array([[1000, 2000]], np.uint16)
+    codes = np.full((480, 640), 1000, np.uint16)
     for folder in ("out", "gt"):
         (tmp_path / folder).mkdir()
         cv2.imwrite(str(tmp_path / folder / "a.png"), codes)
@@ -258,10 +229,10 @@ def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
     by_option = scored(tmp_path, pred_scale=1000.0, gt_scale=1000.0)
     assert by_option.mean["mae"] == 0
     assert by_option.frames[0].kinds["gt"].scale == 1000
-    nyu = scored(tmp_path, protocol="nyu-eigen", crop="none")
+    nyu = scored(tmp_path, protocol="nyu-eigen")
     assert any("÷ 1000; --gt-scale to change" in note for note in nyu.notes)
-    depth_file(tmp_path / "out" / "a.png", [[1, 2]], scale=100)
-    own = scored(tmp_path, protocol="nyu-eigen", crop="none")
+    depth_file(tmp_path / "out" / "a.png", np.ones((480, 640)), scale=100)
+    own = scored(tmp_path, protocol="nyu-eigen")
     assert own.mean["rmse"] == 0
     assert any("÷ 100 (from the file)" in note for note in own.notes)
 
@@ -282,12 +253,12 @@ def test_a_round_factor_between_two_float_files_is_warned_of(
 
 
 @pytest.mark.parametrize("codes", [1000, 5000, 1])
-@pytest.mark.parametrize("side", ["gt", "out", "sparse"])
+@pytest.mark.parametrize("side", ["gt", "out"])
 def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(
     tmp_path: Path, side: str, codes: int
 ) -> None:
     depth = np.random.default_rng(0).integers(1, 9, (6, 8)).astype(np.float32)
-    for folder in ("gt", "out", "sparse"):
+    for folder in ("gt", "out"):
         (tmp_path / folder).mkdir()
         if folder == side:
             image = np.rint(depth * codes).astype(np.uint16)
@@ -297,15 +268,13 @@ def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(
     option, field = {
         "gt": ("--gt-scale", "gt_scale"),
         "out": ("--pred-scale", "pred_scale"),
-        "sparse": ("--sparse-scale", "sparse_scale"),
     }[side]
-    inputs = {"sparse": tmp_path / "sparse"} if side == "sparse" else {}
     with pytest.raises(InputError) as error:
-        scored(tmp_path, **inputs)
+        scored(tmp_path)
     assert f"{option} {codes} (now 256) would remove it, {option} 256 keeps it" in str(error.value)
-    right = scored(tmp_path, **{field: float(codes)}, **inputs)
+    right = scored(tmp_path, **{field: float(codes)})
     assert right.mean["rmse"] == 0
-    wrong = scored(tmp_path, **{field: 256.0}, **inputs)
+    wrong = scored(tmp_path, **{field: 256.0})
     assert any("a scale is probably wrong" in note for note in wrong.notes)
 
 
@@ -320,15 +289,18 @@ def test_sparse_input_in_the_ground_truth_causes_a_warning_and_can_be_excluded(
     points[2, 0], prediction[2, 0] = gt[2, 0], 0  # not scored
     depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", prediction)
-    depth_file(tmp_path / "sparse.npy", points)
-    result = scored(tmp_path, sparse=tmp_path / "sparse.npy")
-    (warning,) = (n for n in result.notes if "sparse input" in n)
+    sparse = depth_file(tmp_path / "sparse.npy", points)
+    record = {"inputs": {"sparse": {"path": str(sparse)}}, "points": {"used": 8}}
+    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
+    (warning,) = (n for n in scored(tmp_path).notes if "sparse input" in n)
     assert " 4 of the scored pixels (4.04%) have a point of the sparse input" in warning
-    assert "--exclude-sparse" in warning
-    without = scored(tmp_path, sparse=tmp_path / "sparse.npy", exclude_sparse=True)
+    without = scored(tmp_path, exclude_sparse=True)
     assert without.frames[0].known == 92
     assert without.mean["mae"] == pytest.approx(1)
     assert not [n for n in without.notes if "sparse input" in n]
+    (tmp_path / "out" / "a.json").unlink()
+    with pytest.raises(InputError, match="has no sparse depth file to exclude"):
+        scored(tmp_path, exclude_sparse=True)
 
 
 def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) -> None:
@@ -343,12 +315,6 @@ def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) ->
     sparse.write_bytes(b"spoilt")
     (two / "out" / "a.json").write_text(json.dumps(record))
     assert scored(two).frames[0].leaked is None
-    for options in ({"sparse": sparse}, {"exclude_sparse": True}):
-        with pytest.raises(InputError, match=r"the first: .*s\.npy is not a depth file"):
-            scored(two, **options)
-    (two / "out" / "a.json").write_text(json.dumps(sampled))
-    with pytest.raises(InputError, match="give it with --sparse; `pnpdepth sample` draws"):
-        scored(two, exclude_sparse=True)
 
 
 def test_a_prediction_in_model_units_is_warned_of_unless_it_is_scaled(two: Path) -> None:
@@ -414,35 +380,10 @@ def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Pa
         scored(tmp_path, protocol="nyu")
 
 
-def test_predictions_of_kittis_benchmark_crop_are_aligned_with_the_frame(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    gt = rng.uniform(2, 60, (375, 1242)).astype(np.float32)
-    prediction = rng.uniform(2, 60, (352, 1216)).astype(np.float32)
-    depth_file(tmp_path / "gt" / "a.npy", gt)
-    depth_file(tmp_path / "out" / "a.npy", prediction)
-    skipped = scored(tmp_path, prediction_crop="kb")
-    error = prediction.astype(np.float64) - gt[375 - 352 :, 13 : 13 + 1216]
-    assert skipped.mean["rmse"] == pytest.approx(np.sqrt((error**2).mean()), rel=1e-6)
-    assert skipped.coverage == pytest.approx(352 * 1216 / (375 * 1242))
-    # BTS and AdaBins paste the crop into zeros, clip, and score inside Garg's crop
-    whole = np.zeros((375, 1242), np.float32)
-    whole[23:, 13:1229] = prediction
-    inside = (slice(153, 371), slice(44, 1197))
-    clipped = np.clip(whole, 1e-3, 80)[inside].astype(np.float64)
-    expected = np.sqrt(((clipped - gt[inside]) ** 2).mean())
-    garg = scored(tmp_path, protocol="garg", prediction_crop="kb")
-    assert garg.mean["rmse"] == pytest.approx(expected, rel=1e-6)
-    same = scored(tmp_path, prediction_crop="13,23,1216,352")
-    assert same.mean == skipped.mean
-    with pytest.raises(UsageError, match="neither X,Y,WIDTH,HEIGHT nor one of kb"):
-        scored(tmp_path, prediction_crop="kitti")
-
-
 REFUSED = [
     ({"gt_scale": 0.0}, "--gt-scale"),
     ({"pred_scale": math.nan}, "--pred-scale"),
     ({"more_measures": ("boundary",)}, "unknown measure 'boundary'"),
-    ({"more_measures": ("boundary_f1",), "average": "pooled"}, "--average pooled does not apply"),
     ({"more_measures": ("boundary_f1",), "protocol": "kitti-devkit"}, "--measures does not apply"),
     ({"depth_limits": (1.0, 2.0), "protocol": "kitti-devkit"}, "--by-depth does not apply"),
     ({"depth_limits": (2.0, 1.0)}, "--by-depth must be two rising depths"),
@@ -481,5 +422,3 @@ def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
     assert math.isnan(second)  # a wall in 2 m has no far pixels
     assert more.mean["rmse_far"] == pytest.approx((first + third) / 2)
     assert [frame.values["boundary_f1"] for frame in more.frames][1] == 0
-    pooled = scored(tmp_path, depth_limits=(4.0, 6.0), average="pooled")
-    assert pooled.mean["mae_near"] != more.mean["mae_near"]

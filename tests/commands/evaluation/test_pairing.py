@@ -124,15 +124,6 @@ def test_two_files_are_one_frame_whatever_they_are_called(tmp_path: Path) -> Non
     assert (pair.name, pair.frame.gt) == ("p", tmp_path / "g.npy")
 
 
-def test_sparse_depth_and_masks_are_one_for_all_or_one_for_each(tmp_path: Path) -> None:
-    out, gt = folders(tmp_path, ["a.png", "b.png"], ["a.png", "b.png"])
-    one, each = depth_at(tmp_path / "one.png"), depth_at(tmp_path / "each" / "b.png")
-    pairs, _ = pair_frames(out, gt, sparse=one, mask=tmp_path / "each")
-    assert [(f.sparse, f.sparse_named, f.mask) for f in pairs] == [
-        (one, True, None), (one, True, each),
-    ]  # fmt: skip
-
-
 def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -> None:
     out, gt = folders(tmp_path, ["a_depth.png", "b_depth.png", "c_depth.png"],
                       ["a.png", "b.png", "c.png"])  # fmt: skip
@@ -144,7 +135,6 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     (out / "c.json").write_text("not JSON at all")
     frames, _ = pair_frames(out, gt)
     assert [(f.sparse, f.image) for f in frames] == [(sparse, image), (None, None), (None, None)]
-    assert not frames[0].sparse_named
 
 
 def test_stacked_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> None:

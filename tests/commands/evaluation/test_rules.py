@@ -44,30 +44,18 @@ def test_the_bounds_are_the_published_ones() -> None:
         "eigen": (1e-3, 80.0, True),
         "garg": (1e-3, 80.0, True),
     }
-    assert {p.average for p in PROTOCOLS.values()} == {"per-image"}
 
 
 def test_a_crop_that_does_not_fit_the_frame_is_refused() -> None:
-    assert crop_window("10,20,30,40", (60, 40)) == (slice(20, 60), slice(10, 40))
-    assert crop_window("0,0,1,1", (60, 40)) == (slice(0, 1), slice(0, 1))
-    with pytest.raises(SizeError, match=r"--pred-crop 10,20,30,40 does not lie in .* 39×60"):
-        crop_window("10,20,30,40", (60, 39), "--pred-crop")
-    with pytest.raises(SizeError, match="kb does not lie in a frame of 1242×351"):
-        crop_window("kb", (351, 1242))
-    with pytest.raises(SizeError, match=r"\b640×480 but this one is 304×228; --crop none"):
+    with pytest.raises(SizeError, match=r"640×480 but this one is 304×228; --protocol paper"):
         crop_window("nyu", (228, 304))
 
 
 REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("papre", {}, "paper, whole"),
-    ("paper", {"min_depth": -1.0}, "--min-depth must be metres >= 0, got -1"),
-    ("paper", {"min_depth": 5.0, "max_depth": 5.0}, "above --min-depth 5, got 5"),
+    ("eigen", {"max_depth": 0.0}, "above 0.001, got 0"),
     ("paper", {"max_depth": float("nan")}, "--max-depth"),
-    ("paper", {"crop": "center"}, "X,Y,WIDTH,HEIGHT"),
-    ("paper", {"crop": "0,0,0,5"}, "X,Y,WIDTH,HEIGHT"),
-    ("paper", {"crop": "-1,0,4,4"}, "X,Y,WIDTH,HEIGHT"),
     ("paper", {"thresholds": (1.0, 1.0, 1.0)}, "above 1"),
-    ("kitti-devkit", {"average": "pooled"}, "--average"),
     ("kitti-devkit", {"thresholds": (1.01, 1.02, 1.03)}, "--delta"),
 ]
 
@@ -83,7 +71,7 @@ def test_a_setting_without_sense_is_refused(
 
 
 def test_unset_fields_stay_as_published() -> None:
-    changed = choose_protocol("eigen", max_depth=50.0, crop=None, clip=None)
+    changed = choose_protocol("eigen", max_depth=50.0, resize=None)
     assert changed == replace(published("eigen"), max_depth=50.0)
 
 
@@ -92,10 +80,3 @@ def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:
     kinds = ("paper", "nyu-eigen", "kitti-devkit", "eigen", "garg")
     rules = [published(name).scoring() for name in kinds]
     assert all(a != b for i, a in enumerate(rules) for b in rules[:i])
-
-
-@pytest.mark.parametrize(("least", "missing"), [(None, "min"), (0.5, "min"), (0.0, "skip")])
-def test_empty_predictions_are_skipped_where_no_bound_is_left_to_score_them_as(
-    least: float | None, missing: str
-) -> None:
-    assert choose_protocol("eigen", min_depth=least).missing == missing

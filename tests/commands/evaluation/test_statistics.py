@@ -7,7 +7,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -24,9 +23,7 @@ from pnpdepth_cli.commands.evaluation.statistics import (
     holm,
     swap_p_values,
 )
-from pnpdepth_cli.core.metrics import error_sums, score, sum_count
 from pnpdepth_cli.io.dataset import groups_by_name
-from pnpdepth_cli.measures import MEASURES
 
 
 def clusters_of(ids: list[int] | np.ndarray) -> Clusters:
@@ -43,17 +40,11 @@ def of_frames(*rows: list[float]) -> FrameTable:
     return FrameTable.of_frames(np.array(rows, float))
 
 
-def test_a_mean_counts_frames_alike_or_pixels_alike_and_skips_what_is_lacking() -> None:
+def test_a_mean_counts_frames_alike_and_skips_what_is_lacking() -> None:
     table = of_frames([1, 10, np.nan], [3, np.nan, np.nan])
     assert table.mean() == pytest.approx([2, 10, np.nan], nan_ok=True)
     totals = of_frames([1], [3], [6]).totals(clusters_of([1, 0, 1]))
     assert totals.tolist() == [[[3], [1]], [[7], [2]]]
-    generator = torch.Generator().manual_seed(0)
-    frames = [torch.rand(2, n, generator=generator) + 1 for n in (3, 50)]
-    sums = np.array([error_sums(p, g).tolist() for p, g in frames])
-    expected = score(*torch.cat(frames, dim=1))
-    mean = FrameTable.of_pixels(sums, ["rmse", "delta1"]).mean()
-    assert mean == pytest.approx([expected.rmse, expected.delta1], rel=1e-12)
 
 
 def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewness() -> None:
@@ -67,15 +58,6 @@ def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewne
     cubic = t + skew * t**2 / 3 + skew**2 * t**3 / 27 + skew / 6
     assert cubic == pytest.approx(stats.t.ppf(0.025, 8))
     assert high > student[1]
-
-
-def test_the_standard_error_of_a_pooled_measure_is_the_delta_methods() -> None:
-    sums = np.random.default_rng(3).uniform(1, 2, (300, sum_count(MEASURES)))
-    low, high = interval(FrameTable.of_pixels(sums, ["rmse"]))
-    _, pixels, squared = sums.T[:3]
-    mean = squared.sum() / pixels.sum()
-    error = np.sqrt(((squared - mean * pixels) ** 2).sum()) / pixels.sum() / (2 * np.sqrt(mean))
-    assert (high[0] - low[0]) / 2 == pytest.approx(1.96 * error, rel=0.05)
 
 
 def test_clusters_of_equal_frames_are_as_sure_as_one_frame_each() -> None:

@@ -155,9 +155,9 @@ def test_a_file_that_goes_after_scoring_costs_one_frame_its_images(root: Path) -
 
 
 def test_a_report_is_the_same_bytes_each_time_and_a_full_disk_leaves_it(root: Path) -> None:
-    reported(root, workers=1)
+    reported(root)
     before = everything(root / "report")
-    reported(root, workers=3)
+    reported(root)
     assert everything(root / "report") == before
     (root / "report" / "notes.txt").write_text("mine")
     write_depth(root / "out" / "a.npy", np.full((60, 80), 9, np.float32))

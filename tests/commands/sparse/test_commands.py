@@ -72,16 +72,6 @@ def test_a_projected_scan_lands_where_it_was_made_to_in_every_format(
     np.testing.assert_allclose(got, want, atol=0.002 if suffix == ".png" else 1e-4)
 
 
-def test_the_size_comes_from_image_option_or_calibration(frame: ScanOnDisk) -> None:
-    by_option = projected(frame, image=None, size=(48, 64))
-    frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
-    by_file = projected(frame, "other.csv", image=None)
-    by_image = projected(frame, "third.csv", size=(48, 64))
-    assert by_option["points"] == by_file["points"] == by_image["points"]
-    target = SparseTarget(output=frame.folder / "fourth.csv")
-    refused(frame, SizeError, "64×48, not of the size given", size=(64, 48), target=target)
-
-
 def refused(frame: ScanOnDisk, error: type[PnpDepthError], message: str, **more: object) -> None:
     before = sorted(frame.folder.rglob("*"))
     with pytest.raises(error) as caught:
@@ -163,13 +153,12 @@ def simulated(frame: ScanOnDisk, output: str, sensor: Lidar, **more: Any) -> dic
 
 def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
     sensor = ideal_lidar(21, 20, -20)
-    for output, position in (("camera.csv", {}), ("scanner.csv", {"position": "calib"})):
-        record = simulated(frame, output, sensor, **position)
-        got = read_sparse(frame.folder / output, size=(60, 100))[0]
-        np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
-        assert record["sensor"]["name"] == "21 beams"
-        assert record["sensor"]["max_range"] is None
-        assert len(got.depth) > 500
+    record = simulated(frame, "out.csv", sensor)
+    got = read_sparse(frame.folder / "out.csv", size=(60, 100))[0]
+    np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
+    assert record["sensor"]["name"] == "21 beams"
+    assert record["sensor"]["max_range"] is None
+    assert len(got.depth) > 500
 
 
 def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(

@@ -53,12 +53,12 @@ def test_projecting_with_extrinsics_records_their_path_and_never_replaces_them(
     pose.write_text((scene.folder / "pose.txt").read_text())
     options = ScanOptions(calib=scene.calib, extrinsics=pose)
     target = SparseTarget(output=scene.folder / "out.png")
-    record = project_scan(scene.scan, options, target, size=(HEIGHT, WIDTH))
+    record = project_scan(scene.scan, options, target, scene.image)
     assert record["extrinsics"] == str(pose)
     assert read_json(scene.folder / "out.json") == record
     target = SparseTarget(output=scene.folder / "pose.png", overwrite=True)
     with pytest.raises(OutputError, match=r"pose\.json is an input"):
-        project_scan(scene.scan, options, target, size=(HEIGHT, WIDTH))
+        project_scan(scene.scan, options, target, scene.image)
 
 
 def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> None:

@@ -142,7 +142,7 @@ def test_a_camera_info_file_is_used_for_the_image_that_is_projected_onto(
     calib = tmp_path / "camera_info.yaml"
     calib.write_text("".join(f"{name}: {value}\n" for name, value in info.items()))
     options, target = ScanOptions(calib=calib), SparseTarget(output=tmp_path / "s.csv")
-    record = project_scan(scan, options, target, image=image)
+    record = project_scan(scan, options, target, image)
     (note,) = (note for note in record["notes"] if note.startswith("camera:"))
     assert note.startswith(
         f"camera: {'rectified images, by P' if rectified else 'raw images, by K'}"
@@ -153,16 +153,6 @@ def test_a_camera_info_file_is_used_for_the_image_that_is_projected_onto(
     blind = read_scan_points(scan, options, SIZE)  # without the image, raw is said to be assumed
     np.testing.assert_array_equal(blind.camera.intrinsics, K)
     assert any(note.startswith("camera: raw images, by K") for note in blind.notes)
-
-
-def test_a_calibration_replaces_that_of_the_bag(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "a.mcap", view=view(rectified=True, topic="/front/image_raw"))
-    (tmp_path / "own.txt").write_text("K: [200, 0, 150, 0, 201, 110, 0, 0, 1]")
-    messages = written(bag, tmp_path / "frames", calib=tmp_path / "own.txt")
-    assert not any(text.startswith("camera:") for text in messages)
-    calibration = read_calibration(tmp_path / "frames" / "calib.txt")
-    assert calibration.camera.intrinsics[:2, :2].tolist() == [[200, 0], [0, 201]]
-    np.testing.assert_allclose(calibration.scanner.translation, ABOVE, atol=1e-9)  # of /tf_static
 
 
 def test_points_ahead_that_fall_outside_the_image_give_a_warning(tmp_path: Path) -> None:

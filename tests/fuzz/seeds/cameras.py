@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.fuzz.seeds.seed import HEIGHT, OUT, SIZE, WIDTH, Seed
+from tests.fuzz.seeds.seed import HEIGHT, IMAGE, OUT, WIDTH, Seed
 from tests.io.test_calibration import POSES
 
 _ROS = f"""image_width: {WIDTH}
@@ -33,7 +33,7 @@ def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> li
 
 
 def _project(*options: str) -> tuple[str, ...]:
-    return ("project", "good.bin", *options, *SIZE, *OUT)
+    return ("project", "good.bin", *options, *IMAGE, *OUT)
 
 
 def _calibrations(folder: Path) -> list[Seed]:

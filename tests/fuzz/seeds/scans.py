@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.bags import write_bag
-from tests.fuzz.seeds.seed import OUT, SIZE, Seed
+from tests.fuzz.seeds.seed import IMAGE, OUT, Seed
 from tests.io.test_scans import FILES
 
 
@@ -31,7 +31,7 @@ def _scans(folder: Path, rng: np.random.Generator) -> list[Seed]:
     for name, content in FILES.items():
         (folder / name).write_bytes(content(points))
     return [
-        Seed(file=name, command=("project", name, "--calib", "calib.txt", *SIZE, *OUT))
+        Seed(file=name, command=("project", name, "--calib", "calib.txt", *IMAGE, *OUT))
         for name in FILES
     ]
 

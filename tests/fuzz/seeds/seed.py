@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 HEIGHT, WIDTH = 24, 32
-SIZE = ("--size", f"{HEIGHT}x{WIDTH}")
+IMAGE = ("--image", "rgb.png")
+"""Of HEIGHT × WIDTH pixels."""
 OUT = ("-o", "out.png", "--overwrite")
 LISTING = ("-o", "batch", "--limit", "1", "--shard", "2/2")
 """Of a batch that lists its frames and refines none."""
