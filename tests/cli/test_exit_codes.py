@@ -25,7 +25,7 @@ COMMANDS = {
     [
         ("refine", "--layer encod", 4, "encode"),
         ("refine", "--checkpoint missing.pt", 4, "does not exist"),
-        ("refine", "--device cuda", 6, "--device cpu"),
+        ("refine", "--device cuda:9", 6, "--device cpu"),
         ("batch", "--shard 0/2", 2, "1/4"),
         ("batch", "--html-3d", 2, "name its folder with --html"),
         ("batch", "--sample many", 2, "500"),

@@ -609,7 +609,9 @@ class UNetTail(nn.Module):
 
 
 def wrapped_network() -> nn.Module:
-    return nn.DataParallel(nn.Sequential(nn.Sequential(conv(3, 4), nn.ReLU(True)), UNetTail()))
+    wrapped = nn.DataParallel(nn.Sequential(nn.Sequential(conv(3, 4), nn.ReLU(True)), UNetTail()))
+    wrapped.device_ids = []  # on the CPU, also where there are GPUs
+    return wrapped
 
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {

@@ -146,7 +146,9 @@ def _read_tiff(path: Path, data: bytes) -> DepthFile:
 def _write_tiff(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
     from PIL import Image
 
-    Image.fromarray(metres).save(file, "TIFF", compression="tiff_adobe_deflate")
+    encoded = io.BytesIO()  # libtiff prints to standard error when a disk is full
+    Image.fromarray(metres).save(encoded, "TIFF", compression="tiff_adobe_deflate")
+    file.write_bytes(encoded.getvalue())
 
 
 TIFF = DepthFormat(
