@@ -10,13 +10,36 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 
 from pnpdepth_cli.cli.main import run
+from pnpdepth_cli.frames.refiner import COMPANION
+from pnpdepth_cli.io.depth import read_depth, write_depth
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 INDOOR = f"refine {SAMPLES}/indoor/rgb.png --sparse {SAMPLES}/indoor/sparse.png"
 FILES = {"rgb.json", "rgb_depth.png", "rgb_improvement.png", "rgb_preview.png"}
+WEIGHTS = Path(__file__).parents[2] / "model_zoo_defs" / "weights"
+RANDOM = """
+import torch
+from torch import nn
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+
+class Net(nn.Module):
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed({seed})
+        down, up = nn.Conv2d(3, 16, 3, 2, 1), nn.ConvTranspose2d(16, 1, 4, 2, 1)
+        self.layers = nn.Sequential(down, nn.ReLU(), nn.Conv2d(16, 16, 3, 1, 1), nn.ReLU(), up)
+
+    def forward(self, rgb):
+        return 1 + self.layers(rgb).exp()
+
+definition = ModelDefinition(
+    name="random", input_kind="rgb", size=Multiple(4), build=Net, complete=True
+)
+"""
 SIGMA = {"rgb_sigma.png", "rgb_sigma_preview.png", "rgb_valid.png"}
 
 
@@ -56,6 +79,42 @@ def test_refine_writes_its_files_and_lowers_the_error(
     assert {path.name for path in Path("out").iterdir()} == FILES | more
     mae = [record["scores"][stage]["mae"] for stage in ("before", "after")]
     assert mae == pytest.approx([before, after], rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def small_frame(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, bytes]:
+    """A quarter of the indoor sample to refine, and the bytes of its depth without --model."""
+    folder = tmp_path_factory.mktemp("quarter")
+    rgb, sparse = folder / "rgb.png", folder / "sparse.png"
+    part = (slice(120, 360), slice(160, 480))
+    cv2.imwrite(str(rgb), cv2.imread(f"{SAMPLES}/indoor/rgb.png")[part])
+    depth = read_depth(SAMPLES / "indoor" / "sparse.png")
+    write_depth(sparse, depth.values[part], scale=1000)
+    line = f"refine {rgb} --sparse {sparse}"
+    assert run([*line.split(), "-o", f"{folder}/out"]) == 0
+    return line, (folder / "out" / "rgb_depth.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        *sorted({path.stem for path in WEIGHTS.glob("*.safetensors")} - {COMPANION}),
+        *(f"random {seed}" for seed in range(3)),
+    ],
+)
+def test_a_network_that_leaves_the_depth_file_as_it_is_has_no_part_which_is_said(
+    network: str, small_frame: tuple[str, bytes], capsys: pytest.CaptureFixture[str]
+) -> None:
+    line, without = small_frame
+    if network.startswith("random"):
+        Path("net.py").write_text(RANDOM.format(seed=network.split()[1]))
+    named = "net.py" if network.startswith("random") else network
+    assert run([*line.split(), "-o", "out", "--model", named]) == 0
+    name = network.split()[0]
+    said = f"{name} has no part in the result" in capsys.readouterr().err
+    assert said or Path("out/rgb_depth.png").read_bytes() != without
+    weights = json.loads(Path("out/rgb.json").read_text())["weights"]
+    assert said == (sum(weight for expert, weight in weights.items() if name in expert) < 0.01)
 
 
 def test_refine_takes_a_scan_with_its_calibration(capsys: pytest.CaptureFixture[str]) -> None:
