@@ -14,7 +14,12 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from pnpdepth_cli.cli.streams import printable
-from pnpdepth_cli.commands.error_tables import baselines_table, means_table, refinement_table
+from pnpdepth_cli.commands.error_tables import (
+    baselines_table,
+    mean_weights_text,
+    means_table,
+    refinement_table,
+)
 from pnpdepth_cli.commands.tables import Cell, Table, write_text
 from pnpdepth_cli.errors import OutputError, UsageError
 
@@ -164,11 +169,8 @@ def print_batch(summary: Mapping[str, Any]) -> None:
     console = _Console(stderr=True, highlight=False)
     console.print(", ".join(parts))
     if summary["weights"]:
-        spans = (
-            f"{name} {each['mean']:.0%} ({each['least']:.0%} to {each['largest']:.0%})"
-            for name, each in summary["weights"].items()
-        )
-        console.print(escape(f"mean weights in the result: {', '.join(spans)}"), soft_wrap=True)
+        mean_weights = mean_weights_text(summary["weights"])
+        console.print(escape(f"mean weights in the result: {mean_weights}"), soft_wrap=True)
     output = summary["output"]
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
 

@@ -131,6 +131,14 @@ def weights_text(weights: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {w:.0%}" for name, w in weights.items() if w >= 0.005)
 
 
+def mean_weights_text(weights: Mapping[str, Mapping[str, float]]) -> str:
+    """Returns mean and range of each expert's weight in the frames of a batch, as text."""
+    return ", ".join(
+        f"{name} {each['mean']:.0%} ({each['least']:.0%} to {each['largest']:.0%})"
+        for name, each in weights.items()
+    )
+
+
 def baselines_table(baselines: Mapping[str, Mapping[str, Any]], unit: str) -> Table:
     """Returns the baselines, the network and the result, best first at the validation points.
 

@@ -23,7 +23,9 @@ from pnpdepth_cli.commands.error_tables import (
     errors_by_basis,
     format_error,
     frames_of,
+    mean_weights_text,
     means_table,
+    weights_text,
 )
 from pnpdepth_cli.commands.report.evaluation import frames_text
 from pnpdepth_cli.errors import InputError, OutputError
@@ -218,6 +220,8 @@ def _notes(row: Row, basis: str | None) -> list[str]:
         notes.append(f"Errors are {BASES[basis]}, {count}.")
     if basis == USED:
         notes.append("Refinement fits these points, so the change there proves nothing.")
+    if row["weights"]:
+        notes.append(f"Weights: {weights_text(row['weights'])}.")
     return [*notes, *row["warnings"]]
 
 
@@ -279,6 +283,8 @@ def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str
     if summary["method"]["kind"] == "default":
         facts.append(("Refinement", "networks refined, fused and propagated (the default method)"))
         facts.append(("Before", "the network's depth, aligned with the points"))
+        if summary["weights"]:
+            facts.append(("Mean weights", mean_weights_text(summary["weights"])))
     elif first is not None:
         used = first["settings"]
         refined = f"{used['iterations']} updates of z at {used['layer']}"

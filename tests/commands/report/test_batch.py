@@ -122,6 +122,20 @@ def test_without_ground_truth_changes_are_those_at_held_out_points_and_settings_
     assert table["caption"] == "means over frames: 4 at held-out points, 4 at points used"
 
 
+def test_weights_of_all_experts_are_shown_for_each_frame_and_in_the_mean(
+    root: Path, report: Path
+) -> None:
+    batch(root, html=report, refine={"propagate": None})
+    weights = json.loads((root / "out/summary.json").read_text())["weights"]
+    shown = dict(page_data(report)["facts"])["Mean weights"]
+    for name, each in weights.items():
+        assert f"{name} {each['mean']:.0%} ({each['least']:.0%} to {each['largest']:.0%})" in shown
+    record = json.loads((root / "out/a.json").read_text())
+    largest = max(record["weights"], key=record["weights"].get)
+    notes = " ".join(frames_of(report)["a"]["notes"])
+    assert f"{largest} {record['weights'][largest]:.0%}" in notes
+
+
 def test_with_neither_ground_truth_nor_held_out_points_there_is_no_change(
     root: Path, report: Path
 ) -> None:
