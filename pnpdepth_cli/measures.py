@@ -11,7 +11,7 @@ the paper and NYU's tables (log10), the KITTI depth completion benchmark (iRMSE,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -168,6 +168,37 @@ class Measure:
     def from_json(cls, entry: Mapping[str, Any]) -> Measure:
         """Returns a measure without formula. Raises TypeError for an entry of something else."""
         return cls(**entry)
+
+
+class FrameMeans:
+    """The means of values over frames, each over the frames that have the value.
+
+    The frames are not kept.
+
+    Args:
+        frames: Values of each frame by their key; None and NaN where a frame has none.
+    """
+
+    def __init__(self, frames: Iterable[Mapping[str, float | None]] = ()) -> None:
+        self._sums: dict[str, tuple[float, int]] = {}
+        for values in frames:
+            self.add(values)
+
+    def add(self, values: Mapping[str, float | None]) -> None:
+        """Adds a frame."""
+        for key, value in values.items():
+            total, count = self._sums.setdefault(key, (0.0, 0))
+            if value is not None and math.isfinite(value):
+                self._sums[key] = total + value, count + 1
+
+    @property
+    def frames(self) -> int:
+        """The number of frames that have any of the values."""
+        return max((count for _, count in self._sums.values()), default=0)
+
+    def means(self) -> dict[str, float | None]:
+        """Returns the means by their key; None where no frame has the value."""
+        return {key: total / count if count else None for key, (total, count) in self._sums.items()}
 
 
 MEASURES = (

@@ -11,7 +11,7 @@ import torch
 from pnpdepth_cli.choices import MEASURES as ON_REQUEST
 from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.measures import TABLE, by_depth
+from pnpdepth_cli.measures import TABLE, FrameMeans, by_depth
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 LIMITS = np.linspace(1.05, 1.25, 10)
@@ -120,3 +120,10 @@ def test_errors_by_depth_are_those_of_the_pixels_of_each_part() -> None:
                 }
         assert found == {k: pytest.approx(v, abs=1e-9, nan_ok=True) for k, v in expected.items()}
     assert "rmse_near" not in ON_REQUEST
+
+
+def test_a_mean_is_over_the_frames_that_have_the_value() -> None:
+    means = FrameMeans([{"mae": 1.0, "rmse": 4.0}, {"mae": 2.0, "rmse": np.nan}])
+    means.add({"mae": None, "rmse": None, "mre": None})
+    assert means.means() == {"mae": 1.5, "rmse": 4.0, "mre": None}
+    assert (means.frames, FrameMeans().frames) == (2, 0)

@@ -54,8 +54,8 @@ def compare(
     pnpdepth compare out/summary.json:before out/summary.json
     pnpdepth compare study/*/ --columns mae --plot mae.png
 
-    A RUN is the output of `pnpdepth eval --json`, the folder or summary.json of a batch, or the
-    record of a refinement with ground truth; FILE:before takes the depth before refinement. Gains
+    A RUN is the output of `pnpdepth eval --json`, or the folder or summary.json of a batch;
+    FILE:before takes the depth before refinement. Gains
     are in per cent of the first run and positive if the other run is better. p is the p-value of a
     paired permutation test over groups of frames (manifest column group, sequence or folder), in a
     single sequence over blocks as long as its errors are correlated, adjusted for the number of

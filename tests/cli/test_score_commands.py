@@ -137,9 +137,6 @@ def test_a_refinement_scores_the_same_when_its_files_are_evaluated(
     assert record["frames"][0]["image"] == str(frame.image)
     assert record["frames"][0]["pixels_given_as_sparse"] == 60
     assert " 60 of the scored pixels (2.10%) have a point of the sparse input" in err
-    evaluated = tmp_path / "img.json"
-    evaluated.write_text(text)
-    assert code_of("compare", f"{out}/img.json:before", evaluated) == 0
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="file names are Unicode there")

@@ -129,8 +129,8 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -
     means = [(2.0, 0.5), (1.0, 0.25), (3.0, None)]
     comparison = {
         "runs": [
-            {"label": label, "mean": {"rmse": rmse, "delta1": delta}}
-            for label, (rmse, delta) in zip("abc", means, strict=True)
+            {"name": name, "mean": {"rmse": rmse, "delta1": delta}}
+            for name, (rmse, delta) in zip("abc", means, strict=True)
         ],
         "measures": measures,
         "gains": [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import IO, Any
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.measures import MEASURES
+from pnpdepth_cli.measures import MEASURES, FrameMeans
 
 Row = dict[str, Any]
 # a file name that is no UTF-8 has surrogates; JSON escapes them so
@@ -84,8 +83,8 @@ class Tally:
         self._units: set[str] = set()
         self._compared, self._worse = 0, 0
         self._weights: defaultdict[str, list[float]] = defaultdict(list)
-        # by kind and stage, the total of each measure and the number of frames that have it
-        self._sums: defaultdict[tuple[str, str], dict[str, tuple[float, int]]] = defaultdict(dict)
+        # by kind and stage
+        self._errors: defaultdict[tuple[str, str], FrameMeans] = defaultdict(FrameMeans)
 
     def add(self, row: Row) -> None:
         """Adds one row."""
@@ -94,11 +93,7 @@ class Tally:
         self.unsure |= dict.fromkeys(row.get("unsure", ()))
         self._units |= {row["unit"]} if "unit" in row else set()
         for key, values in _measured(row).items():
-            sums = self._sums[key]
-            for name, value in values.items():
-                total, count = sums.setdefault(name, (0.0, 0))
-                if value is not None and not math.isnan(value):
-                    sums[name] = (total + value, count + 1)
+            self._errors[key].add(values)
         for name, weight in (row.get("weights") or {}).items():
             self._weights[name].append(weight)
         worse = (row.get("linear") or {}).get("worse")
@@ -113,7 +108,7 @@ class Tally:
     @property
     def baselines(self) -> list[str]:
         """Names of the baselines, in the order of the records."""
-        return [name for kind, name in self._sums if kind == _BASELINE]
+        return [name for kind, name in self._errors if kind == _BASELINE]
 
     def means(self) -> dict[str, Any]:
         """Returns the means of the results, of linear interpolation and of the baselines.
@@ -125,19 +120,20 @@ class Tally:
         """
         mean: dict[str, Any] = {}
         for kind in _MEASURED:
-            frames = max(self._frames(kind, "before"), self._frames(kind, "after"))
-            both = {stage: self._mean(kind, stage) for stage in ("before", "after")}
-            mean[kind] = {"frames": frames, **both} if frames else None
-        checked = self._frames("validation", "")
+            before, after = (self._errors[kind, stage] for stage in ("before", "after"))
+            frames = max(before.frames, after.frames)
+            both = {"frames": frames, "before": before.means(), "after": after.means()}
+            mean[kind] = both if frames else None
+        checked = self._errors["validation", ""]
         linear = {
-            **{kind: self._mean(kind, "linear") for kind in _OF_LINEAR},
-            "validation": self._mean("validation", "") | {"frames": checked} if checked else None,
+            **{kind: self._errors[kind, "linear"].means() for kind in _OF_LINEAR},
+            "validation": checked.means() | {"frames": checked.frames} if checked.frames else None,
             "frames": self._compared,
             "worse": self._worse,
         }
+        of_names = {name: self._errors[_BASELINE, name] for name in self.baselines}
         baselines = {
-            name: {"frames": self._frames(_BASELINE, name), **self._mean(_BASELINE, name)}
-            for name in self.baselines
+            name: {"frames": errors.frames, **errors.means()} for name, errors in of_names.items()
         }
         return {
             "mean": mean,
@@ -153,14 +149,6 @@ class Tally:
             name: {"mean": sum(all_) / len(all_), "least": min(all_), "largest": max(all_)}
             for name, all_ in self._weights.items()
         }
-
-    def _mean(self, kind: str, stage: str) -> dict[str, float | None]:
-        sums = self._sums.get((kind, stage), {})
-        return {name: total / n if n else None for name, (total, n) in sums.items()}
-
-    def _frames(self, kind: str, stage: str) -> int:
-        """The number of frames that have any of the values."""
-        return max((count for _, count in self._sums.get((kind, stage), {}).values()), default=0)
 
 
 def _measured(row: Row) -> dict[tuple[str, str], dict[str, float | None]]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePath
+from itertools import zip_longest
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,11 +13,10 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.pairing import some_names
 from pnpdepth_cli.commands.evaluation.rules import published
-from pnpdepth_cli.commands.evaluation.statistics import (
+from pnpdepth_cli.commands.statistics import (
     LEVEL,
     MIN_CLUSTERS,
     Clusters,
-    FrameTable,
     find_clusters,
     gain,
     holm,
@@ -27,43 +27,51 @@ from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.dataset import groups_by_name
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import plain, read_json
-from pnpdepth_cli.measures import MEASURES, Measure, chosen_measures
+from pnpdepth_cli.measures import MEASURES, FrameMeans, Measure, chosen_measures
 
 ALPHA = 0.05
 PERMUTATIONS, SEED = 10_000, 0
 """Most swaps of the permutation test, and their seed where not all are tried."""
+_SUMMARY = "summary.json"
 _STAGES = ("before", "after")
 _GAIN = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
+
+
+class RunFrame(NamedTuple):
+    """A scored frame of a run."""
+
+    values: Mapping[str, float]
+    """By measure; NaN for null."""
+    before: Mapping[str, float]
+    """The same before refinement; empty for an evaluation."""
+    pixels: int
+    """Scored ones."""
+    known: int
+    """Pixels with ground truth."""
+    group: str
 
 
 class Run(NamedTuple):
     """The scored frames of one saved run, by name."""
 
-    label: str
-    """The name of the folder, or that of the file without its ending."""
+    name: str
+    """That of the folder, or of the file without its ending."""
     path: str
     measures: Sequence[Measure]
     scoring: dict[str, Any]
-    frames: dict[str, dict[str, Any]]
-    """`values` by measure (NaN for null), those `before` refinement (empty for an evaluation),
-    scored `pixels`, `known` pixels of the ground truth (None where the file does not say), and
-    `group`."""
+    frames: dict[str, RunFrame]
     varied: dict[str, str]
     """Options that `batch --vary` varied, with their values; empty for other runs."""
 
-    def coverage(self, names: Sequence[str]) -> float | None:
-        """Returns the fraction of the ground truth that is scored; None where files do not say."""
-        known = [self.frames[name]["known"] or 0 for name in names]
-        if not all(known):
-            return None
-        return float(sum(self.frames[name]["pixels"] for name in names) / sum(known))
+    def coverage(self, names: Sequence[str]) -> float:
+        """Returns the fraction of the ground truth of these frames that is scored."""
+        frames = [self.frames[name] for name in names]
+        known = sum(frame.known for frame in frames)
+        return sum(frame.pixels for frame in frames) / known if known else math.nan
 
 
 def compare(
-    paths: Sequence[str],
-    *,
-    grouped: bool = True,
-    columns: Sequence[str] | None = None,
+    paths: Sequence[str], *, grouped: bool = True, columns: Sequence[str] | None = None
 ) -> dict[str, Any]:
     """Returns the runs on the frames that all of them scored, compared with the first.
 
@@ -71,8 +79,7 @@ def compare(
     `runs` has the means of each run, `gains` those of each but the first: in per cent of the first
     run's mean with the ends of the 95 % interval, and as a difference; positive per cents are
     better. `p_value` is that of no difference, `p_adjusted` by the number of tests, of all
-    measures and runs. None is a
-    value that there is not, as for a single frame.
+    measures and runs. None is a value that there is not, as for a single frame.
 
     Args:
         paths: Files as `read_run` takes them; the first is the reference.
@@ -88,35 +95,24 @@ def compare(
     runs = [read_run(path) for path in paths]
     for run in runs[1:]:
         _check_rules(runs[0], run)
+    # the frames and the measures that all runs have
     names = tuple(name for name in runs[0].frames if all(name in run.frames for run in runs))
     if not names:
         first, other = (some_names(run.frames) or "none" for run in (runs[0], runs[-1]))
         raise InputError(f"the runs have no scored frame in common: {first}; and {other}")
-    shared = set.intersection(*({m.key for m in run.measures} for run in runs))
-    measures = tuple(measure for measure in runs[0].measures if measure.key in shared)
-    main = tuple(measure for measure in measures if measure.main)
-    measures = main if columns is None and main else chosen_measures(measures, columns)
+    measures = _shared_measures(runs, columns)
     keys = [measure.key for measure in measures]
     values = np.array(
-        [[[run.frames[n]["values"].get(k, math.nan) for k in keys] for n in names] for run in runs]
+        [[[run.frames[n].values.get(k, math.nan) for k in keys] for n in names] for run in runs]
     )
     known = np.isfinite(values).all(axis=0)
+    values = np.where(known, values, math.nan)  # (runs, frames, measures)
+    # the tests, over frames that count as independent
+    groups = [runs[0].frames[name].group for name in names]
     differences = np.concatenate(list(values[1:] - values[0]), axis=1)
-    groups = [runs[0].frames[name]["group"] for name in names]
     clusters = find_clusters(groups, differences, grouped=grouped)
-    tables = [FrameTable.of_frames(np.where(known, of_run, math.nan)) for of_run in values]
-    better = np.array([measure.sign for measure in measures], np.float64)
-    means, found, exact = [table.mean() for table in tables], [], True
-    for table, mean in zip(tables[1:], means[1:], strict=True):
-        ends = interval(lambda a, b: gain(a, b, better), (tables[0], table), clusters)
-        p_values, exact = swap_p_values(tables[0], table, clusters, PERMUTATIONS, SEED)
-        found.append([gain(means[0], mean, better), *ends, mean - means[0], p_values])
-    of_runs = np.array(found)  # (runs − 1, 5, measures)
-    of_runs = np.concatenate([of_runs, holm(of_runs[:, 4:])], axis=1)
-    gains = [
-        {key: dict(zip(_GAIN, row, strict=True)) for key, row in zip(keys, rows, strict=True)}
-        for rows in of_runs.transpose(0, 2, 1).tolist()
-    ]
+    gains, exact = _gains(values, measures, clusters)
+    tests = len(gains) * len(measures)
     record = {
         "command": "compare",
         "frames": names,
@@ -124,14 +120,16 @@ def compare(
         "scoring": runs[0].scoring,
         "runs": [
             {
-                "label": label,
+                "name": name,
                 "path": run.path,
-                "mean": dict(zip(keys, mean.tolist(), strict=True)),
-                "before": _mean_before(run, names, keys),
+                "mean": _means(keys, of_run),
+                "before": FrameMeans(
+                    {key: run.frames[frame].before.get(key) for key in keys} for frame in names
+                ).means(),
                 "varied": run.varied,
                 "coverage": run.coverage(names),
             }
-            for label, run, mean in zip(_labels(runs), runs, means, strict=True)
+            for name, run, of_run in zip(_names(runs), runs, values, strict=True)
         ],
         "gains": gains,
         "level": LEVEL,
@@ -139,22 +137,54 @@ def compare(
         "exact_p_values": exact,
         "permutations": PERMUTATIONS,
         "seed": SEED,
-        "tests": of_runs[:, 0].size,
+        "tests": tests,
         "notes": [
             *_notes(runs, names),
             *_lacking(names, measures, known),
-            *_cluster_notes(clusters, len(names), of_runs[:, 0].size),
+            *_cluster_notes(clusters, len(names), tests),
         ],
     }
     result: dict[str, Any] = plain(record)
     return result
 
 
-def _mean_before(run: Run, names: Sequence[str], keys: Sequence[str]) -> dict[str, float]:
-    """The means of these frames before refinement; NaN where there are none."""
-    before = [[run.frames[name]["before"].get(k, math.nan) for k in keys] for name in names]
-    mean = FrameTable.of_frames(np.array(before)).mean()
-    return dict(zip(keys, mean.tolist(), strict=True))
+def _shared_measures(runs: Sequence[Run], columns: Sequence[str] | None) -> tuple[Measure, ...]:
+    """The measures of these keys that all runs have; the main ones for None."""
+    shared = set.intersection(*({measure.key for measure in run.measures} for run in runs))
+    measures = tuple(measure for measure in runs[0].measures if measure.key in shared)
+    main = tuple(measure for measure in measures if measure.main)
+    return main if columns is None and main else chosen_measures(measures, columns)
+
+
+def _means(keys: Sequence[str], values: NDArray[np.float64]) -> dict[str, float | None]:
+    return FrameMeans(dict(zip(keys, frame, strict=True)) for frame in values.tolist()).means()
+
+
+def _gains(
+    values: NDArray[np.float64], measures: Sequence[Measure], clusters: Clusters
+) -> tuple[list[dict[str, dict[str, float]]], bool]:
+    """The gain of each run but the first by measure, and whether the p-values are exact.
+
+    Args:
+        values: (runs, frames, measures), NaN where a frame lacks a measure.
+        measures: Of the last axis.
+        clusters: Of the frames.
+    """
+    keys = [measure.key for measure in measures]
+    better = np.array([measure.sign for measure in measures], np.float64)
+    first, *others = values
+    means = [np.array([*_means(keys, of_run).values()], np.float64) for of_run in values]
+    rows, exact = [], True
+    for other, mean in zip(others, means[1:], strict=True):
+        ends = interval(lambda a, b: gain(a, b, better), (first, other), clusters)
+        p_values, exact = swap_p_values(first, other, clusters, PERMUTATIONS, SEED)
+        rows.append([gain(means[0], mean, better), *ends, mean - means[0], p_values])
+    of_runs = np.array(rows)  # (runs − 1, 5, measures)
+    of_runs = np.concatenate([of_runs, holm(of_runs[:, 4:])], axis=1)
+    return [
+        {key: dict(zip(_GAIN, row, strict=True)) for key, row in zip(keys, rows, strict=True)}
+        for rows in of_runs.transpose(0, 2, 1).tolist()
+    ], exact
 
 
 def _check_rules(first: Run, other: Run) -> None:
@@ -170,14 +200,13 @@ def _check_rules(first: Run, other: Run) -> None:
         )
 
 
-def _labels(runs: Sequence[Run]) -> list[str]:
-    """The shortest ends of the paths that tell the runs apart."""
-    paths = [PurePath(run.path).with_name(run.label).parts for run in runs]
-    for length in range(1, max(map(len, paths)) + 1):
-        names = ["/".join(parts[-length:]) for parts in paths]
-        if len(set(names)) == len(names):
-            return names
-    return [f"{run.label} ({number})" for number, run in enumerate(runs, start=1)]
+def _names(runs: Sequence[Run]) -> list[str]:
+    """Their own names, or else those of the innermost folders that tell the runs apart."""
+    paths = ((run.name, *Path(run.path).parts[-2::-1]) for run in runs)
+    for names in zip_longest(*paths):
+        if None not in names and len({*names}) == len(runs):
+            return list(names)
+    return [f"{run.name} ({number})" for number, run in enumerate(runs, start=1)]
 
 
 def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
@@ -190,21 +219,16 @@ def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
                 f" left out: {some_names(unshared)}"
             )
     frames = {name: [run.frames[name] for run in runs] for name in names}
-    other_truth = [n for n, of in frames.items() if len({f["known"] for f in of} - {None}) > 1]
-    if other_truth:
+    if other_truth := [name for name, of in frames.items() if len({f.known for f in of}) > 1]:
         lines.append(
             f"warning: {len(other_truth):,} frames have another number of pixels with ground truth"
             f" in another run, so the runs were not scored on the same: {some_names(other_truth)}"
         )
-    elif any(len({frame["pixels"] for frame in of}) > 1 for of in frames.values()):
-        shares = []
-        for run in runs:
-            share, pixels = run.coverage(names), sum(run.frames[n]["pixels"] for n in names)
-            text = f"{pixels:,} pixels" if share is None else f"{share:.2%}"
-            shares.append(f"{text} in {run.path}")
+    elif any(len({frame.pixels for frame in of}) > 1 for of in frames.values()):
+        shares = ", ".join(f"{run.coverage(names):.2%} in {run.path}" for run in runs)
         lines.append(
-            f"warning: coverage differs ({', '.join(shares)}), and a run that leaves hard pixels"
-            " empty looks better; this is no ranking"
+            f"warning: coverage differs ({shares}), and a run that leaves hard pixels empty looks"
+            " better; this is no ranking"
         )
     return lines
 
@@ -241,7 +265,7 @@ def _cluster_notes(clusters: Clusters, frames: int, tests: int) -> list[str]:
 def read_run(text: str) -> Run:
     """Returns the run in a file, or in the summary of a batch's folder.
 
-    A run is the output of `pnpdepth eval --json`, a batch's summary, or a refinement's record.
+    A run is the output of `pnpdepth eval --json`, or a batch's summary.
 
     Args:
         text: The path; `FILE:before` means the prediction that a refinement started from, without
@@ -255,76 +279,70 @@ def read_run(text: str) -> Run:
     start, colon, end = text.rpartition(":")
     if colon and end in _STAGES and not path.exists():
         path, stage = Path(start), end
-    label = path.stem
-    if path.is_dir():
-        label, path = path.name, path / "summary.json"
-    record = read_json(path)
-    if record.get("command") == "eval" and stage == "before":
-        raise UsageError(f"{path} is of eval, which has no before; leave out :before")
+    path = path / _SUMMARY if path.is_dir() else path
+    record, name = read_json(path), path.stem
+    if path.name == _SUMMARY:
+        name = path.resolve().parent.name
     try:
-        read = (
-            _evaluated(record) if record.get("command") == "eval" else _refined(record, path, stage)
-        )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        if record.get("command") == "eval":
+            if stage == "before":
+                raise UsageError(f"{path} is of eval, which has no before; leave out :before")
+            return _evaluated(record, name, text)
+        return _refined(record, f"{name}:before" if stage == "before" else name, text, stage)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         fact = one_line(repr(error))
         raise FileFormatError(
-            f"{path} does not hold scores as pnpdepth writes them ({fact}); create it again"
+            f"{path} does not hold scores as pnpdepth writes them ({fact}); give what eval --json"
+            " printed, or the summary of a batch with ground truth"
         ) from error
-    label = f"{label}:before" if stage == "before" else label
-    return Run(label=label, path=text, **read)
 
 
-def _evaluated(record: Mapping[str, Any]) -> dict[str, Any]:
+def _evaluated(record: Mapping[str, Any], name: str, path: str) -> Run:
     """What `eval --json` printed."""
-    return {
-        "measures": tuple(Measure.from_json(entry) for entry in record["measures"]),
-        "scoring": dict(record["protocol"]["scoring"]),
-        "frames": {
-            str(frame["name"]): {
-                "values": _numbers(frame["values"]),
-                "before": {},
-                "pixels": int(frame["pixels"]),
-                "group": str(frame["group"]),
-                "known": None if frame["known"] is None else int(frame["known"]),
-            }
+    return Run(
+        name=name,
+        path=path,
+        measures=[Measure.from_json(entry) for entry in record["measures"]],
+        scoring=dict(record["protocol"]["scoring"]),
+        frames={
+            str(frame["name"]): RunFrame(
+                values=_numbers(frame["values"]),
+                before={},
+                pixels=int(frame["pixels"]),
+                known=int(frame["known"]),
+                group=str(frame["group"]),
+            )
             for frame in record["frames"]
             if frame["error"] is None
         },
-        "varied": {},
-    }
+        varied={},
+    )
 
 
-def _refined(record: Mapping[str, Any], path: Path, stage: str) -> dict[str, Any]:
-    """The scores in a batch's summary, or of the one frame of a record."""
-    named: dict[str, str] = {}  # groups that the data set named
-    if isinstance(record.get("frames"), list):
-        scores = {entry["name"]: entry.get("scores") for entry in record["frames"]}
-        named = {entry["name"]: entry["group"] for entry in record["frames"] if "group" in entry}
-    else:
-        scores = {path.stem: record.get("scores")}
-    values = {name: _numbers(each[stage]) for name, each in scores.items() if each is not None}
-    if not values:
-        raise FileFormatError(
-            f"{path} holds no scores; give what eval --json printed, or the summary of a batch or"
-            " the record of a refinement with ground truth"
+def _refined(record: Mapping[str, Any], name: str, path: str, stage: str) -> Run:
+    """The scores in a batch's summary."""
+    entries = [entry for entry in record["frames"] if entry.get("scores") is not None]
+    if not entries:
+        raise ValueError("no frame has scores")
+    groups = groups_by_name([entry["name"] for entry in entries])
+    frames = {}
+    for entry, group in zip(entries, groups, strict=True):
+        values, before = (_numbers(entry["scores"][side]) for side in (stage, "before"))
+        frames[entry["name"]] = RunFrame(
+            values=values,
+            before=before,
+            pixels=round(values["pixels"]),
+            known=round(values["pixels"] / values["coverage"]) if values["coverage"] else 0,
+            group=entry.get("group", group),
         )
-    return {
-        "measures": tuple(m for m in MEASURES if all(m.key in each for each in values.values())),
-        "scoring": published("paper").scoring(),
-        "frames": {
-            name: {
-                "values": each,
-                "before": _numbers(scores[name]["before"]),
-                "pixels": round(each["pixels"]),
-                "group": named.get(name, group),
-                "known": round(each["pixels"] / each["coverage"]) if each["coverage"] else None,
-            }
-            for (name, each), group in zip(
-                values.items(), groups_by_name(list(values)), strict=True
-            )
-        },
-        "varied": {str(name): str(value) for name, value in dict(record.get("varied", {})).items()},
-    }
+    return Run(
+        name=name,
+        path=path,
+        measures=[m for m in MEASURES if all(m.key in each.values for each in frames.values())],
+        scoring=published("paper").scoring(),
+        frames=frames,
+        varied={str(name): str(value) for name, value in dict(record.get("varied", {})).items()},
+    )
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -19,22 +19,22 @@ from pnpdepth_cli.commands.evaluation.scoring import (
     score_pair,
     summarise_uncertainty,
 )
-from pnpdepth_cli.commands.evaluation.statistics import (
+from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
+from pnpdepth_cli.commands.sparse.options import METRES
+from pnpdepth_cli.commands.statistics import (
     LEVEL,
     MIN_CLUSTERS,
     Clusters,
-    FrameTable,
     find_clusters,
     interval,
 )
-from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
-from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.measures import FrameMeans
 
 _LEAK_WARNING_FRACTION = 0.01
 _LISTED = 3
@@ -50,7 +50,8 @@ class Evaluation:
     """With the user's changes."""
     frames: tuple[FrameScores, ...]
     """A row for each frame of the ground truth, in its order."""
-    mean: dict[str, float]
+    mean: dict[str, float | None]
+    """Of each measure; None where no frame has it."""
     interval: dict[str, tuple[float, float]] | None
     """The ends of the 95 % interval of each mean; None with too few independent frames."""
     clusters: Clusters
@@ -198,17 +199,16 @@ def evaluate(
         raise InputError(f"no frame could be scored; the first: {rows[0].error}")
     keys = [measure.key for measure in protocol.measures]
     values = np.array([[row.values[key] for key in keys] for row in scored])
-    groups = [row.pair.group for row in scored]
-    clusters = find_clusters(groups, values)
-    table = FrameTable.of_frames(values)  # a measure that a frame lacks is averaged over the others
-    mean = devkit_mean(values) if protocol.is_devkit else table.mean()
+    clusters = find_clusters([row.pair.group for row in scored], values)
+    mean = FrameMeans(row.values for row in scored).means()
+    if protocol.is_devkit:
+        mean = dict(zip(keys, devkit_mean(values).tolist(), strict=True))
     bounds, no_interval = None, []
     if clusters.count >= MIN_CLUSTERS:
-        ends = interval(lambda means: means, [table], clusters)
+        low, high = interval(lambda means: means, [values], clusters)
         highest = [1.0 if measure.percent else math.inf for measure in protocol.measures]
-        low, high = (np.where(np.isnan(mean), math.nan, end) for end in ends)
-        inside = np.maximum(low, 0.0).tolist(), np.minimum(high, highest).tolist()
-        bounds = dict(zip(keys, zip(*inside, strict=True), strict=True))
+        ends = zip(np.maximum(low, 0.0).tolist(), np.minimum(high, highest).tolist(), strict=True)
+        bounds = dict(zip(keys, ends, strict=True))
     elif len(scored) > 1:
         no_interval.append(
             f"no interval: {clusters.describe()} are too few to tell how sure the means are;"
@@ -219,7 +219,7 @@ def evaluate(
         request=request,
         protocol=protocol,
         frames=tuple(rows),
-        mean=dict(zip(keys, mean.tolist(), strict=True)),
+        mean=mean,
         interval=bounds,
         clusters=clusters,
         uncertainty=summarise_uncertainty(uncertainties),

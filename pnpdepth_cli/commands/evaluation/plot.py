@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.evaluation.statistics import gain
+from pnpdepth_cli.commands.statistics import gain
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.measures import Measure

@@ -11,13 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.integrate import trapezoid
-from scipy.stats import norm
 
 from pnpdepth_cli.commands.evaluation.frames import Depth, Fit, load_frame
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
@@ -31,7 +30,7 @@ from pnpdepth_cli.measures import Formula
 
 Floats = NDArray[np.float64]
 
-ONE_SIGMA, TWO_SIGMA = (float(2 * norm.cdf(k) - 1) for k in (1, 2))
+ONE_SIGMA, TWO_SIGMA = (2 * NormalDist().cdf(k) - 1 for k in (1, 2))
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, ONE_SIGMA, 0.8, 0.9, TWO_SIGMA, 0.99)
 """Probabilities of intervals."""
 REMOVED = tuple(n / 20 for n in range(20))
@@ -164,7 +163,7 @@ def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty
         return None
     error = np.abs(depth[known].astype(np.float64) - gt[known])
     deviation = sigma[known].astype(np.float64)
-    limits = norm.ppf((1 + np.array(LEVELS)) / 2)
+    limits = [NormalDist().inv_cdf((1 + level) / 2) for level in LEVELS]
     kept = np.maximum(1, np.round((1 - np.array(REMOVED)) * len(error))).astype(int)
 
     def curve(order: NDArray[np.intp]) -> Floats:
@@ -186,6 +185,8 @@ def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> dict[str, Any] 
     pixels `removed`; `ause` is the area between `sparsification` and `oracle` in units of the error
     of all pixels, 0 is best.
     """
+    from scipy.integrate import trapezoid
+
     if not frames:
         return None
     pixels, within, by_sigma, by_error = zip(*frames, strict=True)

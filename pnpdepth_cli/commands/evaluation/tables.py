@@ -140,7 +140,7 @@ def comparison_table(comparison: Mapping[str, Any]) -> Table:
     rows = []
     for measure in measures:
         title, mean = measure.heading, measure.text(base["mean"][measure.key])
-        rows.append([title, base["label"], mean, *["–"] * 4])
+        rows.append([title, base["name"], mean, *["–"] * 4])
         for run, gains in zip(others, comparison["gains"], strict=True):
             found = gains[measure.key]
             percent, p = found["percent"], found["p_adjusted"]
@@ -148,7 +148,7 @@ def comparison_table(comparison: Mapping[str, Any]) -> Table:
             style = style if p is not None and p < ALPHA else "dim"
             rows.append([
                 title,
-                run["label"],
+                run["name"],
                 measure.text(run["mean"][measure.key]),
                 Cell(_signed(percent), style),
                 *(_signed(found[end]) for end in ("low_percent", "high_percent")),
@@ -160,7 +160,7 @@ def comparison_table(comparison: Mapping[str, Any]) -> Table:
         rows=rows,
         caption=(
             f"{len(comparison['frames']):,} shared frames; gains in per cent of the error of"
-            f" {base['label']}, positive is better; intervals (95 %) and p-values, from {swaps}"
+            f" {base['name']}, positive is better; intervals (95 %) and p-values, from {swaps}"
             f" swaps, {_tested(comparison)}"
         ),
     )
@@ -192,7 +192,7 @@ def methods_table(comparison: Mapping[str, Any]) -> Table:
     Stars mark where a run differs from the first significantly.
     """
     runs, measures = comparison["runs"], _measures(comparison)
-    rows: list[list[str]] = [[run["label"]] for run in runs]
+    rows: list[list[str]] = [[run["name"]] for run in runs]
     for measure in measures:
         means = [run["mean"][measure.key] for run in runs]
         pick = max if measure.better == "higher" else min
@@ -210,6 +210,6 @@ def methods_table(comparison: Mapping[str, Any]) -> Table:
         rows=rows,
         caption=(
             f"means over {len(comparison['frames']):,} frames, the best in bold; *, **, ***:"
-            f" differs from {runs[0]['label']} with p < 0.05, 0.01, 0.001 {_tested(comparison)}"
+            f" differs from {runs[0]['name']} with p < 0.05, 0.01, 0.001 {_tested(comparison)}"
         ),
     )

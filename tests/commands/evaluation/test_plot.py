@@ -43,7 +43,7 @@ def test_numbers_lie_along_the_axis_and_names_make_lines(
     errors = {("100", "x"): 0.5, ("20", "x"): 0.75, ("20", "y"): 0.5, ("100", "y"): 1.25}
     runs = [batch(tmp_path, mae, sample=count, loss=loss) for (count, loss), mae in errors.items()]
     comparison = compare(runs)
-    assert [run["label"] for run in comparison["runs"]] == ["100,x", "20,x", "20,y", "100,y"]
+    assert [run["name"] for run in comparison["runs"]] == ["100,x", "20,x", "20,y", "100,y"]
     plot_comparison(comparison, tmp_path / "p.svg")
     above, below = figures[0].axes
     assert (below.get_xlabel(), below.get_xscale()) == ("sample", "log")

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.signal import lfilter
 
-from pnpdepth_cli.commands.evaluation import statistics
-from pnpdepth_cli.commands.evaluation.statistics import (
+from pnpdepth_cli.commands import statistics
+from pnpdepth_cli.commands.statistics import (
     BLOCK_BIAS,
     Clusters,
-    FrameTable,
     block_length,
     find_clusters,
     gain,
@@ -30,21 +29,10 @@ def clusters_of(ids: list[int] | np.ndarray) -> Clusters:
     return Clusters(ids=np.asarray(ids), unit="frames")
 
 
-def interval(table: FrameTable, ids: object = None) -> np.ndarray:
+def interval(values: np.ndarray, ids: object = None) -> np.ndarray:
     """(2, M) the ends of the interval of the means."""
-    clusters = clusters_of(np.arange(len(table.sums)) if ids is None else ids)
-    return np.stack(statistics.interval(lambda mean: mean, [table], clusters))
-
-
-def of_frames(*rows: list[float]) -> FrameTable:
-    return FrameTable.of_frames(np.array(rows, float))
-
-
-def test_a_mean_counts_frames_alike_and_skips_what_is_lacking() -> None:
-    table = of_frames([1, 10, np.nan], [3, np.nan, np.nan])
-    assert table.mean() == pytest.approx([2, 10, np.nan], nan_ok=True)
-    totals = of_frames([1], [3], [6]).totals(clusters_of([1, 0, 1]))
-    assert totals.tolist() == [[[3], [1]], [[7], [2]]]
+    clusters = clusters_of(np.arange(len(values)) if ids is None else ids)
+    return np.stack(statistics.interval(lambda mean: mean, [values], clusters))
 
 
 def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewness() -> None:
@@ -52,7 +40,7 @@ def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewne
     student = stats.t.interval(0.95, 8, loc=values.mean(), scale=stats.sem(values))
     skew = stats.skew(values, bias=False) / 3
     # Hall's transformation of t, which is a cubic, at the end of the interval
-    low, high = np.ravel(interval(of_frames(*values[:, None])))
+    low, high = np.ravel(interval(values[:, None]))
     assert low == pytest.approx(student[0])  # the errors are skewed
     t = (values.mean() - high) / stats.sem(values)
     cubic = t + skew * t**2 / 3 + skew**2 * t**3 / 27 + skew / 6
@@ -62,10 +50,10 @@ def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewne
 
 def test_clusters_of_equal_frames_are_as_sure_as_one_frame_each() -> None:
     values = np.random.default_rng(2).lognormal(0, 0.5, (9, 1))
-    repeated = of_frames(*np.repeat(values, 20, axis=0))
+    repeated = np.repeat(values, 20, axis=0)
     bounds = interval(repeated, ids=np.repeat(np.arange(9), 20))
-    assert bounds == pytest.approx(interval(of_frames(*values)))
-    assert interval(of_frames(*[[2.5]] * 6)).tolist() == [[2.5], [2.5]]
+    assert bounds == pytest.approx(interval(values))
+    assert interval(np.full((6, 1), 2.5)).tolist() == [[2.5], [2.5]]
 
 
 @pytest.mark.parametrize("frames", [5, 8, 20])
@@ -73,7 +61,7 @@ def test_clusters_of_equal_frames_are_as_sure_as_one_frame_each() -> None:
 def test_intervals_hold_the_true_mean_in_93_to_97_per_cent(frames: int, spread: float) -> None:
     rng, trials = np.random.default_rng(0), 1500
     draws = rng.lognormal(-(spread**2) / 2, spread, (frames, trials))  # of mean 1
-    low, high = interval(of_frames(*draws))
+    low, high = interval(draws)
     covered = float(np.mean((low <= 1) & (high >= 1)))
     error = np.sqrt(0.95 * 0.05 / trials)
     assert 0.93 - 2 * error < covered < 0.97 + 2 * error
@@ -82,13 +70,13 @@ def test_intervals_hold_the_true_mean_in_93_to_97_per_cent(frames: int, spread: 
 def test_the_gain_is_in_per_cent_of_the_first_and_its_interval_narrows_with_equal_gains() -> None:
     before = np.random.default_rng(0).lognormal(0, 1, (9, 2))
     noise = np.random.default_rng(1).uniform(0.3, 0.7, before.shape)
-    first, half, noisy = (FrameTable.of_frames(before * by) for by in (1, 0.5, noise))
+    first, half, noisy = (before * by for by in (1, 0.5, noise))
     better, clusters = np.array([-1.0, 1.0]), clusters_of(np.arange(9))
 
-    def gains(other: FrameTable) -> np.ndarray:
+    def gains(other: np.ndarray) -> np.ndarray:
         """(3, 2) the gain and the ends of its interval."""
         between = statistics.interval(lambda a, b: gain(a, b, better), [first, other], clusters)
-        return np.stack([gain(first.mean(), other.mean(), better), *between])
+        return np.stack([gain(first.mean(axis=0), other.mean(axis=0), better), *between])
 
     assert gains(half) == pytest.approx(np.array([[50, -50]] * 3), abs=1e-6)
     value, low, high = gains(noisy)
@@ -99,9 +87,9 @@ def test_the_gain_is_in_per_cent_of_the_first_and_its_interval_narrows_with_equa
 
 def p_value_of(changes: np.ndarray, resamples: int) -> tuple[float, bool]:
     """Of runs whose frames differ by these."""
-    tables = (FrameTable.of_frames(rows[:, None]) for rows in (np.zeros_like(changes), changes))
+    runs = (rows[:, None] for rows in (np.zeros_like(changes), changes))
     clusters = clusters_of(np.arange(len(changes)))
-    (p_value,), exact = swap_p_values(*tables, clusters, resamples, seed=0)
+    (p_value,), exact = swap_p_values(*runs, clusters, resamples, seed=0)
     return p_value, exact
 
 
@@ -127,19 +115,19 @@ def test_a_measure_that_some_frames_lack_has_the_interval_of_the_others() -> Non
     rows = np.random.default_rng(0).lognormal(0, 0.5, (12, 3))
     rows[:4, 1] = np.nan
     rows[:8, 2] = np.nan  # four frames are too few
-    low, high = interval(FrameTable.of_frames(rows))
+    low, high = interval(rows)
     for column, frames in ((0, rows[:, :1]), (1, rows[4:, 1:2])):
-        alone = np.ravel(interval(FrameTable.of_frames(frames)))
+        alone = np.ravel(interval(frames))
         width = alone[1] - alone[0]
         assert [low[column], high[column]] == pytest.approx(alone, rel=1e-9)
         assert low[column] < frames.mean() - width / 10
         assert high[column] > frames.mean() + width / 10
     assert np.isnan([low[2], high[2]]).all()
-    first, worse = (FrameTable.of_frames(rows * by) for by in (1, 1.5))
+    first, worse = (rows * by for by in (1, 1.5))
     p_values, exact = swap_p_values(first, worse, clusters_of(np.arange(12)), 4096, 0)
     assert exact
     assert p_values == pytest.approx([2 / 2**12, 2 / 2**8, 2 / 2**4])
-    nothing = FrameTable.of_frames(np.full((5, 1), np.nan))
+    nothing = np.full((5, 1), np.nan)
     assert np.isnan(swap_p_values(nothing, nothing, clusters_of(np.arange(5)), 50, 0)[0]).all()
 
 

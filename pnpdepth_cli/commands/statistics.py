@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,36 +100,18 @@ def block_length(series: Floats) -> int:
     return min(frames, math.ceil(2 * correlation / (1 - correlation**2) / BLOCK_BIAS))
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameTable:
-    """The scores of N frames as sums, from which the means of any weighting of them follow."""
+def _cluster_sums(values: Floats, clusters: Clusters) -> Floats:
+    """(G, 2, M) the sum of (N, M) values in each cluster, and how many frames have one."""
+    known = np.isfinite(values)
+    sums = np.zeros((clusters.count, 2, values.shape[1]))
+    np.add.at(sums, clusters.ids, np.stack([np.where(known, values, 0.0), known], axis=1))
+    return sums
 
-    sums: Floats
-    """(N, K, M): K summands of each of M measures; (N, K, 1) if all measures share them."""
-    mean_of: Callable[[Floats], Floats]
-    """From sums (…, K, M or 1) to means (…, M); unchanged where the sums are multiplied."""
 
-    @classmethod
-    def of_frames(cls, values: Floats) -> FrameTable:
-        """Every frame counts alike; (N, M) with NaN where a frame lacks a measure."""
-
-        def mean_of(sums: Floats) -> Floats:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                return np.asarray(sums[..., 0, :] / sums[..., 1, :])
-
-        known = np.isfinite(values)
-        sums = np.stack([np.where(known, values, 0.0), known.astype(np.float64)], axis=1)
-        return cls(sums=sums, mean_of=mean_of)
-
-    def mean(self) -> Floats:
-        """Returns (M,) the means over all frames; NaN for a measure that none has."""
-        return self.mean_of(self.sums.sum(axis=0))
-
-    def totals(self, clusters: Clusters) -> Floats:
-        """Returns (G, K, M or 1) the sums of each cluster."""
-        totals = np.zeros((clusters.count, *self.sums.shape[1:]))
-        np.add.at(totals, clusters.ids, self.sums)
-        return totals
+def _mean(sums: Floats) -> Floats:
+    """(…, M) the means of sums and counts (…, 2, M); NaN where no frame has a value."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(sums[..., 0, :] / sums[..., 1, :])
 
 
 def gain(before: Floats, after: Floats, better: Floats) -> Floats:
@@ -146,9 +128,9 @@ def gain(before: Floats, after: Floats, better: Floats) -> Floats:
 
 
 def interval(
-    statistic: Callable[..., Floats], tables: Sequence[FrameTable], clusters: Clusters
+    statistic: Callable[..., Floats], runs: Sequence[Floats], clusters: Clusters
 ) -> tuple[Floats, Floats]:
-    """Returns (M,), (M,): the ends of the 95 % interval of statistic(*means of the tables).
+    """Returns (M,), (M,): the ends of the 95 % interval of statistic(*means of the runs).
 
     The jackknife leaves out one cluster after the other; its pseudo-values are a sample whose mean
     is the statistic. Each end is that of Student's t, or of t corrected for the skewness of the
@@ -156,21 +138,17 @@ def interval(
     clusters have.
 
     Args:
-        statistic: From means (…, M) of each table to (…, M).
-        tables: Of the same frames and measures.
+        statistic: From means (…, M) of each run to (…, M).
+        runs: (N, M) each, of the same frames and measures; NaN where a frame lacks a measure.
         clusters: Of the frames.
     """
-    from scipy import stats
+    from scipy.special import stdtrit
 
-    totals = [table.totals(clusters) for table in tables]
-
-    def value_of(sums: Iterable[Floats]) -> Floats:
-        return statistic(*(table.mean_of(s) for table, s in zip(tables, sums, strict=True)))
-
-    value = value_of(each.sum(axis=0) for each in totals)
-    without = value_of(each.sum(axis=0) - each for each in totals)
+    sums = [_cluster_sums(values, clusters) for values in runs]
+    value = statistic(*(_mean(each.sum(axis=0)) for each in sums))
+    without = statistic(*(_mean(each.sum(axis=0) - each) for each in sums))
     # a cluster without the measure is no observation of it
-    has = np.all([np.isfinite(t.mean_of(s)) for t, s in zip(tables, totals, strict=True)], axis=0)
+    has = np.all([each[:, 1] > 0 for each in sums], axis=0)
     count = has.sum(axis=0).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         # the pseudo-values' deviations from their mean, and standard error and skewness of it
@@ -181,7 +159,7 @@ def interval(
         skew = third / variance**1.5 * np.sqrt(count - 1) / (count - 2)
         error = np.where(count >= MIN_CLUSTERS, error, math.nan)
         skew = np.where(error > 1e-8 * np.maximum(np.abs(value), 1.0), skew, 0.0)
-    reach = stats.t.ppf((1 + LEVEL) / 2, np.maximum(count - 1, 1))
+    reach = stdtrit(np.maximum(count - 1, 1), (1 + LEVEL) / 2)  # quantile of Student's t
     below, above = (
         np.clip(end, reach, _WIDEST * reach)
         for end in (_corrected(reach, skew), -_corrected(-reach, skew))
@@ -197,21 +175,28 @@ def _corrected(t: Floats, skew: Floats) -> Floats:
 
 
 def swap_p_values(
-    first: FrameTable, other: FrameTable, clusters: Clusters, permutations: int, seed: int
+    first: Floats, other: Floats, clusters: Clusters, permutations: int, seed: int
 ) -> tuple[Floats, bool]:
     """Returns (M,) two-sided p-values of paired runs, and whether they are exact.
 
     The p-value is the fraction of swaps of the two runs, cluster by cluster, after which the means
     differ at least as much as observed (Good 2005, chapter 3). All 2^G swaps are tried if they are
     at most `permutations`; else so many random ones, with the observed one counted in.
+
+    Args:
+        first: (N, M), NaN where a frame lacks a measure.
+        other: (N, M) of the same frames.
+        clusters: Of the frames.
+        permutations: The most swaps that are tried.
+        seed: Random seed of the swaps.
     """
-    a, b = first.totals(clusters), other.totals(clusters)
+    a, b = (_cluster_sums(values, clusters) for values in (first, other))
     count = len(a)
 
     def difference(swapped: Floats) -> Floats:
         """(B, M) the differences of means with the clusters swapped where (B, G) is 1."""
         moved = np.tensordot(swapped, b - a, axes=1)
-        return np.abs(other.mean_of(b.sum(axis=0) - moved) - first.mean_of(a.sum(axis=0) + moved))
+        return np.abs(_mean(b.sum(axis=0) - moved) - _mean(a.sum(axis=0) + moved))
 
     exact = count < 60 and 2**count <= permutations
     if count < 2:
