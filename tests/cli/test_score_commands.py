@@ -136,7 +136,7 @@ def test_a_refinement_scores_the_same_when_its_files_are_evaluated(
     assert record["mean"]["mae"] == pytest.approx(refined["scores"]["after"]["mae"], abs=code)
     assert record["frames"][0]["image"] == str(frame.image)
     assert record["frames"][0]["pixels_given_as_sparse"] == 60
-    assert " 60 of the scored pixels (2.10%) have a point of the sparse input" in err
+    assert "60 of the scored pixels (2.10%) have a point of the sparse input" in err
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="file names are Unicode there")

@@ -78,9 +78,7 @@ def libraries_to(text: io.StringIO) -> Iterator[None]:
 def run_input(seed: Seed, data: bytes) -> dict[str, Any]:
     """Returns the exit code, output and cost of the seed's command on these bytes."""
     from pnpdepth_cli.cli.main import main
-    from pnpdepth_cli.commands.evaluation.pairing import _stack
 
-    _stack.cache_clear()
     file = Path(seed.file)
     original = file.read_bytes()
     file.write_bytes(data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +36,6 @@ from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.measures import FrameMeans
 
-_LEAK_WARNING_FRACTION = 0.01
 _LISTED = 3
 _OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
 
@@ -147,7 +146,7 @@ def frame_record(frame: FrameScores) -> dict[str, Any]:
         "pixels": frame.pixels,
         "known": frame.known,
         "coverage": frame.coverage,
-        "pixels_given_as_sparse": frame.leaked,
+        "pixels_given_as_sparse": frame.given,
         "median_ratio": frame.ratio,
         "factor": fit and fit.factor,
         "shift": fit and fit.shift,
@@ -223,31 +222,27 @@ def evaluate(
         interval=bounds,
         clusters=clusters,
         uncertainty=summarise_uncertainty(uncertainties),
-        notes=(*notes, *_kind_notes(rows), *_warnings(rows, protocol), *no_interval),
+        notes=(*notes, *_reading_notes(rows), *_warnings(rows, protocol), *no_interval),
     )
 
 
-def kinds_of(rows: Sequence[FrameScores]) -> dict[str, list[tuple[Reading, int]]]:
-    """Returns the kinds of files of "prediction", "gt" and "sparse" with counts, frequent first."""
-    return {
-        side: Counter(row.kinds[side] for row in rows if side in row.kinds).most_common()
-        for side in _OPTIONS
-    }
+def readings_of(rows: Sequence[FrameScores], side: str) -> list[tuple[Reading, int]]:
+    """Returns how the files "prediction" or "gt" were read with their number, frequent first."""
+    return Counter(row.readings[side] for row in rows if side in row.readings).most_common()
 
 
-def _kind_notes(rows: Sequence[FrameScores]) -> list[str]:
+def _reading_notes(rows: Sequence[FrameScores]) -> list[str]:
     """A line for the predictions, and one for the ground truth."""
     lines = []
-    for side, kinds in kinds_of(rows).items():
+    for side, option in _OPTIONS.items():
         texts = [
-            kind.source
-            + (f"; {_OPTIONS[side]} to change" if kind.assumed else "")
-            + (f" ({count:,} files)" if len(kinds) > 1 else "")
-            for kind, count in kinds[:_LISTED]
+            reading.source
+            + (f"; {option} to change" if reading.assumed else "")
+            + (f" ({count:,} files)" if count < len(rows) else "")
+            for reading, count in readings_of(rows, side)
         ]
-        more = len(kinds) - _LISTED
-        if texts and side != "sparse":
-            lines.append(f"{side}: {', '.join(texts)}{f', {more} more kinds' * (more > 0)}")
+        if texts:
+            lines.append(f"{side}: {some_names(texts)}")
     return lines
 
 
@@ -258,60 +253,78 @@ def _warnings(rows: Sequence[FrameScores], protocol: EvalProtocol) -> list[str]:
         InputError: If a scale that was assumed is wrong by a factor between those in use.
     """
     scored = [row for row in rows if row.scored]
-    lines = []
+    return [
+        *_unscored(rows),
+        *_empty_pixels(scored, protocol),
+        *_scales(scored, protocol),
+        *_given_points(scored, protocol),
+    ]
+
+
+def _unscored(rows: Sequence[FrameScores]) -> Iterator[str]:
+    """Frames that are in no mean."""
     if missing := [row.name for row in rows if row.missing]:
-        lines.append(
+        yield (
             f"warning: {len(missing):,} of {len(rows):,} frames have no prediction:"
             f" {some_names(missing)}"
         )
     failed = [row for row in rows if not row.scored and not row.missing]
-    lines += [
-        f"warning: frame {one_line(row.name)} was not scored: {row.error}"
-        for row in failed[:_LISTED]
-    ]
+    for row in failed[:_LISTED]:
+        yield f"warning: frame {one_line(row.name)} was not scored: {row.error}"
     if (more := len(failed) - _LISTED) > 0:
-        lines.append(f"warning: {more:,} more frames were not scored")
+        yield f"warning: {more:,} more frames were not scored"
+
+
+def _empty_pixels(scored: Sequence[FrameScores], protocol: EvalProtocol) -> Iterator[str]:
+    """Pixels of the ground truth without prediction."""
     known = sum(row.known for row in scored)
+    treatment = "lowers the coverage and is in no error"
+    if protocol.missing == "min":
+        treatment = f"is scored as {protocol.min_depth:g} m"
+    elif protocol.is_devkit:
+        treatment = "was filled in from its neighbours before scoring"
     if empty := known - sum(row.predicted for row in scored):
-        treatment = {
-            "skip": "lowers the coverage and is in no error",
-            "min": f"is scored as {protocol.min_depth:g} m",
-        }.get(protocol.missing, "")
-        if protocol.is_devkit:
-            treatment = "was filled in from its neighbours before scoring"
-        lines.append(
+        yield (
             f"warning: {empty:,} pixels ({empty / known:.2%}) of the ground truth have no"
             f" prediction; what is missing {treatment}"
         )
     if holes := [row.name for row in scored if math.isnan(row.values.get("log_mae", 0.0))]:
-        lines.append(
+        yield (
             f"warning: {len(holes):,} predictions have empty rows between filled ones, which the"
             f" development kit sets to −1 m and scores (its logarithmic errors are then NaN):"
             f" {some_names(holes)}"
         )
+
+
+def _scales(scored: Sequence[FrameScores], protocol: EvalProtocol) -> Iterator[str]:
+    """How predictions were scaled, and what looks like a wrong scale."""
     if factors := [row.fit.factor for row in scored if row.fit is not None]:
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan
-        lines.append(
+        yield (
             f"scale-by {protocol.scale_by}: factor {median:.4g} (median of {len(factors):,}"
             f" images), standard deviation / median {spread:.3f}"
         )
-    if protocol.scale_by == "none" and (unscaled := [r for r in scored if r.pair.unit != METRES]):
-        lines.append(
+    elif unscaled := [row for row in scored if row.pair.unit != METRES]:
+        yield (
             f"warning: {len(unscaled):,} predictions are in {unscaled[0].pair.unit}, not in metres,"
             " so errors against the ground truth show nothing; --scale-by median scales each image"
         )
-    kinds = {side: found[0][0] for side, found in kinds_of(rows).items() if found}
     ratios = [row.ratio for row in scored if math.isfinite(row.ratio)] or [math.nan]
-    by_option = {_OPTIONS[name]: kinds.get(name) for name in ("prediction", "gt")}
-    lines += filter(None, [scale_warning("predictions", float(np.median(ratios)), by_option)])
-    leaked = sum(row.leaked or 0 for row in scored)
-    if leaked and not protocol.exclude_sparse:
-        fraction = leaked / sum(row.pixels for row in scored if row.leaked is not None)
-        sign = "warning: " if fraction >= _LEAK_WARNING_FRACTION else ""
-        lines.append(
-            f"{sign}{leaked:,} of the scored pixels ({fraction:.2%}) have a point of the sparse"
-            " input as ground truth, which the prediction could copy; --exclude-sparse leaves them"
-            " out"
+    by_option = {
+        option: next((reading for reading, _ in readings_of(scored, side)), None)
+        for side, option in _OPTIONS.items()
+    }
+    if warning := scale_warning("predictions", float(np.median(ratios)), by_option):
+        yield warning
+
+
+def _given_points(scored: Sequence[FrameScores], protocol: EvalProtocol) -> Iterator[str]:
+    """Scored pixels at which the network was given a depth."""
+    given = sum(row.given or 0 for row in scored)
+    if given and not protocol.exclude_sparse:
+        fraction = given / sum(row.pixels for row in scored if row.given is not None)
+        yield (
+            f"{given:,} of the scored pixels ({fraction:.2%}) have a point of the sparse input;"
+            " --exclude-sparse leaves them out"
         )
-    return lines

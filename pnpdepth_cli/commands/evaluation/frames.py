@@ -5,6 +5,7 @@ Predictions of relative networks are scaled to the ground truth of each image (`
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.evaluation.pairing import FramePair, load_stacked
+from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.rules import EvalProtocol, crop_window
-from pnpdepth_cli.errors import InputError, SizeError
+from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image
 from pnpdepth_cli.io.depth import (
@@ -26,8 +27,9 @@ from pnpdepth_cli.io.depth import (
 )
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.sparse_files import read_sparse
-from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors.pixels import as_depth_image
+from pnpdepth_cli.points import in_frame
+from pnpdepth_cli.sensors import sample_points
+from pnpdepth_cli.sensors.pixels import pixel_index
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -49,26 +51,15 @@ class LoadedFrame:
     """(H, W) metres, 0 where unknown."""
     gt: Depth
     """(H, W) metres, 0 where unknown or not scored."""
-    kinds: dict[str, Reading]
-    """Of the files by "prediction", "gt" and "sparse"."""
-    sparse: Depth | None = None
-    """(H, W) metres of the network's sparse input, 0 elsewhere; None if it is not known."""
+    readings: dict[str, Reading]
+    """How the files "prediction" and "gt" were read."""
+    given: Mask | None = None
+    """(H, W) true where the network was given a sparse point; None if that is not known."""
     predicted: Mask | None = None
     """(H, W) true where the file has a prediction; None without a file."""
     fit: Fit | None = None
     sigma: Depth | None = None
     """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
-
-    @property
-    def both(self) -> Mask:
-        """(H, W) true where prediction and ground truth are known."""
-        return (self.depth > 0) & (self.gt > 0)
-
-    @property
-    def tolerance(self) -> float:
-        """Metres that rounding to integer codes can put between equal depths."""
-        kinds = (self.kinds.get(side) for side in ("gt", "sparse"))
-        return sum(0.5 / scale for scale in {k.scale for k in kinds if k and k.scale})
 
 
 def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) -> LoadedFrame:
@@ -80,30 +71,26 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
     """
     frame = pair.frame
     if isinstance(frame.gt, Hdf5Array):
-        source = f"{frame.gt.path.suffix} array"
-        whole = DepthFile(values=depth_of(frame.gt), reading=Reading(source))
+        whole = DepthFile(values=depth_of(frame.gt), reading=Reading("HDF5 array"))
     else:
         assert frame.gt is not None
         scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
-        whole = _read(frame.gt, scale, protocol, pair.index)
+        whole = _read(frame.gt, scale, protocol)
     gt = np.ascontiguousarray(frame.part.apply(masked(whole.values, frame.masks)))
-    kinds = {"gt": whole.reading}
-    sparse, kind = _known_sparse(pair, protocol, gt.shape)
-    if kind is not None:
-        kinds["sparse"] = kind
-    mask = _scored_mask(gt, protocol)
+    given = _given_points(pair, gt, required=protocol.exclude_sparse)
+    scored = _scored_mask(gt, protocol)
     if protocol.exclude_sparse:
-        if sparse is None:
+        if given is None:
             raise InputError(
                 f"frame {pair.name} has no sparse depth file to exclude: neither the record beside"
                 " the prediction nor the data set names one"
             )
-        mask &= sparse == 0
+        scored &= ~given
     loaded = LoadedFrame(
         depth=np.zeros_like(gt),
-        gt=np.where(mask, gt, np.float32(0)),
-        sparse=sparse,
-        kinds=kinds,
+        gt=np.where(scored, gt, np.float32(0)),
+        readings={"gt": whole.reading},
+        given=given,
     )
     return loaded if pair.prediction is None else _with_prediction(loaded, pair, protocol, request)
 
@@ -114,7 +101,7 @@ def _with_prediction(
     """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
     assert pair.prediction is not None
     size = frame.gt.shape
-    image = _read(pair.prediction, request.pred_scale, protocol, pair.index)
+    image = _read(pair.prediction, request.pred_scale, protocol)
     values = _to_size(pair, image.values, size, protocol.resize)
     depth, fit = scaled(values, frame.gt, protocol.prediction_kind, protocol.scale_by)
     if protocol.clip:
@@ -127,7 +114,7 @@ def _with_prediction(
     return replace(
         frame,
         depth=depth,
-        kinds={"prediction": image.reading, **frame.kinds},
+        readings={"prediction": image.reading, **frame.readings},
         predicted=values > 0,
         fit=fit,
         sigma=_read_sigma(pair.sigma, size) if has_sigma else None,
@@ -145,9 +132,9 @@ def _read_sigma(path: Path | None, size: Size) -> Depth | None:
     return values if values.shape == size else None
 
 
-def _read(path: Path, scale: float | None, protocol: EvalProtocol, index: int | None) -> DepthFile:
+def _read(path: Path, scale: float | None, protocol: EvalProtocol) -> DepthFile:
     """The depth image; codes are metres × the scale, else the file's own, else the protocol's."""
-    stored = load_stored(path) if index is None else load_stacked(path, index)
+    stored = load_stored(path)
     assumed = scale is None and stored.reading.scale is None and stored.values.dtype.kind != "f"
     image = depth_from_stored(path, stored, protocol.scale if assumed else scale)
     if protocol.is_devkit and image.reading.scale is not None and stored.values.ndim == 2:
@@ -156,35 +143,32 @@ def _read(path: Path, scale: float | None, protocol: EvalProtocol, index: int | 
     return replace(image, reading=image.reading._replace(assumed=assumed))
 
 
-def _known_sparse(
-    pair: FramePair, protocol: EvalProtocol, size: Size
-) -> tuple[Depth | None, Reading | None]:
-    """(H, W) metres of the points on their pixels, 0 elsewhere, and the kind of file.
+def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
+    """(H, W) true at the network's sparse points; None where they are not known or unusable.
 
-    (None, None) for an unusable file.
+    Points that were drawn from the ground truth (H, W) are drawn again.
     """
-    if pair.sparse is None:
-        return None, None
-    height, width = size
+    size = gt.shape[0], gt.shape[1]
     try:
-        scale = pair.frame.sparse_scale
-        sparse, reading = read_sparse(pair.sparse, size=(height, width), scale=scale)
-        assumed = reading.assumed
-        if assumed and protocol.scale != reading.scale:
-            sparse, reading = read_sparse(pair.sparse, size=(height, width), scale=protocol.scale)
-        xy, source_size = sparse.xy, sparse.size
-        if source_size != size:
-            xy = pair.frame.part.in_crop(xy, source_size)
-            if pair.frame.part.apply(np.zeros(source_size, bool)).shape != size:
-                raise _different(pair, "sparse depth", pair.sparse, source_size, size)
-    except InputError:
-        if protocol.exclude_sparse:
+        if pair.drawn is not None:
+            image = image_of(pair, size) if pair.drawn.pattern.kind == "features" else None
+            xy = sample_points(gt, pair.drawn.pattern, pair.drawn.seed, image=image).xy
+        elif pair.sparse is not None:
+            sparse, _ = read_sparse(pair.sparse, size=size, scale=pair.frame.sparse_scale)
+            xy = sparse.xy
+            if sparse.size != size:
+                xy = pair.frame.part.in_crop(xy, sparse.size)
+                if pair.frame.part.apply(np.zeros(sparse.size, bool)).shape != size:
+                    raise _different(pair, "sparse depth", pair.sparse, sparse.size, size)
+        else:
+            return None
+    except PnpDepthError:
+        if required:
             raise
-        return None, None
-    inside = in_frame(xy, (height, width))
-    depth = sparse.depth[inside]
-    points = SparsePoints(xy=xy[inside], depth=depth, size=(height, width))
-    return as_depth_image(points), reading._replace(assumed=assumed)
+        return None
+    given = np.zeros(size, bool)
+    given.flat[pixel_index(xy[in_frame(xy, size)], size)] = True
+    return given
 
 
 def image_of(pair: FramePair, size: Size) -> Depth | None:
@@ -201,14 +185,12 @@ def image_of(pair: FramePair, size: Size) -> Depth | None:
     return rgb if rgb.shape[:2] == size else None
 
 
-def _scored_mask(ground_truth: Depth, protocol: EvalProtocol) -> Mask:
+def _scored_mask(gt: Depth, protocol: EvalProtocol) -> Mask:
     """(H, W) true where the protocol scores known ground truth."""
-    scored = np.zeros(ground_truth.shape, bool)
-    scored[crop_window(protocol.crop, ground_truth.shape)] = True
-    scored &= ground_truth > protocol.min_depth
-    if protocol.max_depth is not None:
-        scored &= ground_truth < protocol.max_depth
-    return scored
+    scored = np.zeros(gt.shape, bool)
+    scored[crop_window(protocol.crop, gt.shape)] = True
+    highest = math.inf if protocol.max_depth is None else protocol.max_depth
+    return scored & (gt > protocol.min_depth) & (gt < highest)
 
 
 def _to_size(pair: FramePair, depth: Depth, size: Size, resize: str | None) -> Depth:

@@ -1,22 +1,17 @@
-"""Finds the prediction of each frame of the ground truth: files matched by name, or stacked."""
+"""Finds the prediction of each frame of the ground truth by its name."""
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.commands.sparse.options import METRES
-from pnpdepth_cli.errors import FileFormatError, InputError, PnpDepthError, UsageError
+from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.dataset import (
     Frame,
     Source,
@@ -24,16 +19,23 @@ from pnpdepth_cli.io.dataset import (
     groups_by_name,
 )
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, DepthFile, Reading
-from pnpdepth_cli.io.formats.arrays import parse_npy
+from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.layouts import find_layout, list_frames
 from pnpdepth_cli.protocols import WHOLE, FramePart
+from pnpdepth_cli.sensors import SamplePattern
 
 _DEPTH_MARKS = ("_depth", ".depth")
 _COMPANIONS = ("_sigma_preview", "_preview", "_improvement", "_sigma", "_valid")
 # KITTI's selection names the kind of file in the middle.
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5
+
+
+class DrawnPoints(NamedTuple):
+    """The pattern and the random seed of points that were drawn from ground truth."""
+
+    pattern: SamplePattern
+    seed: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,10 +52,8 @@ class FramePair:
     sparse: Path | None = None
     """The network's sparse input, of the run's record or the data set."""
     sigma: Path | None = None
-    index: int | None = None
-    """Of the frame, in files of several frames."""
-    sampled: int = 0
-    """Points of the ground truth that were the sparse input, by the run's record."""
+    drawn: DrawnPoints | None = None
+    """How the network's sparse input was drawn from the ground truth, by the run's record."""
     unit: str = METRES
     image: Source | None = None
 
@@ -93,8 +93,6 @@ def pair_frames(
         predictions, notes = depth_files(prediction)
         frames, more_notes = _true_frames(ground_truth, layout, part)
         notes += more_notes
-    elif (count := stack_size(prediction)) is not None:
-        return _stacked_pairs(prediction, ground_truth, count)
     else:
         name = frame_name(prediction.stem)
         frames, predictions = [Frame(name=name, gt=ground_truth)], {name: prediction}
@@ -145,8 +143,6 @@ def _pair(frame: Frame, prediction: Path | None) -> FramePair:
             (result,) = result_frames(prediction)
             record, sigma = result.record, result.sigma
     inputs = _dict(record.get("inputs"))
-    used = _dict(record.get("points")).get("used")
-    is_sampled = "sampled_from" in _dict(inputs.get("sparse"))
     known = frame.sparse
     if known is not None and known.suffix.lower() not in DEPTH_SUFFIXES:
         known = None
@@ -155,11 +151,21 @@ def _pair(frame: Frame, prediction: Path | None) -> FramePair:
         prediction=prediction,
         frame=frame,
         sparse=_input(inputs, "sparse") or known,
+        drawn=_drawn_points(_dict(inputs.get("sparse"))),
         sigma=sigma,
-        sampled=used if is_sampled and isinstance(used, int) else 0,
         image=_input(inputs, "image") or frame.image,
         unit=str(record.get("unit", METRES)),
     )
+
+
+def _drawn_points(entry: Mapping[str, Any]) -> DrawnPoints | None:
+    """The points that a record says were drawn from the ground truth; None if it does not."""
+    if "sampled_from" not in entry:
+        return None
+    with contextlib.suppress(KeyError, TypeError, ValueError, UsageError):
+        pattern = SamplePattern(**{name: entry[name] for name in ("kind", "count", "fraction")})
+        return DrawnPoints(pattern, int(entry["seed"]))
+    return None
 
 
 def _input(inputs: Mapping[str, Any], part: str) -> Path | None:
@@ -232,46 +238,3 @@ def some_names(names: Iterable[str]) -> str:
     text = ", ".join(one_line(name) for name in listed[:_LISTED])
     more = len(listed) - _LISTED
     return f"{text} and {more:,} more" if more > 0 else text
-
-
-def _stacked_pairs(
-    prediction: Path, ground_truth: Path, count: int
-) -> tuple[list[FramePair], list[str]]:
-    """A frame for each map of two files of several frames."""
-    others = stack_size(ground_truth)
-    if others != count:
-        stored = "no stack of frames" if others is None else f"{others:,} frames"
-        raise InputError(f"{prediction} holds {count:,} frames but {ground_truth} {stored}")
-    frames = (Frame(name=f"{index:04}", gt=ground_truth) for index in range(count))
-    return [
-        FramePair(name=frame.name, prediction=prediction, frame=frame, index=index)
-        for index, frame in enumerate(frames)
-    ], [f"{count:,} frames in each of the two files"]
-
-
-def stack_size(path: Path) -> int | None:
-    """Returns how many frames a `(N, H, W)` NPY file stacks; None for anything else."""
-    stack = _stack(path)
-    return None if stack is None else len(stack)
-
-
-def load_stacked(path: Path, index: int) -> DepthFile:
-    """Returns frame `index` of a stack as it is stored."""
-    stack = _stack(path)
-    assert stack is not None
-    values = np.asarray(stack[index])
-    reading = Reading(f"{values.dtype} NPY of {len(stack):,} frames")
-    return DepthFile(values=values, reading=reading)
-
-
-@functools.lru_cache(maxsize=4)
-def _stack(path: Path) -> NDArray[Any] | None:
-    """The stack in a file; None for anything else, which the reader of single maps reports."""
-    if path.suffix.lower() != ".npy":
-        return None
-    try:
-        check_network_file(path, "stack", FileFormatError)
-        array = parse_npy(path, path.read_bytes())
-    except (FileFormatError, OSError):
-        return None
-    return array if array.ndim == 3 and 1 not in (len(array), array.shape[2]) else None

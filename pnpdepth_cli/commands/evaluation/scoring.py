@@ -65,10 +65,10 @@ class FrameScores:
     fit: Fit | None = None
     ratio: float = math.nan
     """Median of prediction / ground truth."""
-    leaked: int | None = None
-    """Scored pixels whose ground truth is a value of the sparse input; None if that is unknown."""
-    kinds: dict[str, Reading] = field(default_factory=dict)
-    """Of the files by "prediction", "gt" and "sparse"."""
+    given: int | None = None
+    """Scored pixels at which the network was given a sparse point; None if that is unknown."""
+    readings: dict[str, Reading] = field(default_factory=dict)
+    """How the files "prediction" and "gt" were read."""
     uncertainty: FrameUncertainty | None = field(default=None, compare=False)
 
     @property
@@ -100,49 +100,36 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
         SizeError: Where sizes differ.
     """
     frame = load_frame(pair, protocol, request)
-    depth, gt, both = frame.depth, frame.gt, frame.both
-    known, pixels = int(np.count_nonzero(gt)), int(both.sum())
-    if not known:
+    depth, gt = frame.depth, frame.gt
+    known, both = gt > 0, (gt > 0) & (depth > 0)
+    if not known.any():
         raise InputError(
             f"{pair.frame.gt} has no known depth where protocol {protocol.name} scores"
         )
-    row = FrameScores(pair=pair, known=known, kinds=frame.kinds)
+    row = FrameScores(pair=pair, known=int(known.sum()), readings=frame.readings)
     if frame.predicted is None:
         return replace(row, error="there is no prediction")
-    summed = [m for m in protocol.measures if isinstance(m.formula, Formula)]
-    both_depths = torch.from_numpy(depth), torch.from_numpy(gt)
-    sums = error_sums(*both_depths, protocol.thresholds, summed)
     row = replace(
         row,
-        pixels=pixels,
-        predicted=int(np.count_nonzero(frame.predicted & (gt > 0))),
+        pixels=int(both.sum()),
+        predicted=int((frame.predicted & known).sum()),
         fit=frame.fit,
-    )
-    if protocol.is_devkit:
-        values = devkit_errors(depth, gt)
-    elif not pixels:
-        where = " where the ground truth is known" if (depth > 0).any() else ""
-        return replace(row, error=f"{pair.prediction} holds no valid depth{where}")
-    else:
-        of_pixels = measures_of(sums, summed).tolist()
-        values = {m.key: value for m, value in zip(summed, of_pixels, strict=True)}
-        values |= {m.key: m.value(depth, gt) for m in protocol.measures if m.key not in values}
-    leaked = min(pair.sampled, pixels) or None
-    if frame.sparse is not None:
-        equal = np.abs(frame.sparse - gt) <= frame.tolerance + 1e-6 * gt
-        leaked = int(np.count_nonzero(both & (frame.sparse > 0) & equal))
-    return replace(
-        row,
-        values=values,
-        ratio=_median_ratio(depth, gt),
-        leaked=leaked,
+        ratio=float(np.median(depth[both] / gt[both])) if both.any() else math.nan,
+        given=None if frame.given is None else int((frame.given & both).sum()),
         uncertainty=None if frame.sigma is None else frame_uncertainty(depth, gt, frame.sigma),
     )
-
-
-def _median_ratio(depth: Depth, gt: Depth) -> float:
-    both = (depth > 0) & (gt > 0)
-    return float(np.median(depth[both] / gt[both])) if both.any() else math.nan
+    if protocol.is_devkit:
+        return replace(row, values=devkit_errors(depth, gt))
+    if not row.pixels:
+        where = " where the ground truth is known" if (depth > 0).any() else ""
+        return replace(row, error=f"{pair.prediction} holds no valid depth{where}")
+    # measures of sums over pixels, then those of whole images
+    summed = [m for m in protocol.measures if isinstance(m.formula, Formula)]
+    both_depths = torch.from_numpy(depth), torch.from_numpy(gt)
+    of_pixels = measures_of(error_sums(*both_depths, protocol.thresholds, summed), summed).tolist()
+    values = {m.key: value for m, value in zip(summed, of_pixels, strict=True)}
+    values |= {m.key: m.value(depth, gt) for m in protocol.measures if m.key not in values}
+    return replace(row, values=values)
 
 
 def filled(depth: Depth) -> Depth:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pnpdepth_cli.commands.evaluation.compare import ALPHA
-from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, frame_record, kinds_of
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, frame_record, readings_of
 from pnpdepth_cli.commands.evaluation.scoring import FrameScores
 from pnpdepth_cli.commands.tables import (
     Cell,
@@ -57,10 +57,10 @@ def means_row(evaluation: Evaluation, name: str, columns: Sequence[str] | None) 
         cells = [f"{cell} ({end})" for cell, end in zip(cells, ends, strict=True)]
     scored = f"{len(evaluation.scored):,} of {len(evaluation.frames):,}"
     assumed = {
-        f"{side}: {kind}"
-        for side, kinds in kinds_of(evaluation.frames).items()
-        for kind, _ in kinds
-        if kind.assumed
+        f"{side}: {reading}"
+        for side in ("prediction", "gt")
+        for reading, _ in readings_of(evaluation.frames, side)
+        if reading.assumed
     }
     return Table(
         header=["", *(m.heading for m in measures), "frames", "coverage"],

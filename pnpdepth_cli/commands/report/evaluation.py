@@ -177,8 +177,8 @@ def _entry(
 ) -> dict[str, Any]:
     values = frame.values | {"coverage": frame.coverage}
     notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
-    if frame.leaked:
-        notes.append(f"{frame.leaked:,} of them were given to the network as sparse depth.")
+    if frame.given:
+        notes.append(f"{frame.given:,} of them were given to the network as sparse depth.")
     notes += [f"Prediction: {frame.pair.prediction}", f"Ground truth: {frame.pair.frame.gt}"]
     try:
         drawn = _drawn(frame, evaluation, images)

@@ -18,6 +18,7 @@ from pnpdepth_cli.commands.evaluation.scoring import filled
 from pnpdepth_cli.commands.evaluation.tables import worst
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.sensors import SamplePattern, as_depth_image, sample_points
 
 
 def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
@@ -228,7 +229,7 @@ def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
     assert scored(tmp_path).mean["rmse"] == 0
     by_option = scored(tmp_path, pred_scale=1000.0, gt_scale=1000.0)
     assert by_option.mean["mae"] == 0
-    assert by_option.frames[0].kinds["gt"].scale == 1000
+    assert by_option.frames[0].readings["gt"].scale == 1000
     nyu = scored(tmp_path, protocol="nyu-eigen")
     assert any("÷ 1000; --gt-scale to change" in note for note in nyu.notes)
     depth_file(tmp_path / "out" / "a.png", np.ones((480, 640)), scale=100)
@@ -278,24 +279,23 @@ def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(
     assert any("a scale is probably wrong" in note for note in wrong.notes)
 
 
-def test_sparse_input_in_the_ground_truth_causes_a_warning_and_can_be_excluded(
+def test_scored_pixels_with_a_sparse_point_are_counted_and_can_be_excluded(
     tmp_path: Path,
 ) -> None:
     gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
     points = np.zeros_like(gt)
-    points[0, :4] = gt[0, :4]  # the ground truth itself
-    points[1, :3] = gt[1, :3] + 0.2  # measured anew
+    points[0, :4] = gt[0, :4]
     prediction = np.where(points > 0, points, gt + 1)
     points[2, 0], prediction[2, 0] = gt[2, 0], 0  # not scored
     depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", prediction)
     sparse = depth_file(tmp_path / "sparse.npy", points)
-    record = {"inputs": {"sparse": {"path": str(sparse)}}, "points": {"used": 8}}
+    record = {"inputs": {"sparse": {"path": str(sparse)}}}
     (tmp_path / "out" / "a.json").write_text(json.dumps(record))
-    (warning,) = (n for n in scored(tmp_path).notes if "sparse input" in n)
-    assert " 4 of the scored pixels (4.04%) have a point of the sparse input" in warning
+    (note,) = (n for n in scored(tmp_path).notes if "sparse input" in n)
+    assert note.startswith("4 of the scored pixels (4.04%) have a point of the sparse input")
     without = scored(tmp_path, exclude_sparse=True)
-    assert without.frames[0].known == 92
+    assert without.frames[0].known == 95
     assert without.mean["mae"] == pytest.approx(1)
     assert not [n for n in without.notes if "sparse input" in n]
     (tmp_path / "out" / "a.json").unlink()
@@ -303,18 +303,31 @@ def test_sparse_input_in_the_ground_truth_causes_a_warning_and_can_be_excluded(
         scored(tmp_path, exclude_sparse=True)
 
 
-def test_the_record_beside_a_prediction_is_enough_to_find_the_leak(two: Path) -> None:
+def test_points_that_were_drawn_from_the_ground_truth_are_drawn_again_to_be_excluded(
+    tmp_path: Path,
+) -> None:
+    gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
+    drawn = as_depth_image(sample_points(gt, SamplePattern(count=30), 7))
+    depth_file(tmp_path / "gt" / "a.npy", gt)
+    depth_file(tmp_path / "out" / "a.npy", np.where(drawn > 0, gt, gt + 1))
+    entry = {"sampled_from": "gt", "kind": "uniform", "count": 30, "fraction": None, "seed": 7}
+    (tmp_path / "out" / "a.json").write_text(json.dumps({"inputs": {"sparse": entry}}))
+    assert scored(tmp_path).frames[0].given == 30
+    without = scored(tmp_path, exclude_sparse=True)
+    assert (without.frames[0].known, without.mean["mae"]) == (70, pytest.approx(1))
+    (tmp_path / "out" / "a.json").write_text('{"inputs": {"sparse": {"sampled_from": "gt"}}}')
+    assert scored(tmp_path).frames[0].given is None
+
+
+def test_a_sparse_file_that_cannot_be_read_hides_only_how_many_points_were_given(two: Path) -> None:
     sparse = depth_file(two / "s.npy", [[1, 0]])
-    record = {"inputs": {"sparse": {"path": str(sparse)}}, "points": {"used": 2}}
+    record = {"inputs": {"sparse": {"path": str(sparse)}}}
     (two / "out" / "a.json").write_text(json.dumps(record))
-    result = scored(two)
-    assert [f.leaked for f in result.frames] == [1, None]
-    sampled = {"inputs": {"sparse": {"sampled_from": "gt"}}, "points": {"used": 2}}
-    (two / "out" / "a.json").write_text(json.dumps(sampled))
-    assert scored(two).frames[0].leaked == 2
+    assert [f.given for f in scored(two).frames] == [1, None]
     sparse.write_bytes(b"spoilt")
-    (two / "out" / "a.json").write_text(json.dumps(record))
-    assert scored(two).frames[0].leaked is None
+    assert [f.given for f in scored(two).frames] == [None, None]
+    with pytest.raises(InputError, match="no frame could be scored"):
+        scored(two, exclude_sparse=True)
 
 
 def test_a_prediction_in_model_units_is_warned_of_unless_it_is_scaled(two: Path) -> None:
@@ -373,7 +386,7 @@ def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Pa
     result = scored(tmp_path, protocol="nyu-eigen")
     error = (predictions - depths)[:, 45:471, 41:601].astype(np.float64)
     expected = np.sqrt((error**2).mean(axis=(1, 2))).mean()
-    assert "gt: .mat array" in result.notes
+    assert "gt: HDF5 array" in result.notes
     assert result.mean["rmse"] == pytest.approx(expected, rel=1e-6)
     assert scored(tmp_path, protocol="nyu-eigen").mean == result.mean
     with pytest.raises(InputError, match=r"no frame could be scored; the first: .*304×228"):

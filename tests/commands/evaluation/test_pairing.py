@@ -1,4 +1,4 @@
-"""Predictions and truths matched by name, and files of several frames."""
+"""Predictions and truths matched by name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pnpdepth_cli.commands.evaluation.pairing import (
     FramePair,
     frame_name,
     pair_frames,
-    stack_size,
 )
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.errors import InputError, UsageError
@@ -137,16 +136,18 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     assert [(f.sparse, f.image) for f in frames] == [(sparse, image), (None, None), (None, None)]
 
 
-def test_stacked_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> None:
+def test_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     gt = rng.uniform(1, 70, (6, 30, 40)).astype(np.float32)
     gt[rng.random(gt.shape) < 0.5] = 0
     disparity = (1 / (np.where(gt > 0, gt, 5) * rng.lognormal(0, 0.2, gt.shape))).astype("f4") / 30
-    np.save(tmp_path / "disps.npy", disparity)
-    np.save(tmp_path / "gt_depths.npy", gt)
+    for folder, images in (("out", disparity), ("gt", gt)):
+        (tmp_path / folder).mkdir()
+        for number, image in enumerate(images):
+            np.save(tmp_path / folder / f"{number:04}.npy", image)
     request = EvalRequest(
-        prediction=tmp_path / "disps.npy",
-        ground_truth=tmp_path / "gt_depths.npy",
+        prediction=tmp_path / "out",
+        ground_truth=tmp_path / "gt",
         protocol="garg",
         prediction_kind="disparity",
         scale_by="median",
@@ -167,18 +168,3 @@ def test_stacked_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> No
     spread = f"standard deviation / median {np.std(np.array(ratios) / median):.3f}"
     factor = f"scale-by median: factor {median:.4g}"
     assert any(note.startswith(factor) and note.endswith(spread) for note in result.notes)
-
-
-def test_single_maps_are_no_stack_and_numbers_of_frames_must_agree(tmp_path: Path) -> None:
-    sizes = {}
-    for name, shape in (("map", (4, 5)), ("channel", (1, 4, 5)), ("last", (3, 4, 1)),
-                        ("three", (3, 4, 5)), ("two", (2, 4, 5))):  # fmt: skip
-        np.save(tmp_path / f"{name}.npy", np.ones(shape, np.float32))
-        sizes[name] = stack_size(tmp_path / f"{name}.npy")
-    assert sizes == {"map": None, "channel": None, "last": None, "three": 3, "two": 2}
-    np.save(tmp_path / "objects.npy", np.array([{}, 1], dtype=object), allow_pickle=True)
-    assert stack_size(tmp_path / "objects.npy") is None
-    with pytest.raises(InputError, match=r"holds 3 frames but .* 2 frames"):
-        pair_frames(tmp_path / "three.npy", tmp_path / "two.npy")
-    with pytest.raises(InputError, match=r"holds 3 frames but .* no stack of frames"):
-        pair_frames(tmp_path / "three.npy", tmp_path / "map.npy")

@@ -1,4 +1,4 @@
-"""Depth, points, stacks and images."""
+"""Depth, points and images."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.fuzz.seeds.seed import HEIGHT, OUT, WIDTH, Seed
 
 
 def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
-    """Returns depth in every format, sparse points, stacks, and images."""
+    """Returns depth in every format, sparse points, and images."""
     return [*_depths(folder, depth, rng), *_images(folder, rng)]
 
 
@@ -24,7 +24,6 @@ def _depths(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[S
     points = np.column_stack([rng.uniform(0, 20, (30, 2)), rng.uniform(1, 9, 30)])
     np.savetxt(folder / "points.csv", points, delimiter=",", header="x,y,depth", comments="")
     np.save(folder / "points.npy", points)
-    np.save(folder / "stack.npy", np.stack([depth, depth]))
     return [
         *(
             Seed(file=name, command=("sample", name, "--count", "20", *OUT))
@@ -34,7 +33,6 @@ def _depths(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[S
             Seed(file=name, command=("eval", "gt.npy", "gt.npy", "--sparse", name))
             for name in ("points.csv", "points.npy")
         ),
-        Seed(file="stack.npy", command=("eval", "stack.npy", "stack.npy")),
     ]
 
 

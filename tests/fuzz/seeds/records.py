@@ -23,7 +23,7 @@ def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> li
 
 
 def _scores(folder: Path) -> list[Seed]:
-    text = _output_of(["eval", "stack.npy", "stack.npy", "--json"])
+    text = _output_of(["eval", "gt.npy", "gt.npy", "--json"])
     for name in ("run.json", "other.json"):
         (folder / name).write_text(text)
     return [Seed(file="run.json", command=("compare", "run.json", "other.json"))]
