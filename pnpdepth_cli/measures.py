@@ -249,6 +249,8 @@ MEASURES = (
     ),
 )
 """The measures that are computed everywhere, in the order of all tables."""
+COVERAGE = Measure(key="coverage", title="coverage", better="higher", percent=True, decimals=2)
+"""The fraction of the ground truth that has a prediction, which stands beside the measures."""
 
 
 def by_depth(near_m: float, far_m: float) -> tuple[Measure, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,9 +85,9 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
     print_notes([f"protocol {evaluation.protocol.describe()}", *evaluation.notes])
-    name = prediction.stem if prediction.is_file() else prediction.resolve().name
-    means = tables.means_row(evaluation, name, keys)
-    to_stdout = files.write(csv=tables.frames_csv(evaluation, keys), latex=means)
+    frames, means = tables.frames_table(evaluation, keys), tables.means_table(evaluation, keys)
+    described = replace(means, title=f"{means.title}; {evaluation.describe()}")
+    to_stdout = files.write(csv=frames, latex=described)
     if files.as_json:
         print_json(evaluation.as_record())
     elif not to_stdout:

@@ -43,12 +43,13 @@ def list_command(as_json: bool) -> None:
     if as_json:
         print_json(listed)
         return
-    from pnpdepth_cli.cli.tables import print_rows
+    from pnpdepth_cli.cli.tables import print_table
+    from pnpdepth_cli.commands.tables import Table
 
-    print_rows(
-        "networks",
-        ("name", "takes", "size", "gives", "params", "weights", "defaults"),
-        [
+    print_table(Table(
+        title="networks",
+        columns=("name", "takes", "size", "gives", "params", "weights", "defaults"),
+        rows=[
             (
                 model["name"],
                 model["input_kind"],
@@ -61,7 +62,7 @@ def list_command(as_json: bool) -> None:
             )
             for model in listed
         ],
-    )
+    ))  # fmt: skip
 
 
 @models.command(short_help="Load a network, run it and cut it at its layers.")
@@ -123,14 +124,15 @@ def layers(every: bool, as_json: bool, **values: Any) -> None:
     if as_json:
         print_json([asdict(row) for row in rows])
         return
-    from pnpdepth_cli.cli.tables import print_rows
+    from pnpdepth_cli.cli.tables import print_table
+    from pnpdepth_cli.commands.tables import Table
 
     fields = ("field\nin z", "field\nin depth")
-    print_rows(
-        f"layers of {choice.model}",
-        ("layer", "z", "stride", "params", "cost\nbehind", "time\nbehind", *fields),
-        [_cells(asdict(row)) for row in rows],
-    )
+    print_table(Table(
+        title=f"layers of {choice.model}",
+        columns=("layer", "z", "stride", "params", "cost\nbehind", "time\nbehind", *fields),
+        rows=[_cells(asdict(row)) for row in rows],
+    ))  # fmt: skip
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:

@@ -82,27 +82,22 @@ def print_table(table: Table, *, err: bool = False) -> None:
     """Prints a table on stdout or stderr, as wide as needed unless that is a terminal."""
     console = _Console(stderr=err, highlight=False)
     shown = RichTable(
-        title=escape(printable(table.caption)),
+        title=escape(printable(table.title)),
         title_justify="left",
         box=SIMPLE_HEAD,
         pad_edge=False,
     )
-    for number, column in enumerate(table.header):
+    for number, column in enumerate(table.headings):
         first = number == 0
         shown.add_column(
             escape(column), overflow="fold", justify="left" if first else "right", no_wrap=first
         )
-    for row in table.rows:
+    for row in table.texts:
         shown.add_row(*map(_markup, row))
     if not console.is_terminal:
         wide = console.options.update(max_width=1000)
         console.width = max(console.width, console.measure(shown, options=wide).maximum)
     console.print(shown)
-
-
-def print_rows(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Prints a table on stdout; its arguments are those of `Table`."""
-    print_table(Table(caption=title, header=columns, rows=rows))
 
 
 def _markup(cell: str) -> str:

@@ -51,11 +51,11 @@ def errors_by_basis(errors: Mapping[str, Any]) -> dict[str, dict[str, Mapping[st
     return found
 
 
-def error_table(caption: str, errors: Mapping[str, Any], unit: str) -> Table:
+def error_table(title: str, errors: Mapping[str, Any], unit: str) -> Table:
     """Returns a row for each measure: before, after and change, and linear interpolation beside.
 
     Args:
-        caption: Of the table.
+        title: Of the table.
         errors: As of `errors_by_basis`.
         unit: Of the depths.
     """
@@ -64,17 +64,17 @@ def error_table(caption: str, errors: Mapping[str, Any], unit: str) -> Table:
         before, after = sides["before"], sides["after"]
         count = f"{after['points']:,} " if "points" in after else ""
         for key in (key for key in _MEASURES if key in before):
-            title = _title(key)
+            name = _title(key)
             values = [side.get(key) for side in (before, after, sides["linear"])]
             shown = [format_error(key, value, unit) for value in values]
             changes = ["", ""]
             if basis != USED:
                 changes = [change(key, beside, values[1]) for beside in (values[0], values[2])]
             if basis != GT:
-                title = f"error {BASES[basis].replace('at ', f'at {count}')}, {title}"
-            rows.append([title, *shown[:2], changes[0], shown[2], changes[1]])
-    header = ["", "before", "after", "change", "linear", "vs linear"]
-    return Table(caption=caption, header=header, rows=rows)
+                name = f"error {BASES[basis].replace('at ', f'at {count}')}, {name}"
+            rows.append([name, *shown[:2], changes[0], shown[2], changes[1]])
+    columns = ["", "before", "after", "change", "linear", "vs linear"]
+    return Table(title=title, columns=columns, rows=rows)
 
 
 def means_table(summary: Mapping[str, Any]) -> Table:
@@ -94,23 +94,23 @@ def refinement_table(record: Mapping[str, Any]) -> Table:
     scores = record["scores"]
     if record["method"]["kind"] == "default":
         return _stages_table(record)
-    caption = f"{record['model']['name']} cut at {record['settings']['layer']}"
+    title = f"{record['model']['name']} cut at {record['settings']['layer']}"
     if scores is not None:
-        caption += f"; {_scored_on(scores['after'])}"
-    return error_table(caption, record, record["unit"])
+        title += f"; {_scored_on(scores['after'])}"
+    return error_table(title, record, record["unit"])
 
 
 def _stages_table(record: Mapping[str, Any]) -> Table:
     """The stages of the default method: scores on the ground truth, or at validation points."""
     beside, names = record["linear"], record["method"]["networks"]
-    keys, rows, caption = ["mae"], dict[str, Any](), "too few points to validate the result at some"
+    keys, rows, scored = ["mae"], dict[str, Any](), "too few points to validate the result at some"
     if record["stages"] is not None:
         rows = {stage["stage"]: stage["scores"] for stage in record["stages"]}
         rows |= {"result": record["scores"]["after"], "linear": beside["scores"]}
-        keys, caption = ["rmse", "mae", "mre", "delta1"], _scored_on(rows["linear"])
+        keys, scored = ["rmse", "mae", "mre", "delta1"], _scored_on(rows["linear"])
     elif (at := beside["validation"]) is not None:
         rows = {name: {"mae": at[name]} for name in _STAGES if name in at}
-        caption = f"at {at['points']:,} validation points, which the rows did not get"
+        scored = f"at {at['points']:,} validation points, which the rows did not get"
     if sum(weight > 0 for weight in record["weights"].values()) == 1 and "alone" not in rows:
         rows.pop("result", None)  # the network's own
     last = [name for name in rows if name != "linear"][-1:]
@@ -122,8 +122,8 @@ def _stages_table(record: Mapping[str, Any]) -> Table:
         cells = [format_error(key, scores[key], record["unit"]) for key in keys]
         title = _STAGES[name].format(**of_names)
         lines.append([*(Cell(text, style) for text in (title, *cells)), against])
-    header = ["", *(_title(key) for key in keys), "MAE vs linear"]
-    return Table(caption=f"{' + '.join(names)}; {caption}", header=header, rows=lines)
+    columns = ["", *(_title(key) for key in keys), "MAE vs linear"]
+    return Table(title=f"{' + '.join(names)}; {scored}", columns=columns, rows=lines)
 
 
 def weights_text(weights: Mapping[str, float]) -> str:
@@ -159,8 +159,8 @@ def baselines_table(baselines: Mapping[str, Mapping[str, Any]], unit: str) -> Ta
         style: Style = "bold" if name == "result" else ""
         cells = [format_error("mae", rows[name].get(key), unit) for key in titles]
         lines.append([Cell(text, style) for text in (name, *cells)])
-    header = ["", *titles.values()]
-    return Table(caption="against every simple baseline", header=header, rows=lines)
+    columns = ["", *titles.values()]
+    return Table(title="against every simple baseline", columns=columns, rows=lines)
 
 
 def format_error(key: str, value: float | None, unit: str) -> str:

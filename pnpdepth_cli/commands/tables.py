@@ -1,16 +1,17 @@
-"""One table for every place it goes to: the terminal, CSV, Markdown and LaTeX."""
+"""One table for every place it goes to: the terminal, CSV, LaTeX and the page of a report."""
 
 from __future__ import annotations
 
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
+from pnpdepth_cli.measures import Measure
 
 Style = Literal["", "bold", "dim", "good", "bad"]
 
@@ -27,7 +28,7 @@ _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
 class Cell(str):
-    """A cell with a style: Markdown and LaTeX show "bold", the terminal all."""
+    """A text with a style: LaTeX shows "bold", the terminal all."""
 
     style: Style
 
@@ -40,28 +41,49 @@ class Cell(str):
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Rows; the first column is left-aligned, the others, of numbers, right-aligned."""
+    """Rows of cells; the first column is left-aligned, the others, of numbers, right-aligned."""
 
-    header: Sequence[str]
+    title: str = ""
+    columns: Sequence[Measure | str]
+    """A measure for values of it, or the heading of any other column."""
     rows: Sequence[Sequence[Any]]
-    """Texts; for CSV, also numbers and None."""
-    caption: str = ""
+    """Texts, values of the column's measure, other numbers, and None."""
+
+    @property
+    def headings(self) -> list[str]:
+        """The headings of the columns."""
+        return [c.heading if isinstance(c, Measure) else c for c in self.columns]
+
+    @property
+    def texts(self) -> list[list[str]]:
+        """The cells as they are shown."""
+        return [list(map(_text, self.columns, row)) for row in self.rows]
+
+    def only(self, keys: Sequence[str]) -> Table:
+        """Returns the columns that have these keys or headings, in this order."""
+        names = self._keys
+        places = [names.index(key) for key in keys]
+        return replace(
+            self,
+            columns=[self.columns[place] for place in places],
+            rows=[[row[place] for place in places] for row in self.rows],
+        )
 
     def csv(self) -> str:
-        """Returns the table as `write_csv` writes it."""
+        """Returns the cells as they are, below the keys of the measures, as `write_csv` does."""
         buffer = io.StringIO()
-        write_csv(buffer, self.header, self.rows)
+        write_csv(buffer, self._keys, self.rows)
         return buffer.getvalue()
 
     def latex(self) -> str:
-        """Returns a tabular with rules of the package booktabs; its caption is a comment above."""
+        """Returns a tabular with rules of the package booktabs; its title is a comment above."""
         header, *rows = (
-            " & ".join(map(_in_latex, line)) + r" \\" for line in (self.header, *self.rows)
+            " & ".join(map(_in_latex, line)) + r" \\" for line in (self.headings, *self.texts)
         )
         return "\n".join(
             (
-                f"% {' '.join(self.caption.split())}",
-                rf"\begin{{tabular}}{{l{'r' * (len(self.header) - 1)}}}",
+                f"% {' '.join(self.title.split())}",
+                rf"\begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}",
                 r"\toprule",
                 header,
                 r"\midrule",
@@ -71,6 +93,18 @@ class Table:
                 "",
             )
         )
+
+    @property
+    def _keys(self) -> list[str]:
+        return [c.key if isinstance(c, Measure) else c for c in self.columns]
+
+
+def _text(column: Measure | str, cell: Any) -> str:
+    if isinstance(cell, str):
+        return cell
+    if isinstance(column, Measure):
+        return column.text(cell)
+    return "" if cell is None else f"{cell:,}"
 
 
 def _in_latex(cell: str) -> str:

@@ -69,7 +69,7 @@ class Head:
     facts: Sequence[tuple[str, str]] = ()
     notes: Sequence[str] = ()
     tables: Sequence[Any] = ()
-    """Each has caption, header and rows of text, as `commands.tables.Table`."""
+    """Each has title, headings and texts, as `commands.tables.Table`."""
     charts: Sequence[Mapping[str, Any]] = ()
     """Each has caption, x_title, y_title and lines over fractions from 0 to 1, the last one dashed:
     (x, y) by the name of the line."""

@@ -86,7 +86,7 @@ def test_errors_stand_by_what_they_are_measured_on_and_validation_points_count_o
     }
     table = refinement_table(record)
     scored = "scored on 1,200 pixels of ground truth (50.0% of those known)"
-    assert table.caption == f"net cut at middle; {scored}"
+    assert table.title == f"net cut at middle; {scored}"
     at_used = ["error at 2,000 points used, MAE", "0.5000 m", "0.2500 m", "", "–", ""]
     assert table.rows == [
         ["RMSE", "2.0000 m", "1.0000 m", "-50.0%", "4.0000 m", "-75.0%"],
@@ -95,7 +95,7 @@ def test_errors_stand_by_what_they_are_measured_on_and_validation_points_count_o
         at_used,
     ]
     table = refinement_table(record | dict.fromkeys(("scores", "held_out_error")))
-    assert table.caption == "net cut at middle"
+    assert table.title == "net cut at middle"
     validated = ["error at 12 validation points, MAE", "4.0000 m", "1.0000 m", "-75.0%"]
     assert table.rows == [[*validated, "2.0000 m", "-50.0%"], at_used]
 
@@ -107,7 +107,12 @@ def test_baselines_are_sorted_and_have_ground_truth_where_one_of_them_has() -> N
         "linear": {"validation_mae": None},
     }
     table = baselines_table(baselines, "m")
-    assert table.header == ["", "MAE, validation points", "MAE, ground truth", "RMSE, ground truth"]
+    assert table.columns == [
+        "",
+        "MAE, validation points",
+        "MAE, ground truth",
+        "RMSE, ground truth",
+    ]
     assert styled(table) == [
         [("result", "bold"), ("1.0000 m", "bold"), ("–", "bold"), ("–", "bold")],
         [("nearest", ""), ("2.0000 m", ""), ("3.0000 m", ""), ("4.0000 m", "")],
@@ -152,6 +157,6 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -
     plain, better, worse = ("–", ""), ("+50.00", "good"), ("-50.00", "bad")
     assert gains == [plain, better, worse, plain, worse, ("–", "dim")]
     assert comparison_table(comparison).rows[1][4:] == ["–", "+1.00", "0.0009"]
-    assert "from 1,000 random swaps, over 2 frames" in comparison_table(comparison).caption
+    assert "from 1,000 random swaps, over 2 frames" in comparison_table(comparison).title
     for table in (comparison_table(comparison), methods_table(comparison)):
-        assert table.caption.endswith("; without the pixels of sparse points")
+        assert table.title.endswith("; without the pixels of sparse points")

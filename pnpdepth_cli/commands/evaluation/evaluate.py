@@ -78,6 +78,16 @@ class Evaluation:
         known = sum(frame.known for frame in self.frames)
         return sum(frame.predicted for frame in self.frames) / known if known else math.nan
 
+    def describe(self) -> str:
+        """Returns the protocol and every scale of files that was assumed, on one line."""
+        readings = (
+            f"{side}: {reading}"
+            for side in _OPTIONS
+            for reading, _ in readings_of(self.frames, side)
+            if reading.assumed
+        )
+        return "; ".join([self.protocol.describe(), *readings])
+
     def unscored(self) -> str | None:
         """Returns one line on the frames that are in no mean; None if all are."""
         out = len(self.frames) - len(self.scored)

@@ -11,7 +11,7 @@ import numpy as np
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
 from pnpdepth_cli.commands.evaluation.frames import image_of, load_frame
 from pnpdepth_cli.commands.evaluation.scoring import FrameScores, filled
-from pnpdepth_cli.commands.evaluation.tables import calibration_tables, means_by_measure
+from pnpdepth_cli.commands.evaluation.tables import calibration_tables, means_table
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
@@ -113,7 +113,7 @@ def _head(
             ("Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"),
         ],
         notes=evaluation.notes,
-        tables=[means_by_measure(evaluation, keys), *calibration_tables(evaluation)],
+        tables=[means_table(evaluation, keys), *calibration_tables(evaluation)],
         charts=_charts(evaluation),
         without_title=f"Not scored: {len(without):,}",
         without=without,
