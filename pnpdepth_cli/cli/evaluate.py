@@ -71,7 +71,6 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
     from pnpdepth_cli.commands.evaluation import tables
     from pnpdepth_cli.commands.evaluation.evaluate import evaluate as run_evaluation
-    from pnpdepth_cli.commands.evaluation.rules import choose_protocol
     from pnpdepth_cli.commands.report import evaluation as report_eval
     from pnpdepth_cli.measures import chosen_measures
 
@@ -81,10 +80,10 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     if html is not None:
         report_eval.check_eval_report(html, [prediction, ground_truth], overwrite=files.overwrite)
     request = EvalRequest(prediction=prediction, ground_truth=ground_truth, **values)
-    chosen_measures(choose_protocol(request.protocol, **request.changes()).measures, keys)
+    chosen_measures(request.measures, keys)
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
-    print_notes([f"protocol {evaluation.protocol.describe()}", *evaluation.notes])
+    print_notes([f"protocol {request.describe()}", *evaluation.notes])
     frames, means = tables.frames_table(evaluation, keys), tables.means_table(evaluation, keys)
     described = replace(means, title=f"{means.title}; {evaluation.describe()}")
     to_stdout = files.write(csv=frames, latex=described)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.pairing import some_names
-from pnpdepth_cli.commands.evaluation.rules import published
+from pnpdepth_cli.commands.evaluation.request import scoring_of
 from pnpdepth_cli.commands.statistics import (
     LEVEL,
     MIN_CLUSTERS,
@@ -28,6 +28,7 @@ from pnpdepth_cli.io.dataset import groups_by_name
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import plain, read_json
 from pnpdepth_cli.measures import MEASURES, FrameMeans, Measure, chosen_measures
+from pnpdepth_cli.protocols import find_protocol
 
 ALPHA = 0.05
 PERMUTATIONS, SEED = 10_000, 0
@@ -339,7 +340,7 @@ def _refined(record: Mapping[str, Any], name: str, path: str, stage: str) -> Run
         name=name,
         path=path,
         measures=[m for m in MEASURES if all(m.key in each.values for each in frames.values())],
-        scoring=published("paper").scoring(),
+        scoring=scoring_of(find_protocol("paper")),
         frames=frames,
         varied={str(name): str(value) for name, value in dict(record.get("varied", {})).items()},
     )

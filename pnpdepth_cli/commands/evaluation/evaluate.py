@@ -13,7 +13,6 @@ import numpy as np
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.commands.evaluation.rules import EvalProtocol, choose_protocol
 from pnpdepth_cli.commands.evaluation.scoring import (
     FrameScores,
     score_pair,
@@ -45,8 +44,6 @@ class Evaluation:
     """Scored frames and their means."""
 
     request: EvalRequest
-    protocol: EvalProtocol
-    """With the user's changes."""
     frames: tuple[FrameScores, ...]
     """A row for each frame of the ground truth, in its order."""
     mean: dict[str, float | None]
@@ -86,7 +83,7 @@ class Evaluation:
             for reading, _ in readings_of(self.frames, side)
             if reading.assumed
         )
-        return "; ".join([self.protocol.describe(), *readings])
+        return "; ".join([self.request.describe(), *readings])
 
     def unscored(self) -> str | None:
         """Returns one line on the frames that are in no mean; None if all are."""
@@ -101,7 +98,7 @@ class Evaluation:
 
     def as_record(self) -> dict[str, Any]:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
-        request, protocol = self.request, self.protocol
+        request = self.request
         bounds = None
         if self.interval is not None:
             bounds = {
@@ -120,12 +117,11 @@ class Evaluation:
                 "scales": {"prediction": request.pred_scale, "truth": request.gt_scale},
             },
             "protocol": {
-                "name": protocol.name,
-                "scale": protocol.scale,
-                "described": protocol.describe(),
-                "scoring": protocol.scoring(),
+                "name": request.protocol,
+                "described": request.describe(),
+                "scoring": request.scoring(),
             },
-            "measures": [measure.to_json() for measure in protocol.measures],
+            "measures": [measure.to_json() for measure in request.measures],
             "counts": {
                 "frames": len(self.frames),
                 "scored": len(self.scored),
@@ -180,17 +176,12 @@ def evaluate(
         PnpDepthError: For two single files whatever is wrong with them, for folders only what
             concerns all frames.
     """
-    protocol = choose_protocol(request.protocol, **request.changes())
-    pairs, notes = pair_frames(
-        request.prediction,
-        request.ground_truth,
-        part=protocol.part,
-    )
+    pairs, notes = pair_frames(request.prediction, request.ground_truth, part=request.rules.part)
     single = request.prediction.is_file() and len(pairs) == 1
 
     def score(pair: FramePair) -> FrameScores:
         try:
-            row = score_pair(pair, protocol, request)
+            row = score_pair(pair, request)
         except PnpDepthError as error:
             if single:
                 raise
@@ -206,16 +197,16 @@ def evaluate(
     scored = [row for row in rows if row.scored]
     if not scored:
         raise InputError(f"no frame could be scored; the first: {rows[0].error}")
-    keys = [measure.key for measure in protocol.measures]
+    keys = [measure.key for measure in request.measures]
     values = np.array([[row.values[key] for key in keys] for row in scored])
     clusters = find_clusters([row.pair.group for row in scored], values)
     mean = FrameMeans(row.values for row in scored).means()
-    if protocol.is_devkit:
+    if request.is_devkit:
         mean = dict(zip(keys, devkit_mean(values).tolist(), strict=True))
     bounds, no_interval = None, []
     if clusters.count >= MIN_CLUSTERS:
         low, high = interval(lambda means: means, [values], clusters)
-        highest = [1.0 if measure.percent else math.inf for measure in protocol.measures]
+        highest = [1.0 if measure.percent else math.inf for measure in request.measures]
         ends = zip(np.maximum(low, 0.0).tolist(), np.minimum(high, highest).tolist(), strict=True)
         bounds = dict(zip(keys, ends, strict=True))
     elif len(scored) > 1:
@@ -226,13 +217,12 @@ def evaluate(
     uncertainties = [row.uncertainty for row in scored if row.uncertainty is not None]
     return Evaluation(
         request=request,
-        protocol=protocol,
         frames=tuple(rows),
         mean=mean,
         interval=bounds,
         clusters=clusters,
         uncertainty=summarise_uncertainty(uncertainties),
-        notes=(*notes, *_reading_notes(rows), *_warnings(rows, protocol), *no_interval),
+        notes=(*notes, *_reading_notes(rows), *_warnings(rows, request), *no_interval),
     )
 
 
@@ -256,7 +246,7 @@ def _reading_notes(rows: Sequence[FrameScores]) -> list[str]:
     return lines
 
 
-def _warnings(rows: Sequence[FrameScores], protocol: EvalProtocol) -> list[str]:
+def _warnings(rows: Sequence[FrameScores], request: EvalRequest) -> list[str]:
     """The warnings of an evaluation, each one line.
 
     Raises:
@@ -265,9 +255,9 @@ def _warnings(rows: Sequence[FrameScores], protocol: EvalProtocol) -> list[str]:
     scored = [row for row in rows if row.scored]
     return [
         *_unscored(rows),
-        *_empty_pixels(scored, protocol),
-        *_scales(scored, protocol),
-        *_given_points(scored, protocol),
+        *_empty_pixels(scored, request),
+        *_scales(scored, request),
+        *_given_points(scored, request),
     ]
 
 
@@ -285,13 +275,13 @@ def _unscored(rows: Sequence[FrameScores]) -> Iterator[str]:
         yield f"warning: {more:,} more frames were not scored"
 
 
-def _empty_pixels(scored: Sequence[FrameScores], protocol: EvalProtocol) -> Iterator[str]:
+def _empty_pixels(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:
     """Pixels of the ground truth without prediction."""
     known = sum(row.known for row in scored)
     treatment = "lowers the coverage and is in no error"
-    if protocol.missing == "min":
-        treatment = f"is scored as {protocol.min_depth:g} m"
-    elif protocol.is_devkit:
+    if request.rules.missing == "min":
+        treatment = f"is scored as {request.rules.min_depth:g} m"
+    elif request.is_devkit:
         treatment = "was filled in from its neighbours before scoring"
     if empty := known - sum(row.predicted for row in scored):
         yield (
@@ -306,13 +296,13 @@ def _empty_pixels(scored: Sequence[FrameScores], protocol: EvalProtocol) -> Iter
         )
 
 
-def _scales(scored: Sequence[FrameScores], protocol: EvalProtocol) -> Iterator[str]:
+def _scales(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:
     """How predictions were scaled, and what looks like a wrong scale."""
     if factors := [row.fit.factor for row in scored if row.fit is not None]:
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan
         yield (
-            f"scale-by {protocol.scale_by}: factor {median:.4g} (median of {len(factors):,}"
+            f"scale-by {request.scale_by}: factor {median:.4g} (median of {len(factors):,}"
             f" images), standard deviation / median {spread:.3f}"
         )
     elif unscaled := [row for row in scored if row.pair.unit != METRES]:
@@ -329,10 +319,10 @@ def _scales(scored: Sequence[FrameScores], protocol: EvalProtocol) -> Iterator[s
         yield warning
 
 
-def _given_points(scored: Sequence[FrameScores], protocol: EvalProtocol) -> Iterator[str]:
+def _given_points(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:
     """Scored pixels at which the network was given a depth."""
     given = sum(row.given or 0 for row in scored)
-    if given and not protocol.exclude_sparse:
+    if given and not request.exclude_sparse:
         fraction = given / sum(row.pixels for row in scored if row.given is not None)
         yield (
             f"{given:,} of the scored pixels ({fraction:.2%}) have a point of the sparse input;"

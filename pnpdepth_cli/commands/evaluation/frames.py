@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.commands.evaluation.rules import EvalProtocol, crop_window
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.dataset import Hdf5Array
 from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image
@@ -28,12 +27,23 @@ from pnpdepth_cli.io.depth import (
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import in_frame
+from pnpdepth_cli.protocols import Protocol
 from pnpdepth_cli.sensors import sample_points
 from pnpdepth_cli.sensors.pixels import pixel_index
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Size = tuple[int, ...]
+
+# (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
+# Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by
+# trial to reproduce Eigen et al. 2014. Nearly all later evaluations use these two.
+_CROP_FRACTIONS = {
+    "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),
+    "eigen": (0.3324324, 0.91351351, 0.0359477, 0.96405229),
+}
+# Eigen et al. 2014 for NYU Depth v2: rows 45 to 470, columns 41 to 600 of 480x640 pixels.
+_NYU_CROP = (slice(45, 471), slice(41, 601))
 
 
 class Fit(NamedTuple):
@@ -62,7 +72,7 @@ class LoadedFrame:
     """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
 
 
-def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) -> LoadedFrame:
+def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
     """Returns the frame's depths as the protocol scores them.
 
     Raises:
@@ -75,11 +85,11 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
     else:
         assert frame.gt is not None
         scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
-        whole = _read(frame.gt, scale, protocol)
+        whole = _read(frame.gt, scale, request)
     gt = np.ascontiguousarray(frame.part.apply(masked(whole.values, frame.masks)))
-    given = _given_points(pair, gt, required=protocol.exclude_sparse)
-    scored = _scored_mask(gt, protocol)
-    if protocol.exclude_sparse:
+    given = _given_points(pair, gt, required=request.exclude_sparse)
+    scored = _scored_mask(gt, request.rules)
+    if request.exclude_sparse:
         if given is None:
             raise InputError(
                 f"frame {pair.name} has no sparse depth file to exclude: neither the record beside"
@@ -92,25 +102,22 @@ def load_frame(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
         readings={"gt": whole.reading},
         given=given,
     )
-    return loaded if pair.prediction is None else _with_prediction(loaded, pair, protocol, request)
+    return loaded if pair.prediction is None else _with_prediction(loaded, pair, request)
 
 
-def _with_prediction(
-    frame: LoadedFrame, pair: FramePair, protocol: EvalProtocol, request: EvalRequest
-) -> LoadedFrame:
+def _with_prediction(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> LoadedFrame:
     """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
     assert pair.prediction is not None
-    size = frame.gt.shape
-    image = _read(pair.prediction, request.pred_scale, protocol)
-    values = _to_size(pair, image.values, size, protocol.resize)
-    depth, fit = scaled(values, frame.gt, protocol.prediction_kind, protocol.scale_by)
-    if protocol.clip:
-        clipped = np.clip(depth, protocol.min_depth, protocol.max_depth)
+    rules, size = request.rules, frame.gt.shape
+    image = _read(pair.prediction, request.pred_scale, request)
+    values = _to_size(pair, image.values, size, request.resize)
+    depth, fit = scaled(values, frame.gt, request.prediction_kind, request.scale_by)
+    if rules.clip:
+        clipped = np.clip(depth, rules.min_depth, rules.max_depth)
         depth = np.where(depth > 0, clipped, 0).astype(np.float32)
-    empty = ~(depth > 0)
-    if protocol.missing == "min":
-        depth = np.where(empty, np.float32(protocol.min_depth), depth)
-    has_sigma = fit is None and protocol.prediction_kind == "depth"
+    if rules.missing == "min":
+        depth = np.where(depth > 0, depth, np.float32(rules.min_depth))
+    has_sigma = fit is None and request.prediction_kind == "depth"
     return replace(
         frame,
         depth=depth,
@@ -132,12 +139,12 @@ def _read_sigma(path: Path | None, size: Size) -> Depth | None:
     return values if values.shape == size else None
 
 
-def _read(path: Path, scale: float | None, protocol: EvalProtocol) -> DepthFile:
+def _read(path: Path, scale: float | None, request: EvalRequest) -> DepthFile:
     """The depth image; codes are metres × the scale, else the file's own, else the protocol's."""
     stored = load_stored(path)
     assumed = scale is None and stored.reading.scale is None and stored.values.dtype.kind != "f"
-    image = depth_from_stored(path, stored, protocol.scale if assumed else scale)
-    if protocol.is_devkit and image.reading.scale is not None and stored.values.ndim == 2:
+    image = depth_from_stored(path, stored, request.rules.scale if assumed else scale)
+    if request.is_devkit and image.reading.scale is not None and stored.values.ndim == 2:
         # the development kit reads every code but 0 as a depth, the largest too
         image = replace(image, values=known_metres(stored.values / image.reading.scale))
     return replace(image, reading=image.reading._replace(assumed=assumed))
@@ -185,12 +192,33 @@ def image_of(pair: FramePair, size: Size) -> Depth | None:
     return rgb if rgb.shape[:2] == size else None
 
 
-def _scored_mask(gt: Depth, protocol: EvalProtocol) -> Mask:
+def _scored_mask(gt: Depth, rules: Protocol) -> Mask:
     """(H, W) true where the protocol scores known ground truth."""
     scored = np.zeros(gt.shape, bool)
-    scored[crop_window(protocol.crop, gt.shape)] = True
-    highest = math.inf if protocol.max_depth is None else protocol.max_depth
-    return scored & (gt > protocol.min_depth) & (gt < highest)
+    scored[crop_window(rules.crop, gt.shape)] = True
+    highest = math.inf if rules.max_depth is None else rules.max_depth
+    return scored & (gt > rules.min_depth) & (gt < highest)
+
+
+def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
+    """Returns the rows and columns of a frame of `size` (H, W) pixels that lie in a crop.
+
+    Raises:
+        SizeError: If the crop does not fit the frame.
+    """
+    height, width = size
+    if crop == "none":
+        return slice(0, height), slice(0, width)
+    if crop == "nyu":
+        if size != (480, 640):
+            raise SizeError(
+                f"crop nyu is for frames of 640×480 but this one is {width}×{height}; --protocol"
+                " paper scores any size"
+            )
+        return _NYU_CROP
+    top, bottom, left, right = _CROP_FRACTIONS[crop]
+    rows, columns = (top * height, bottom * height), (left * width, right * width)
+    return slice(*map(int, rows)), slice(*map(int, columns))
 
 
 def _to_size(pair: FramePair, depth: Depth, size: Size, resize: str | None) -> Depth:

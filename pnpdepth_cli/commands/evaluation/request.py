@@ -1,15 +1,23 @@
-"""What the user asks of an evaluation. Imports neither numpy nor torch."""
+"""What the user asks of an evaluation, and the rules that follow. Imports no torch."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.measures import MEASURES, Measure, by_depth
+from pnpdepth_cli.protocols import KITTI_DEVKIT, Protocol, find_protocol
 from pnpdepth_cli.settings import option
+
+_IN_MILLIMETRES = tuple(
+    replace(m, shown_unit="mm", shown_factor=1000.0, decimals=1) if m.key in ("rmse", "mae") else m
+    for m in MEASURES
+)
 
 
 def parse_thresholds(text: str) -> tuple[float, float, float]:
@@ -28,7 +36,7 @@ def parse_names(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoringRules:
-    """Fields of the protocol that the user sets otherwise; None leaves the protocol's."""
+    """What is scored, and how; None leaves what the protocol says."""
 
     max_depth: float | None = option(None, "Score ground truth below M metres.", metavar="M")
     thresholds: tuple[float, float, float] | None = option(
@@ -38,16 +46,18 @@ class ScoringRules:
         metavar="D",
         parse=parse_thresholds,
     )
-    scale_by: str | None = option(
-        None,
-        "Scale each image to its ground truth, for relative predictions.  [default: none]",
+    scale_by: str = option(
+        "none",
+        "Scale each image to its ground truth, for relative predictions.",
         choices=choices.SCALINGS,
+        show_default=True,
     )
-    prediction_kind: str | None = option(
-        None,
-        "What predictions are.  [default: depth]",
+    prediction_kind: str = option(
+        "depth",
+        "What predictions are.",
         flag="--pred-kind",
         choices=choices.PREDICTION_KINDS,
+        show_default=True,
     )
     more_measures: tuple[str, ...] | None = option(
         None,
@@ -66,17 +76,16 @@ class ScoringRules:
     resize: str | None = option(
         None, "Resize predictions to the size of the ground truth.", choices=choices.RESIZES
     )
-
-    exclude_sparse: bool | None = option(None, "Leave out pixels with a sparse point.")
-
-    def changes(self) -> dict[str, Any]:
-        """Returns all rules by their names in a protocol."""
-        return {field.name: getattr(self, field.name) for field in fields(ScoringRules)}
+    exclude_sparse: bool = option(False, "Leave out pixels with a sparse point.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvalRequest(ScoringRules):
-    """What to score, and how."""
+    """What to score, and how.
+
+    Raises:
+        UsageError: For an unknown protocol, or a setting out of its range.
+    """
 
     prediction: Path
     """A depth file, or a folder of them."""
@@ -92,8 +101,86 @@ class EvalRequest(ScoringRules):
     gt_scale: float | None = option(None, "Integer ground truth holds metres × S.", metavar="S")
 
     def __post_init__(self) -> None:
-        for name in ("pred_scale", "gt_scale"):
-            scale = getattr(self, name)
+        for flag, scale in (("--pred-scale", self.pred_scale), ("--gt-scale", self.gt_scale)):
             if scale is not None and not (math.isfinite(scale) and scale > 0):
-                flag = f"--{name.replace('_', '-')}"
                 raise UsageError(f"{flag} must be a finite number above 0, got {scale:g}")
+        low, high = self.rules.min_depth, self.rules.max_depth
+        if high is not None and not (math.isfinite(high) and high > low):
+            raise UsageError(f"--max-depth must be metres above {low:g}, got {high:g}")
+        if not all(math.isfinite(limit) and limit > 1 for limit in self.rules.thresholds):
+            raise UsageError("--delta must be above 1: δ counts ratios below it")
+        near, far = self.depth_limits or (1.0, 2.0)
+        if not (0 < near < far and math.isfinite(far)):
+            raise UsageError(f"--by-depth must be two rising depths in metres: {near:g} {far:g}")
+        if self.is_devkit and (self.thresholds or self.more_measures or self.depth_limits):
+            raise UsageError(
+                f"--delta, --measures and --by-depth do not apply to {KITTI_DEVKIT}, which has its"
+                " own measures"
+            )
+        _ = self.measures
+
+    @cached_property
+    def rules(self) -> Protocol:
+        """The protocol with the bounds and thresholds that the user changes."""
+        own = find_protocol(self.protocol)
+        return replace(
+            own,
+            max_depth=own.max_depth if self.max_depth is None else self.max_depth,
+            thresholds=self.thresholds or own.thresholds,
+        )
+
+    @property
+    def is_devkit(self) -> bool:
+        """True if the development kit's definitions replace the usual ones."""
+        return self.protocol == KITTI_DEVKIT
+
+    @cached_property
+    def measures(self) -> tuple[Measure, ...]:
+        """The measures in order, and how tables show them."""
+        if self.is_devkit:
+            from pnpdepth_cli.commands.evaluation.kitti_devkit import DEVKIT_MEASURES
+
+            return DEVKIT_MEASURES
+        base = _IN_MILLIMETRES if self.protocol == "kitti" else MEASURES
+        of_parts = () if self.depth_limits is None else by_depth(*self.depth_limits)
+        return (*base, *of_parts, *(choices.MEASURES[key] for key in self.more_measures or ()))
+
+    def describe(self) -> str:
+        """Returns one line, such as `eigen: ground truth in 0.001–80 m, crop eigen, …`."""
+        rules = self.rules
+        bounds = f" above {rules.min_depth:g} m" if rules.min_depth else ""
+        if rules.max_depth is not None:
+            bounds = f" in {rules.min_depth:g}–{rules.max_depth:g} m"
+        changed = "" if rules == find_protocol(self.protocol) else " (changed)"
+        limits = ", ".join(f"{limit:.6g}" for limit in rules.thresholds)
+        parts = {
+            f"{rules.name}{changed}: all known ground truth{bounds}": True,
+            "no crop" if rules.crop == "none" else f"crop {rules.crop}": True,
+            "predictions clipped to the same range": rules.clip,
+            "without the pixels of sparse points": self.exclude_sparse,
+            f"predictions resized ({self.resize})": self.resize,
+            "predictions are disparity": self.prediction_kind == "disparity",
+            f"each image scaled by {self.scale_by}": self.scale_by != "none",
+            "empty predictions scored as the lower bound": rules.missing == "min",
+            "missing predictions filled in, errors as its program prints them": self.is_devkit,
+            f"δ below {limits}": not self.is_devkit,
+            "mean over the images": True,
+        }
+        return ", ".join(text for text, applies in parts.items() if applies)
+
+    def scoring(self) -> dict[str, Any]:
+        """Returns what decides the figures; equal for two evaluations that can be compared."""
+        return scoring_of(self.rules, self.scale_by, exclude_sparse=self.exclude_sparse)
+
+
+def scoring_of(
+    rules: Protocol, scale_by: str = "none", *, exclude_sparse: bool = False
+) -> dict[str, Any]:
+    """Returns the rules that decide figures, by their names."""
+    names = ("min_depth", "max_depth", "clip", "crop", "missing")
+    return {name: getattr(rules, name) for name in names} | {
+        "thresholds": list(rules.thresholds),
+        "scale_by": scale_by,
+        "exclude_sparse": exclude_sparse,
+        "definitions": KITTI_DEVKIT if rules.name == KITTI_DEVKIT else "usual",
+    }

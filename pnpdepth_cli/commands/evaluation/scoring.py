@@ -22,7 +22,6 @@ from pnpdepth_cli.commands.evaluation.frames import Depth, Fit, load_frame
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.commands.evaluation.rules import EvalProtocol
 from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.formats import Reading
@@ -92,19 +91,19 @@ class FrameScores:
         return self.predicted / self.known if self.known else math.nan
 
 
-def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) -> FrameScores:
+def score_pair(pair: FramePair, request: EvalRequest) -> FrameScores:
     """Returns the scores of a frame's files; a missing or empty prediction has a row without any.
 
     Raises:
         InputError: For a file that cannot be read, or no ground truth where the protocol scores.
         SizeError: Where sizes differ.
     """
-    frame = load_frame(pair, protocol, request)
+    frame = load_frame(pair, request)
     depth, gt = frame.depth, frame.gt
     known, both = gt > 0, (gt > 0) & (depth > 0)
     if not known.any():
         raise InputError(
-            f"{pair.frame.gt} has no known depth where protocol {protocol.name} scores"
+            f"{pair.frame.gt} has no known depth where protocol {request.protocol} scores"
         )
     row = FrameScores(pair=pair, known=int(known.sum()), readings=frame.readings)
     if frame.predicted is None:
@@ -118,17 +117,19 @@ def score_pair(pair: FramePair, protocol: EvalProtocol, request: EvalRequest) ->
         given=None if frame.given is None else int((frame.given & both).sum()),
         uncertainty=None if frame.sigma is None else frame_uncertainty(depth, gt, frame.sigma),
     )
-    if protocol.is_devkit:
+    if request.is_devkit:
         return replace(row, values=devkit_errors(depth, gt))
     if not row.pixels:
         where = " where the ground truth is known" if (depth > 0).any() else ""
         return replace(row, error=f"{pair.prediction} holds no valid depth{where}")
     # measures of sums over pixels, then those of whole images
-    summed = [m for m in protocol.measures if isinstance(m.formula, Formula)]
+    summed = [m for m in request.measures if isinstance(m.formula, Formula)]
     both_depths = torch.from_numpy(depth), torch.from_numpy(gt)
-    of_pixels = measures_of(error_sums(*both_depths, protocol.thresholds, summed), summed).tolist()
+    of_pixels = measures_of(
+        error_sums(*both_depths, request.rules.thresholds, summed), summed
+    ).tolist()
     values = {m.key: value for m, value in zip(summed, of_pixels, strict=True)}
-    values |= {m.key: m.value(depth, gt) for m in protocol.measures if m.key not in values}
+    values |= {m.key: m.value(depth, gt) for m in request.measures if m.key not in values}
     return replace(row, values=values)
 
 

@@ -36,18 +36,18 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
         title += f"; 95 % interval over {evaluation.clusters.describe()}"
     rows = []
     mean = evaluation.mean | {COVERAGE.key: evaluation.coverage}
-    for measure in (*chosen_measures(evaluation.protocol.measures, keys), COVERAGE):
+    for measure in (*chosen_measures(evaluation.request.measures, keys), COVERAGE):
         row = [measure.heading, measure.text(mean[measure.key])]
         if intervals is not None:
             row.append(" … ".join(measure.text(end) for end in intervals.get(measure.key, ())))
         rows.append(row)
-    title += _without_sparse(evaluation.protocol.exclude_sparse)
+    title += _without_sparse(evaluation.request.exclude_sparse)
     return Table(title=title, columns=columns, rows=rows)
 
 
 def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
-    measures = chosen_measures(evaluation.protocol.measures, keys)
+    measures = chosen_measures(evaluation.request.measures, keys)
     records = [plain(frame_record(frame)) for frame in evaluation.frames]
     facts = [name for name in records[0] if name not in ("values", "error")]
     return Table(
@@ -65,14 +65,14 @@ def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     if len(evaluation.frames) > _FRAMES_SHOWN:
         found = replace(evaluation, frames=tuple(worst(evaluation, "rmse")[:_FRAMES_SHOWN]))
         title = f"The {_FRAMES_SHOWN} worst by RMSE; --csv has all"
-    shown = keys or [measure.key for measure in evaluation.protocol.measures[:_FRAME_COLUMNS]]
+    shown = keys or [measure.key for measure in evaluation.request.measures[:_FRAME_COLUMNS]]
     table = frames_table(found, keys).only(["name", *shown, COVERAGE.key])
-    return replace(table, title=title + _without_sparse(evaluation.protocol.exclude_sparse))
+    return replace(table, title=title + _without_sparse(evaluation.request.exclude_sparse))
 
 
 def worst(evaluation: Evaluation, key: str) -> list[FrameScores]:
     """Returns the scored frames by one measure, worst first, those with NaN at the very end."""
-    (measure,) = (m for m in evaluation.protocol.measures if m.key == key)
+    (measure,) = (m for m in evaluation.request.measures if m.key == key)
     values = ((frame, frame.values[key]) for frame in evaluation.scored)
     ordered = sorted(values, key=lambda of: (math.isnan(of[1]), measure.sign * of[1]))
     return [frame for frame, _ in ordered]

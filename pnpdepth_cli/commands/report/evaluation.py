@@ -90,7 +90,7 @@ def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[dict[st
                 higher_is_better=measure.better == "higher",
                 listed=measure.main or keys is not None,
             )
-            for measure in chosen_measures(evaluation.protocol.measures, keys)
+            for measure in chosen_measures(evaluation.request.measures, keys)
         ),
         column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
     ]
@@ -101,7 +101,7 @@ def _head(
 ) -> Head:
     request = evaluation.request
     without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
-    fill = " (filled in)" if evaluation.protocol.is_devkit else ""
+    fill = " (filled in)" if evaluation.request.is_devkit else ""
     return Head(
         kind="Depth evaluation",
         title=str(request.prediction),
@@ -109,7 +109,7 @@ def _head(
         facts=[
             ("Prediction", str(request.prediction)),
             ("Ground truth", str(request.ground_truth)),
-            ("Protocol", evaluation.protocol.describe()),
+            ("Protocol", evaluation.request.describe()),
             ("Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"),
         ],
         notes=evaluation.notes,
@@ -138,7 +138,7 @@ def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
         ("Frames scored", of, ", ".join(unscored)),
         *(
             (measure.title, measure.text(evaluation.mean[measure.key], measure.table_unit), "")
-            for measure in evaluation.protocol.measures
+            for measure in evaluation.request.measures
             if measure.main
         ),
         ("Coverage", coverage, "of the ground truth has a prediction"),
@@ -196,10 +196,10 @@ def _entry(
 
 def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str, Any]:
     """Writes the images of a frame and returns the page's entry of them."""
-    protocol, pair = evaluation.protocol, frame.pair
-    loaded = load_frame(pair, protocol, evaluation.request)
+    pair = frame.pair
+    loaded = load_frame(pair, evaluation.request)
     gt, depth = loaded.gt, loaded.depth
-    if protocol.is_devkit:
+    if evaluation.request.is_devkit:
         depth = filled(depth)
     try:
         image = image_of(pair, gt.shape)

@@ -397,8 +397,11 @@ REFUSED = [
     ({"gt_scale": 0.0}, "--gt-scale"),
     ({"pred_scale": math.nan}, "--pred-scale"),
     ({"more_measures": ("boundary",)}, "unknown measure 'boundary'"),
-    ({"more_measures": ("boundary_f1",), "protocol": "kitti-devkit"}, "--measures does not apply"),
-    ({"depth_limits": (1.0, 2.0), "protocol": "kitti-devkit"}, "--by-depth does not apply"),
+    (
+        {"more_measures": ("boundary_f1",), "protocol": "kitti-devkit"},
+        "--measures and --by-depth do not apply",
+    ),
+    ({"depth_limits": (1.0, 2.0), "protocol": "kitti-devkit"}, "--by-depth do not apply"),
     ({"depth_limits": (2.0, 1.0)}, "--by-depth must be two rising depths"),
 ]
 
@@ -430,7 +433,7 @@ def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
     )
     assert list(more.mean)[: len(default.mean)] == list(default.mean)
     assert default.mean.items() <= more.mean.items()
-    assert more.protocol.scoring() == default.protocol.scoring()
+    assert more.request.scoring() == default.request.scoring()
     first, second, third = (frame.values["rmse_far"] for frame in more.frames)
     assert math.isnan(second)  # a wall in 2 m has no far pixels
     assert more.mean["rmse_far"] == pytest.approx((first + third) / 2)

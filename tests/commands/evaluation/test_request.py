@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pnpdepth_cli.commands.evaluation.rules import choose_protocol, crop_window, published
+from pnpdepth_cli.commands.evaluation.frames import crop_window
+from pnpdepth_cli.commands.evaluation.request import EvalRequest, scoring_of
 from pnpdepth_cli.errors import SizeError, UsageError
-from pnpdepth_cli.protocols import PROTOCOLS
+from pnpdepth_cli.protocols import PROTOCOLS, find_protocol
 
 # (protocol, frame, (top, bottom, left, right)) as the published evaluations cut them
 WINDOWS = [
@@ -28,7 +30,7 @@ def test_a_protocol_scores_the_window_that_was_published(
     name: str, size: tuple[int, int], window: tuple[int, int, int, int]
 ) -> None:
     top, bottom, left, right = window
-    crop = published(name).crop
+    crop = find_protocol(name).crop
     assert crop_window(crop, size) == (slice(top, bottom), slice(left, right))
 
 
@@ -56,8 +58,12 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("eigen", {"max_depth": 0.0}, "above 0.001, got 0"),
     ("paper", {"max_depth": float("nan")}, "--max-depth"),
     ("paper", {"thresholds": (1.0, 1.0, 1.0)}, "above 1"),
-    ("kitti-devkit", {"thresholds": (1.01, 1.02, 1.03)}, "--delta"),
+    ("kitti-devkit", {"thresholds": (1.01, 1.02, 1.03)}, "--delta, --measures and"),
 ]
+
+
+def request(name: str, **changes: Any) -> EvalRequest:
+    return EvalRequest(prediction=Path(), ground_truth=Path(), protocol=name, **changes)
 
 
 @pytest.mark.parametrize(("name", "changes", "message"), REFUSED)
@@ -65,18 +71,22 @@ def test_a_setting_without_sense_is_refused(
     name: str, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(UsageError) as error:
-        choose_protocol(name, **changes)
+        request(name, **changes)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_unset_fields_stay_as_published() -> None:
-    changed = choose_protocol("eigen", max_depth=50.0, resize=None)
-    assert changed == replace(published("eigen"), max_depth=50.0)
+    changed = request("eigen", max_depth=50.0, resize=None).rules
+    assert changed == replace(find_protocol("eigen"), max_depth=50.0)
 
 
 def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:
-    assert published("paper").scoring() == choose_protocol("kitti", resize="nearest").scoring()
+    assert scoring_of(find_protocol("paper")) == request("kitti", resize="nearest").scoring()
     kinds = ("paper", "nyu-eigen", "kitti-devkit", "eigen", "garg")
-    rules = [published(name).scoring() for name in kinds]
+    rules = [request(name).scoring() for name in kinds]
+    rules += [
+        request("paper", **{k: v}).scoring()
+        for k, v in (("exclude_sparse", True), ("scale_by", "log"))
+    ]
     assert all(a != b for i, a in enumerate(rules) for b in rules[:i])
