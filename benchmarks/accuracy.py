@@ -39,8 +39,7 @@ from benchmarks.frames import (
     without_occluded,
 )
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.refinement.inputs import Inputs
-from pnpdepth_cli.frames.frame import DepthMap
+from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.settings import PAPER, Settings
@@ -55,7 +54,7 @@ NETWORKS = ("compact", "fastdepth", "eigen-tiny", "fcrn-tiny", "sparse2dense-tin
 COUNTS = (20, 100, 500)
 
 
-def by_method(network: Network, name: str, inputs: Inputs, seed: int) -> tuple[DepthMap, DepthMap]:
+def by_method(network: Network, name: str, inputs: Frame, seed: int) -> tuple[DepthMap, DepthMap]:
     """The plain and the refined depth."""
     method = METHODS[name]
     if method is PAPER:

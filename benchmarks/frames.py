@@ -12,10 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.batch.running import registering
-from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.completion.image_registration import estimated, evidence
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.frames.frame import Refined, Register, tensor_of
+from pnpdepth_cli.frames.frame import Frame, Refined, Register, tensor_of
 from pnpdepth_cli.frames.refine import refine_frame
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.depth import read_depth
@@ -173,18 +172,18 @@ def registered(
     return [replace(frame, register=one) for frame, one in zip(frames, found, strict=True)]
 
 
-def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> Inputs:
+def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> Frame:
     """A frame in memory, as the program reads one from files."""
-    return Inputs(rgb=tensor_of(rgb), points=points, own=points, gt=gt)
+    return Frame(rgb=tensor_of(rgb), points=points, gt=gt)
 
 
-def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Inputs:
+def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Frame:
     """The frame with points of its ground truth, or with all points of its LiDAR (None)."""
     points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
     return replace(frame_inputs(frame.rgb, points, frame.gt), register=frame.register)
 
 
-def refined(network: Network, layer: str, settings: Settings, inputs: Inputs) -> Refined:
+def refined(network: Network, layer: str, settings: Settings, inputs: Frame) -> Refined:
     """The refinement of a frame with all of its points."""
     with network.cut_at(layer) as split:
         return refine_frame(network, split, settings, inputs.registered())
@@ -205,7 +204,7 @@ def opened(name: str, data: Path) -> Network:
     return load_network(name, data / "weights" / WEIGHTS[name] if name in WEIGHTS else None)
 
 
-def by_default(network: Network, inputs: Inputs, seed: int = 0) -> Refined:
+def by_default(network: Network, inputs: Frame, seed: int = 0) -> Refined:
     """The frame as `pnpdepth refine` gives it by default."""
     with Refiner(network, Settings(seed=seed)) as refiner:
         return refiner.refine_frame(inputs)

@@ -172,7 +172,7 @@ FORMATS = Table(
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
 LAYOUTS = Table(
-    "io/layouts",
+    "dataset/layouts",
     group="layouts",
     noun="layout",
     names=(
@@ -181,7 +181,7 @@ LAYOUTS = Table(
         *("arkitscenes", "pairs", "image-depth", "nyu-h5"),
     ),
 )
-"""Data set layouts, in the order in which they are guessed: `pnpdepth_cli.io.layouts.Layout`."""
+"""Data set layouts, in the order in which they are guessed (`dataset.layouts.Layout`)."""
 
 EXPORTS = Table(
     "commands/exports",

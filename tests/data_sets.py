@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.dataset.arrays import depth_of
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Hdf5Array
+from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset import Frame, Hdf5Array
-from pnpdepth_cli.io.dataset.reading import depth_of
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.layouts import list_frames
 from tests.colmap_models import write_text_model
 from tests.empty_files import touch, tree
 
@@ -147,7 +147,7 @@ def nyu_mat(root: Path) -> None:
         file["depths"] = np.tile(np.arange(640, dtype=np.float32)[:, None] + 1, (4, 1, 480))
 
 
-def read_frames(root: Path, name: str | None = None) -> list[Frame]:
+def read_frames(root: Path, name: str | None = None) -> list[FrameFiles]:
     """The frames of a data set, all of which are complete."""
     _, listing = list_frames(root, name)
     if listing.broken:
@@ -155,7 +155,7 @@ def read_frames(root: Path, name: str | None = None) -> list[Frame]:
     return listing.frames
 
 
-def ground_truth(frame: Frame) -> np.ndarray:
+def ground_truth(frame: FrameFiles) -> np.ndarray:
     """The ground truth (H, W) of a frame in metres, cut as its protocol says."""
     assert frame.gt is not None
     if isinstance(frame.gt, Hdf5Array):

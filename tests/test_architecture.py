@@ -33,8 +33,12 @@ MAY_IMPORT = {
     "completion": {*GROUND_FLOOR, "core"},
     "models": {*GROUND_FLOOR, "core", "completion"},
     "frames": {*GROUND_FLOOR, "core", "completion", "models"},
-    "commands": {*GROUND_FLOOR, "core", "completion", "models", "frames", "sensors", "io"},
-    "cli": {*GROUND_FLOOR, "commands"},
+    "dataset": {*GROUND_FLOOR, "completion", "frames", "sensors", "io"},
+    "commands": {
+        *GROUND_FLOOR,
+        *("core", "completion", "models", "frames", "sensors", "io", "dataset"),
+    },
+    "cli": {*GROUND_FLOOR, "commands", "dataset"},
     "api": {*GROUND_FLOOR, "core", "models", "frames"},
 }
 

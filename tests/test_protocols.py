@@ -13,8 +13,9 @@ from pnpdepth_cli.commands.batch.frames import find_frames, task_of
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.commands.refinement.refine import read_requested
 from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS
 from pnpdepth_cli.sensors import behind_foreground
@@ -74,10 +75,12 @@ BY_HAND: dict[str, tuple[Callable[[Path], None], int, int, int]] = {
 }
 
 
-def inputs_of(root: Path, protocol: str) -> list[Inputs]:
+def inputs_of(root: Path, protocol: str) -> list[Frame]:
     refine = RefineRequest()
     request = BatchRequest(source=root, output=root / "out", refine=refine, protocol=protocol)
-    return [read_inputs(task_of(request, frame).request) for frame in find_frames(request).chosen]
+    return [
+        read_requested(task_of(request, frame).request) for frame in find_frames(request).chosen
+    ]
 
 
 @pytest.mark.parametrize("name", BY_HAND)
@@ -89,7 +92,7 @@ def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_p
         source=root, output=tmp_path / "out", refine=RefineRequest(), protocol=name
     )
     chosen = find_frames(request).chosen
-    read = [read_inputs(task_of(request, frame).request) for frame in chosen]
+    read = [read_requested(task_of(request, frame).request) for frame in chosen]
     assert [len(each.points) for each in read] == [points] * frames
     for frame, each in zip(chosen, read, strict=True):
         assert each.gt is not None

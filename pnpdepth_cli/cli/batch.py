@@ -24,13 +24,12 @@ from pnpdepth_cli.commands.batch.request import (
     SequenceOptions,
 )
 from pnpdepth_cli.commands.refinement.request import (
-    FrameFiles,
     HoldOut,
     NetworkChoice,
     OutputOptions,
     parse_sample,
 )
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.settings import Settings
 
@@ -49,7 +48,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     groups={
         "Frames": ("--sample", FrameSelection, "--shard"),
         "Sequences": (SequenceOptions, "--adapt"),
-        "Input": (ScanOptions, FrameFiles),
+        "Input": (ScanOptions, ReadOptions),
         "Network": (NetworkChoice,),
         "Method": (Settings, HoldOut),
         "Study": ("--vary",),

@@ -9,13 +9,12 @@ from typing import Any
 import click
 
 from pnpdepth_cli.commands.refinement.request import (
-    FrameFiles,
     HoldOut,
     NetworkChoice,
     OutputOptions,
     RefineRequest,
 )
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import LARGEST_SEED, OptionField, Settings, options_of
 
 FILE = click.Path(path_type=Path)
@@ -92,7 +91,7 @@ def refinement(*, without: Collection[str] = ()) -> Callable[[Any], Any]:
     Args:
         without: Names of fields of a `RefineRequest` that are left out.
     """
-    groups = (ScanOptions, FrameFiles, NetworkChoice, Settings, HoldOut, OutputOptions)
+    groups = (ScanOptions, ReadOptions, NetworkChoice, Settings, HoldOut, OutputOptions)
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         return models(options_of_groups(*groups, without=["model", *without])(command))
@@ -118,7 +117,7 @@ models = click.option(
 checkpoint = _only(NetworkChoice, "checkpoint")
 device = _only(NetworkChoice, "device")
 layer = _only(Settings, "layer")
-depth_scale = _only(FrameFiles, "depth_scale")
+depth_scale = _only(ReadOptions, "depth_scale")
 seed = _only(Settings, "seed")
 overwrite = _only(OutputOptions, "overwrite")
 camera = _only(ScanOptions, "camera")

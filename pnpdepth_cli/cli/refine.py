@@ -10,12 +10,11 @@ from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.cli.streams import print_json
 from pnpdepth_cli.commands.refinement.request import (
-    FrameFiles,
     HoldOut,
     NetworkChoice,
     OutputOptions,
 )
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Settings
 
 
@@ -24,7 +23,7 @@ from pnpdepth_cli.settings import Settings
     cls=grouped_help.GroupedCommand,
     common=grouped_help.COMMON,
     groups={
-        "Input": ("--sparse", "--gt", ScanOptions, FrameFiles),
+        "Input": ("--sparse", "--gt", ScanOptions, ReadOptions),
         "Network": (NetworkChoice,),
         "Method": (Settings, HoldOut),
         "Output": ("--output", OutputOptions, "--json"),

@@ -11,7 +11,7 @@ from pnpdepth_cli.choices import PATTERNS, SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.streams import say
 from pnpdepth_cli.commands.refinement.request import sample_pattern
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.dataset.read_options import ScanOptions
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")

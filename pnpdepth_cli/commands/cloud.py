@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.frame_camera import (
+from pnpdepth_cli.commands.results import ResultFrame, result_frames
+from pnpdepth_cli.dataset.frame_camera import (
     Pose,
     camera_of_exif,
     camera_of_file,
     camera_of_fov,
     describe_pinhole,
 )
-from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud

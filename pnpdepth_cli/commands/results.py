@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.frame_camera import Pose, camera_from_json
-from pnpdepth_cli.commands.sparse.options import METRES
+from pnpdepth_cli.dataset.frame_camera import Pose, camera_from_json
+from pnpdepth_cli.dataset.frame_files import find_files
+from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
-from pnpdepth_cli.io.dataset import find_files
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.record import read_json

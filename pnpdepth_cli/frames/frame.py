@@ -12,6 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.completion.alignment import Alignment
 from pnpdepth_cli.completion.image_registration import ImageRegistration, estimated, evidence
 from pnpdepth_cli.core.refine import Refinement
@@ -47,6 +48,24 @@ class Frame:
     that take one. None without."""
     registration: ImageRegistration | None = None
     """How `rgb` was moved into the frame of the points. None: it was not."""
+    given: SparsePoints | None = None
+    """All points of the frame's own files, also those held out. None: `points`."""
+    camera: Camera | None = None
+    """The camera in pixels of the image frame. None: unknown."""
+    pose: NDArray[np.float64] | None = None
+    """(3, 4) from the camera's frame to the world's, in `unit`. None: unknown."""
+    depth_scale: float | None = None
+    """Integers per metre of the file of the sparse depth. None if it holds metres."""
+    sources: Mapping[str, Any] = field(default_factory=dict)
+    """Path, digest and reading of each file, by its part, for a record."""
+    assumed: tuple[str, ...] = ()
+    """Files whose scale is assumed, and how they were read."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def own(self) -> SparsePoints:
+        """All points of the frame's own files, also those held out."""
+        return self.points if self.given is None else self.given
 
     @property
     def size(self) -> tuple[int, int]:

@@ -14,9 +14,9 @@ from safetensors.torch import save_file
 from torch import nn
 
 from pnpdepth_cli.cli.main import run
+from pnpdepth_cli.dataset.arrays import depth_of
+from pnpdepth_cli.dataset.frame_files import Hdf5Array
 from pnpdepth_cli.io.bags import open_bag
-from pnpdepth_cli.io.dataset import Hdf5Array
-from pnpdepth_cli.io.dataset.reading import depth_of
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_focal_length, read_rgb
 from pnpdepth_cli.io.yaml_file import parse_yaml

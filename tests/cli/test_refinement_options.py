@@ -11,8 +11,8 @@ import pytest
 from pnpdepth_cli.cli.batch import batch
 from pnpdepth_cli.cli.options import taken
 from pnpdepth_cli.cli.refine import refine
-from pnpdepth_cli.commands.refinement.request import FrameFiles, OutputOptions, RefineRequest
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.commands.refinement.request import OutputOptions, RefineRequest
+from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
 from pnpdepth_cli.settings import PAPER, Settings, options_of
@@ -52,7 +52,7 @@ def test_options_reach_the_settings(command: click.Command) -> None:
     params = dict(command.make_context("command", arguments).params)
     assert params["normalise"] == "bytes"
     assert taken(ScanOptions, params)["extrinsics"] == Path("pose.txt")
-    assert taken(FrameFiles, params)["unit_scale"] == 2
+    assert taken(ReadOptions, params)["unit_scale"] == 2
     assert taken(OutputOptions, params).get("format", "exr") == "exr"
 
 

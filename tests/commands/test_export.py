@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.exports import export_results
-from pnpdepth_cli.commands.refinement.frame_camera import camera_to_json
-from pnpdepth_cli.commands.sparse.colmap_points import read_colmap_points
+from pnpdepth_cli.dataset.colmap_points import read_colmap_points
+from pnpdepth_cli.dataset.frame_camera import camera_to_json
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import write_depth
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model

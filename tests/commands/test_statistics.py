@@ -22,7 +22,7 @@ from pnpdepth_cli.commands.statistics import (
     holm,
     swap_p_values,
 )
-from pnpdepth_cli.io.dataset import groups_by_name
+from pnpdepth_cli.dataset.frame_files import groups_by_name
 
 
 def clusters_of(ids: list[int] | np.ndarray) -> Clusters:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.report import VIEWER
 from tests.commands.batches import batch, pairs_on_disk

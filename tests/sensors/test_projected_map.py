@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Extrinsics
-from pnpdepth_cli.commands.refinement.inputs import read_inputs
-from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.commands.refinement.refine import read_requested
+from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.read_frame import read_frame
+from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
@@ -92,15 +93,15 @@ def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: 
     points = boards_before_a_wall()
     write_depth(tmp_path / "sparse.png", as_depth_image(points), scale=256)
     files = FrameFiles(sparse=tmp_path / "sparse.png")
-    read = read_inputs(RefineRequest(files=files))
-    count = read.record["sparse"]["dropped"]["hidden by foreground"]
+    read = read_requested(RefineRequest(files=files))
+    count = read.sources["sparse"]["dropped"]["hidden by foreground"]
     assert len(read.points) == len(points) - count < len(points)
     assert sum("--preset paper" in note for note in read.notes) == 1
-    kept = read_inputs(RefineRequest(files=replace(files, scan=ScanOptions(keep_occluded=True))))
+    kept = read_frame(files, ReadOptions(scan=ScanOptions(keep_occluded=True)))
     assert len(kept.points) == len(points)
     assert not any("occluded" in note for note in kept.notes)
     paper = RefineRequest(files=files, method=Settings(preset="paper"))
-    assert len(read_inputs(paper).points) == len(points)
+    assert len(read_requested(paper).points) == len(points)
 
 
 def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: Path) -> None:

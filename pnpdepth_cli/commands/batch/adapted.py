@@ -15,15 +15,15 @@ import numpy as np
 from pnpdepth_cli.commands.batch.frames import Task, task_of
 from pnpdepth_cli.commands.batch.records import settings_of
 from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import DivergedError, InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
-from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.record import read_json, write_json
 
 if TYPE_CHECKING:
     from pnpdepth_cli.frames.adapt import Learnt
-    from pnpdepth_cli.frames.frame import Frame as FrameInMemory
+    from pnpdepth_cli.frames.frame import Frame
     from pnpdepth_cli.models.network import Network
 
 MOST_FRAMES = 64
@@ -34,7 +34,7 @@ def with_adapted_weights(
     request: BatchRequest,
     model: dict[str, Any],
     sequence: str,
-    frames: Sequence[Frame],
+    frames: Sequence[FrameFiles],
     say: Callable[[str], None],
     stopped: Callable[[], bool] | None = None,
 ) -> BatchRequest:
@@ -89,7 +89,7 @@ def _learn(
     stopped: Callable[[], bool],
 ) -> str | None:
     """Writes adapted weights if they are better beyond chance; returns why they are not."""
-    from pnpdepth_cli.commands.refinement.inputs import read_inputs  # these import torch
+    from pnpdepth_cli.commands.refinement.refine import read_requested  # these import torch
     from pnpdepth_cli.frames.adapt import learn, too_little
     from pnpdepth_cli.frames.resolve import resolve_definition
     from pnpdepth_cli.models.network import load_network
@@ -98,12 +98,12 @@ def _learn(
         if stopped():
             raise KeyboardInterrupt
 
-    def frames() -> Iterator[tuple[str, FrameInMemory]]:
+    def frames() -> Iterator[tuple[str, Frame]]:
         for task in tasks:
             check()
-            yield task.name, read_inputs(task.request)
+            yield task.name, read_requested(task.request)
 
-    first = read_inputs(tasks[0].request)
+    first = read_requested(tasks[0].request)
     if why := too_little(len(tasks), first):
         return why
     choice = request.refine.network

@@ -31,8 +31,8 @@ from pnpdepth_cli.commands.batch.summary import (
     write_summaries,
 )
 from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.lock import in_turn, locked_folder
 from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.protocols import WHOLE, find_protocol
@@ -106,7 +106,7 @@ class _Part(NamedTuple):
 
     request: BatchRequest
     records: Records
-    frames: Sequence[Frame]
+    frames: Sequence[FrameFiles]
 
 
 class _Batch:
@@ -150,10 +150,10 @@ class _Batch:
                 part = _Part(request, records, frames)
                 self._parts |= dict.fromkeys([frame.name for frame in frames], part)
 
-    def _part(self, frame: Frame) -> _Part:
+    def _part(self, frame: FrameFiles) -> _Part:
         return self._parts.get(frame.name, self._whole)
 
-    def _task(self, frame: Frame) -> Task:
+    def _task(self, frame: FrameFiles) -> Task:
         return task_of(self._part(frame).request, frame)
 
     def _check_report(self) -> None:
@@ -202,7 +202,7 @@ class _Batch:
         make_folder(output)
         stack.enter_context(locked_folder(output, self.request.shard, clean))
 
-    def to_do(self) -> list[tuple[Frame, str]]:
+    def to_do(self) -> list[tuple[FrameFiles, str]]:
         """Returns the frames that are to be done, and why, and says how many."""
         chosen = self.found.chosen
         reasons = _read_in_parts(
@@ -219,7 +219,7 @@ class _Batch:
         return to_do
 
     def rows(
-        self, to_do: list[Frame], listener: Listener, stopped: Callable[[], bool]
+        self, to_do: list[FrameFiles], listener: Listener, stopped: Callable[[], bool]
     ) -> Generator[Row, None, None]:
         """Refines frames in this process or on Ray workers; yields a row as each is done."""
         # these import torch, which a run with nothing to do does not need
@@ -250,9 +250,9 @@ class _Batch:
                         settings_worked=worked, stopped=stopped,
                     )  # fmt: skip
 
-    def _by_part(self, to_do: list[Frame]) -> list[tuple[_Part, list[Frame]]]:
+    def _by_part(self, to_do: list[FrameFiles]) -> list[tuple[_Part, list[FrameFiles]]]:
         """The frames to refine, by how they are refined."""
-        parts: dict[int, tuple[_Part, list[Frame]]] = {}
+        parts: dict[int, tuple[_Part, list[FrameFiles]]] = {}
         for frame in to_do:
             part = self._part(frame)
             parts.setdefault(id(part.records), (part, []))[1].append(frame)
@@ -319,7 +319,9 @@ class _Batch:
         return head
 
 
-def _read_in_parts(work: Callable[[Frame], Result], frames: Sequence[Frame]) -> Iterator[Result]:
+def _read_in_parts(
+    work: Callable[[FrameFiles], Result], frames: Sequence[FrameFiles]
+) -> Iterator[Result]:
     """Yields the result of each frame in order, computed by threads that take many at once."""
     starts = range(0, len(frames), _PART)
     parts = in_order(lambda n: [work(frame) for frame in frames[n : n + _PART]], starts, _READERS)

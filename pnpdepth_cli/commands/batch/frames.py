@@ -13,20 +13,21 @@ from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.sequence import with_neighbours
 from pnpdepth_cli.commands.batch.summary import CSV, JSON
 from pnpdepth_cli.commands.refinement.output_files import Outputs, outputs_in
-from pnpdepth_cli.commands.refinement.request import FrameFiles, NeighbourFiles, RefineRequest
-from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.io.bags import is_bag
-from pnpdepth_cli.io.colmap_model import model_files
-from pnpdepth_cli.io.dataset import (
+from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
-    Frame,
+    FrameFiles,
     Source,
     Unmatched,
     file_of,
     name_problem,
 )
+from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
+from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.io.bags import is_bag
+from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.protocols import find_protocol
 
@@ -38,11 +39,11 @@ class BatchFrames:
     """The frames of a batch."""
 
     layout: str
-    frames: Sequence[Frame]
+    frames: Sequence[FrameFiles]
     """All frames of the source whose results have files of their own."""
-    chosen: Sequence[Frame]
+    chosen: Sequence[FrameFiles]
     """Those within the limit and the shard."""
-    refused: Sequence[tuple[Frame, str]]
+    refused: Sequence[tuple[FrameFiles, str]]
     """Frames whose results would have no files of their own, and why."""
     unmatched: tuple[Unmatched, ...]
 
@@ -51,13 +52,21 @@ class BatchFrames:
 class Task:
     """One frame to refine."""
 
-    name: str
     request: RefineRequest
+    """What is asked for, with the frame's files."""
     inputs: dict[str, Path]
     """The files that are read for it, by their part."""
     outputs: Outputs
-    group: str | None = None
-    """The sequence that the data set says it belongs to."""
+
+    @property
+    def name(self) -> str:
+        """The name of the frame."""
+        return self.request.files.name
+
+    @property
+    def group(self) -> str | None:
+        """The sequence that the data set says it belongs to."""
+        return self.request.files.group
 
     @property
     def record(self) -> Path:
@@ -115,7 +124,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f"{source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
-    if request.files.sample is None and all(frame.sparse is None for frame in found):
+    if request.reading.sample is None and all(frame.sparse is None for frame in found):
         raise UsageError(
             f"{source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
@@ -132,66 +141,38 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     )
 
 
-def task_of(request: FrameSelection, frame: Frame) -> Task:
+def task_of(request: FrameSelection, frame: FrameFiles) -> Task:
     """Returns the frame's task; options of the user go before what the data set states."""
-    refine = request.refine
-    files = _files_of(request, frame)
-    neighbours = (
-        NeighbourFiles(
-            files=_files_of(request, each.frame),
-            motion=each.motion,
-            poses=each.poses,
-            apart=each.apart,
-        )
-        for each in frame.neighbours
-    )
+    reading, refine = request.reading, request.refine
+    files = _chosen(request, frame)
+    neighbours = (replace(each, files=_chosen(request, each.files)) for each in frame.neighbours)
     files = replace(files, neighbours=tuple(neighbours))
     return Task(
-        name=frame.name,
-        request=replace(refine, files=files),
-        inputs=dict(_input_files(files)),
+        request=replace(refine, files=files, reading=reading),
+        inputs=dict(_input_files(files, reading)),
         outputs=outputs_in(request.output, frame.name, refine),
-        group=frame.group,
     )
 
 
-def _files_of(request: FrameSelection, frame: Frame) -> FrameFiles:
-    """The files of a frame, without its neighbours."""
-    base, part = request.files, frame.part
+def _chosen(request: FrameSelection, frame: FrameFiles) -> FrameFiles:
+    """The files of a frame that are read for it, without its neighbours."""
+    files = replace(frame, neighbours=())
     if request.protocol is not None:
-        part = find_protocol(request.protocol).part or part
-    sparse = frame.sparse if base.sample is None else None
-    gt = frame.gt
-    if base.sample is not None and gt is None and _is_scan_file(frame.sparse):
-        gt = frame.sparse  # points are sampled from the projected scan
-    is_scan = _reads_scan(base, sparse, gt)
-    scan = base.scan
-    if is_scan:
-        camera = frame.camera if scan.camera is None else scan.camera
-        scan = replace(scan, calib=scan.calib or frame.calib, camera=camera)
-    return replace(
-        base,
-        image=frame.image,
-        sparse=sparse,
-        gt=gt,
-        camera_file=None if is_scan else frame.calib,
-        camera_number=frame.camera if scan.camera is None else scan.camera,
-        gt_masks=frame.masks,
-        gt_size_ok=frame.gt_other_size,
-        sparse_scale=frame.sparse_scale if base.depth_scale is None else None,
-        gt_scale=base.depth_scale or frame.gt_scale,
-        scan=scan,
-        part=part,
-    )
+        files = replace(files, part=find_protocol(request.protocol).part or files.part)
+    if request.reading.sample is None:
+        return files
+    # points are sampled from the ground truth, else from the projected scan
+    gt = frame.sparse if frame.gt is None and _is_scan_file(frame.sparse) else frame.gt
+    return replace(files, sparse=None, gt=gt)
 
 
-def _reads_scan(files: FrameFiles, sparse: Path | None, gt: Source | None) -> bool:
+def _reads_scan(files: FrameFiles, scan: ScanOptions) -> bool:
     """Whether one of them is a scan that is projected, which needs the scanner's pose."""
-    suffix = "" if sparse is None else sparse.suffix.lower()
+    suffix = "" if files.sparse is None else files.sparse.suffix.lower()
     return (
-        _is_scan_file(gt)
-        or _is_scan_file(sparse)
-        or (suffix == ".npy" and files.scan.calib is not None)
+        _is_scan_file(files.gt)
+        or _is_scan_file(files.sparse)
+        or (suffix == ".npy" and scan.calib is not None)
     )
 
 
@@ -199,13 +180,13 @@ def _is_scan_file(source: Source | None) -> bool:
     return isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES
 
 
-def source_files(frame: Frame) -> list[Path]:
+def source_files(frame: FrameFiles) -> list[Path]:
     """Returns the files of the frame's image, sparse depth and ground truth."""
     parts = [frame.image, frame.sparse, frame.gt]
     return [file_of(part) for part in parts if part is not None]
 
 
-def _input_files(files: FrameFiles) -> Iterator[tuple[str, Path]]:
+def _input_files(files: FrameFiles, reading: ReadOptions) -> Iterator[tuple[str, Path]]:
     parts = (("image", files.image), ("sparse", files.sparse), ("gt", files.gt))
     for part, source in parts:
         path = None if source is None else file_of(source)
@@ -221,9 +202,9 @@ def _input_files(files: FrameFiles) -> Iterator[tuple[str, Path]]:
             if each.motion is None and image is not None:  # the motion is estimated
                 yield f"image of {path.stem}", file_of(image)
     if files.gt is not None:
-        yield from ((f"mask {number}", path) for number, path in enumerate(files.gt_masks))
-    calib, extrinsics = files.scan.calib or files.camera_file, files.scan.extrinsics
-    if _reads_scan(files, files.sparse, files.gt) and extrinsics is not None:
+        yield from ((f"mask {number}", path) for number, path in enumerate(files.masks))
+    calib, extrinsics = reading.scan.over(files).calib, reading.scan.extrinsics
+    if _reads_scan(files, reading.scan) and extrinsics is not None:
         yield "extrinsics", extrinsics
     if calib is not None and calib.is_dir():
         yield from ((f"calib {path.name}", path) for path in sorted(calib.glob("calib_*.txt")))
@@ -231,11 +212,13 @@ def _input_files(files: FrameFiles) -> Iterator[tuple[str, Path]]:
         yield "calib", calib
 
 
-def _outside(output: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list[Unmatched]]:
+def _outside(
+    output: Path, frames: Sequence[FrameFiles]
+) -> tuple[list[FrameFiles], list[Unmatched]]:
     """The frames without a file in the output folder, and the files of the others there."""
     if not output.exists():
         return list(frames), []
-    folder, kept, ignored = output.resolve(), list[Frame](), list[Unmatched]()
+    folder, kept, ignored = output.resolve(), list[FrameFiles](), list[Unmatched]()
     is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
     for frame in frames:
         path = next((path for path in source_files(frame) if is_inside(path.parent)), None)
@@ -249,15 +232,15 @@ def _outside(output: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list[U
 
 
 def _with_own_files(
-    frames: Sequence[Frame], refine: RefineRequest
-) -> tuple[list[Frame], list[tuple[Frame, str]]]:
+    frames: Sequence[FrameFiles], refine: RefineRequest
+) -> tuple[list[FrameFiles], list[tuple[FrameFiles, str]]]:
     """The frames whose results have files of their own, and the others with the reason.
 
     Names that differ in Unicode normalisation only are one file on macOS.
     """
     endings = [path.name for path in outputs_in(Path(), "", refine).values()]
     owners, folders = dict[str, str](), dict[str, str]()  # names of frames by file, by folder
-    kept, refused = list[Frame](), list[tuple[Frame, str]]()
+    kept, refused = list[FrameFiles](), list[tuple[FrameFiles, str]]()
     for frame in frames:
         name = unicodedata.normalize("NFC", frame.name)
         files, parts = [name + ending for ending in endings], name.split("/")

@@ -19,8 +19,8 @@ from pnpdepth_cli.commands.batch.frames import task_of
 from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
 from pnpdepth_cli.commands.batch.request import LOCAL, BatchRequest, RayWorkers
 from pnpdepth_cli.commands.batch.summary import Row
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
-from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.lock import LOCKS
 
@@ -76,7 +76,9 @@ class Worker:
         """Raises ClusterError if this node differs from the driver's."""
         check_node(self._versions, self._shared)
 
-    def refine(self, frames: Sequence[Frame], settings_worked: bool) -> tuple[list[Row], list[str]]:
+    def refine(
+        self, frames: Sequence[FrameFiles], settings_worked: bool
+    ) -> tuple[list[Row], list[str]]:
         """Returns the rows of the frames, and notes, after their results are written."""
         from pnpdepth_cli.commands.batch.running import opened_network, refine_tasks
 
@@ -119,7 +121,7 @@ def rows_of_workers(
     request: BatchRequest,
     workers: RayWorkers,
     references: References,
-    to_do: Sequence[Frame],
+    to_do: Sequence[FrameFiles],
     records: Records,
     *,
     settings_worked: bool,
@@ -154,10 +156,10 @@ def rows_of_workers(
 def rows_of_actors(
     ray: Any,
     actors: Sequence[Any],
-    to_do: Sequence[Frame],
+    to_do: Sequence[FrameFiles],
     *,
     worked: bool,
-    lost: Callable[[Frame, str], Row],
+    lost: Callable[[FrameFiles, str], Row],
     say: Callable[[str], None],
     stopped: Callable[[], bool],
 ) -> Iterator[Row]:
@@ -171,7 +173,7 @@ def rows_of_actors(
     waiting = deque((to_do[i : i + size], 0) for i in range(0, len(to_do), size))
     idle, said = list[Any](), set[str]()
     # a call's actor, its frames (none: the actor starts), their deaths, and `worked` at its start
-    running = dict[Any, tuple[Any, Sequence[Frame], int, bool]]()
+    running = dict[Any, tuple[Any, Sequence[FrameFiles], int, bool]]()
 
     def start(actor: Any) -> None:
         running[actor.ready.options(max_task_retries=-1).remote()] = actor, (), 0, worked

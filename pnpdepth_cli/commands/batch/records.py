@@ -144,7 +144,7 @@ class Records:
 
     def _digest(self, task: Task) -> str:
         """The SHA-256 of the settings that decide the frame's result."""
-        files, last = task.request.settings("files"), self._last  # several threads ask
+        files, last = task.request.settings("files", "reading"), self._last  # several threads ask
         arrays = files.get("neighbours")
         if not arrays and last is not None and last[0] == files:  # as of most consecutive frames
             return last[1]

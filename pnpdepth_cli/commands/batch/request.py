@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS, PROTOCOLS
-from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest, parse_sample
+from pnpdepth_cli.commands.refinement.request import RefineRequest, parse_sample
+from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.settings import option
@@ -47,17 +48,17 @@ class FrameSelection:
     limit: int | None = option(None, "Only the first N frames.", metavar="N", least=1)
 
     @property
-    def files(self) -> FrameFiles:
+    def reading(self) -> ReadOptions:
         """How the files of every frame are read, with the points that the protocol has."""
-        files = self.refine.files
+        reading = self.refine.reading
         if self.protocol is None:
-            return files
+            return reading
         protocol = find_protocol(self.protocol)
-        files = replace(files, foreground=protocol.foreground)
-        if files.sample is not None or protocol.sample is None:
-            return files
+        reading = replace(reading, foreground=protocol.foreground)
+        if reading.sample is not None or protocol.sample is None:
+            return reading
         sample = parse_sample(protocol.sample)
-        return replace(files, sample=sample, sample_seed=protocol.seed)
+        return replace(reading, sample=sample, sample_seed=protocol.seed)
 
 
 @dataclass(frozen=True, kw_only=True)

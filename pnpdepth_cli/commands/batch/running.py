@@ -19,9 +19,9 @@ from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import Row
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
-from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.commands.refinement.refine import load_refiner, write_refined
+from pnpdepth_cli.commands.refinement.refine import load_refiner, read_requested, write_refined
 from pnpdepth_cli.commands.stopwatch import Stopwatch
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import (
     InputError,
     ModelError,
@@ -29,9 +29,8 @@ from pnpdepth_cli.errors import (
     StorageError,
     UsageError,
 )
-from pnpdepth_cli.frames.frame import Refined
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.refiner import Refiner
-from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
 
 Item = TypeVar("Item")
@@ -39,7 +38,7 @@ REGISTERING = 16
 """Frames that decide together how images are moved into the frame of the points."""
 
 
-def read_frame(task: Task, known: dict[str, Fingerprint] | None = None) -> Inputs:
+def read_task(task: Task, known: dict[str, Fingerprint] | None = None) -> Frame:
     """Returns the contents of a frame's files.
 
     Args:
@@ -47,25 +46,25 @@ def read_frame(task: Task, known: dict[str, Fingerprint] | None = None) -> Input
         known: Gets the fingerprints of the files, by part.
 
     Raises:
-        PnpDepthError: As of `read_inputs`.
+        PnpDepthError: As of `read_frame`.
     """
     if known is not None:
         known |= {part: fingerprint(path) for part, path in task.inputs.items()}
-    return read_inputs(task.request)
+    return read_requested(task.request)
 
 
 class References(NamedTuple):
     """The frames that decide for all frames of a batch."""
 
-    first: Frame
+    first: FrameFiles
     """The first one that can be read."""
-    others: Sequence[Frame]
+    others: Sequence[FrameFiles]
     """More frames, for input ranges where the network states none."""
-    registering: Sequence[Frame]
+    registering: Sequence[FrameFiles]
     """Frames that decide how images are moved into the frame of the points."""
 
 
-def references_of(request: BatchRequest, frames: Sequence[Frame]) -> References | None:
+def references_of(request: BatchRequest, frames: Sequence[FrameFiles]) -> References | None:
     """Returns the frames that decide, of all frames, so that every run and shard decides the same.
 
     Returns:
@@ -103,13 +102,13 @@ def opened_network(
         say: Receives what was decided.
     """
     task = task_of(request, references.first)
-    first = read_frame(task)
+    first = read_task(task)
     for note in first.notes:
         say(f"{task.name}: {note}")
 
-    def readable(frames: Iterable[Frame]) -> Iterator[Inputs]:
+    def readable(frames: Iterable[FrameFiles]) -> Iterator[Frame]:
         read = (_readable(task_of(request, frame)) for frame in frames)
-        return (inputs for inputs in read if inputs is not None)
+        return (frame for frame in read if frame is not None)
 
     others = functools.cache(lambda: [*readable(references.others)])
     refiner = load_refiner(task.request, first, others)
@@ -136,13 +135,13 @@ def opened_network(
         yield refiner
 
 
-def _readable(task: Task) -> Inputs | None:
+def _readable(task: Task) -> Frame | None:
     """The frame's contents; None if it cannot be read, which is reported later.
 
     UsageError if an option is wrong, for all frames.
     """
     try:
-        return read_frame(task)
+        return read_task(task)
     except UsageError:
         raise
     except Exception:
@@ -154,7 +153,7 @@ class FrameInMemory:
     """A frame on its way through the network."""
 
     task: Task
-    inputs: Inputs | None = None
+    inputs: Frame | None = None
     fingerprints: dict[str, Fingerprint] = field(default_factory=dict)
     watch: Stopwatch = field(default_factory=Stopwatch)
     result: Refined | Exception | None = None
@@ -229,7 +228,7 @@ def _read(task: Task) -> FrameInMemory:
     frame = FrameInMemory(task=task)
     try:
         with frame.watch("read"):
-            frame.inputs = read_frame(task, frame.fingerprints)
+            frame.inputs = read_task(task, frame.fingerprints)
     except Exception as error:  # concerns this frame only
         frame.result = error
     return frame
@@ -244,7 +243,9 @@ def _write(frame: FrameInMemory, refiner: Refiner, records: Records) -> Row:
             return records.write(
                 frame.task,
                 frame.fingerprints,
-                lambda outputs: write_refined(outputs, refiner, inputs, refined, frame.watch),
+                lambda outputs: write_refined(
+                    frame.task.request, outputs, refiner, inputs, refined, frame.watch
+                ),
             )
         except StorageError:
             raise

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Neighbour, groups_by_name
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.dataset import Frame, Neighbour, groups_by_name
 from pnpdepth_cli.io.poses import read_oxts_poses, read_poses
 
 KnownPose = tuple[NDArray[np.float64], str]
 """(3, 4) from the camera's frame to the world's in metres, and where it is from."""
 
 
-def sequences_of(frames: Sequence[Frame]) -> dict[str, list[int]]:
+def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
     """Returns the indices of the frames of each sequence, which one camera took, in order."""
     by_name = groups_by_name([frame.name for frame in frames])
     sequences: dict[tuple[str, int | None], list[int]] = {}
@@ -31,7 +31,9 @@ def sequences_of(frames: Sequence[Frame]) -> dict[str, list[int]]:
     }
 
 
-def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> list[Frame]:
+def with_neighbours(
+    frames: Sequence[FrameFiles], reach: int, poses: Path | None
+) -> list[FrameFiles]:
     """Returns the frames, each with those at most `reach` before and after it in its sequence.
 
     Args:
@@ -58,7 +60,7 @@ def with_neighbours(frames: Sequence[Frame], reach: int, poses: Path | None) -> 
     return result
 
 
-def note_of_poses(frames: Sequence[Frame]) -> str | None:
+def note_of_poses(frames: Sequence[FrameFiles]) -> str | None:
     """Returns which poses the neighbours of the frames have, as a line; None without neighbours."""
     counts = Counter(each.poses for frame in frames for each in frame.neighbours)
     if len(counts) < 2:
@@ -69,7 +71,7 @@ def note_of_poses(frames: Sequence[Frame]) -> str | None:
 
 
 def _neighbour(
-    other: Frame, other_pose: KnownPose | None, pose: KnownPose | None, apart: int
+    other: FrameFiles, other_pose: KnownPose | None, pose: KnownPose | None, apart: int
 ) -> Neighbour:
     if (other.sparse or other.gt) is None or (other.sparse is not None and other.sparse.is_dir()):
         raise UsageError(
@@ -81,15 +83,15 @@ def _neighbour(
             raise UsageError(
                 f"{other.name}: --accumulate needs the poses of frames without images; give --poses"
             )
-        return Neighbour(frame=other, motion=None, poses="estimated from the images", apart=apart)
+        return Neighbour(files=other, motion=None, poses="estimated from the images", apart=apart)
     (matrix, source), (other_matrix, _) = pose, other_pose
     turn = matrix[:, :3].T @ other_matrix[:, :3]
     shift = matrix[:, :3].T @ (other_matrix[:, 3] - matrix[:, 3])
     motion = tuple(map(tuple, np.column_stack([turn, shift]).tolist()))
-    return Neighbour(frame=other, motion=motion, poses=source, apart=apart)
+    return Neighbour(files=other, motion=motion, poses=source, apart=apart)
 
 
-def _poses(frames: Sequence[Frame], path: Path | None) -> list[KnownPose | None]:
+def _poses(frames: Sequence[FrameFiles], path: Path | None) -> list[KnownPose | None]:
     """The pose of each frame; None where it is unknown."""
     if path is not None:
         return [(row, str(path)) for row in read_poses(path, len(frames), "frames")]

@@ -23,8 +23,8 @@ from pnpdepth_cli.commands.statistics import (
     interval,
     swap_p_values,
 )
+from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
-from pnpdepth_cli.io.dataset import groups_by_name
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import plain, read_json
 from pnpdepth_cli.measures import MEASURES, FrameMeans, Measure, chosen_measures

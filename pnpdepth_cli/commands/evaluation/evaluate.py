@@ -19,7 +19,6 @@ from pnpdepth_cli.commands.evaluation.scoring import (
     summarise_uncertainty,
 )
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
-from pnpdepth_cli.commands.sparse.options import METRES
 from pnpdepth_cli.commands.statistics import (
     LEVEL,
     MIN_CLUSTERS,
@@ -28,6 +27,7 @@ from pnpdepth_cli.commands.statistics import (
     interval,
 )
 from pnpdepth_cli.commands.stopwatch import versions
+from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.dataset.arrays import depth_of, masked, read_image
+from pnpdepth_cli.dataset.frame_files import Hdf5Array
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
-from pnpdepth_cli.io.dataset import Hdf5Array
-from pnpdepth_cli.io.dataset.reading import depth_of, masked, read_image
 from pnpdepth_cli.io.depth import (
     depth_from_stored,
     known_metres,

@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pnpdepth_cli.commands.results import result_frames
-from pnpdepth_cli.commands.sparse.options import METRES
-from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.dataset import (
-    Frame,
+from pnpdepth_cli.dataset.frame_files import (
+    FrameFiles,
     Source,
     find_files,
     groups_by_name,
 )
+from pnpdepth_cli.dataset.layouts import find_layout, list_frames
+from pnpdepth_cli.dataset.read_options import METRES
+from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
-from pnpdepth_cli.io.layouts import find_layout, list_frames
 from pnpdepth_cli.protocols import WHOLE, FramePart
 from pnpdepth_cli.sensors import SamplePattern
 
@@ -45,7 +45,7 @@ class FramePair:
     name: str
     """By which runs are compared."""
     prediction: Path | None
-    frame: Frame
+    frame: FrameFiles
     """The ground truth's frame; it has `gt`."""
     group: str = ""
     """The sequence of the frame: the data set's, the manifest's, or what its name says."""
@@ -95,7 +95,7 @@ def pair_frames(
         notes += more_notes
     else:
         name = frame_name(prediction.stem)
-        frames, predictions = [Frame(name=name, gt=ground_truth)], {name: prediction}
+        frames, predictions = [FrameFiles(name=name, gt=ground_truth)], {name: prediction}
     names = {frame.name for frame in frames}
     if names.isdisjoint(predictions):
         raise InputError(
@@ -119,11 +119,11 @@ def pair_frames(
 
 def _true_frames(
     folder: Path, layout: str | None, part: FramePart | None
-) -> tuple[list[Frame], list[str]]:
+) -> tuple[list[FrameFiles], list[str]]:
     """The frames with ground truth of a folder of files or a data set, and notes."""
     if layout is None:
         files, notes = depth_files(folder)
-        return [Frame(name=name, gt=path) for name, path in files.items()], notes
+        return [FrameFiles(name=name, gt=path) for name, path in files.items()], notes
     frames = [frame for frame in list_frames(folder, layout)[1].frames if frame.gt is not None]
     if not frames:
         raise InputError(f"{folder} looks like {layout!r}, and no frame in it has ground truth")
@@ -134,7 +134,7 @@ def _true_frames(
     return frames, [note + (f", of which {cuts} is used" if cuts else "")]
 
 
-def _pair(frame: Frame, prediction: Path | None) -> FramePair:
+def _pair(frame: FrameFiles, prediction: Path | None) -> FramePair:
     """The frame with what the record of a refinement, beside its depth, says of its inputs."""
     record: Mapping[str, Any] = {}
     sigma: Path | None = None

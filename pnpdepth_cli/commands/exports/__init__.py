@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import EXPORTS
-from pnpdepth_cli.commands.refinement.frame_camera import Pose
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
+from pnpdepth_cli.dataset.frame_camera import Pose
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
 from pnpdepth_cli.io.record import write_json

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pnpdepth_cli.commands.exports import Export, ExportFrame, new_file
-from pnpdepth_cli.commands.sparse.options import METRES
+from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.depth import write_depth

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 
 _FILE_SUFFIXES = {
@@ -46,7 +46,7 @@ def plan_outputs(request: RefineRequest) -> dict[str, Path]:
         OutputError: One exists and may not be replaced, or is one of the inputs.
     """
     files, options = request.files, request.outputs
-    sources = [files.image, files.sparse, files.gt, files.scan.calib]
+    sources = [files.image, files.sparse, files.gt, request.reading.scan.calib]
     inputs = [path for path in sources if isinstance(path, Path)]
     output = options.output or Path(f"{inputs[0].stem}_refined")
     suffix, formats = output.suffix.lower(), " ".join(DEPTH_SUFFIXES)

@@ -14,9 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.refinement.output_files import Outputs
-from pnpdepth_cli.frames.frame import Refined
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.colours import depth_scale
 from pnpdepth_cli.io.depth import metres, write_depth
@@ -50,13 +49,13 @@ _RAY_NODES = 64
 """Nodes of the grid of directions along the longer side: exact to 1e-4 of it for strong lenses."""
 
 
-def output_scale(inputs: Inputs) -> float:
+def output_scale(inputs: Frame) -> float:
     """Returns the codes per metre of an integer depth file for this frame.
 
     The sparse depth file's own, else 256 unless the points do not fit; known before refinement.
     """
-    if inputs.sparse_scale is not None:
-        return inputs.sparse_scale
+    if inputs.depth_scale is not None:
+        return inputs.depth_scale
     nearest, farthest = float(inputs.own.depth.min()), float(inputs.own.depth.max())
     scale = INTEGER_SCALE
     for coarser in _COARSER:
@@ -68,7 +67,7 @@ def output_scale(inputs: Inputs) -> float:
     return scale
 
 
-def within_range(outputs: Outputs, inputs: Inputs, frame: Refined) -> Refined:
+def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:
     """Returns the frame with depths that the format can hold, with a note if any is clipped."""
     depth_format = format_of_suffix(outputs["depth"].suffix)
     if depth_format is None or not depth_format.integer:
@@ -90,7 +89,7 @@ def within_range(outputs: Outputs, inputs: Inputs, frame: Refined) -> Refined:
     return replace(frame, after=after, notes=(*frame.notes, *notes))
 
 
-def write_outputs(outputs: Outputs, inputs: Inputs, frame: Refined) -> dict[str, Any]:
+def write_outputs(outputs: Outputs, inputs: Frame, frame: Refined) -> dict[str, Any]:
     """Writes the depth and its images. Returns their entries of the record."""
     image = replace(inputs, register=frame.registration).registered().image
     make_folder(outputs["depth"].parent)
@@ -134,7 +133,7 @@ def _write_sigma(path: Path, sigma: Image) -> None:
 
 
 def _write_improvement(
-    path: Path, image: Image | None, inputs: Inputs, frame: Refined
+    path: Path, image: Image | None, inputs: Frame, frame: Refined
 ) -> tuple[float, Content]:
     if inputs.gt is not None:
         return improvement(frame.before, frame.after, inputs.gt, path, rgb=image)
@@ -151,7 +150,7 @@ def _write_improvement(
     )
 
 
-def _write_view(path: Path, image: Image | None, inputs: Inputs, frame: Refined) -> None:
+def _write_view(path: Path, image: Image | None, inputs: Frame, frame: Refined) -> None:
     """Writes the 3D view for a report: depths, the ground truth if known, colours and camera.
 
     Every depth is cut at its edges, as a cloud is, on one grid. An image of more pixels than

@@ -12,14 +12,14 @@ import numpy as np
 import torch
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.refinement.frame_camera import camera_to_json
-from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
 from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs
 from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.dataset.frame_camera import camera_to_json
+from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import DivergedError, ModelError
 from pnpdepth_cli.frames.default import ALIGNED, RESULT
 from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
@@ -58,7 +58,7 @@ def refine_image(
     watch = Stopwatch()
     outputs = plan_outputs(request)
     with watch("read"):
-        inputs = read_inputs(request)
+        inputs = read_requested(request)
     with watch("load network"):
         refiner = load_refiner(request, inputs)
     with watch("refine"), refiner:
@@ -66,7 +66,18 @@ def refine_image(
         frame = refiner.refine_frame(
             inputs, on_iteration=lambda done, loss: on_iteration(done, of, loss)
         )
-    return write_refined(outputs, refiner, inputs, frame, watch)
+    return write_refined(request, outputs, refiner, inputs, frame, watch)
+
+
+def read_requested(request: RefineRequest) -> Frame:
+    """Returns the frame that is asked for, as `read_frame` reads it."""
+    return read_frame(
+        request.files,
+        request.read_options,
+        seed=request.method.seed,
+        holdout=request.hold_out.holdout,
+        needs_camera=request.outputs.view_3d,
+    )
 
 
 def load_refiner(
@@ -98,14 +109,19 @@ def load_refiner(
 
 
 def write_refined(
-    outputs: Outputs, refiner: Refiner, inputs: Inputs, frame: Refined, watch: Stopwatch
+    request: RefineRequest,
+    outputs: Outputs,
+    refiner: Refiner,
+    inputs: Frame,
+    frame: Refined,
+    watch: Stopwatch,
 ) -> RefineOutcome:
     """Scores the refined frame and writes it with its record.
 
     The record is the same from run to run, except `seconds` and `peak_memory_mb`.
     """
     frame = within_range(outputs, inputs, frame)
-    record = record_of(refiner, inputs, frame)
+    record = record_of(request, refiner, inputs, frame)
     with all_or_none(outputs.values()):
         with watch("write"):
             record |= write_outputs(outputs, inputs, frame)
@@ -116,17 +132,19 @@ def write_refined(
     return RefineOutcome(record=record, outputs=outputs, diverged=frame.diverged)
 
 
-def record_of(refiner: Refiner, inputs: Inputs, frame: Refined) -> dict[str, Any]:
+def record_of(
+    request: RefineRequest, refiner: Refiner, inputs: Frame, frame: Refined
+) -> dict[str, Any]:
     """Returns what the record says of a refined frame, apart from its files and times."""
-    request, network, gt = inputs.request, refiner.network, inputs.gt
+    network, gt = refiner.network, inputs.gt
     own_used = len(inputs.own) - len(frame.held_out)
-    moved = {"moved": len(frame.used) - own_used} if inputs.has_neighbours else {}
+    moved = {"moved": len(frame.used) - own_used} if "neighbours" in inputs.sources else {}
     of_networks = [note for member in refiner.members for note in member.network.notes]
     stages = None if gt is None else frame.stages  # of the default method
     return {
         "versions": versions(),
         "unit": inputs.unit,
-        "inputs": inputs.record,
+        "inputs": dict(inputs.sources),
         "camera": inputs.camera and camera_to_json(inputs.camera, inputs.pose),
         "model": model_record(network, request.network.model),
         "method": {

@@ -6,94 +6,18 @@ Command line options and batch cache keys are derived from these declarations
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import choices
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.protocols import WHOLE, ForegroundFilter, FramePart
 from pnpdepth_cli.settings import Settings, option
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.io.dataset import Pose, Source
     from pnpdepth_cli.sensors import SamplePattern
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameFiles:
-    """The files of a frame and how they are read."""
-
-    image: Source | None = None
-    """None for a network that takes sparse depth alone."""
-    sparse: Path | None = None
-    """Sparse depth, a LiDAR scan, or a COLMAP model. None: `sample` takes points of the ground
-    truth."""
-    gt: Source | None = None
-    depth_scale: float | None = option(
-        None,
-        "Integer depth files hold metres × S.  [default: from the file, else 256]",
-        metavar="S",
-    )
-    sparse_scale: float | None = None
-    """Of the sparse depth, over `depth_scale`."""
-    gt_scale: float | None = None
-    """Of the ground truth, over `depth_scale`."""
-    unit_scale: float | None = option(
-        None,
-        "Metres per unit of a COLMAP model.  [default: depth is in model units]",
-        metavar="M",
-    )
-    registration: str = option(
-        "auto",
-        "Whether the image is moved into the frame of the points: auto, if their depth edges show"
-        " that it is not registered; or off.",
-        choices=choices.REGISTRATIONS,
-        show_default=True,
-    )
-    scan: ScanOptions = field(default_factory=ScanOptions)
-    camera_file: Path | None = None
-    """Calibration of the camera, where `sparse` is no LiDAR scan and an output needs the camera."""
-    camera_number: int | None = None
-    neighbours: tuple[NeighbourFiles, ...] = ()
-    """Other frames of the sequence, whose points are moved into this one."""
-    gt_masks: tuple[Path, ...] = ()
-    """Where one of these is 0, the ground truth is unknown."""
-    gt_size_ok: bool = False
-    """Accept ground truth of another size; its known pixels are moved to the image."""
-    sample: SamplePattern | None = None
-    sample_seed: int | None = None
-    """Random seed of `sample`; None for that of the method."""
-    foreground: ForegroundFilter | None = None
-    """Which points of a depth map are removed; None for the program's own choice."""
-    part: FramePart = WHOLE
-    """The part of the frame that is used."""
-
-    def __post_init__(self) -> None:
-        if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
-            raise UsageError(
-                f"--unit-scale must be above 0 metres per unit, got {self.unit_scale:g}"
-            )
-
-    @property
-    def image_file(self) -> Path | None:
-        """The file of the image; None for none, or for an array of a data set."""
-        return self.image if isinstance(self.image, Path) else None
-
-
-@dataclass(frozen=True, kw_only=True)
-class NeighbourFiles:
-    """Another frame of the sequence, whose points are moved into this one."""
-
-    files: FrameFiles
-    motion: Pose | None
-    """(3, 4) from the other camera's frame to this one's, metres. None: it is estimated."""
-    poses: str
-    """Where the motion is from, for a person."""
-    apart: int
-    """Distance in frames, at least 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,8 +84,8 @@ class OutputOptions:
 
 _NOT_IN_DIGEST = frozenset(
     {
-        *("image", "sparse", "gt", "gt_masks", "model", "checkpoint", "output", "overwrite"),
-        *("camera_file", "camera_number", "view_3d"),
+        *("name", "group", "image", "sparse", "gt", "calib", "pose", "oxts", "masks"),
+        *("model", "checkpoint", "output", "overwrite", "view_3d"),
     }
 )
 """Fields that say where something lies, whose content is compared instead, or that add a file."""
@@ -172,6 +96,7 @@ class RefineRequest:
     """Everything the user asks of the refinement of one frame."""
 
     files: FrameFiles = field(default_factory=FrameFiles)
+    reading: ReadOptions = field(default_factory=ReadOptions)
     network: NetworkChoice = field(default_factory=NetworkChoice)
     method: Settings = field(default_factory=Settings)
     hold_out: HoldOut = field(default_factory=HoldOut)
@@ -181,6 +106,18 @@ class RefineRequest:
     def from_fields(cls, **values: Any) -> RefineRequest:
         """Returns the request with these fields of its groups, whichever group each is in."""
         return cls().with_fields(**values)
+
+    @property
+    def read_options(self) -> ReadOptions:
+        """How the frame's files are read. The paper's setting moves and drops nothing."""
+        if self.method.preset is None:
+            return self.reading
+        registration = self.reading.registration
+        return replace(
+            self.reading,
+            registration="off" if registration == "auto" else registration,
+            scan=replace(self.reading.scan, keep_occluded=True),
+        )
 
     def with_fields(self, **values: Any) -> RefineRequest:
         """Returns a copy with other values of these fields, whichever group each is in."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.commands.sparse.scan_points import chosen_camera
+from pnpdepth_cli.dataset.scan_points import chosen_camera
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.bags import (

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Extrinsics
-from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scan_points import check_size, read_scan_points
+from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.scan_points import check_size, read_scan_points
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration

@@ -13,8 +13,8 @@ import pytest
 
 from pnpdepth_cli.commands.batch.request import SequenceOptions
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.dataset import Frame
 from pnpdepth_cli.sensors import SamplePattern
 from tests.commands.batches import RecordingListener, batch, depths, done
 from tests.commands.drives import drive_on_disk, without_results
@@ -80,11 +80,11 @@ STILL = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 def test_frames_of_another_sequence_or_camera_are_no_neighbours(tmp_path: Path) -> None:
     kinds = [("a_1", 2), ("a_2", 2), ("b_1", 2), ("a_1", 3), ("a_2", 3)]
     frames = [
-        Frame(name=name, sparse=tmp_path / f"{name}_{camera}.png", camera=camera, pose=STILL)
+        FrameFiles(name=name, sparse=tmp_path / f"{name}_{camera}.png", camera=camera, pose=STILL)
         for name, camera in kinds
     ]
     linked = with_neighbours(frames, 2, None)
-    assert [[each.frame.sparse.stem for each in frame.neighbours] for frame in linked] == [
+    assert [[each.files.sparse.stem for each in frame.neighbours] for frame in linked] == [
         ["a_2_2"], ["a_1_2"], [], ["a_2_3"], ["a_1_3"],
     ]  # fmt: skip
 
@@ -92,7 +92,7 @@ def test_frames_of_another_sequence_or_camera_are_no_neighbours(tmp_path: Path) 
 def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
     turned = ((0.0, -1.0, 0.0, 4.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0))
     frames = [
-        Frame(name=f"a_{number}", sparse=Path("s.png"), pose=pose)
+        FrameFiles(name=f"a_{number}", sparse=Path("s.png"), pose=pose)
         for number, pose in enumerate((STILL, turned))
     ]
     (of_turned,), (of_still,) = (each.neighbours for each in with_neighbours(frames, 1, None))
@@ -103,19 +103,19 @@ def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
 
 
 def test_a_frame_without_points_cannot_be_accumulated() -> None:
-    frame = Frame(name="a", pose=STILL)
+    frame = FrameFiles(name="a", pose=STILL)
     with pytest.raises(UsageError, match="not images alone"):
         with_neighbours([frame, frame], 1, None)
 
 
 def test_frames_without_images_need_poses_to_be_accumulated() -> None:
-    frame = Frame(name="a", sparse=Path("s.png"))
+    frame = FrameFiles(name="a", sparse=Path("s.png"))
     with pytest.raises(UsageError, match="--poses"):
         with_neighbours([frame, frame], 1, None)
 
 
 def test_the_note_names_the_poses_that_are_used() -> None:
-    own = Frame(name="a_1", image=Path("i.png"), sparse=Path("s.png"), pose=STILL)
+    own = FrameFiles(name="a_1", image=Path("i.png"), sparse=Path("s.png"), pose=STILL)
     without = replace(own, name="a_2", pose=None)
     assert note_of_poses([own]) is None
     assert note_of_poses(with_neighbours([own, own], 1, None)) == "poses: the layout's"

@@ -18,7 +18,7 @@ from pnpdepth_cli.commands.batch import running as batch_running
 from pnpdepth_cli.commands.batch.batch import run_batch
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import _SCORES, Tally, failed_row
-from pnpdepth_cli.commands.refinement.inputs import read_inputs
+from pnpdepth_cli.commands.refinement.refine import read_requested
 from pnpdepth_cli.commands.report.batch import write_batch_report
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.frames.refiner import Refiner
@@ -409,12 +409,12 @@ def test_only_a_few_frames_are_in_memory_at_once(
 
     def watched(request: Any) -> Any:
         nonlocal most
-        inputs = read_inputs(request)
+        inputs = read_requested(request)
         alive.add(inputs.points.xy)
         most = max(most, len(alive))
         return inputs
 
-    monkeypatch.setattr(batch_running, "read_inputs", watched)
+    monkeypatch.setattr(batch_running, "read_requested", watched)
     monkeypatch.setattr(batch_running, "THREADS", 1)
     batch(root, refine={"iterations": 0})
     assert most <= 6
@@ -432,7 +432,7 @@ def test_reading_and_writing_go_on_while_the_network_runs(
         read.add(str(request.files.image))
         if len(read) == 2:
             second_is_read.set()
-        return read_inputs(request)
+        return read_requested(request)
 
     def refining(self: Refiner, inputs: Any) -> Any:
         nonlocal refined
@@ -447,7 +447,7 @@ def test_reading_and_writing_go_on_while_the_network_runs(
         assert second_is_refined.wait(60), "the second frame waits until the first is written"
         return write(*arguments)
 
-    monkeypatch.setattr(batch_running, "read_inputs", reading)
+    monkeypatch.setattr(batch_running, "read_requested", reading)
     monkeypatch.setattr(batch_running, "write_refined", writing)
     monkeypatch.setattr(Refiner, "refine_frame", refining)
     monkeypatch.setattr(batch_running, "THREADS", 1)

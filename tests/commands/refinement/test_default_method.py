@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.refinement.inputs import read_inputs
-from pnpdepth_cli.commands.refinement.refine import load_refiner
+from pnpdepth_cli.commands.refinement.refine import load_refiner, read_requested
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
@@ -77,6 +76,6 @@ def test_networks_of_the_default_method_are_aligned_and_updated_a_few_times(
         model=str(frame.model),
         checkpoint=frame.checkpoint,
     )
-    user, compact = load_refiner(request, read_inputs(request)).members
+    user, compact = load_refiner(request, read_requested(request)).members
     assert (user.settings.align, user.settings.iterations) == ("auto", 5)
     assert (compact.settings.align, compact.settings.iterations) == ("none", 2)

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.commands.refinement.inputs import Inputs
 from pnpdepth_cli.commands.refinement.outputs import output_scale, within_range
 from pnpdepth_cli.core.refine import Refinement
-from pnpdepth_cli.frames.frame import Refined, no_points
+from pnpdepth_cli.frames.frame import Frame, Refined, no_points
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.points import SparsePoints
 from tests.commands.frames import frame_on_disk, run
@@ -21,13 +20,13 @@ from tests.commands.frames import frame_on_disk, run
 PNG = {"depth": Path("depth.png")}
 
 
-def inputs_at(*depths: float, scale: float | None = None) -> Inputs:
+def inputs_at(*depths: float, scale: float | None = None) -> Frame:
     xy = torch.tensor([[float(column), 0.0] for column in range(len(depths))])
     points = SparsePoints(xy=xy, depth=torch.tensor(depths), size=(1, 4))
-    return Inputs(rgb=None, points=points, own=points, sparse_scale=scale)
+    return Frame(rgb=None, points=points, depth_scale=scale)
 
 
-def refined_to(*depths: float, inputs: Inputs) -> Refined:
+def refined_to(*depths: float, inputs: Frame) -> Refined:
     depth = np.array([depths], np.float32)
     dense = torch.from_numpy(depth)
     return Refined(

@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from pnpdepth_cli.commands.refinement.inputs import _scale_warning
 from pnpdepth_cli.commands.refinement.refine import _point_error
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.dataset.read_frame import _scale_warning
+from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import (
     InputError,
     LayerError,

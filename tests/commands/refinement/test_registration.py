@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from pnpdepth_cli import Refiner, load_network
-from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
-from pnpdepth_cli.commands.refinement.refine import load_refiner
+from pnpdepth_cli.commands.refinement.refine import load_refiner, read_requested
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.completion.image_registration import estimated, evidence
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.settings import Settings
@@ -80,7 +80,7 @@ def test_a_moved_image_gives_what_the_same_image_moved_on_disk_gives(
 
 def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> None:
     files = write_frame(tmp_path, 0, 800)
-    inputs = read_inputs(RefineRequest.from_fields(**files))
+    inputs = read_requested(RefineRequest.from_fields(**files))
     record = refined(tmp_path, frame, count=800, holdout=0.5, seed=3)
     assert inputs.image is not None
     all_points = evidence(inputs.image, inputs.points)
@@ -121,11 +121,11 @@ def test_of_frames_that_say_nothing_three_are_read(frame: FrameOnDisk) -> None:
     request = RefineRequest.from_fields(
         image=frame.image, sparse=frame.sparse, model=str(frame.model), checkpoint=frame.checkpoint
     )
-    inputs = read_inputs(request)
+    inputs = read_requested(request)
     few = replace(inputs, points=inputs.points.select(torch.arange(60) < 5))
     read = []
 
-    def group() -> Iterator[Inputs]:
+    def group() -> Iterator[Frame]:
         for number in range(10):
             read.append(number)
             yield few

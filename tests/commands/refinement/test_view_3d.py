@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.outputs import LARGEST_VIEW, _rays, _stride
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.lens import rays_of

@@ -13,8 +13,8 @@ pytest.importorskip("rosbags")
 
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.sparse.bag_frames import RECORD, FramesRequest, write_frames
-from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scan_points import read_scan_points
+from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import FileFormatError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration

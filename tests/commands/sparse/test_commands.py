@@ -18,8 +18,8 @@ from pnpdepth_cli.commands.sparse.make import (
     sample_depth,
     simulate_scan,
 )
-from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scan_points import read_scan_points
+from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import (
     OutputError,
     PnpDepthError,

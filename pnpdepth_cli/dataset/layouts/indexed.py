@@ -17,11 +17,17 @@ from pathlib import Path
 
 import numpy as np
 
+from pnpdepth_cli.dataset.frame_files import (
+    IMAGE_SUFFIXES,
+    FrameFiles,
+    Unmatched,
+    as_pose,
+    find_files,
+)
+from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.colmap_model import model_files, read_model
-from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Frame, Unmatched, as_pose, find_files
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout
 from pnpdepth_cli.io.poses import read_trajectory
 
 _ASSOCIATIONS = "associations.txt"
@@ -38,7 +44,7 @@ def _is_tum(root: Path) -> bool:
     return (root / _ASSOCIATIONS).is_file() or all((root / name).is_file() for name in names)
 
 
-def _of_tum(root: Path) -> Iterator[Frame | Unmatched]:
+def _of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
     """One frame for each image with a depth image within 0.02 s; each is used once."""
     poses = root / "groundtruth.txt"
     trajectory = read_trajectory(poses) if poses.is_file() else None
@@ -63,7 +69,7 @@ def _of_tum(root: Path) -> Iterator[Frame | Unmatched]:
                     yield Unmatched(path=path, why=why, spare=True)
     for (time_s, image_path), (_, depth_path) in pairs:
         pose = None if trajectory is None else trajectory.at(time_s, _LONGEST_POSE_GAP_S)
-        yield Frame(
+        yield FrameFiles(
             name=image_path.stem,
             image=image_path,
             gt=depth_path,
@@ -124,7 +130,7 @@ def _colmap_models(root: Path) -> list[Path]:
     return found if (root / "images").is_dir() else []
 
 
-def _of_colmap(root: Path) -> Iterator[Frame | Unmatched]:
+def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
     """One frame for each registered image that exists."""
     models = [read_model(folder) for folder in _colmap_models(root)]
     model, photos = max(models, key=lambda other: len(other.images)), root / "images"
@@ -146,7 +152,7 @@ def _of_colmap(root: Path) -> Iterator[Frame | Unmatched]:
             continue
         pose = as_pose(np.column_stack([turn, -turn @ image.translation]))
         stem = Path(name).with_suffix("").as_posix()
-        yield Frame(name=stem, image=path, sparse=model.folder, pose=pose)
+        yield FrameFiles(name=stem, image=path, sparse=model.folder, pose=pose)
 
 
 COLMAP = Layout(matches=_colmap_models, frames=_of_colmap, needs=("images", "sparse/*/cameras.*"))

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, Hdf5Array, Source
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
-from pnpdepth_cli.io.dataset import IMAGE_SUFFIXES, Hdf5Array, Source
 from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
 from pnpdepth_cli.io.rgb import read_rgb

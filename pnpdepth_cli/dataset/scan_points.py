@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Extrinsics
-from pnpdepth_cli.commands.sparse.options import METRES, ScanOptions
+from pnpdepth_cli.dataset.read_options import METRES, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from pnpdepth_cli.dataset.frame_files import FrameFiles, name_problem
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset import Frame, name_problem
 from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.data_sets import read_frames
 from tests.empty_files import touch
 
 
-def frames_named(folder: Path, *names: str) -> list[Frame]:
+def frames_named(folder: Path, *names: str) -> list[FrameFiles]:
     (folder / "i.png").touch()
     path = folder / "m.jsonl"
     path.write_text("".join(json.dumps({"image": "i.png", "name": n}) + "\n" for n in names))
@@ -44,7 +44,7 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
     from_json, from_csv = (read_frames(tmp_path / name) for name in ("m.jsonl", "m.csv"))
     assert from_json == from_csv
     assert from_csv == [
-        Frame(
+        FrameFiles(
             name="first",
             image=tmp_path / "i.png",
             sparse=tmp_path / "s.bin",

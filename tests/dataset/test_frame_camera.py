@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.frame_camera import (
+from pnpdepth_cli.dataset.frame_camera import (
     camera_from_json,
     camera_of_file,
     camera_to_json,
 )
-from pnpdepth_cli.commands.sparse.options import ScanOptions
+from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import pixels_of, unproject

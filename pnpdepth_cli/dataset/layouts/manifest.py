@@ -18,10 +18,10 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
+from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import FileFormatError, UsageError
-from pnpdepth_cli.io.dataset import Frame, Unmatched
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Layout
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 _PATHS = ("image", "sparse", "gt", "calib", "mask")
@@ -46,7 +46,7 @@ _VALUES: dict[str, Callable[[str], Any]] = {
 """What a text becomes, by column; ValueError and our errors say what is wrong."""
 
 
-def _frames(root: Path) -> list[Frame | Unmatched]:
+def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     """A frame for each line of the file; missing files are broken.
 
     Raises:
@@ -57,7 +57,7 @@ def _frames(root: Path) -> list[Frame | Unmatched]:
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{root} is not a text file; give CSV or JSON lines") from error
     rows = _csv_rows if root.suffix.lower() == ".csv" else _json_rows
-    frames: dict[int, Frame] = {}
+    frames: dict[int, FrameFiles] = {}
     broken = []
     for number, row in rows(root, text):
         files, values = _parts(root.parent, f"{root}, line {number}", row)
@@ -68,9 +68,9 @@ def _frames(root: Path) -> list[Frame | Unmatched]:
         masks = (files.pop("mask"),) if "mask" in files else ()
         values["gt_other_size"] = values.pop("gt_size_ok", False)
         values["part"] = values.pop("protocol", WHOLE)
-        frames[number] = Frame(**{"name": "", "masks": masks, **files, **values})
+        frames[number] = FrameFiles(**{"name": "", "masks": masks, **files, **values})
     named = _named(list(frames.values()))
-    first: dict[str, Frame] = {}
+    first: dict[str, FrameFiles] = {}
     for number, frame in zip(frames, named, strict=True):
         if first.setdefault(frame.name.casefold(), frame) is not frame:
             raise FileFormatError(
@@ -123,7 +123,7 @@ def _parts(folder: Path, where: str, row: dict[str, Any]) -> tuple[dict[str, Pat
     return files, values
 
 
-def _named(frames: list[Frame]) -> list[Frame]:
+def _named(frames: list[FrameFiles]) -> list[FrameFiles]:
     """All with names: by the stem, or by the path if stems are not unique."""
     paths = [frame.image or frame.sparse for frame in frames if not frame.name]
     files = [path for path in paths if isinstance(path, Path)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.frame_camera import Pose, camera_of_frame
-from pnpdepth_cli.commands.refinement.neighbours import read_neighbours
-from pnpdepth_cli.commands.refinement.request import FrameFiles, RefineRequest
-from pnpdepth_cli.commands.sparse.colmap_points import read_colmap_points
-from pnpdepth_cli.commands.sparse.options import METRES, ScanOptions
-from pnpdepth_cli.commands.sparse.scan_points import SparseDepth, read_scan_points
-from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
-from pnpdepth_cli.frames.frame import Frame, Register, registration_to_make, tensor_of
-from pnpdepth_cli.io.dataset import SCAN_ONLY_SUFFIXES, Hdf5Array, Source, file_of
-from pnpdepth_cli.io.dataset.reading import (
+from pnpdepth_cli.dataset.arrays import (
     check_same_view,
     depth_of,
     masked,
@@ -29,6 +19,20 @@ from pnpdepth_cli.io.dataset.reading import (
     moved_to,
     rgb_of,
 )
+from pnpdepth_cli.dataset.colmap_points import read_colmap_points
+from pnpdepth_cli.dataset.frame_camera import camera_of_frame
+from pnpdepth_cli.dataset.frame_files import (
+    SCAN_ONLY_SUFFIXES,
+    FrameFiles,
+    Hdf5Array,
+    Source,
+    file_of,
+)
+from pnpdepth_cli.dataset.neighbours import read_neighbours
+from pnpdepth_cli.dataset.read_options import METRES, ReadOptions, ScanOptions
+from pnpdepth_cli.dataset.scan_points import SparseDepth, read_scan_points
+from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.frames.frame import Frame, Register, registration_to_make, tensor_of
 from pnpdepth_cli.io.depth import (
     describe_range,
     implausible,
@@ -47,6 +51,7 @@ from pnpdepth_cli.sensors import (
     occluded_in_map,
     sample_points,
 )
+from pnpdepth_cli.settings import Settings
 
 ImageArray = NDArray[np.float32]
 
@@ -57,113 +62,109 @@ _MIN_COMPARED = 10  # fewer points decide nothing
 _SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, have x and y swapped
 
 
-@dataclass(frozen=True, kw_only=True)
-class Inputs(Frame):
-    """A frame as it was read; `points` are those to use, with the neighbours'."""
+def read_frame(
+    files: FrameFiles,
+    options: ReadOptions,
+    *,
+    seed: int = 0,
+    holdout: float = 0.0,
+    needs_camera: bool = False,
+) -> Frame:
+    """Returns the frame of these files.
 
-    request: RefineRequest = field(default_factory=RefineRequest)
-    own: SparsePoints
-    """All points of the frame's own files, also those held out."""
-    sparse_scale: float | None = None
-    """Integers per metre of the sparse depth file. None if it holds metres."""
-    assumed: tuple[str, ...] = ()
-    """Files whose scale is assumed, and how they were read."""
-    record: dict[str, Any] = field(default_factory=dict)
-    """Files and digests, for a record."""
-    notes: tuple[str, ...] = ()
-    camera: Camera | None = None
-    """The camera in pixels of the image frame. None: unknown."""
-    pose: Pose | None = None
-    """From the camera's frame to the world's. None: unknown."""
-    has_neighbours: bool = False
-
-
-def read_inputs(request: RefineRequest) -> Inputs:
-    """Returns the frame that is asked for.
+    Args:
+        files: The files of the frame.
+        options: How they are read.
+        seed: Random seed of points that are sampled, and of those that are held out.
+        holdout: Fraction of the points that is held out.
+        needs_camera: Whether the camera must be known, if need be from EXIF.
 
     Raises:
         InputError: A file cannot be used, or the files do not fit together.
     """
-    files, method, crop = request.files, request.method, request.files.part.apply
-    notes, record = list[str](), dict[str, Any]()
+    crop = files.part.apply
+    notes, sources = list[str](), dict[str, Any]()
     rgb: ImageArray | None = None
     gt: ImageArray | None = None
     whole: tuple[int, int] | None = None
-    gt_scale: float | None = None
+    # the image
     if files.image is not None:
         image, note = _read_image(files, files.image)
         whole, rgb = (image.shape[0], image.shape[1]), np.ascontiguousarray(crop(image))
-        record["image"] = _file_record(files.image)
+        sources["image"] = _file_record(files.image)
         notes += [f"image: {note}"] if note else []
+    # the ground truth, which has the image's size
+    truth_reading: Reading | None = None
     truth_notes: list[str] = []
     if files.gt is not None:
-        truth, of_truth, truth_notes = _read_ground_truth(request, files, files.gt, whole)
-        gt, gt_scale = np.ascontiguousarray(crop(truth.values)), truth.reading.scale
+        truth, of_truth, truth_notes = _read_ground_truth(files, options, files.gt, whole)
+        gt, truth_reading = np.ascontiguousarray(crop(truth.values)), truth.reading
         if whole not in (None, truth.values.shape):
             raise _size_error(files, truth.values.shape, whole)
         if not bool((gt > 0).any()):
             raise InputError(f"ground truth {files.gt} has no pixel with known depth")
+    # the sparse depth
     if files.sparse is None:
-        sparse = _sampled(files, rgb, gt, gt_scale, method.seed)
+        scale = truth_reading and truth_reading.scale
+        sparse = _sampled(files, options, rgb, gt, scale, seed)
     else:
-        sparse = _read_sparse(request, files, whole)
-    own, far = _without_far_points(sparse)
+        sparse = _read_sparse(files, options, whole)
+    given, far = _without_far_points(sparse)
     if gt is not None and sparse.unit != METRES:
         raise UsageError(
             f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
             " --unit-scale, or leave out --gt"
         )
-    if gt is not None and gt.shape != own.size:
-        raise _size_error(files, gt.shape, own.size)
-    record["sparse"] = sparse.record
+    if gt is not None and gt.shape != given.size:
+        raise _size_error(files, gt.shape, given.size)
+    sources["sparse"] = sparse.record
     notes += (*sparse.notes, *far, *truth_notes)
     if files.gt is not None:
-        record["gt"] = of_truth
+        sources["gt"] = of_truth
         size = whole or (truth.values.shape[0], truth.values.shape[1])
     else:
-        size = whole or own.size
-    readings = {"gt": None if files.gt is None else truth.reading, "sparse": sparse.reading}
-    camera, of_camera = camera_of_frame(request, sparse, size)
-    used, held_out = _split(own, request.hold_out.holdout, method.seed)
+        size = whole or given.size
+    # the camera, and with it the points of neighbouring frames
+    camera, of_camera = camera_of_frame(files, options, sparse, size, needs_camera=needs_camera)
+    used, held_out = _split(given, holdout, seed)
     points, neighbours, lost = read_neighbours(
-        files, used, camera, lambda other: _points_of(request, other, size)
+        files, used, camera, lambda other: _points_of(other, options, size, seed)
     )
+    # the ground truth against the sparse depth
+    readings = {"gt": truth_reading, "sparse": sparse.reading}
     if gt is not None and files.sparse is not None:
-        depth = own.scatter()[0, 0].numpy()
+        depth = given.scatter()[0, 0].numpy()
         notes += _leak_warning(depth, gt)
         by_option = {"--depth-scale": readings["sparse"], "gt_scale of a list": readings["gt"]}
         notes += _scale_warning(depth, gt, by_option)
     notes += (*of_camera, *lost)
     if neighbours:
-        record["neighbours"] = neighbours
-    return Inputs(
-        request=request,
+        sources["neighbours"] = neighbours
+    return Frame(
         rgb=None if rgb is None else tensor_of(rgb),
         points=points,
-        own=own,
+        given=given,
         held_out=held_out,
-        register=_register(request),
+        register=_register(files, options),
         gt=gt,
-        sparse_scale=sparse.reading.scale,
+        depth_scale=sparse.reading.scale,
         assumed=tuple(f"{side}: {r}" for side, r in readings.items() if r and r.assumed),
-        record=record,
+        sources=sources,
         notes=tuple(notes),
         unit=sparse.unit,
         camera=camera,
         pose=sparse.pose,
-        has_neighbours=bool(neighbours),
     )
 
 
-def _register(request: RefineRequest) -> Register:
+def _register(files: FrameFiles, options: ReadOptions) -> Register:
     """How the image is to be moved. A calibrated scan and SfM points are registered."""
-    files = request.files
     calibrated = files.sparse is not None and (
-        files.sparse.is_dir() or files.scan.describes(files.sparse)
+        files.sparse.is_dir() or options.scan.describes(files.sparse)
     )
-    if calibrated and files.registration == "auto":
+    if calibrated and options.registration == "auto":
         return None
-    return registration_to_make(files.registration, request.method)
+    return registration_to_make(options.registration, Settings())
 
 
 def _split(points: SparsePoints, fraction: float, seed: int) -> tuple[SparsePoints, SparsePoints]:
@@ -180,19 +181,21 @@ def _split(points: SparsePoints, fraction: float, seed: int) -> tuple[SparsePoin
     return points.select(~mask), points.select(mask)
 
 
-def _points_of(request: RefineRequest, files: FrameFiles, size: tuple[int, int]) -> SparsePoints:
+def _points_of(
+    files: FrameFiles, options: ReadOptions, size: tuple[int, int], seed: int
+) -> SparsePoints:
     """The points of another frame of the sequence, read or sampled as it does itself."""
     if files.sparse is not None:
-        return _read_sparse(request, files, size).points
+        return _read_sparse(files, options, size).points
     crop = files.part.apply
     rgb: ImageArray | None = None
     gt: ImageArray | None = None
     if files.image is not None:
         rgb = np.ascontiguousarray(crop(_read_image(files, files.image)[0]))
     if files.gt is not None:
-        truth, _, _ = _read_ground_truth(request, files, files.gt, size)
+        truth, _, _ = _read_ground_truth(files, options, files.gt, size)
         gt = np.ascontiguousarray(crop(truth.values))
-    return _sampled(files, rgb, gt, None, request.method.seed).points
+    return _sampled(files, options, rgb, gt, None, seed).points
 
 
 def _read_image(files: FrameFiles, source: Source) -> tuple[ImageArray, str | None]:
@@ -204,31 +207,23 @@ def _read_image(files: FrameFiles, source: Source) -> tuple[ImageArray, str | No
 
 
 def _read_ground_truth(
-    request: RefineRequest, files: FrameFiles, source: Source, size: tuple[int, int] | None
+    files: FrameFiles, options: ReadOptions, source: Source, size: tuple[int, int] | None
 ) -> tuple[DepthFile, dict[str, Any], list[str]]:
     """The ground truth of an image (H, W), what a record keeps of it, and lines for a person."""
     if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
-        options = _scan_options(request, files)
-        scan = read_scan_points(source, options, size, files.image_file)
+        scan = read_scan_points(source, options.scan.over(files), size, files.image_file)
         truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
         return truth, scan.record, [note.replace("sparse:", "gt:", 1) for note in scan.notes]
     if isinstance(source, Hdf5Array):
         truth = DepthFile(values=depth_of(source), reading=Reading("HDF5"))
     else:
-        scale = files.gt_scale or files.depth_scale
-        truth = read_depth(source, scale=scale)
-    values = masked(truth.values, files.gt_masks)
-    if files.gt_size_ok and size is not None and values.shape != size:
+        truth = read_depth(source, scale=options.depth_scale or files.gt_scale)
+    values = masked(truth.values, files.masks)
+    if files.gt_other_size and size is not None and values.shape != size:
         values = moved_to(file_of(source), values, size)
     described = describe_range(values, truth.reading, noun="pixels", option="gt_scale of a list")
     record = _file_record(source) | {"read_as": str(truth.reading)}
     return replace(truth, values=values), record, [f"gt: {described}"]
-
-
-def _scan_options(request: RefineRequest, files: FrameFiles) -> ScanOptions:
-    """How a scan of these files is read; the paper's setting keeps occluded points."""
-    keep = files.scan.keep_occluded or request.method.preset is not None
-    return replace(files.scan, keep_occluded=keep)
 
 
 def _file_record(source: Source) -> dict[str, Any]:
@@ -237,32 +232,33 @@ def _file_record(source: Source) -> dict[str, Any]:
 
 def _sampled(
     files: FrameFiles,
+    options: ReadOptions,
     rgb: ImageArray | None,
     gt: ImageArray | None,
     scale: float | None,
     seed: int,
 ) -> SparseDepth:
     """Points sampled from the ground truth, whose file has so many integers per metre."""
-    if files.sample is None:
+    if options.sample is None:
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
     if gt is None:
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
-    seed = seed if files.sample_seed is None else files.sample_seed
+    seed = seed if options.sample_seed is None else options.sample_seed
     try:
-        points = sample_points(gt, files.sample, seed, image=rgb)
+        points = sample_points(gt, options.sample, seed, image=rgb)
     except UsageError as error:  # the pattern itself is good, this frame is too poor for it
         raise InputError(f"{files.gt}: {error}") from error
-    reading = Reading(f"{files.sample.kind} of the ground truth, seed {seed}", scale)
+    reading = Reading(f"{options.sample.kind} of the ground truth, seed {seed}", scale)
     return SparseDepth(
         points=points.tensors(),
         reading=reading,
-        record={"sampled_from": str(files.gt), **asdict(files.sample), "seed": seed},
+        record={"sampled_from": str(files.gt), **asdict(options.sample), "seed": seed},
         notes=(f"sparse: {describe_range(points.depth, reading)}",),
     )
 
 
 def _read_sparse(
-    request: RefineRequest, files: FrameFiles, size: tuple[int, int] | None
+    files: FrameFiles, options: ReadOptions, size: tuple[int, int] | None
 ) -> SparseDepth:
     """The sparse depth of an image (H, W), in the part of it that the protocol keeps."""
     path, image = files.sparse, files.image_file
@@ -270,18 +266,17 @@ def _read_sparse(
     if path.is_dir():
         if size is None or image is None:
             raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
-        if files.scan != ScanOptions():
+        if replace(options.scan, keep_occluded=False) != ScanOptions():
             raise UsageError(
                 f"{path} is a COLMAP model, so the options of a LiDAR scan do not apply"
             )
-        sparse = read_colmap_points(path, image, size, unit_scale=files.unit_scale)
-    elif files.unit_scale is not None:
+        sparse = read_colmap_points(path, image, size, unit_scale=options.unit_scale)
+    elif options.unit_scale is not None:
         raise UsageError(f"{path} is no COLMAP model, so --unit-scale does not apply")
-    elif files.scan.describes(path):
-        sparse = read_scan_points(path, _scan_options(request, files), size, image)
+    elif options.scan.describes(path):
+        sparse = read_scan_points(path, options.scan.over(files), size, image)
     else:
-        keep = _scan_options(request, files).keep_occluded
-        sparse = _read_points(files, path, size, keep_occluded=keep)
+        sparse = _read_points(files, options, path, size)
     points = sparse.points.tensors()
     # an array of the image's size that takes no memory, to find the size of the part
     part = files.part.apply(np.broadcast_to(np.False_, points.size)).shape
@@ -292,10 +287,10 @@ def _read_sparse(
 
 
 def _read_points(
-    files: FrameFiles, path: Path, image_size: tuple[int, int] | None, *, keep_occluded: bool
+    files: FrameFiles, options: ReadOptions, path: Path, image_size: tuple[int, int] | None
 ) -> SparseDepth:
     """The points of a depth map or a list, in the image."""
-    scale = files.sparse_scale or files.depth_scale
+    scale = options.depth_scale or files.sparse_scale
     visible, reading = read_sparse(path, size=image_size, scale=scale)
     depth = visible.depth
     size = image_size or visible.size
@@ -304,8 +299,9 @@ def _read_points(
     record = _file_record(path) | {"read_as": str(reading)}
     if visible.size != size:
         notes.append(f"sparse: {moved_note(visible.size, size)}")
-    if files.foreground is not None:
-        behind = behind_foreground(visible, *files.foreground)
+    keep_occluded = options.scan.keep_occluded
+    if options.foreground is not None:
+        behind = behind_foreground(visible, *options.foreground)
         visible, count = visible.select(~behind), int(behind.sum())
         record["dropped"] = {"behind the foreground": count}
         notes.append(f"sparse: dropped {count:,} points behind others, as the protocol does")

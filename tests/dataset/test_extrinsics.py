@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
-from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scan_points import (
+from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.scan_points import (
     _is_upright,
     check_direction,
     read_scan_points,

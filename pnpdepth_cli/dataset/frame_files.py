@@ -1,4 +1,4 @@
-"""One frame of a data set: its files, what is needed to read them, its name, and its cut."""
+"""The files of a frame, what is needed to read them, its name, and its cut."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.protocols import WHOLE, FramePart
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".exr")
 SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
@@ -58,20 +60,22 @@ def as_pose(matrix: NDArray[np.float64]) -> Pose:
 class Neighbour:
     """Another frame of the same sequence, whose points are moved into this one."""
 
-    frame: Frame
+    files: FrameFiles
     motion: Pose | None  # from the other camera's frame to this one's. None: to be estimated.
     poses: str  # where the motion is from, for a person
     apart: int  # frames between the two, at least 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame:
-    """One frame; parts that it does not have are None."""
+class FrameFiles:
+    """The files of one frame; parts that it does not have are None."""
 
-    name: str  # unique in its data set, and fit for a file name; slashes separate folders
+    name: str = ""
+    """Unique in its data set, and fit for a file name; slashes separate folders."""
     image: Source | None = None
     sparse: Path | None = None
-    """A depth file, a list of points, or a scan; None where points are sampled from `gt`."""
+    """A depth file, a list of points, a scan, or the folder of a COLMAP model. None where points
+    are sampled from `gt`."""
     gt: Source | None = None
     calib: Path | None = None  # the calibration, as `read_calibration` takes it
     camera: int | None = None  # which camera of the calibration
@@ -92,6 +96,11 @@ class Frame:
         for source in (self.image, self.sparse, self.gt, self.calib, *self.masks):
             if source is not None:
                 _check_no_nul(file_of(source))
+
+    @property
+    def image_file(self) -> Path | None:
+        """The file of the image; None for none, or for an array of a data set."""
+        return self.image if isinstance(self.image, Path) else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
+from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest, nyu, rows
+from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset import Frame, Unmatched
-from pnpdepth_cli.io.layouts import indexed, kitti, manifest, nyu, rows
-from pnpdepth_cli.io.layouts.layout import Layout
 
 __all__ = ["LAYOUTS", "Layout", "Listing", "find_layout", "list_frames"]
 
@@ -38,7 +38,7 @@ TABLE: dict[str, Layout] = {
 class Listing(NamedTuple):
     """What a data set holds."""
 
-    frames: list[Frame]  # complete frames, in a fixed order
+    frames: list[FrameFiles]  # complete frames, in a fixed order
     broken: list[Unmatched]  # files of frames that lack a part, or cannot be read
     spare: list[Unmatched]  # other files beside them
 
@@ -109,7 +109,7 @@ def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
     frames = [
         each if folder == root else replace(each, name=f"{folder.name}/{each.name}")
         for folder, each in found
-        if isinstance(each, Frame)
+        if isinstance(each, FrameFiles)
     ]
     lost = dict.fromkeys(each for _, each in found if isinstance(each, Unmatched))
     return layout, Listing(

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pnpdepth_cli.dataset.arrays import depth_of, read_image, shape_of
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Hdf5Array
+from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset import Frame, Hdf5Array
-from pnpdepth_cli.io.dataset.reading import depth_of, read_image, shape_of
-from pnpdepth_cli.io.layouts import list_frames
 from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.data_sets import ground_truth, nyu_h5, nyu_mat, read_frames
 from tests.empty_files import touch
@@ -18,7 +18,7 @@ from tests.empty_files import touch
 h5py = pytest.importorskip("h5py")
 
 
-def image_of(frame: Frame) -> np.ndarray:
+def image_of(frame: FrameFiles) -> np.ndarray:
     assert frame.image is not None
     return frame.part.apply(read_image(frame.image))
 

@@ -16,8 +16,8 @@ pytest.importorskip("rosbags")
 
 from pnpdepth_cli.commands.sparse.bag_frames import _some_frames
 from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
-from pnpdepth_cli.commands.sparse.options import ScanOptions
-from pnpdepth_cli.commands.sparse.scan_points import read_scan_points
+from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.scans import read_scan
 from tests.bags import View, write_bag

@@ -14,11 +14,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from pnpdepth_cli.dataset.arrays import shape_of
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Hdf5Array
+from pnpdepth_cli.dataset.layouts.layout import Files, Layout, row
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.dataset import Frame, Hdf5Array
-from pnpdepth_cli.io.dataset.reading import shape_of
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.layouts.layout import Files, Layout, row
 from pnpdepth_cli.protocols import NYU_PART, ODOMETRY_PART
 
 _WIDEST_KINECT = 1000  # pixels; NYU's frames have 640, KITTI's 1224 or more
@@ -55,14 +55,14 @@ def _labeled(root: Path) -> Path:
     return root if root.name == _LABELED else root / _LABELED
 
 
-def _of_mat(root: Path) -> Iterator[Frame]:
+def _of_mat(root: Path) -> Iterator[FrameFiles]:
     """The frames of the test set, or all without a split; numbered from 1."""
     path = _labeled(root)
     count = shape_of(path, "depths")[0]
     if count > _MOST_FRAMES:
         raise FileFormatError(f"{path} claims {count:,} frames; the official file has 1,449")
     for number in _split(path.parent, count) or range(1, count + 1):
-        yield Frame(
+        yield FrameFiles(
             name=f"{number:04}",
             image=Hdf5Array(path=path, name="images", axes=(2, 1, 0), index=number - 1),
             gt=Hdf5Array(path=path, name="depths", axes=(1, 0), index=number - 1),

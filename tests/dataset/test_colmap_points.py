@@ -12,16 +12,16 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.cli.main import run as run_command
-from pnpdepth_cli.commands.refinement.request import FrameFiles
-from pnpdepth_cli.commands.sparse import colmap_points
-from pnpdepth_cli.commands.sparse.colmap_points import read_colmap_points
+from pnpdepth_cli.dataset import colmap_points
+from pnpdepth_cli.dataset.colmap_points import read_colmap_points
+from pnpdepth_cli.dataset.layouts import list_frames
+from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.layouts import list_frames
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 from tests.commands.frames import FrameOnDisk, frame_on_disk, run
 
-PHOTOS = Path(__file__).parents[3] / "samples" / "photos"
+PHOTOS = Path(__file__).parents[2] / "samples" / "photos"
 METRES_PER_UNIT = 0.0876
 """Of the samples' model, found by comparison with their ground truth."""
 
@@ -54,7 +54,7 @@ def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.inf, np.nan])
 def test_a_unit_out_of_range_is_refused(wrong: float) -> None:
     with pytest.raises(UsageError, match="--unit-scale must be"):
-        FrameFiles(unit_scale=wrong)
+        ReadOptions(unit_scale=wrong)
 
 
 @pytest.mark.parametrize("orientation", [3, 6])

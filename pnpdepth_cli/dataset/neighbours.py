@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.request import FrameFiles
+from pnpdepth_cli.dataset.arrays import read_image
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Source, file_of
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset import Source, file_of
-from pnpdepth_cli.io.dataset.reading import read_image
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.io.dataset import (
+from pnpdepth_cli.dataset.frame_files import (
     IMAGE_SUFFIXES,
     SCAN_ONLY_SUFFIXES,
-    Frame,
+    FrameFiles,
     Unmatched,
     find_files,
     one_of_each,
@@ -27,7 +27,7 @@ _SUFFIXES = {
 """What a pattern of file names may end with, for any of these."""
 
 Files = dict[str, Path]
-"""Of one frame, by field of `Frame`."""
+"""Of one frame, by field of `FrameFiles`."""
 Fields = Mapping[str, Any] | Unmatched | None
 """More fields of a frame, why it is none, or None for one that is not wanted."""
 
@@ -37,7 +37,7 @@ class Layout:
     """How the files of a data set lie on disk."""
 
     matches: Callable[[Path], Any]  # true for a folder or file of this layout
-    frames: Callable[[Path], Iterable[Frame | Unmatched]]
+    frames: Callable[[Path], Iterable[FrameFiles | Unmatched]]
     """The frames of a folder or file that matches, and what is in no frame."""
     needs: tuple[str, ...] = ()
     """Patterns of what the folder or one in it holds, for the message of an unknown folder."""
@@ -97,7 +97,7 @@ def row(
     """Returns the layout of a data set whose parts lie in folders, with files of one stem.
 
     Args:
-        parts: By field of `Frame`, or "mask…" for its masks, "folder|other folder/*.png": the
+        parts: By field of `FrameFiles`, or "mask…" for its masks, "folder|other folder/*.png": the
             names of its files in the first of these folders that exists in a place. `*`, or groups
             of a regular expression, make the stem; `**` are paths in the folder and all folders in
             it. A part that ends with ? may be missing; every frame has the first.
@@ -128,7 +128,7 @@ def row(
 
     find_places = places or find
 
-    def frames(root: Path) -> Iterator[Frame | Unmatched]:
+    def frames(root: Path) -> Iterator[FrameFiles | Unmatched]:
         for place in find_places(root):
             fields_of = more(place)
             shared = {"calib": place / calib} if calib and (place / calib).is_file() else {}
@@ -143,7 +143,7 @@ def row(
                 elif extra is not None:
                     values = {**shared, **files, **fields, **extra}
                     masks = tuple(values.pop(key) for key in files if key.startswith("mask"))
-                    yield Frame(name=name(root, place, stem), masks=masks, **values)
+                    yield FrameFiles(name=name(root, place, stem), masks=masks, **values)
 
     missing = (*(kind.folders[0] for kind in wanted), *marks)
     return Layout(

@@ -21,9 +21,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pnpdepth_cli.dataset.frame_files import Unmatched, as_pose
+from pnpdepth_cli.dataset.layouts.layout import Fields, Files, Layout, row
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.dataset import Unmatched, as_pose
-from pnpdepth_cli.io.layouts.layout import Fields, Files, Layout, row
 from pnpdepth_cli.io.poses import PACKETS, read_poses
 from pnpdepth_cli.protocols import ODOMETRY_PART
 

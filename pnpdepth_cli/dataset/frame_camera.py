@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
-from pnpdepth_cli.commands.refinement.request import RefineRequest
-from pnpdepth_cli.commands.sparse.scan_points import SparseDepth, check_size
+from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.read_options import ReadOptions
+from pnpdepth_cli.dataset.scan_points import SparseDepth, check_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.rgb import read_focal_length
@@ -62,28 +63,33 @@ def camera_from_json(entry: Mapping[str, Any]) -> tuple[Camera, Pose | None]:
 
 
 def camera_of_frame(
-    request: RefineRequest, sparse: SparseDepth, size: tuple[int, int]
+    files: FrameFiles,
+    options: ReadOptions,
+    sparse: SparseDepth,
+    size: tuple[int, int],
+    *,
+    needs_camera: bool,
 ) -> tuple[Camera | None, list[str]]:
     """Returns the camera of the part of the frame that its protocol keeps, and lines for a person.
 
     The camera is None if it is unknown.
 
     Args:
-        request: What is asked for. EXIF is read only for a 3D view.
+        files: The files of the frame.
+        options: How they are read.
         sparse: The sparse depth, with the camera of the whole image if it came with one.
         size: (H, W) of the whole image.
+        needs_camera: Whether it must be known; only then it is taken from EXIF.
 
     Raises:
-        UsageError: A 3D view needs the camera, and nothing gives it.
+        UsageError: The camera is needed, and nothing gives it.
         SizeError: The calibration is of another image.
     """
-    files, image = request.files, request.files.image_file
+    image, scan = files.image_file, options.scan.over(files)
     known, notes = sparse.camera, list[str]()
-    if known is None and files.scan.calib is not None:
-        known, notes = camera_of_file(files.scan.calib, files.scan.camera, size, image)
-    elif known is None and files.camera_file is not None:
-        known, notes = camera_of_file(files.camera_file, files.camera_number, size, image)
-    if known is None and request.outputs.view_3d:
+    if known is None and scan.calib is not None:
+        known, notes = camera_of_file(scan.calib, scan.camera, size, image)
+    if known is None and needs_camera:
         known = None if image is None else camera_of_exif(image, size)
         if known is None:
             raise UsageError(

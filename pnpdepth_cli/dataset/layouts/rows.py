@@ -22,8 +22,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pnpdepth_cli.dataset.layouts.layout import Files, Layout, row
 from pnpdepth_cli.io.file_bytes import read_bytes
-from pnpdepth_cli.io.layouts.layout import Files, Layout, row
 
 
 def _joined(mark: str) -> Callable[[Path, Path, str], str]:

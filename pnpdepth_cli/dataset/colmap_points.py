@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.commands.sparse.options import METRES, MODEL_UNITS
-from pnpdepth_cli.commands.sparse.scan_points import SparseDepth
+from pnpdepth_cli.dataset.arrays import check_same_view, moved_note
+from pnpdepth_cli.dataset.read_options import METRES, MODEL_UNITS
+from pnpdepth_cli.dataset.scan_points import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.io.colmap_model import (
     ColmapModel,
@@ -17,7 +18,6 @@ from pnpdepth_cli.io.colmap_model import (
     name_in_model,
     read_model,
 )
-from pnpdepth_cli.io.dataset.reading import check_same_view, moved_note
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.formats import Reading

@@ -11,12 +11,13 @@ import pytest
 
 from pnpdepth_cli.commands.batch.frames import task_of
 from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.refinement.inputs import Inputs, read_inputs
+from pnpdepth_cli.commands.refinement.refine import read_requested
 from pnpdepth_cli.commands.refinement.request import RefineRequest, sample_pattern
+from pnpdepth_cli.dataset.arrays import masked, moved_to
+from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.layouts import LAYOUTS, find_layout, list_frames
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
-from pnpdepth_cli.io.dataset import Frame
-from pnpdepth_cli.io.dataset.reading import masked, moved_to
-from pnpdepth_cli.io.layouts import LAYOUTS, find_layout, list_frames
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.protocols import NYU_PART, ODOMETRY_PART, FramePart, find_protocol
 from tests.data_sets import (
     BENCHMARKS,
@@ -226,7 +227,7 @@ def test_associations_pair_images_and_depth(line: str, tmp_path: Path) -> None:
     (tmp_path / "associations.txt").write_text(f"# comment\n{line}\n")
     (tmp_path / "groundtruth.txt").write_text("1 5 0 0 0 0 0 1\n1.5 7 0 0 0 0 0 1\n")
     assert read_frames(tmp_path) == [
-        Frame(
+        FrameFiles(
             name="0",
             image=tmp_path / "rgb/0.png",
             gt=tmp_path / "depth/0.png",
@@ -257,12 +258,12 @@ def test_a_line_of_tum_that_means_nothing_is_named(
         read_frames(tmp_path)
 
 
-def inputs_of(frame: Frame, root: Path) -> Inputs:
+def inputs_of(frame: FrameFiles, root: Path) -> Frame:
     """The frame as a batch reads it; points are sampled where it has none."""
     pattern = None if frame.sparse is not None else sample_pattern("uniform", "20")
     refine = RefineRequest.from_fields(sample=pattern)
     request = BatchRequest(source=root, output=root / "out", refine=refine)
-    return read_inputs(task_of(request, frame).request)
+    return read_requested(task_of(request, frame).request)
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)

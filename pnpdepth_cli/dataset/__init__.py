@@ -1,0 +1,1 @@
+"""One frame on disk: layouts to `FrameFiles`, and files to a `Frame`."""
