@@ -96,6 +96,8 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
         with progress_bar("report", "frame") as show:
             report_eval.write_eval_report(html, evaluation, keys, on_frame=show)
         say(f"wrote {html / 'index.html'}")
-    unscored = evaluation.unscored()
-    if unscored is not None:
-        raise FramesFailedError(unscored)
+    if reasons := evaluation.unscored():
+        out, of = len(evaluation.frames) - len(evaluation.scored), len(evaluation.frames)
+        raise FramesFailedError(
+            f"{out:,} of {of:,} frames were not scored ({reasons}); the means are over the others"
+        )

@@ -31,6 +31,7 @@ from pnpdepth_cli.io.atomic import (
 from pnpdepth_cli.io.colours import LOGARITHMIC_FROM, DepthScale, Pixels, hex_colours
 from pnpdepth_cli.io.figure import resized
 from pnpdepth_cli.io.record import plain, read_json, write_json
+from pnpdepth_cli.measures import Measure
 
 PAGE = "index.html"
 IMAGES = "images"
@@ -43,19 +44,25 @@ _SMALL = 480  # smaller views are enlarged by a whole number, so that their pixe
 _QUALITY = 85
 
 
-def column(key: str, title: str, **shown: Any) -> dict[str, Any]:
-    """Returns a value of each frame, and how the page shows it.
+def column(measure: Measure, *, signed: bool = False, listed: bool = True) -> dict[str, Any]:
+    """Returns how the page shows a measure of each frame.
 
     Args:
-        key: Of the value.
-        title: Without the unit.
-        **shown: `unit` of value × `factor`; `decimals`; `percent`; `higher_is_better`; `signed` if
-            values below 0 are better and above 0 worse; `listed` in the list of frames, not only in
-            a frame's own view.
+        measure: Of the frames.
+        signed: Whether values below 0 are better and above 0 worse.
+        listed: Whether the list of frames has it, not only a frame's own view.
     """
-    defaults = {"unit": "", "decimals": 4, "factor": 1.0, "percent": False, "signed": False}
-    defaults |= {"higher_is_better": False, "listed": True}
-    return {"key": key, "title": title, **defaults, **shown}
+    return {
+        "key": measure.key,
+        "title": measure.title,
+        "unit": measure.table_unit,
+        "decimals": measure.decimals,
+        "factor": measure.shown_factor,
+        "percent": measure.percent,
+        "higher_is_better": measure.better == "higher",
+        "signed": signed,
+        "listed": listed,
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +71,6 @@ class Head:
 
     kind: str
     title: str
-    tiles: Sequence[tuple[str, str, str]] = ()
-    """Label, value and remark of the figures that are shown large."""
     facts: Sequence[tuple[str, str]] = ()
     notes: Sequence[str] = ()
     tables: Sequence[Any] = ()
@@ -150,8 +155,8 @@ def visible(text: str) -> str:
 
 def write_report(
     folder: Path, head: Head, frames: Iterable[Mapping[str, Any]], *, viewer: bool = False
-) -> int:
-    """Writes the page, removes images of frames that it does not have, and returns its size.
+) -> None:
+    """Writes the page.
 
     Args:
         folder: The report's folder.
@@ -160,14 +165,6 @@ def write_report(
             its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
     """
-    used = {VIEWER} if viewer else set[str]()
-
-    def shown() -> Iterator[Any]:
-        for frame in frames:
-            used.update(Path(view["src"]).name for view in frame.get("views", {}).values())
-            used.update([f"{frame['key']}_view.js"] if frame.get("view_mb") else [])
-            yield plain(frame)
-
     style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
     data = {
         "columns": head.columns,
@@ -179,20 +176,17 @@ def write_report(
         "depth_colours": hex_colours(DepthScale(low_m=1, high_m=2).paint(np.linspace(1, 2, 17))),
         "logarithmic_from": LOGARITHMIC_FROM,
     }
-    page = folder / PAGE
     parts = _environment().get_template("report.html").generate(
-        head=head, data=plain(data), frames=shown(), style=Markup(style), script=Markup(script),
-        policy=_policy(style, script, viewer=viewer), version=__version__,
+        head=head, data=plain(data), frames=map(plain, frames), style=Markup(style),
+        script=Markup(script), policy=_policy(style, script, viewer=viewer), version=__version__,
     )  # fmt: skip
     with (
-        atomic_path(page) as temporary,
+        atomic_path(folder / PAGE) as temporary,
         temporary.open("w", encoding="utf-8", newline="\n") as file,
     ):
         file.writelines(parts)
     if viewer:
         _write_text(folder / VIEWER, _source("../three/three.min.js") + "\n" + _source(VIEWER))
-    _remove_unused(folder, used)
-    return page.stat().st_size
 
 
 def save_views(images: Path, key: str, views: Mapping[str, Pixels]) -> dict[str, dict[str, Any]]:

@@ -145,7 +145,7 @@ def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
     assert Path("out/indoor_depth.png").stat().st_mtime_ns == before
 
     scored = result(capsys, f"eval out/indoor_depth.png {SAMPLES}/indoor/gt.png")
-    assert scored["frames"][0]["values"]["mae"] == pytest.approx(mae["indoor"], rel=1e-3)
+    assert scored["frames"][0]["scores"]["after"]["mae"] == pytest.approx(mae["indoor"], rel=1e-3)
 
     table = output(capsys, "compare out/summary.json out/summary.json --csv table.csv")
     assert "MAE" in table

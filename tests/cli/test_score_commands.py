@@ -42,7 +42,7 @@ def test_json_is_the_whole_result_with_every_option(
     options = "--protocol garg --max-depth 10 --scale-by median --delta 1.06 --json"
     assert code_of("eval", "out", "gt", *options.split()) == 0
     record = json.loads(capsys.readouterr().out)
-    assert record["protocol"]["scoring"]["max_depth"] == 10
+    assert record["scoring"]["max_depth"] == 10
     assert record["mean"]["mre"] == pytest.approx(0, abs=1e-6)  # predictions are 1.1 × too far
     assert record["frames"][0]["factor"] == pytest.approx(1 / 1.1)
 

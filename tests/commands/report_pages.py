@@ -23,12 +23,10 @@ def page_data(folder: Path) -> dict[str, Any]:
         (part,) = re.findall(f'(?s)id="{element}">(.*?)</[du]l>', head) or [""]
         return _found(f"<{first}>(.*?)</{first}><{second}>(.*?)</{second}>", part)
 
-    (tiles,) = re.findall('(?s)id="tiles">(.*?)</dl>', head)
     return {
         **data["head"],
         "frames": data["frames"],
         "title": unescape(re.findall('id="title">(.*?)<', head)[0]),
-        "tiles": _found('<dt>(.*?)</dt><dd>(.*?)</dd><dd class="remark">(.*?)</dd>', tiles),
         "facts": pairs("facts", "dt", "dd"),
         "without": pairs("reasons", "strong", "span"),
         "notes": re.findall("<li[^>]*>(.*?)</li>", head.split('id="notes">')[1].split("</ul>")[0]),
@@ -49,7 +47,7 @@ def _table(text: str) -> dict[str, Any]:
         for row in re.findall("(?s)<tr>(.*?)</tr>", text)
     )
     return {
-        "caption": unescape(re.findall("<caption>(.*?)<", text)[0]), "header": header, "rows": rows
+        "title": unescape(re.findall("<caption>(.*?)<", text)[0]), "header": header, "rows": rows
     }  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from pnpdepth_cli.io.report import (
     link_image,
     save_view_3d,
     visible,
+    whole_report,
     write_report,
 )
 from tests.commands.report_pages import page_data
@@ -91,21 +92,20 @@ def test_frames_are_taken_one_by_one(tmp_path: Path) -> None:
             seen.append((tmp_path / "index.html").exists())
             yield frame(f"{number:04}")
 
-    size = write_report(tmp_path, HEAD, frames())
+    write_report(tmp_path, HEAD, frames())
     assert not any(seen)
-    assert size == (tmp_path / "index.html").stat().st_size
     assert len(page_data(tmp_path)["frames"]) == 3000
 
 
-def test_images_of_no_frame_are_removed_and_nothing_else(tmp_path: Path) -> None:
+def test_images_of_the_report_before_are_removed_and_nothing_else(tmp_path: Path) -> None:
     images = begin_report(tmp_path, {})
     kept, stale = image_key("a"), image_key("b")
     for name in (f"{kept}_map.jpg", f"{stale}_map.jpg", "mine.jpg", f"{stale}.txt"):
         (images / name).write_bytes(b"x")
-    shown = frame("a", kept) | {"views": {"map": {"src": f"images/{kept}_map.jpg"}}}
-    write_report(tmp_path, HEAD, [shown, frame("without")])
-    left = {path.name for path in images.iterdir()}
-    assert left == {f"{kept}_map.jpg", "mine.jpg", f"{stale}.txt"}
+    with whole_report(tmp_path) as temporary:
+        (begin_report(temporary, {}) / f"{kept}_map.jpg").write_bytes(b"y")
+    left = {path.name: path.read_bytes() for path in images.iterdir()}
+    assert left == {f"{kept}_map.jpg": b"y", "mine.jpg": b"x", f"{stale}.txt": b"x"}
 
 
 def test_a_linked_image_is_the_file_itself_or_on_another_disk_a_copy(

@@ -284,12 +284,23 @@ def read_run(text: str) -> Run:
     record, name = read_json(path), path.stem
     if path.name == _SUMMARY:
         name = path.resolve().parent.name
+    if record.get("command") == "eval" and stage == "before":
+        raise UsageError(f"{path} is of eval, which has no before; leave out :before")
     try:
-        if record.get("command") == "eval":
-            if stage == "before":
-                raise UsageError(f"{path} is of eval, which has no before; leave out :before")
-            return _evaluated(record, name, text)
-        return _refined(record, f"{name}:before" if stage == "before" else name, text, stage)
+        frames = _scored_frames(record["frames"], stage)
+        measures = [Measure.from_json(entry) for entry in record.get("measures", ())]
+        return Run(
+            name=f"{name}:before" if stage == "before" else name,
+            path=text,
+            measures=[
+                measure
+                for measure in measures or MEASURES
+                if all(measure.key in frame.values for frame in frames.values())
+            ],
+            scoring=dict(record.get("scoring") or scoring_of(find_protocol("paper"))),
+            frames=frames,
+            varied={str(key): str(value) for key, value in record.get("varied", {}).items()},
+        )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         fact = one_line(repr(error))
         raise FileFormatError(
@@ -298,53 +309,26 @@ def read_run(text: str) -> Run:
         ) from error
 
 
-def _evaluated(record: Mapping[str, Any], name: str, path: str) -> Run:
-    """What `eval --json` printed."""
-    return Run(
-        name=name,
-        path=path,
-        measures=[Measure.from_json(entry) for entry in record["measures"]],
-        scoring=dict(record["protocol"]["scoring"]),
-        frames={
-            str(frame["name"]): RunFrame(
-                values=_numbers(frame["values"]),
-                before={},
-                pixels=int(frame["pixels"]),
-                known=int(frame["known"]),
-                group=str(frame["group"]),
-            )
-            for frame in record["frames"]
-            if frame["error"] is None
-        },
-        varied={},
-    )
-
-
-def _refined(record: Mapping[str, Any], name: str, path: str, stage: str) -> Run:
-    """The scores in a batch's summary."""
-    entries = [entry for entry in record["frames"] if entry.get("scores") is not None]
-    if not entries:
+def _scored_frames(entries: Sequence[Mapping[str, Any]], stage: str) -> dict[str, RunFrame]:
+    """The frames with scores by name; their counts stand among the scores or beside them."""
+    scored = [entry for entry in entries if entry.get("scores") is not None]
+    if not scored:
         raise ValueError("no frame has scores")
-    groups = groups_by_name([entry["name"] for entry in entries])
     frames = {}
-    for entry, group in zip(entries, groups, strict=True):
-        values, before = (_numbers(entry["scores"][side]) for side in (stage, "before"))
+    groups = groups_by_name([entry["name"] for entry in scored])
+    for entry, group in zip(scored, groups, strict=True):
+        scores = entry["scores"]
+        counts = {**entry, **scores[stage]}
+        pixels, coverage = counts["pixels"], counts["coverage"]
         frames[entry["name"]] = RunFrame(
-            values=values,
-            before=before,
-            pixels=round(values["pixels"]),
-            known=round(values["pixels"] / values["coverage"]) if values["coverage"] else 0,
-            group=entry.get("group", group),
+            values=_numbers(scores[stage]),
+            before=_numbers(scores.get("before", {})),
+            pixels=round(pixels),
+            known=round(counts.get("known", pixels / coverage if coverage else 0)),
+            group=str(entry.get("group", group)),
         )
-    return Run(
-        name=name,
-        path=path,
-        measures=[m for m in MEASURES if all(m.key in each.values for each in frames.values())],
-        scoring=scoring_of(find_protocol("paper")),
-        frames=frames,
-        varied={str(name): str(value) for name, value in dict(record.get("varied", {})).items()},
-    )
+    return frames
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    return {key: math.nan if value is None else float(value) for key, value in dict(values).items()}
+    return {key: math.nan if value is None else float(value) for key, value in values.items()}

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
@@ -33,7 +34,7 @@ from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.measures import FrameMeans
+from pnpdepth_cli.measures import FrameMeans, Measure
 
 _LISTED = 3
 _OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
@@ -60,16 +61,6 @@ class Evaluation:
         return tuple(frame for frame in self.frames if frame.scored)
 
     @property
-    def missing(self) -> tuple[FrameScores, ...]:
-        """The frames without a prediction."""
-        return tuple(frame for frame in self.frames if frame.missing)
-
-    @property
-    def failed(self) -> tuple[FrameScores, ...]:
-        """The frames with a faulty file."""
-        return tuple(frame for frame in self.frames if not frame.scored and not frame.missing)
-
-    @property
     def coverage(self) -> float:
         """Fraction of all ground truth, of frames without prediction too, that has a prediction."""
         known = sum(frame.known for frame in self.frames)
@@ -85,53 +76,37 @@ class Evaluation:
         )
         return "; ".join([self.request.describe(), *readings])
 
-    def unscored(self) -> str | None:
-        """Returns one line on the frames that are in no mean; None if all are."""
-        out = len(self.frames) - len(self.scored)
-        if not out:
-            return None
-        return (
-            f"{out:,} of {len(self.frames):,} frames were not scored"
-            f" ({len(self.missing):,} without prediction, {len(self.failed):,} with a faulty file);"
-            f" the means are over the other {len(self.scored):,}"
-        )
+    def unscored(self) -> str:
+        """Returns why frames are in no mean; empty if all are."""
+        missing = sum(frame.missing for frame in self.frames)
+        faulty = len(self.frames) - len(self.scored) - missing
+        reasons = [f"{missing:,} without prediction"] * bool(missing)
+        return ", ".join([*reasons, *[f"{faulty:,} with a faulty file"] * bool(faulty)])
 
     def as_record(self) -> dict[str, Any]:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
         request = self.request
-        bounds = None
-        if self.interval is not None:
-            bounds = {
-                "level": LEVEL,
-                "clusters": self.clusters.count,
-                "unit": self.clusters.unit,
-                "low": {key: low for key, (low, _) in self.interval.items()},
-                "high": {key: high for key, (_, high) in self.interval.items()},
-            }
         record = {
             "command": "eval",
             "versions": versions(),
-            "inputs": {
-                "prediction": request.prediction,
-                "truth": request.ground_truth,
-                "scales": {"prediction": request.pred_scale, "truth": request.gt_scale},
-            },
-            "protocol": {
-                "name": request.protocol,
-                "described": request.describe(),
-                "scoring": request.scoring(),
-            },
+            "prediction": request.prediction,
+            "truth": request.ground_truth,
+            "scales": {"prediction": request.pred_scale, "truth": request.gt_scale},
+            "protocol": request.protocol,
+            "described": request.describe(),
+            "scoring": request.scoring(),
             "measures": [measure.to_json() for measure in request.measures],
             "counts": {
                 "frames": len(self.frames),
                 "scored": len(self.scored),
-                "missing": len(self.missing),
-                "failed": len(self.failed),
+                "missing": sum(frame.missing for frame in self.frames),
                 "pixels": sum(frame.pixels for frame in self.frames),
                 "coverage": self.coverage,
             },
             "mean": self.mean,
-            "interval": bounds,
+            "interval": self.interval,
+            "level": LEVEL,
+            "clusters": {"count": self.clusters.count, "unit": self.clusters.unit},
             "uncertainty": self.uncertainty,
             "frames": [frame_record(frame) for frame in self.frames],
             "notes": self.notes,
@@ -143,12 +118,10 @@ class Evaluation:
 def frame_record(frame: FrameScores) -> dict[str, Any]:
     """Returns a frame's row as files have it."""
     pair, fit = frame.pair, frame.fit
-    paths = {"prediction": pair.prediction, "truth": pair.frame.gt, "sparse": pair.sparse}
-    paths |= {"image": pair.image}
     return {
         "name": frame.name,
         "group": pair.group,
-        **{name: None if path is None else str(path) for name, path in paths.items()},
+        **{name: None if path is None else str(path) for name, path in pair.paths.items()},
         "pixels": frame.pixels,
         "known": frame.known,
         "coverage": frame.coverage,
@@ -156,7 +129,7 @@ def frame_record(frame: FrameScores) -> dict[str, Any]:
         "median_ratio": frame.ratio,
         "factor": fit and fit.factor,
         "shift": fit and fit.shift,
-        "values": frame.values,
+        "scores": {"after": frame.values} if frame.scored else None,
         "error": frame.error,
     }
 
@@ -177,7 +150,7 @@ def evaluate(
             concerns all frames.
     """
     pairs, notes = pair_frames(request.prediction, request.ground_truth, part=request.rules.part)
-    single = request.prediction.is_file() and len(pairs) == 1
+    single = request.prediction.is_file()
 
     def score(pair: FramePair) -> FrameScores:
         try:
@@ -197,33 +170,38 @@ def evaluate(
     scored = [row for row in rows if row.scored]
     if not scored:
         raise InputError(f"no frame could be scored; the first: {rows[0].error}")
-    keys = [measure.key for measure in request.measures]
-    values = np.array([[row.values[key] for key in keys] for row in scored])
+    # means, and how sure they are over frames that count as independent
+    values = np.array([[row.values[measure.key] for measure in request.measures] for row in scored])
     clusters = find_clusters([row.pair.group for row in scored], values)
     mean = FrameMeans(row.values for row in scored).means()
     if request.is_devkit:
-        mean = dict(zip(keys, devkit_mean(values).tolist(), strict=True))
-    bounds, no_interval = None, []
-    if clusters.count >= MIN_CLUSTERS:
-        low, high = interval(lambda means: means, [values], clusters)
-        highest = [1.0 if measure.percent else math.inf for measure in request.measures]
-        ends = zip(np.maximum(low, 0.0).tolist(), np.minimum(high, highest).tolist(), strict=True)
-        bounds = dict(zip(keys, ends, strict=True))
-    elif len(scored) > 1:
-        no_interval.append(
+        mean = dict(zip(mean, devkit_mean(values).tolist(), strict=True))
+    if len(scored) > 1 and clusters.count < MIN_CLUSTERS:
+        notes.append(
             f"no interval: {clusters.describe()} are too few to tell how sure the means are;"
             f" {MIN_CLUSTERS} are needed"
         )
-    uncertainties = [row.uncertainty for row in scored if row.uncertainty is not None]
     return Evaluation(
         request=request,
         frames=tuple(rows),
         mean=mean,
-        interval=bounds,
+        interval=_intervals(request.measures, values, clusters),
         clusters=clusters,
-        uncertainty=summarise_uncertainty(uncertainties),
-        notes=(*notes, *_reading_notes(rows), *_warnings(rows, request), *no_interval),
+        uncertainty=summarise_uncertainty([row.uncertainty for row in scored if row.uncertainty]),
+        notes=(*notes, *_reading_notes(rows), *_warnings(rows, request)),
     )
+
+
+def _intervals(
+    measures: Sequence[Measure], values: NDArray[np.float64], clusters: Clusters
+) -> dict[str, tuple[float, float]] | None:
+    """The ends of the interval of each mean within what the measure can be."""
+    if clusters.count < MIN_CLUSTERS:
+        return None
+    low, high = interval(lambda means: means, [values], clusters)
+    highest = [1.0 if measure.percent else math.inf for measure in measures]
+    ends = zip(np.maximum(low, 0.0).tolist(), np.minimum(high, highest).tolist(), strict=True)
+    return dict(zip((measure.key for measure in measures), ends, strict=True))
 
 
 def readings_of(rows: Sequence[FrameScores], side: str) -> list[tuple[Reading, int]]:
@@ -238,7 +216,7 @@ def _reading_notes(rows: Sequence[FrameScores]) -> list[str]:
         texts = [
             reading.source
             + (f"; {option} to change" if reading.assumed else "")
-            + (f" ({count:,} files)" if count < len(rows) else "")
+            + (f" ({count:,} of {len(rows):,})" if count < len(rows) else "")
             for reading, count in readings_of(rows, side)
         ]
         if texts:
@@ -264,15 +242,12 @@ def _warnings(rows: Sequence[FrameScores], request: EvalRequest) -> list[str]:
 def _unscored(rows: Sequence[FrameScores]) -> Iterator[str]:
     """Frames that are in no mean."""
     if missing := [row.name for row in rows if row.missing]:
-        yield (
-            f"warning: {len(missing):,} of {len(rows):,} frames have no prediction:"
-            f" {some_names(missing)}"
-        )
-    failed = [row for row in rows if not row.scored and not row.missing]
-    for row in failed[:_LISTED]:
-        yield f"warning: frame {one_line(row.name)} was not scored: {row.error}"
-    if (more := len(failed) - _LISTED) > 0:
-        yield f"warning: {more:,} more frames were not scored"
+        yield f"warning: {len(missing):,} frames have no prediction: {some_names(missing)}"
+    if faulty := [row for row in rows if not row.scored and not row.missing]:
+        for row in faulty[:_LISTED]:
+            yield f"warning: frame {one_line(row.name)} was not scored: {row.error}"
+        if (more := len(faulty) - _LISTED) > 0:
+            yield f"warning: {more:,} more frames were not scored"
 
 
 def _empty_pixels(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:

@@ -57,6 +57,12 @@ class FramePair:
     unit: str = METRES
     image: Source | None = None
 
+    @property
+    def paths(self) -> dict[str, Source | None]:
+        """The files of the frame."""
+        files = {"prediction": self.prediction, "truth": self.frame.gt}
+        return files | {"sparse": self.sparse, "image": self.image}
+
 
 def pair_frames(
     prediction: Path,
@@ -199,15 +205,7 @@ def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     Raises:
         InputError: If there is none, or two are one frame.
     """
-    files, notes = _files(folder, DEPTH_SUFFIXES)
-    if not files:
-        suffixes = " ".join(DEPTH_SUFFIXES)
-        raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
-    return files, notes
-
-
-def _files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path], list[str]]:
-    found, problems = find_files(folder, suffixes)
+    found, problems = find_files(folder, DEPTH_SUFFIXES)
     for problem in problems:
         if problem.path.is_file():
             raise InputError(str(problem))
@@ -221,6 +219,9 @@ def _files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path], li
         if name in by_frame:
             raise InputError(f"{path} and {by_frame[name].name} are one frame; keep one")
         by_frame[name] = path
+    if not by_frame:
+        suffixes = " ".join(DEPTH_SUFFIXES)
+        raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
     notes = [f"warning: {problem}" for problem in problems]
     if ignored := [found[stem].name for stem in sorted(marked & found.keys())]:
         notes.append(f"{folder}: ignored, as there is a _depth of each: {some_names(ignored)}")

@@ -49,14 +49,14 @@ def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
     measures = chosen_measures(evaluation.request.measures, keys)
     records = [plain(frame_record(frame)) for frame in evaluation.frames]
-    facts = [name for name in records[0] if name not in ("values", "error")]
-    return Table(
-        columns=[*(COVERAGE if n == COVERAGE.key else n for n in facts), *measures, "error"],
-        rows=[
-            [*(r[n] for n in facts), *(r["values"].get(m.key) for m in measures), r["error"]]
-            for r in records
-        ],
-    )
+    facts = [name for name in records[0] if name not in ("scores", "error")]
+    rows = []
+    for record in records:
+        values = (record["scores"] or {}).get("after", {})
+        row = [*(record[name] for name in facts), *(values.get(m.key) for m in measures)]
+        rows.append([*row, record["error"]])
+    columns = [COVERAGE if name == COVERAGE.key else name for name in facts]
+    return Table(columns=[*columns, *measures, "error"], rows=rows)
 
 
 def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:

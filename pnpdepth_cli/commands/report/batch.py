@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,11 @@ from pnpdepth_cli.commands.error_tables import (
     USED,
     VALIDATION,
     baselines_table,
-    change,
     errors_by_basis,
-    format_error,
-    frames_of,
     mean_weights_text,
     means_table,
     weights_text,
 )
-from pnpdepth_cli.commands.report.evaluation import frames_text
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.colours import hex_colours, signed_bar
 from pnpdepth_cli.io.record import read_json
@@ -43,6 +40,7 @@ from pnpdepth_cli.io.report import (
     whole_report,
     write_report,
 )
+from pnpdepth_cli.measures import MEASURES, Measure
 
 Row = Mapping[str, Any]
 
@@ -53,6 +51,11 @@ _PANELS = {
     "Image": "image",
     "Sparse depth": "sparse",
 }
+_IMPROVED = Measure(key="improved", title="Improved", better="higher", percent=True, decimals=1)
+_SETTINGS = (
+    *("model", "layer", "iterations", "lr", "loss", "update", "align", "propagate", "holdout"),
+    "seed",
+)
 _LABELS = {
     "first": "Before",
     "second": "After",
@@ -184,19 +187,19 @@ def _measures(basis: str) -> tuple[str, ...]:
 def _columns(best: str, unit: str) -> list[dict[str, Any]]:
     """Errors before and after on the best basis; with changes unless it is the points used."""
     columns = []
-    percent: dict[str, Any] = {"decimals": 1, "percent": True}
-    for key in _measures(best):
-        title = key.upper()
+    for measure in MEASURES:
+        if measure.key not in _measures(best):
+            continue
+        change = replace(measure, title=f"{measure.title} change", unit="", percent=True)
         if best != USED:
             columns.append(
-                column(key=f"{key}_change", title=f"{title} change", signed=True, **percent)
+                column(replace(change, key=f"{measure.key}_change", decimals=1), signed=True)
             )
-        columns += [
-            column(key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
-            for stage in ("before", "after")
-        ]
+        for stage in ("before", "after"):
+            key, title = f"{measure.key}_{stage}", f"{measure.title} {stage}"
+            columns.append(column(replace(measure, key=key, title=title, unit=unit)))
     if best != VALIDATION:  # the map is then of the points used
-        columns.append(column(key="improved", title="Improved", higher_is_better=True, **percent))
+        columns.append(column(_IMPROVED))
     return columns
 
 
@@ -240,7 +243,6 @@ def _head(summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str,
     return Head(
         kind="Batch refinement",
         title=summary["output"],
-        tiles=_tiles(summary, means),
         facts=_facts(summary, first),
         notes=notes,
         tables=tables,
@@ -255,48 +257,24 @@ def _head(summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str,
     )
 
 
-def _tiles(summary: Mapping[str, Any], means: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """The number of frames, and errors that were not measured at the points used."""
-    counts, unit = summary["counts"], summary["unit"]
-    refined = counts["done"] + counts["diverged"]
-    others = [
-        f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
-    ]
-    tiles = [("Frames refined", f"{refined:,} of {counts['frames']:,}", ", ".join(others))]
-    for basis, errors in errors_by_basis(means).items():
-        frames = frames_text(frames_of(errors))
-        for key in _measures(basis) if basis != USED else ():
-            before, after = errors["before"].get(key), errors["after"].get(key)
-            shown = " → ".join(format_error(key, value, "").strip() for value in (before, after))
-            remark = f"{change(key, before, after)} {BASES[basis]}, {frames}"
-            tiles.append((f"{key.upper()} [{unit}]", shown, remark))
-    return tiles
-
-
 def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str]]:
-    settings = summary["settings"]
-    facts = [
-        ("Frames of", f"{summary['source']} (layout {summary['layout']})"),
-        ("Results in", summary["output"]),
-        ("Network", str(settings["model"])),
+    """What was refined, and how: the settings that decide the results, by their options."""
+    counts, method = summary["counts"], "the default method"
+    settings = dict(summary["settings"])
+    if summary["method"]["kind"] != "default":
+        method = "the method of these settings"
+        settings |= {} if first is None else first["settings"]
+    frames = [
+        f"{counts[kind]:,} {kind.replace('_', ' ')}"
+        for kind in ("done", "diverged", "failed", "pending", "with_warnings")
+        if counts[kind]
     ]
-    if summary["method"]["kind"] == "default":
-        facts.append(("Refinement", "networks refined, fused and propagated (the default method)"))
-        facts.append(("Before", "the network's depth, aligned with the points"))
-        if summary["weights"]:
-            facts.append(("Mean weights", mean_weights_text(summary["weights"])))
-    elif first is not None:
-        used = first["settings"]
-        refined = f"{used['iterations']} updates of z at {used['layer']}"
-        facts.append(
-            ("Refinement", f"{refined} ({used['update']}, {used['loss']}, step {used['lr']})")
-        )
-        facts.append(("Alignment", str(used["align"])))
-    if settings["propagate"]:
-        facts.append(("Propagation", settings["propagate"]))
-    if settings["holdout"]:
-        held_out = f"{settings['holdout']:.0%} of the points, seed {settings['seed']}"
-        facts.append(("Held out", held_out))
-    if summary["counts"]["with_warnings"]:
-        facts.append(("Warnings", f"in {frames_text(summary['counts']['with_warnings'])}"))
-    return facts
+    weights = summary["weights"] or {}
+    return [
+        ("frames of", f"{summary['source']} (layout {summary['layout']})"),
+        ("frames", ", ".join(frames)),
+        ("results in", summary["output"]),
+        ("refined by", method),
+        *([("mean weights", mean_weights_text(weights))] if weights else []),
+        *((name, str(settings[name])) for name in _SETTINGS if settings.get(name)),
+    ]

@@ -26,7 +26,7 @@ from pnpdepth_cli.io.report import (
     write_report,
 )
 from pnpdepth_cli.io.visualisation import error_map
-from pnpdepth_cli.measures import chosen_measures
+from pnpdepth_cli.measures import COVERAGE, chosen_measures
 
 _SOURCE = {"command": "eval"}
 
@@ -72,27 +72,11 @@ def write_eval_report(
         write_report(temporary, _head(evaluation, keys, columns), entries(images))
 
 
-def frames_text(count: int) -> str:
-    """Returns text such as `12 frames`."""
-    return f"{count:,} frame{'' if count == 1 else 's'}"
-
-
 def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[dict[str, Any]]:
+    measures = chosen_measures(evaluation.request.measures, keys)
     return [
-        *(
-            column(
-                key=measure.key,
-                title=measure.title,
-                unit=measure.table_unit,
-                decimals=measure.decimals,
-                factor=measure.shown_factor,
-                percent=measure.percent,
-                higher_is_better=measure.better == "higher",
-                listed=measure.main or keys is not None,
-            )
-            for measure in chosen_measures(evaluation.request.measures, keys)
-        ),
-        column(key="coverage", title="Coverage", percent=True, decimals=2, higher_is_better=True),
+        *(column(measure, listed=measure.main or keys is not None) for measure in measures),
+        column(COVERAGE),
     ]
 
 
@@ -101,21 +85,19 @@ def _head(
 ) -> Head:
     request = evaluation.request
     without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
-    fill = " (filled in)" if evaluation.request.is_devkit else ""
+    fill = " (filled in)" if request.is_devkit else ""
     return Head(
         kind="Depth evaluation",
         title=str(request.prediction),
-        tiles=_tiles(evaluation),
         facts=[
             ("Prediction", str(request.prediction)),
             ("Ground truth", str(request.ground_truth)),
-            ("Protocol", evaluation.request.describe()),
-            ("Pixels scored", f"{sum(frame.pixels for frame in evaluation.frames):,}"),
+            ("Protocol", request.describe()),
         ],
         notes=evaluation.notes,
         tables=[means_table(evaluation, keys), *calibration_tables(evaluation)],
         charts=_charts(evaluation),
-        without_title=f"Not scored: {len(without):,}",
+        without_title=f"Not scored: {evaluation.unscored()}",
         without=without,
         columns=columns,
         sort_by=columns[0]["key"],
@@ -127,30 +109,12 @@ def _head(
     )  # fmt: skip
 
 
-def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
-    frames, scored = len(evaluation.frames), len(evaluation.scored)
-    missing, failed = len(evaluation.missing), len(evaluation.failed)
-    unscored = [f"{missing:,} without prediction"] if missing else []
-    unscored += [f"{failed:,} with a faulty file"] if failed else []
-    of = f"{scored:,} of {frames:,}" if scored != frames else f"{frames:,}"
-    coverage = f"{evaluation.coverage:.2%}"
-    return [
-        ("Frames scored", of, ", ".join(unscored)),
-        *(
-            (measure.title, measure.text(evaluation.mean[measure.key], measure.table_unit), "")
-            for measure in evaluation.request.measures
-            if measure.main
-        ),
-        ("Coverage", coverage, "of the ground truth has a prediction"),
-    ]
-
-
 def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
     """The calibration plot and the sparsification curve of the predicted standard deviation."""
     found = evaluation.uncertainty
     if found is None:
         return []
-    frames = frames_text(found["frames"])
+    frames = f"{found['frames']:,} frames"
     observed = list(zip(found["expected"], found["observed"], strict=True))
     charts: list[dict[str, Any]] = [{
         "caption": f"Calibration, {frames}",

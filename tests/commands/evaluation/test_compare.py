@@ -121,8 +121,8 @@ def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path
     one, two = [], []
     for path, values in zip(paths, (one, two), strict=True):
         record = json.loads(Path(path).read_text())
-        record["frames"][0]["values"]["imae"] = None
-        values += [frame["values"]["imae"] for frame in record["frames"][1:]]
+        record["frames"][0]["scores"]["after"]["imae"] = None
+        values += [frame["scores"]["after"]["imae"] for frame in record["frames"][1:]]
         Path(path).write_text(json.dumps(record))
     comparison = compare(paths, columns=("mae", "imae"), grouped=False)
     gain = comparison["gains"][0]["imae"]

@@ -71,7 +71,7 @@ def test_what_runs_before_and_what_was_lost_is_in_the_next_report_without_being_
     answers = iter([False, True, True, True])
     batch(root, html=report, stopped=lambda: next(answers))
     assert list(frames_of(report)) == ["a"]
-    assert page_data(report)["tiles"][0][2] == "3 pending"
+    assert dict(page_data(report)["facts"])["frames"] == "1 done, 3 pending"
     batch(root, html=report, shard=(1, 2))  # a and c
     shutil.rmtree(report)
     assert done(root, html=report) == ["b", "d"]
@@ -112,14 +112,14 @@ def test_without_ground_truth_changes_are_those_at_held_out_points_and_settings_
     shutil.rmtree(root / "gt")
     batch(root, html=report, refine={"holdout": 0.3, "propagate": "gp"})
     facts = dict(page_data(report)["facts"])
-    assert facts["Refinement"] == "5 updates of z at middle (sign, l1, step 0.01)"
-    assert (facts["Alignment"], facts["Propagation"]) == ("none", "gp")
-    assert facts["Held out"] == "30% of the points, seed 0"
+    assert (facts["iterations"], facts["layer"], facts["lr"]) == ("5", "middle", "0.01")
+    assert (facts["update"], facts["loss"], facts["align"]) == ("sign", "l1", "none")
+    assert (facts["propagate"], facts["holdout"]) == ("gp", "0.3")
     frame = frames_of(report)["a"]
     assert frame["values"]["rmse_change"] is not None
     assert any("at held-out points" in note for note in frame["notes"])
     (table,) = page_data(report)["tables"]
-    assert table["caption"] == "means over frames: 4 at held-out points, 4 at points used"
+    assert table["title"] == "means over frames: 4 at held-out points, 4 at points used"
 
 
 def test_weights_of_all_experts_are_shown_for_each_frame_and_in_the_mean(
@@ -127,7 +127,7 @@ def test_weights_of_all_experts_are_shown_for_each_frame_and_in_the_mean(
 ) -> None:
     batch(root, html=report, refine={"propagate": None})
     weights = json.loads((root / "out/summary.json").read_text())["weights"]
-    shown = dict(page_data(report)["facts"])["Mean weights"]
+    shown = dict(page_data(report)["facts"])["mean weights"]
     for name, each in weights.items():
         assert f"{name} {each['mean']:.0%} ({each['least']:.0%} to {each['largest']:.0%})" in shown
     record = json.loads((root / "out/a.json").read_text())
@@ -145,7 +145,6 @@ def test_with_neither_ground_truth_nor_held_out_points_there_is_no_change(
     assert not [column for column in data["columns"] if "change" in column["title"]]
     assert data["columns"][data["sort_by"]]["key"] == "rmse_after"
     assert {row[3] for row in data["tables"][0]["rows"]} == {""}  # no change
-    assert [label for label, *_ in data["tiles"]] == ["Frames refined"]
     assert "no error is measured" in data["notes"][0]
     assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
 
