@@ -23,12 +23,14 @@ from pnpdepth_cli.dataset.read_options import ScanOptions
     required=True,
     help="Camera image: gives the size, and is drawn on.",
 )
+@options.depth_scale
 @options.sparse_output
 @click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on the image.")
 @options.overwrite
 def project(
     scan: Path,
     image: Path,
+    depth_scale: float | None,
     output: Path,
     overlay: Path | None,
     overwrite: bool,
@@ -48,7 +50,7 @@ def project(
 
     target = SparseTarget(output=output, overlay=overlay, overwrite=overwrite)
     of_scan = ScanOptions(**options.taken(ScanOptions, values))
-    print_sparse(project_scan(scan, of_scan, target, image))
+    print_sparse(project_scan(scan, of_scan, target, image, scale=depth_scale))
 
 
 @click.command(short_help="Sample sparse depth from dense depth.")

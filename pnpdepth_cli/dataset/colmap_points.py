@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.dataset.arrays import check_same_view, moved_note
+from pnpdepth_cli.dataset.plausible import far_values
 from pnpdepth_cli.dataset.read_options import METRES, MODEL_UNITS
 from pnpdepth_cli.dataset.scan_points import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError
@@ -61,6 +62,9 @@ def read_colmap_points(
     assert camera.size is not None  # of every camera of a model
     check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
     points = _observed(model, name, unit_scale or 1.0)
+    dropped = points.dropped
+    far, lines = far_values(points.depth, MODEL_UNITS if unit_scale is None else METRES)
+    points = points.select(~far)
     turn, shift = model.images[name].rotation.T, model.images[name].translation
     unit = MODEL_UNITS if unit_scale is None else METRES
     reading = Reading(
@@ -72,8 +76,9 @@ def read_colmap_points(
         notes.append(f"sparse: {moved_note(camera.size, size)}")
     if camera.has_lens:
         notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
-    lost = describe_dropped(points.dropped)
+    lost = describe_dropped(dropped)
     notes += [f"sparse: dropped {lost}"] if lost else []
+    notes += [f"sparse: {line}" for line in lines]
     if unit == MODEL_UNITS:
         notes.append("unit: depth is in model units; --unit-scale M gives metres per unit")
     return SparseDepth(
@@ -90,7 +95,7 @@ def read_colmap_points(
             "lens": camera.lens,
             "distortion": list(camera.distortion),
             "unit_scale": unit_scale,
-            "dropped": dict(points.dropped),
+            "dropped": dict(dropped),
         },
         notes=tuple(notes),
     )

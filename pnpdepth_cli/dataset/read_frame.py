@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -29,17 +28,18 @@ from pnpdepth_cli.dataset.frame_files import (
     file_of,
 )
 from pnpdepth_cli.dataset.neighbours import read_neighbours
+from pnpdepth_cli.dataset.plausible import (
+    check_pixels,
+    check_same_scale,
+    divisor_to_metres,
+    far_values,
+    plausible_map,
+)
 from pnpdepth_cli.dataset.read_options import METRES, ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.scan_points import SparseDepth, read_scan_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame, Register, registration_to_make, tensor_of
-from pnpdepth_cli.io.depth import (
-    describe_range,
-    implausible,
-    metres,
-    read_depth,
-    scale_warning,
-)
+from pnpdepth_cli.io.depth import describe_range, read_depth
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.rgb import read_rgb
@@ -56,10 +56,6 @@ from pnpdepth_cli.settings import Settings
 ImageArray = NDArray[np.float32]
 
 _LEAK_FRACTION = 0.5  # of the ground truth's pixels equal to the sparse depth gives a warning
-_FAR = 1000.0  # times the median depth; no point of an image is farther
-_OTHER_SCALE = 1.5  # ratio of ground truth to sparse depth that no noise explains
-_MIN_COMPARED = 10  # fewer points decide nothing
-_SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, have x and y swapped
 
 
 def read_frame(
@@ -109,7 +105,7 @@ def read_frame(
         sparse = _sampled(files, options, rgb, gt, scale, seed)
     else:
         sparse = _read_sparse(files, options, whole)
-    given, far = _without_far_points(sparse)
+    given = sparse.points
     if gt is not None and sparse.unit != METRES:
         raise UsageError(
             f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
@@ -118,7 +114,7 @@ def read_frame(
     if gt is not None and gt.shape != given.size:
         raise _size_error(files, gt.shape, given.size)
     sources["sparse"] = sparse.record
-    notes += (*sparse.notes, *far, *truth_notes)
+    notes += (*sparse.notes, *truth_notes)
     if files.gt is not None:
         sources["gt"] = of_truth
         size = whole or (truth.values.shape[0], truth.values.shape[1])
@@ -136,7 +132,7 @@ def read_frame(
         depth = given.scatter()[0, 0].numpy()
         notes += _leak_warning(depth, gt)
         by_option = {"--depth-scale": readings["sparse"], "gt_scale of a list": readings["gt"]}
-        notes += _scale_warning(depth, gt, by_option)
+        notes += check_same_scale(depth, gt, by_option)
     notes += (*of_camera, *lost)
     if neighbours:
         sources["neighbours"] = neighbours
@@ -160,11 +156,16 @@ def read_frame(
 def _register(files: FrameFiles, options: ReadOptions) -> Register:
     """How the image is to be moved. A calibrated scan and SfM points are registered."""
     calibrated = files.sparse is not None and (
-        files.sparse.is_dir() or options.scan.describes(files.sparse)
+        files.sparse.is_dir() or _is_scan(files.sparse, files, options)
     )
     if calibrated and options.registration == "auto":
         return None
     return registration_to_make(options.registration, Settings())
+
+
+def _is_scan(path: Path, files: FrameFiles, options: ReadOptions) -> bool:
+    """Whether sparse depth is a scan, by the calibration of the user or of the data set."""
+    return (options.scan.over(files) if files.calib else options.scan).describes(path)
 
 
 def _split(points: SparsePoints, fraction: float, seed: int) -> tuple[SparsePoints, SparsePoints]:
@@ -210,20 +211,23 @@ def _read_ground_truth(
     files: FrameFiles, options: ReadOptions, source: Source, size: tuple[int, int] | None
 ) -> tuple[DepthFile, dict[str, Any], list[str]]:
     """The ground truth of an image (H, W), what a record keeps of it, and lines for a person."""
+    scale = options.depth_scale or files.gt_scale
     if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
-        scan = read_scan_points(source, options.scan.over(files), size, files.image_file)
+        of_scan = options.scan.over(files)
+        scan = read_scan_points(source, of_scan, size, files.image_file, scale=scale)
         truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
         return truth, scan.record, [note.replace("sparse:", "gt:", 1) for note in scan.notes]
     if isinstance(source, Hdf5Array):
         truth = DepthFile(values=depth_of(source), reading=Reading("HDF5"))
     else:
-        truth = read_depth(source, scale=options.depth_scale or files.gt_scale)
+        truth = read_depth(source, scale=scale)
     values = masked(truth.values, files.masks)
     if files.gt_other_size and size is not None and values.shape != size:
         values = moved_to(file_of(source), values, size)
+    values, notes = plausible_map(values, truth.reading, "gt", "gt_scale of a list", scale)
     described = describe_range(values, truth.reading, noun="pixels", option="gt_scale of a list")
     record = _file_record(source) | {"read_as": str(truth.reading)}
-    return replace(truth, values=values), record, [f"gt: {described}"]
+    return replace(truth, values=values), record, [f"gt: {described}", *notes]
 
 
 def _file_record(source: Source) -> dict[str, Any]:
@@ -273,8 +277,9 @@ def _read_sparse(
         sparse = read_colmap_points(path, image, size, unit_scale=options.unit_scale)
     elif options.unit_scale is not None:
         raise UsageError(f"{path} is no COLMAP model, so --unit-scale does not apply")
-    elif options.scan.describes(path):
-        sparse = read_scan_points(path, options.scan.over(files), size, image)
+    elif _is_scan(path, files, options):
+        scale = options.depth_scale or files.sparse_scale
+        sparse = read_scan_points(path, options.scan.over(files), size, image, scale=scale)
     else:
         sparse = _read_points(files, options, path, size)
     points = sparse.points.tensors()
@@ -282,7 +287,10 @@ def _read_sparse(
     part = files.part.apply(np.broadcast_to(np.False_, points.size)).shape
     if part != points.size:
         xy = torch.from_numpy(files.part.in_crop(points.xy.numpy(), points.size))
-        points = _inside(path, SparsePoints(xy=xy, depth=points.depth, size=(part[0], part[1])))
+        whole = SparsePoints(xy=xy, depth=points.depth, size=(part[0], part[1]))
+        points = whole.cropped(0, 0, *whole.size)
+        if not len(points):
+            raise NoPointsError(f"{path}: none of its {len(whole)} points lies in the image")
     return replace(sparse, points=points)
 
 
@@ -292,10 +300,12 @@ def _read_points(
     """The points of a depth map or a list, in the image."""
     scale = options.depth_scale or files.sparse_scale
     visible, reading = read_sparse(path, size=image_size, scale=scale)
+    far, lines = far_values(visible.depth)
+    visible = visible.select(~far)
     depth = visible.depth
     size = image_size or visible.size
     check_same_view(str(path), visible.size, size)
-    notes = [f"sparse: {describe_range(depth, reading)}"]
+    notes = [f"sparse: {describe_range(depth, reading)}", *(f"sparse: {line}" for line in lines)]
     record = _file_record(path) | {"read_as": str(reading)}
     if visible.size != size:
         notes.append(f"sparse: {moved_note(visible.size, size)}")
@@ -314,68 +324,17 @@ def _read_points(
             f"sparse: a projected LiDAR scan; dropped {count:,} points occluded from the camera by"
             " nearer ones; --preset paper keeps them"
         )
-    points = _inside(path, visible.tensors().resized(*size))
-    if len(points) < len(visible):
-        notes.append(f"sparse: {len(visible) - len(points):,} points outside the image")
-    if unlikely := implausible(depth, reading.scale):
-        notes.append(f"warning: {unlikely}")
+    points = visible.tensors().resized(*size)
+    inside, of_pixels = check_pixels(path, points.xy.numpy(), size)
+    divisor, warnings = divisor_to_metres(depth, reading, "sparse", "--depth-scale", scale)
+    points = points.select(torch.from_numpy(inside))
+    notes += (*of_pixels, *warnings)
     return SparseDepth(
-        points=points,
+        points=replace(points, depth=points.depth / divisor),
         reading=reading,
         record=record,
         notes=tuple(notes),
     )
-
-
-def _inside(path: Path, points: SparsePoints) -> SparsePoints:
-    height, width = points.size
-    inside = points.cropped(0, 0, height, width)
-    outside = len(points) - len(inside)
-    if outside > _SWAPPED * len(points) and len(points.cropped(0, 0, width, height)) == len(points):
-        raise SizeError(
-            f"{path}: {outside:,} of {len(points):,} points are outside the {width}×{height} image,"
-            f" but all are inside {height}×{width}: swap x and y, or turn the image by 90°"
-        )
-    if not len(inside):
-        raise NoPointsError(f"{path}: none of its {len(points)} points lies in the image")
-    return inside
-
-
-def _without_far_points(sparse: SparseDepth) -> tuple[SparsePoints, list[str]]:
-    """The points without those farther than anything in one image can be, and a note."""
-    points: SparsePoints = sparse.points
-    median = float(points.depth.median())
-    far = points.depth > _FAR * median
-    if not bool(far.any()) or len(points) < _MIN_COMPARED:
-        return points, []
-    note = (
-        f"sparse: dropped {int(far.sum()):,} of {len(points):,} points more than {_FAR:,.0f} times"
-        f" as far as the median of {metres(median)} {sparse.unit}; the farthest was at"
-        f" {metres(float(points.depth.max()))} {sparse.unit}"
-    )
-    return points.select(~far), [note]
-
-
-def _scale_warning(
-    sparse: ImageArray, gt: ImageArray, readings: Mapping[str, Reading | None]
-) -> list[str]:
-    """A warning if ground truth and sparse depth differ by a factor where both are known.
-
-    Raises:
-        InputError: A scale that was assumed explains it.
-    """
-    both = (sparse > 0) & (gt > 0)
-    if int(both.sum()) < _MIN_COMPARED:
-        return []
-    ratio = float(np.median(gt[both] / sparse[both]))
-    if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
-        return []
-    scale_warning("sparse points", 1 / ratio, readings)
-    return [
-        f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
-        f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give"
-        " --depth-scale, or a list with gt_scale"
-    ]
 
 
 def _leak_warning(sparse: ImageArray, gt: ImageArray) -> list[str]:

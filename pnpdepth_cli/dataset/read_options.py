@@ -40,18 +40,24 @@ class ScanOptions:
     """Whether points that are occluded from the camera stay."""
 
     def describes(self, sparse: Path) -> bool:
-        """Returns whether the sparse depth is a scan: by its suffix, or a .npy with a calibration.
+        """Returns whether the sparse depth is a scan: by its suffix, or x y z with a calibration.
 
         A calibration of other sparse depth is that of the camera.
 
         Raises:
+            InputError: A list of points cannot be read.
             UsageError: It is not, and an option is given that only a scan has.
         """
         from pnpdepth_cli.dataset.frame_files import SCAN_ONLY_SUFFIXES
 
         suffix = sparse.suffix.lower()
-        if suffix in SCAN_ONLY_SUFFIXES or (suffix == ".npy" and self.calib is not None):
+        if suffix in SCAN_ONLY_SUFFIXES:
             return True
+        if self.calib is not None and suffix in (".npy", ".csv", ".txt"):
+            from pnpdepth_cli.io.sparse_files import holds_scan
+
+            if holds_scan(sparse):
+                return True
         camera = self.camera if self.calib is None else None
         if replace(self, calib=None, camera=camera, keep_occluded=False) != ScanOptions():
             for_maps = ("calib", "keep_occluded")

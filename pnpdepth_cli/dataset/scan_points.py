@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Extrinsics
+from pnpdepth_cli.dataset.plausible import scan_returns
 from pnpdepth_cli.dataset.read_options import METRES, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
@@ -56,6 +57,8 @@ def read_scan_points(
     options: ScanOptions,
     size: tuple[int, int] | None,
     image: Path | None = None,
+    *,
+    scale: float | None = None,
 ) -> SparseDepth:
     """Returns the points of a scan that are visible in an image.
 
@@ -64,6 +67,7 @@ def read_scan_points(
         options: The calibration, and whether occluded points stay.
         size: (H, W) of the image; None for the calibration's.
         image: Its file; tells whether it is rectified, where the calibration leaves that open.
+        scale: Numbers of the scan per metre, for one whose range is implausible in metres.
 
     Raises:
         InputError: A file cannot be read.
@@ -88,24 +92,19 @@ def read_scan_points(
         raise SizeError(f"{named} does not give the image's size; give --image")
     warnings = check_size(named, calibration.camera, size, image)
     scan = read_scan(path)
+    xyz, no_returns, mended = scan_returns(path, scan.points, scale)
     if calibration.rectified:
-        frames = [] if image is None else [(read_rgb(image).values, scan.points)]
+        frames = [] if image is None else [(read_rgb(image).values, xyz)]
         calibration, note = chosen_camera(calibration, frames)
         warnings.append(note)
     camera, scanner = calibration.camera, calibration.scanner
     assert scanner is not None
     if not camera.source.startswith("KITTI"):  # whose pose has one direction
-        warnings += check_direction(scan.points, camera, scanner, size)
-    points = project_velodyne(
-        scan.points,
-        camera,
-        scanner,
-        size,
-        keep_occluded=options.keep_occluded,
-    )
-    warnings += _outside_warning(scanner.moved(scan.points), camera, size)
-    reading = Reading(f"{scan.source} of {len(scan.points):,} points, {camera.source}")
-    notes = [f"sparse: {describe_range(points.depth, reading)}"]
+        warnings += check_direction(xyz, camera, scanner, size)
+    points = project_velodyne(xyz, camera, scanner, size, keep_occluded=options.keep_occluded)
+    warnings += _outside_warning(scanner.moved(xyz), camera, size)
+    reading = Reading(f"{scan.source} of {len(xyz):,} points, {camera.source}")
+    notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
     if lost := describe_dropped(points.dropped):
         notes.append(f"sparse: dropped {lost}")
     return SparseDepth(
@@ -119,7 +118,7 @@ def read_scan_points(
             "camera": options.camera,
             "extrinsics": None if options.extrinsics is None else str(options.extrinsics),
             "keep_occluded": options.keep_occluded,
-            "dropped": dict(points.dropped),
+            "dropped": {**no_returns, **points.dropped},
         },
         notes=(*notes, *warnings),
         reading=reading,

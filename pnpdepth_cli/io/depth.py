@@ -29,13 +29,9 @@ from pnpdepth_cli.io.formats import (
     kind_of,
 )
 
-_SHORTEST_M, _LONGEST_M = 0.02, 1000.0
-_COMMON_M = (0.2, 200.0)
 _FARTHEST_INDOORS_M = 40.0
 """Below it, a map read by KITTI's scale may be a room in millimetres: 40 m are 10.2 m then."""
-# Codes per metre in use, most likely first: millimetres, KITTI, TUM RGB-D, centimetres.
-_COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
-# Quotients of these, which a wrong one gives, within a tenth.
+# Quotients of codes per metre in use, which a wrong one gives, within a tenth.
 _SCALE_QUOTIENTS = (1000.0, 256.0, 100.0, 10.0, 1000.0 / 256.0, 5.0, 5000.0 / 256.0, 5000.0)
 _QUOTIENT_TOLERANCE = math.log(1.1)
 
@@ -200,31 +196,6 @@ def describe_range(
     return f"{count}, {extent} {unit} ({source}{hint})"
 
 
-def implausible(depth: NDArray[Any], scale: float | None = None) -> str | None:
-    """Returns a warning if half of the known depths cannot be metres, else None.
-
-    `scale` is that of integers, in codes per metre; None for a float file.
-    """
-    known = _known(depth)
-    if known.size == 0:
-        return None
-    median = float(np.median(known))
-    if _SHORTEST_M <= median <= _LONGEST_M:
-        return None
-    fact = f"median depth {metres(median)} m is implausible, the scale is probably wrong"
-    if scale is None:
-        divided = median / 1000
-        advice = f"; divided by 1000 it would be {metres(divided)} m" if _is_common(divided) else ""
-        return f"{fact}: a float file must hold metres{advice}"
-    better = next((s for s in _COMMON_SCALES if _is_common(median * scale / s)), None)
-    if better is None:
-        return f"{fact}: give codes per metre with --depth-scale (now {scale:g})"
-    return (
-        f"{fact}: --depth-scale {better:g} (now {scale:g}) "
-        f"would make it {metres(median * scale / better)} m"
-    )
-
-
 def scale_warning(what: str, ratio: float, kinds: Mapping[str, Reading | None]) -> str | None:
     """Returns a warning if depths are a multiple of the ground truth that a wrong scale explains.
 
@@ -264,10 +235,6 @@ def metres(value: float) -> str:
     if value >= 1e6 or (0 < value < 1e-3):
         return f"{value:.1e}"
     return f"{value:,.1f}" if value >= 0.95 else f"{value:.2g}"
-
-
-def _is_common(median: float) -> bool:
-    return _COMMON_M[0] <= median <= _COMMON_M[1]
 
 
 def _known(depth: NDArray[Any]) -> NDArray[np.float64]:

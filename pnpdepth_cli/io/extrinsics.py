@@ -94,6 +94,11 @@ def checked_pose(path: Path, name: str, rotation: Floats, translation: Floats) -
     """Returns the pose. Raises FileFormatError if it holds no rotation, or is of no sensor."""
     if not is_rotation(rotation):
         off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if off <= _ROTATION_TOLERANCE:
+            raise FileFormatError(
+                f"{path}: the {name} is no rotation but mirrors (determinant −1): the scan is"
+                " left-handed, as CARLA's and Unity's are; negate its y, and the second column here"
+            )
         raise FileFormatError(f"{path}: the {name} is no rotation (R·Rᵀ is off by {off:.2g})")
     if not (np.abs(translation) < _FARTHEST_M).all():
         raise FileFormatError(

@@ -14,18 +14,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, NoPointsError
+from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import damaged, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.arrays import parse_npy
+from pnpdepth_cli.io.sparse_files import read_rows
 
-_FARTHEST_M = 1e5
-_KITTI_FIELDS, _NUSCENES_FIELDS = 4, 5  # x, y, z, reflectance; nuScenes adds the laser's index
-_SAMPLE = 4096
-"""Rows that tell the number of fields; checking all takes twice as long as reading them."""
+_FIELD_COUNTS = (3, 4, 5, 6, 7, 8)
+_BIN_SOURCES = {4: "KITTI scan", 5: "nuScenes scan"}
+"""x, y, z, reflectance; nuScenes adds the laser's index."""
 
-_NEARLY_ALL = 0.95
-"""Fraction of points; read with the wrong number of fields, at most half of them look right."""
+_SMALLEST = 1e-3
+"""Numbers near 0 are alike."""
+
+_AS_MUCH = 0.85
+"""Fraction of the variance that the best count explains: what its divisors do not reach."""
+
+_LEAST_EXPLAINED = 0.03
+"""Of the variance; numbers in any order have less."""
 
 _PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 _PLY_KINDS = {
@@ -46,19 +52,18 @@ Points = NDArray[np.float32]
 class ScanFile:
     """A LiDAR scan as read from a file."""
 
-    points: Points  # (N, 3) metres, x y z in the scanner's frame; all finite, in file order
+    points: Points  # (N, 3) metres, x y z in the scanner's frame as stored, in file order
     source: str  # what was read, for a person
 
 
 def read_scan(path: Path) -> ScanFile:
-    """Returns the points of a KITTI or nuScenes .bin, .npy (N, 3 or more columns), .pcd or .ply.
+    """Returns the points of a .bin, a .npy of (N, 3 or more) floats, a .pcd, a .ply, or text.
 
     Args:
         path: The file; its suffix says the format.
 
     Raises:
-        FileFormatError: The file is damaged, ambiguous, or holds points that are no numbers.
-        NoPointsError: It holds no point.
+        FileFormatError: The file is damaged or ambiguous.
     """
     suffix = path.suffix.lower()
     if suffix not in SCAN_SUFFIXES:
@@ -71,19 +76,6 @@ def read_scan(path: Path) -> ScanFile:
         points, source = _parse_bin(path, data)
     else:
         points, source = _READERS[suffix](path, data)
-    if not len(points):
-        raise NoPointsError(f"{path} holds no point; give a scan with points")
-    if not np.isfinite(points).all():
-        bad = ~np.isfinite(points).all(axis=1)
-        raise FileFormatError(
-            f"{path}: {int(bad.sum()):,} of {len(points):,} points have no finite coordinates"
-            f" (the first is number {int(np.argmax(bad)) + 1:,}); remove them"
-        )
-    if np.abs(points).max() > _FARTHEST_M:
-        raise FileFormatError(
-            f"{path}: a coordinate of {np.abs(points).max():.3g} m is none of a scan; its numbers"
-            " are probably not stored as the format says"
-        )
     return ScanFile(points=points, source=source)
 
 
@@ -95,44 +87,42 @@ def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
             " numbers a point); it is cut short, or its points have another number of fields"
         )
     points = np.frombuffer(data, "<f4").reshape(-1, fields)
-    names = {_KITTI_FIELDS: "KITTI scan", _NUSCENES_FIELDS: "nuScenes scan"}
-    source = names.get(fields, f"scan of {fields} fields a point")
+    source = _BIN_SOURCES.get(fields, f"scan of {fields} fields a point")
     return np.ascontiguousarray(points[:, :3], np.float32), source
 
 
 def _fields_of_bin(path: Path, data: bytes) -> int:
-    """4 for KITTI, 5 for nuScenes, by name and size, and by content where both sizes fit."""
-    if path.name.lower().endswith(".pcd.bin"):  # nuScenes' own name
-        return _NUSCENES_FIELDS
-    by_size = [n for n in (_KITTI_FIELDS, _NUSCENES_FIELDS) if len(data) % (4 * n) == 0]
-    if by_size == [_KITTI_FIELDS]:
-        return _KITTI_FIELDS
-    numbers = np.frombuffer(data, "<f4", len(data) // 4)
-    by_content = [n for n in by_size if _looks_like_scan(numbers.reshape(-1, n))]
-    if len(by_content) == 1:
-        return by_content[0]
-    if _KITTI_FIELDS not in by_size:
-        raise FileFormatError(
-            f"{path}: {len(data):,} bytes are not a multiple of 16 (KITTI: x, y, z and reflectance"
-            " as float32) nor of 20 (nuScenes); it is cut short or no such scan"
-        )
-    raise FileFormatError(
-        f"{path} may hold 4 numbers a point (KITTI) or 5 (nuScenes); save its x, y, z as NPY (N, 3)"
-    )
+    """How many numbers a point has: those of one field are alike, those of two are not.
 
-
-def _looks_like_scan(rows: NDArray[np.float32]) -> bool:
-    """True if nearly all rows of (N, 4 or 5), or of a sample of them, are plausible points.
-
-    Coordinates are not too far, reflectance is not negative, and a fifth column holds whole numbers
-    0…255, the index of a laser.
+    For each count, the fraction of the variance of the numbers that the field explains is taken
+    from the whole file. A multiple of the true count explains as much, so the least one counts.
     """
-    rows = rows[:: -(-len(rows) // _SAMPLE)]
-    with np.errstate(invalid="ignore"):
-        near = (np.abs(rows[:, :3]) <= _FARTHEST_M).all(axis=1) & (rows[:, 3] >= 0)
-        laser = rows[:, 4:]
-        numbered = ((laser >= 0) & (laser < 256) & (laser == np.floor(laser))).all(axis=1)
-    return bool(np.mean(near & numbered) >= _NEARLY_ALL)
+    numbers = np.frombuffer(data, "<f4", len(data) // 4).astype(np.float64)
+    numbers = np.where(np.isfinite(numbers), numbers, 0)
+    with np.errstate(divide="ignore"):
+        size = np.log10(np.abs(numbers) + _SMALLEST)
+    # by sign, order of magnitude, and whether it is a whole number, such as the index of a laser
+    features = np.stack([np.sign(numbers), size, numbers == np.rint(numbers)])
+    features = features[features.var(axis=1) > 0]
+    explained = {count: _explained(features, count) for count in _FIELD_COUNTS}
+    most = max(explained.values())
+    count = next(n for n, fraction in explained.items() if fraction >= _AS_MUCH * most)
+    if most < _LEAST_EXPLAINED:
+        raise FileFormatError(
+            f"{path}: its content does not tell how many numbers a point has"
+            f" ({', '.join(map(str, _FIELD_COUNTS))} are tried); save its x, y, z as NPY (N, 3)"
+        )
+    return count
+
+
+def _explained(features: NDArray[np.float64], count: int) -> float:
+    """Mean fraction of the variance of features (F, N) that N modulo `count` explains, 0…1."""
+    rows = features.shape[1] // count
+    if rows < 2 or not len(features):
+        return 0.0
+    whole = features[:, : rows * count].reshape(len(features), rows, count)
+    within = whole.var(axis=1, ddof=1).mean(axis=1)
+    return float((1 - within / features.var(axis=1)).mean())
 
 
 def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
@@ -155,7 +145,7 @@ Column = tuple[str, str, int]
 
 
 def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
-    """x y z of a PCD, ASCII or binary, without beams that have no return: all three are NaN."""
+    """x y z of a PCD, ASCII or binary."""
     header, body = _header(path, data, "PCD", b"DATA")
     entries = {words[0].upper(): words[1:] for words in header if not words[0].startswith("#")}
     missing = [k for k in ("FIELDS", "SIZE", "TYPE", "POINTS", "DATA") if not entries.get(k)]
@@ -176,12 +166,10 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
             " (pcl_convert_pcd_ascii_binary does it)"
         )
     points = _xyz(path, "PCD", columns, number, body, "<" if stored == "binary" else None)
-    returned = ~np.isnan(points).all(axis=1)
-    lost = int(len(points) - np.count_nonzero(returned))
-    source = f"{stored} PCD" + (f", {lost:,} beams without return" if lost else "")
+    source = f"{stored} PCD"
     if entries.get("VIEWPOINT", []) not in ([], ["0", "0", "0", "1", "0", "0", "0"]):
         source += ", its VIEWPOINT not applied"
-    return points[returned], source
+    return points, source
 
 
 def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
@@ -276,10 +264,19 @@ def _whole(path: Path, text: str) -> int:
     return int(text)
 
 
+def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:
+    """The first numbers of lines of text."""
+    rows, _ = read_rows(path, data)
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(rows[:, :3], np.float32), "text scan"
+
+
 _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
     ".npy": _parse_array,
     ".pcd": _parse_pcd,
     ".ply": _parse_ply,
+    ".csv": _parse_text,
+    ".txt": _parse_text,
 }
 
 SCAN_SUFFIXES = (".bin", *_READERS)

@@ -32,6 +32,10 @@ _PROVENANCE_KEY = "pnpdepth:made"
 Points = SparsePoints[NDArray[np.float32]]
 
 _TEXT_SUFFIXES = (".csv", ".txt")
+_PIXELS = ["x", "y", "depth"]
+_MOST_COLUMNS = 8  # of a scan; a wider array is a depth map
+_MANY_ROWS = 200  # of so few columns, which no depth map has
+_BELOW_ZERO = 0.1  # of the rows
 _SEPARATOR = re.compile(r"[\s,;]+")
 
 
@@ -58,7 +62,13 @@ def read_sparse(
     if path.suffix.lower() in _TEXT_SUFFIXES:
         data = read_bytes(path)
         if kind_of(data) is None:
-            return _from_rows(path, _parse_text(path, data), "point list", size)
+            rows_of_text, _ = read_rows(path, data)
+            if rows_of_text.shape[1] != 3:
+                raise FileFormatError(
+                    f"{path}: {rows_of_text.shape[1]} numbers a line are not x, y and depth; if"
+                    " they are x y z of a scan, give --calib"
+                )
+            return _from_rows(path, rows_of_text, "point list", size)
     stored = load_stored(path)
     if not stored.is_image and stored.values.ndim == 2 and stored.values.shape[1] == 3:
         if stored.values.dtype.kind != "f":
@@ -66,6 +76,12 @@ def read_sparse(
                 f"{path}: a point list of {stored.values.dtype}; save x, y, depth as float metres"
             )
         return _from_rows(path, stored.values, f"point list, {stored.reading.source}", size)
+    shape, is_list = stored.values.shape, not stored.is_image
+    if is_list and len(shape) == 2 and 3 < shape[1] <= _MOST_COLUMNS and shape[0] > _MANY_ROWS:
+        raise FileFormatError(
+            f"{path} holds {shape[0]:,} rows of {shape[1]} numbers, not x, y and depth; if they are"
+            " x y z of a scan, give --calib"
+        )
     image = depth_from_stored(path, stored, scale)
     rows, columns = np.nonzero(image.valid)
     if rows.size == 0:
@@ -83,43 +99,78 @@ def _from_rows(
     known = depth > 0
     if not known.any():
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
-    xy = rows[known, :2].astype(np.float32)
-    if not np.isfinite(xy).all():
-        row = int(np.flatnonzero(known)[~np.isfinite(xy).all(axis=1)][0])
-        raise FileFormatError(
-            f"{path}: point {row + 1} has no finite coordinates; correct or remove it"
-        )
     if size is None:
         raise SizeError(f"{path} is a list of points, which needs an image to say the frame's size")
+    known &= np.isfinite(rows[:, :2]).all(axis=1)
+    if not known.all():
+        source += (
+            f", without {np.count_nonzero(~known):,} rows that have no depth above 0 or no pixel"
+        )
+    xy = rows[known, :2].astype(np.float32)
     return SparsePoints(xy=xy, depth=depth[known], size=size), Reading(source)
 
 
-def _parse_text(path: Path, data: bytes) -> NDArray[np.float64]:
+def holds_scan(path: Path) -> bool:
+    """Returns whether a list holds x y z of a scan, not x y depth of pixels.
+
+    By its header or by more than three numbers a row; else many x or y are far below 0, as no
+    pixels are.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    data = read_bytes(path)
+    if path.suffix.lower() in _TEXT_SUFFIXES and kind_of(data) is None:
+        rows, header = read_rows(path, data)
+        if header:
+            return header != _PIXELS
+    else:
+        stored = load_stored(path)
+        rows = stored.values
+        if stored.is_image or rows.ndim != 2 or rows.dtype.kind != "f":
+            return False
+    if not 3 <= rows.shape[1] <= _MOST_COLUMNS:
+        return False
+    with np.errstate(invalid="ignore"):
+        below = (rows[:, :2] < -0.5).any(axis=1)
+    return rows.shape[1] > 3 or bool(np.count_nonzero(below) > _BELOW_ZERO * len(rows))
+
+
+def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
+    """Returns the numbers (N, 3 or more) of lines of text, and the words of a header, if any.
+
+    Raises:
+        FileFormatError: A line is not made of as many numbers as the first.
+    """
     try:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise FileFormatError(
             f"{path} is not a text file; give lines of x, y and depth in metres"
         ) from error
-    rows: list[tuple[float, float, float]] = []
+    rows: list[list[float]] = []
+    header: list[str] = []
     for number, line in enumerate(lines, start=1):
         text = line.split("#", 1)[0].strip()
         words = _SEPARATOR.split(text)
-        header = not rows and [word.strip('"').lower() for word in words] == ["x", "y", "depth"]
-        if not text or header:
+        names = [word.strip('"').lower() for word in words]
+        if not rows and not header and names[:3] in (_PIXELS, ["x", "y", "z"]):
+            header = names
+            continue
+        if not text:
             continue
         try:
-            x, y, depth = map(float, words)
-        except ValueError as error:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        count = len(rows[0]) if rows else 3
+        if len(row) < 3 or (rows and len(row) != count):
             raise FileFormatError(
-                f"{path}, line {number}: {one_line(text)[:60]!r} is not x, y and depth; correct it"
-            ) from error
-        if not np.isfinite((x, y)).all():
-            raise FileFormatError(
-                f"{path}, line {number}: the coordinates are not finite; correct or remove it"
+                f"{path}, line {number}: {one_line(text)[:60]!r} is not {count} numbers,"
+                " x, y and depth; correct it"
             )
-        rows.append((x, y, depth))
-    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+        rows.append(row)
+    return np.array(rows, dtype=np.float64).reshape(len(rows), -1 if rows else 3), header
 
 
 def write_sparse(

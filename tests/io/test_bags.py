@@ -65,18 +65,17 @@ def test_an_image_of_other_size_than_its_bytes_or_of_another_kind_is_refused(
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_an_organised_cloud_gives_its_finite_points_row_by_row(order: str) -> None:
+def test_an_organised_cloud_gives_its_points_row_by_row(order: str) -> None:
     points = np.arange(18, dtype=np.float32).reshape(2, 3, 3)
-    points[0, 1, 2] = np.nan
     rows = points.astype(f"{order}f4").view(np.uint8).reshape(2, -1)
     padded = np.pad(rows, ((0, 0), (0, 5)))
     fields = [SimpleNamespace(name=n, offset=4 * k, datatype=7) for k, n in enumerate("xyz")]
     cloud = {"fields": fields, "is_bigendian": order == ">", "data": padded.tobytes()}
     cloud |= {"height": 2, "width": 3, "point_step": 12, "row_step": 41}
     got = cloud_points(SimpleNamespace(**cloud), "/scan")
-    assert got.tolist() == [points[k].tolist() for k in ((0, 0), (0, 2), (1, 0), (1, 1), (1, 2))]
+    assert got.tolist() == points.reshape(-1, 3).tolist()
     flat = cloud_points(SimpleNamespace(**(cloud | {"height": 1, "row_step": 0})), "/scan")
-    assert flat.tolist() == got[:2].tolist()
+    assert flat.tolist() == got[:3].tolist()
     for claim in ({"height": 3}, {"width": 4}, {"point_step": 11}, {"row_step": 35}):
         with pytest.raises(FileFormatError, match="the bag is damaged"):
             cloud_points(SimpleNamespace(**(cloud | claim)), "/scan")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.depth import describe_range, implausible, scale_warning
+from pnpdepth_cli.io.depth import describe_range, scale_warning
 from pnpdepth_cli.io.formats import Reading
 
 PNG = "16-bit PNG ÷ 256"
@@ -32,41 +32,6 @@ def test_the_range_has_count_ends_and_what_was_assumed(
     depth: list[float], source: str, assumed: bool, line: str
 ) -> None:
     assert describe_range(np.array(depth), Reading(source, assumed=assumed)) == line
-
-
-@pytest.mark.parametrize("median", [0, 0.02, 0.5, 80, 1000])
-def test_plausible_metres_and_nothing_known_need_no_word(median: float) -> None:
-    some_far = np.array([median] * 5 + [1e6 * (median > 0)] * 2)
-    assert implausible(some_far, 256) is None
-
-
-@pytest.mark.parametrize(
-    ("median", "scale", "advice"),
-    [
-        (2000.0, 1.0, "--depth-scale 1000 (now 1) would make it 2.0 m"),
-        (0.01, 100_000.0, "--depth-scale 1000 (now 100000) would make it 1.0 m"),
-        (0.002, 1000.0, "--depth-scale 10 (now 1000) would make it 0.2 m"),
-        (4e9, 1.0, "give codes per metre with --depth-scale (now 1)"),
-    ],
-)
-def test_a_scale_that_would_be_plausible_is_proposed(
-    median: float, scale: float, advice: str
-) -> None:
-    warning = implausible(np.full(3, median), scale)
-    assert warning is not None
-    assert advice in warning
-    assert warning.startswith("median depth ")
-
-
-def test_a_float_file_in_millimetres_is_an_error_that_names_metres() -> None:
-    warning = implausible(np.full(3, 2500.0))
-    assert warning == (
-        "median depth 2,500.0 m is implausible, the scale is probably wrong: "
-        "a float file must hold metres; divided by 1000 it would be 2.5 m"
-    )
-    warning = implausible(np.full(3, 1e9))
-    assert warning is not None
-    assert warning.endswith(": a float file must hold metres")
 
 
 FLOAT = Reading("PFM", None, False)

@@ -78,21 +78,13 @@ def test_points_of_any_scan_survive_every_format(tmp_path: Path, name: str, scal
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_points_that_are_no_numbers_are_refused_and_counted(tmp_path: Path, name: str) -> None:
+def test_points_that_are_no_numbers_are_left_to_the_gate_in_every_format(
+    tmp_path: Path, name: str
+) -> None:
     bad = POINTS.copy()
-    bad[5, 1], bad[20, 0] = np.nan, np.inf
+    bad[5], bad[20, 0] = np.nan, np.inf
     (tmp_path / name).write_bytes(FILES[name](bad))
-    with pytest.raises(FileFormatError, match=r"\b2 of 37 points .* number 6"):
-        read_scan(tmp_path / name)
-
-
-def test_a_beam_without_return_in_a_pcd_is_left_out_with_a_note(tmp_path: Path) -> None:
-    organised = POINTS.copy()
-    organised[[4, 9]] = np.nan
-    (tmp_path / "a.pcd").write_bytes(pcd_bytes(organised))
-    got = read_scan(tmp_path / "a.pcd")
-    assert np.array_equal(got.points, np.delete(POINTS, [4, 9], axis=0))
-    assert got.source == "binary PCD, 2 beams without return"
+    np.testing.assert_array_equal(read_scan(tmp_path / name).points, bad)
 
 
 @pytest.mark.parametrize("name", sorted(set(FILES) - {"kitti.bin", "scan.npy"}))
@@ -115,19 +107,16 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
     [
         ("a.png", b"\x89PNG\r\n\x1a\n" + bytes(24), "not a scan; give a file of .bin"),
         ("a.bin", b"\x89PNG\r\n\x1a\n" + bytes(24), "is a PNG file"),
-        ("a.bin", np.array([1, 1, -1e9, 1], "<f4").tobytes(), "1e+09 m is none of a scan"),
         ("a.bin", bin_bytes(POINTS)[:-1], "not a multiple of 16"),
         ("a.bin", b"", "empty"),
         ("a.npy", npy_bytes(POINTS)[:-4], "cannot be read"),
         ("a.npy", b"text", "not an NPY file"),
-        ("a.npy", npy_bytes(POINTS * [1, 1e9, 1]), "m is none of a scan"),
         ("a.npy", npy_bytes(POINTS, np.int32), "int32 of shape 37×4"),
         ("a.pcd", b"VERSION 0.7\nPOINTS 3\n", "no header that ends with DATA"),
         ("a.pcd", b"FIELDS x y z\nDATA ascii\n", "has no SIZE"),
         ("a.pcd", pcd_bytes(POINTS).replace(b" y ", b" w "), "without one y"),
         ("a.pcd", pcd_bytes(POINTS).replace(b"COUNT 1 1", b"COUNT 1"), "another number of fields"),
         ("a.pcd", pcd_bytes(POINTS).replace(b"DATA binary", b"DATA binary_compressed"), "convert"),
-        ("a.ply", ply_bytes(POINTS[:0]), "holds no point"),
         ("a.ply", b"ply\nend_header\n", "does not begin with ply and its format"),
         ("a.ply", ply_bytes(POINTS)[4:], "does not begin with ply and its format"),
         ("a.ply", b"ply\nformat\nelement vertex 1\nend_header\n", "unknown format ''"),

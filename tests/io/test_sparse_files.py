@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.io.sparse_files import read_sparse
+from pnpdepth_cli.io.sparse_files import holds_scan, read_sparse
 
 SIZE = (10, 20)
 ROWS = [[10.5, 3.25, 4.0], [0.0, 0.0, 0.5], [7.0, 2.0, 80.0]]
@@ -80,22 +80,50 @@ def test_rows_written_as_text_come_back_exactly(
     assert rows_of(path) == [list(row) for row in rows]
 
 
+def test_rows_that_are_no_numbers_are_dropped_and_counted(tmp_path: Path) -> None:
+    rows = np.array([*ROWS, [np.nan, 2, 3], [1, np.inf, 3], [1, 1, np.nan], [1, 1, -2]])
+    np.save(tmp_path / "s.npy", rows)
+    np.savetxt(tmp_path / "s.txt", rows)
+    for name in ("s.npy", "s.txt"):
+        points, reading = read_sparse(tmp_path / name, size=SIZE)
+        assert np.column_stack([points.xy, points.depth]).tolist() == ROWS
+        assert "without 4 rows" in reading.source
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".txt", ".csv"])
+def test_rows_are_of_a_scan_or_of_pixels_by_their_content_whatever_the_format(
+    tmp_path: Path, suffix: str
+) -> None:
+    scan = np.random.default_rng(0).normal(0, 9, (50, 4))
+    pixels = np.column_stack([np.abs(scan[:, :2]), 1 + np.abs(scan[:, 2])])
+    cases = {"xyz": scan[:, :3], "xyzi": scan, "pixels": pixels, "map": np.abs(scan).repeat(9, 1)}
+    for name, rows in cases.items():
+        path = tmp_path / f"{name}{suffix}"
+        np.save(path, rows) if suffix == ".npy" else np.savetxt(path, rows)
+        assert holds_scan(path) == name.startswith("xyz")
+
+
+def test_a_header_says_whether_rows_are_of_a_scan(tmp_path: Path) -> None:
+    for header, of_scan in (("x,y,z", True), ("x y z intensity", True), ("x,y,depth", False)):
+        path = tmp_path / "rows.csv"
+        path.write_text(f"{header}\n" + "5 6 7\n" * 20)
+        assert holds_scan(path) is of_scan
+
+
 NONE = (NoPointsError, "holds no depth above 0")
 
 
 @pytest.mark.parametrize(
     ("name", "content", "error", "message"),
     [
-        ("s.csv", "1 2 3\n4 5\n", FileFormatError, "line 2: '4 5' is not x, y and depth"),
-        ("s.csv", "1 2 3 4\n", FileFormatError, "line 1: '1 2 3 4' is not"),
+        ("s.csv", "1 2 3\n4 5\n", FileFormatError, "line 2: '4 5' is not 3 numbers"),
+        ("s.csv", "1 2 3 4\n", FileFormatError, "4 numbers a line .* give --calib"),
         ("s.csv", "1 2 3\nx y depth\n", FileFormatError, "line 2: 'x y depth' is not"),
         ("s.csv", "u v w\n1 2 3\n", FileFormatError, "line 1"),
-        ("s.csv", "1,5;2,5;3,5\n", FileFormatError, "line 1"),
-        ("s.csv", "1 inf 3\n", FileFormatError, "line 1: the coordinates are not finite"),
+        ("s.csv", "1,5;2,5;3,5\n", FileFormatError, "6 numbers a line"),
         ("s.csv", b"\xff\xfe1\x00", FileFormatError, "is not a text file"),
         ("s.csv", "1 2 3\n", SizeError, "which needs an image to say the frame's size"),
         ("none.csv", None, InputError, r"none\.csv: no such file"),
-        ("s.npy", [[1, 1, 0], [np.nan, 2, 3.0]], FileFormatError, "point 2 has no finite"),
         ("s.npy", [[1, 1, 2]], FileFormatError, "save x, y, depth as float metres"),
         ("s.npy", [[0.0] * 3] * 5, *NONE),
         ("s.npy", [[0.0] * 4] * 5, *NONE),

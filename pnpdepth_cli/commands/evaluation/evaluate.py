@@ -233,6 +233,7 @@ def _warnings(rows: Sequence[FrameScores], request: EvalRequest) -> list[str]:
     scored = [row for row in rows if row.scored]
     return [
         *_unscored(rows),
+        *_ground_truth(rows),
         *_empty_pixels(scored, request),
         *_scales(scored, request),
         *_given_points(scored, request),
@@ -248,6 +249,15 @@ def _unscored(rows: Sequence[FrameScores]) -> Iterator[str]:
             yield f"warning: frame {one_line(row.name)} was not scored: {row.error}"
         if (more := len(faulty) - _LISTED) > 0:
             yield f"warning: {more:,} more frames were not scored"
+
+
+def _ground_truth(rows: Sequence[FrameScores]) -> Iterator[str]:
+    """What was made of ground truth that is none."""
+    noted = [row for row in rows if row.notes]
+    for row in noted[:_LISTED]:
+        yield from (f"frame {one_line(row.name)}: {note}" for note in row.notes)
+    if (more := len(noted) - _LISTED) > 0:
+        yield f"{more:,} more frames have such ground truth"
 
 
 def _empty_pixels(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:

@@ -18,6 +18,7 @@ from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.dataset.arrays import depth_of, masked, read_image
 from pnpdepth_cli.dataset.frame_files import Hdf5Array
+from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import (
     depth_from_stored,
@@ -70,6 +71,8 @@ class LoadedFrame:
     fit: Fit | None = None
     sigma: Depth | None = None
     """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
+    notes: tuple[str, ...] = ()
+    """What a person should know of the ground truth."""
 
 
 def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
@@ -80,13 +83,15 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
         SizeError: Where sizes differ.
     """
     frame = pair.frame
+    scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
     if isinstance(frame.gt, Hdf5Array):
         whole = DepthFile(values=depth_of(frame.gt), reading=Reading("HDF5 array"))
     else:
         assert frame.gt is not None
-        scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
         whole = _read(frame.gt, scale, request)
-    gt = np.ascontiguousarray(frame.part.apply(masked(whole.values, frame.masks)))
+    masked_gt = masked(whole.values, frame.masks)
+    values, notes = plausible_map(masked_gt, whole.reading, "gt", "--gt-scale", scale)
+    gt = np.ascontiguousarray(frame.part.apply(values))
     given = _given_points(pair, gt, required=request.exclude_sparse)
     scored = _scored_mask(gt, request.rules)
     if request.exclude_sparse:
@@ -101,6 +106,7 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
         gt=np.where(scored, gt, np.float32(0)),
         readings={"gt": whole.reading},
         given=given,
+        notes=tuple(notes),
     )
     return loaded if pair.prediction is None else _with_prediction(loaded, pair, request)
 

@@ -68,6 +68,8 @@ class FrameScores:
     """Scored pixels at which the network was given a sparse point; None if that is unknown."""
     readings: dict[str, Reading] = field(default_factory=dict)
     """How the files "prediction" and "gt" were read."""
+    notes: tuple[str, ...] = ()
+    """What a person should know of the ground truth."""
     uncertainty: FrameUncertainty | None = field(default=None, compare=False)
 
     @property
@@ -105,7 +107,8 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameScores:
         raise InputError(
             f"{pair.frame.gt} has no known depth where protocol {request.protocol} scores"
         )
-    row = FrameScores(pair=pair, known=int(known.sum()), readings=frame.readings)
+    readings = frame.readings
+    row = FrameScores(pair=pair, known=int(known.sum()), readings=readings, notes=frame.notes)
     if frame.predicted is None:
         return replace(row, error="there is no prediction")
     row = replace(

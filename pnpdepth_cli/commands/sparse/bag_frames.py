@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pnpdepth_cli.dataset.plausible import scan_returns
 from pnpdepth_cli.dataset.scan_points import chosen_camera
-from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.bags import (
     CLOUDS,
@@ -47,6 +49,7 @@ from pnpdepth_cli.io.poses import Trajectory
 from pnpdepth_cli.io.record import plain, read_json, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.sensors import describe_dropped
 
 POSES_FILE = "poses.txt"
 """Rows as of the TUM RGB-D benchmark, one for each frame in the order of their names."""
@@ -113,21 +116,31 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         say(f"topics: images of {topics[0]}, points of {topics[1]}")
         _clear(request)
         lost, times, poses = 0, list[float](), None
+        dropped = Counter[str]()
         frames = "", ""
         for image, scan in nearest_pairs(_stream(bag, *topics), tolerance):
             if scan is None:
                 lost += 1
                 continue
+            cloud = cloud_points(scan.message, topics[1])
+            try:  # the unit is left to what reads the frames
+                xyz, counts, _ = scan_returns(topics[1], cloud, scale=1.0)
+            except NoPointsError:
+                lost += 1
+                continue
+            dropped.update(counts)
             frames = frames if times else (frame_of(image.message), frame_of(scan.message))
-            _write_frame(request.output, topics, image, scan)
+            _write_frame(request.output, topics[0], image, xyz)
             times.append(image.time_s)
             if len(times) == request.limit:
                 break
+        if dropped:
+            say(f"points: dropped {describe_dropped(dropped)}")
         if times:
             camera = _write_calibration(request, bag, topics[0], frames, say)
             poses = _write_poses(request, bag, camera, times, say)
     if lost:
-        say(f"warning: {lost:,} images have no scan within {tolerance:g} s")
+        say(f"warning: {lost:,} images have no scan with points within {tolerance:g} s")
     if not times:
         raise InputError(
             f"{request.bag}: no image of {topics[0]} has a scan of {topics[1]} within"
@@ -170,13 +183,13 @@ def _stream(bag: Bag, images: str, points: str) -> Iterator[tuple[bool, Stamped]
         yield topic == images, Stamped(seconds_of(message, logged_ns), message)
 
 
-def _write_frame(folder: Path, topics: tuple[str, str], image: Stamped, scan: Stamped) -> None:
+def _write_frame(folder: Path, topic: str, image: Stamped, xyz: NDArray[np.float32]) -> None:
     """Writes rgb/NAME.png and sparse/NAME.ply; the name is the image's time."""
     name = f"{image.time_s:.6f}".replace(".", "_")
-    suffix, data = image_file(image.message, topics[0])
+    suffix, data = image_file(image.message, topic)
     with atomic_path(folder / "rgb" / f"{name}{suffix}") as temporary:
         temporary.write_bytes(data)
-    write_points(folder / "sparse" / f"{name}.ply", cloud_points(scan.message, topics[1]))
+    write_points(folder / "sparse" / f"{name}.ply", xyz)
 
 
 def _write_calibration(

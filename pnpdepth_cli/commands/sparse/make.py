@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Extrinsics
+from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import check_size, read_scan_points
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.depth import describe_range, implausible, read_depth
+from pnpdepth_cli.io.depth import describe_range, read_depth
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.record import plain, sha256_of, write_json
 from pnpdepth_cli.io.rgb import read_rgb
@@ -127,6 +128,8 @@ def project_scan(
     options: ScanOptions,
     target: SparseTarget,
     image: Path,
+    *,
+    scale: float | None = None,
 ) -> dict[str, Any]:
     """Writes the scan's points that the camera sees, and returns the record.
 
@@ -135,10 +138,12 @@ def project_scan(
         options: The calibration.
         target: Files to write.
         image: The camera's image, which gives the size and the ground of an overlay.
+        scale: Numbers of the scan per metre, as of `read_scan_points`.
     """
     target.check((scan, image, options.calib, options.extrinsics))
     rgb = read_rgb(image).values
-    projected = read_scan_points(scan, options, (rgb.shape[0], rgb.shape[1]), image)
+    size = (rgb.shape[0], rgb.shape[1])
+    projected = read_scan_points(scan, options, size, image, scale=scale)
     settings = plain(asdict(options))
     inputs, notes = {"image": image, "scan": projected.record}, projected.notes
     return target.write("project", projected.points, settings, inputs=inputs, notes=notes, rgb=rgb)
@@ -217,12 +222,11 @@ def simulate_scan(
     return target.write("simulate", points, settings, inputs=inputs, notes=notes)
 
 
-def _dense(path: Path, **reading: Any) -> tuple[NDArray[np.float32], list[str]]:
+def _dense(path: Path, scale: float | None = None) -> tuple[NDArray[np.float32], list[str]]:
     """The dense depth (H, W), and lines for a person."""
-    dense = read_depth(path, **reading)
-    text = describe_range(dense.values, dense.reading, noun="pixels")
-    unlikely = implausible(dense.values, dense.reading.scale)
-    return dense.values, [f"depth: {text}", *([f"warning: {unlikely}"] if unlikely else [])]
+    dense = read_depth(path, scale=scale)
+    values, notes = plausible_map(dense.values, dense.reading, "depth", "--depth-scale", scale)
+    return values, [f"depth: {describe_range(values, dense.reading, noun='pixels')}", *notes]
 
 
 def read_noise(noise: str | None, outliers: str | None) -> SampleNoise:

@@ -83,7 +83,7 @@ def _pixels(message: Any, topic: str) -> NDArray[np.uint8]:
 
 
 def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
-    """Returns the (N, 3) finite points x y z of a sensor_msgs/PointCloud2, of any field layout.
+    """Returns the (N, 3) points x y z of a sensor_msgs/PointCloud2, of any field layout.
 
     Raises:
         FileFormatError: It has no x, y and z, or claims more than it holds.
@@ -113,8 +113,7 @@ def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
     rows = data[: height * row].reshape(height, row)[:, : width * step]
     points = np.frombuffer(np.ascontiguousarray(rows).tobytes(), layout)
     with np.errstate(over="ignore", invalid="ignore"):
-        xyz = np.column_stack([points[name] for name in "xyz"]).astype(np.float32)
-    return np.asarray(xyz[np.isfinite(xyz).all(axis=1)])
+        return np.column_stack([points[name] for name in "xyz"]).astype(np.float32)
 
 
 def seconds_of(message: Any, logged_ns: int) -> float:

@@ -11,7 +11,6 @@ import torch
 from PIL import Image
 
 from pnpdepth_cli.commands.refinement.refine import _point_error
-from pnpdepth_cli.dataset.read_frame import _scale_warning
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import (
     InputError,
@@ -75,9 +74,6 @@ def test_ground_truth_whose_assumed_scale_is_another_one_in_use_stops_and_names_
 def test_ground_truth_that_no_two_scales_explain_is_warned_of(frame: FrameOnDisk) -> None:
     record = run(frame, gt=frame.gt, gt_scale=500.0, iterations=0).record
     assert noted(record, "warning: the ground truth is 2 times the sparse depth")
-    sparse = np.full((5, 5), 2, np.float32)
-    wild = np.where(np.eye(5) > 0, np.float32(1e5), sparse)
-    assert _scale_warning(sparse, wild, {}) == []
 
 
 def test_a_point_beyond_everything_is_dropped_with_a_note(frame: FrameOnDisk) -> None:

@@ -91,7 +91,7 @@ def test_topics_can_be_named_and_images_without_a_scan_in_time_are_none(tmp_path
         FramesRequest(bag=bag, output=tmp_path, tolerance=-1)
     with pytest.raises(UsageError, match=r"no topic /rear .* there are /front/image_raw, /lidar"):
         written(bag, tmp_path / "frames", topics=("/rear",))
-    assert len(written(bag, tmp_path / "frames", topics=(POINTS, IMAGES))) == 2
+    assert len(written(bag, tmp_path / "frames", topics=(POINTS, IMAGES))) == 3
 
 
 def test_a_bag_without_calibration_gets_a_note_that_names_it(tmp_path: Path) -> None:

@@ -113,8 +113,9 @@ def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
 def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> None:
     assert ScanOptions(calib=frame.calib).describes(frame.scan)
     assert ScanOptions().describes(frame.scan)
-    assert ScanOptions(calib=frame.calib).describes(Path("scan.npy"))
-    assert not ScanOptions().describes(Path("sparse.npy"))
+    np.save(frame.folder / "scan.npy", [[1.0, -2, 3], [-4, 5, 6]])
+    assert ScanOptions(calib=frame.calib).describes(frame.folder / "scan.npy")
+    assert not ScanOptions().describes(frame.folder / "scan.npy")
     with pytest.raises(UsageError, match="is no scan"):
         ScanOptions(extrinsics=frame.calib).describes(frame.gt)
     assert not ScanOptions(keep_occluded=True).describes(frame.gt)

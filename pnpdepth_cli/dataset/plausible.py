@@ -1,0 +1,298 @@
+"""The gate that every number from a sensor passes, from scans, maps, lists, bags and ground truth.
+
+Each rule has one sentence and its evidence in numbers. It mends and counts, or it stops and names
+the option that mends.
+
+| rule | evidence | then |
+|---|---|---|
+| a return is somewhere | none of x y z is finite, or it is within 1 mm of the sensor | dropped |
+| beams end at different places | one x y z on 0.5 % of the points, at least 3 | dropped |
+| a coordinate is a number | some of x y z are none, or beyond 100 km; stops at 10 % | dropped |
+| a surface has several depths | the largest on 0.5 %, at least 3, far above the rest | unknown |
+| depths are of one order | above 1,000 times the median | unknown |
+| depth is in metres | the median; whole numbers in a float file | stops |
+| two files of a frame agree | their ratio's median is a quotient of common scales | stops |
+| a list holds pixels | all within 0…1 or −1…1; many below 0 | stops |
+| pixels are of this image | all in the upper left corner | warns |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError
+from pnpdepth_cli.io.depth import metres, scale_warning
+from pnpdepth_cli.io.formats import Reading
+from pnpdepth_cli.points import in_frame
+
+_AT_SENSOR_M = 1e-3
+_FARTHEST_M = 1e5  # of a coordinate of a scan
+_BROKEN = 0.1  # of the points; more that are no numbers are another format
+_SAME, _LEAST_SAME = 0.005, 3  # of the numbers, and how many, that no surface shares
+_EQUAL = 1e-5  # relative difference of ranges that were computed from one number
+_FEW = 10  # fewer numbers decide nothing
+_FAR_ABOVE, _FAR_M = 1.5, 40.0  # times the largest of the rest, and metres
+_FAR_BEYOND = 10.0  # times the 98th percentile of the rest, which edges of the sky may exceed
+_FAR = 1000.0  # times the median depth; no point of an image is farther
+_CODES = 100.0  # median from which floats that are whole numbers are codes
+_COMMON_M = (0.2, 200.0)
+# Codes per metre in use, most likely first: millimetres, KITTI, TUM RGB-D, centimetres.
+_COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
+_OTHER_SCALE = 1.5  # ratio of ground truth to sparse depth that no noise explains
+_SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, have x and y swapped
+_CORNER, _MANY = 0.75, 50  # of the image's sides that so many points keep within: another size
+_BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of a scan
+
+Mask = NDArray[np.bool_]
+
+
+MAPS, SCANS = (0.02, 1000.0), (0.05, 300.0)
+"""The smallest and the largest median, metres, of depth maps and of ranges of scans."""
+
+
+def scan_returns(
+    path: Path | str, xyz: NDArray[np.floating], scale: float | None = None
+) -> tuple[NDArray[np.float32], dict[str, int], list[str]]:
+    """Returns the points (N, 3) of a scan that are returns, in metres; counts; lines for a person.
+
+    Args:
+        path: Of the scan, or its topic.
+        xyz: (N, 3) in the scanner's frame, as they are stored.
+        scale: Numbers per metre that the user states, which count where metres are implausible.
+
+    Raises:
+        FileFormatError: Many coordinates are none of a scan.
+        InputError: The points are implausible in metres.
+        NoPointsError: No point is left.
+    """
+    if not len(xyz):
+        raise NoPointsError(f"{path} holds no point; give a scan with points")
+    counts, keep = dict[str, int](), np.ones(len(xyz), bool)
+
+    def drop(mask: Mask, why: str) -> None:
+        counts[why] = int(np.count_nonzero(keep & mask))
+        np.logical_and(keep, ~mask, out=keep)
+
+    # beams without return: as no numbers, as zeros, at one place, at the sensor's largest range
+    finite = np.isfinite(xyz)
+    drop(~finite.any(axis=1), "without return, as they are not finite")
+    range_m = np.linalg.norm(np.where(finite, xyz, 0).astype(np.float64), axis=1)
+    drop(finite.all(axis=1) & (range_m < _AT_SENSOR_M), "without return, as they are at the sensor")
+    drop(_repeated(xyz, keep), "without return, as they are at one and the same place")
+    plane = np.zeros(len(xyz), bool)
+    plane[keep] = _far_plane(range_m[keep])[0]
+    drop(plane, "without return, as they are at one range far beyond all others")
+    # coordinates that are none
+    odd = ~finite.all(axis=1) | (np.abs(np.where(finite, xyz, 0)) > _FARTHEST_M).any(axis=1)
+    if np.count_nonzero(odd & keep) > _BROKEN * len(xyz):
+        first = int(np.flatnonzero(odd & keep)[0])
+        raise FileFormatError(
+            f"{path}: {np.count_nonzero(odd & keep):,} of {len(xyz):,} points have a coordinate"
+            f" that is none of a scan (number {first + 1:,}:"
+            f" {' '.join(f'{n:.3g}' for n in xyz[first])} m); its numbers are probably not stored"
+            " as the format says"
+        )
+    drop(odd, "with a coordinate that is none")
+    if not keep.any():
+        raise NoPointsError(f"{path}: none of its {len(xyz):,} points is a return")
+    dropped = {why: count for why, count in counts.items() if count}
+    notes = [f"sparse: dropped {n:,} of {len(xyz):,} points {why}" for why, n in dropped.items()]
+    points, name = np.ascontiguousarray(xyz[keep], np.float32), f"{path}: range"
+    divisor, lines = divisor_to_metres(
+        range_m[keep], Reading("scan"), name, "--depth-scale", scale, SCANS
+    )
+    points = points if divisor == 1 else (points / np.float32(divisor)).astype(np.float32)
+    return points, dropped, [*notes, *lines]
+
+
+def _repeated(xyz: NDArray[np.floating], keep: Mask) -> Mask:
+    """(N,) true for the points to keep at one place that more of them share than beams can."""
+    result, rows = np.zeros(len(xyz), bool), np.asarray(xyz[keep], np.float64)
+    if len(rows) >= _FEW:
+        mixed = rows @ (1.0, np.pi, np.e**2)  # one number for each place
+        keys, counts = np.unique(mixed, return_counts=True)
+        if counts.max() >= max(_LEAST_SAME, _SAME * len(rows)):
+            result[keep] = mixed == keys[counts.argmax()]
+    return result
+
+
+def _far_plane(values: NDArray[np.float64]) -> tuple[Mask, float, float]:
+    """(N,) true for the sky, its value, and 98 % of the rest."""
+    none = np.zeros(len(values), bool), 0.0, 0.0
+    if len(values) < _FEW:
+        return none
+    largest = float(values.max())
+    same = values >= largest * (1 - _EQUAL)
+    rest = values[~same]
+    if not rest.size or np.count_nonzero(same) < max(_LEAST_SAME, _SAME * len(values)):
+        return none
+    most = float(np.quantile(rest, 0.98))
+    if largest >= _FAR_BEYOND * most:  # a renderer may mix the two at edges of the sky
+        return values > math.sqrt(largest * most), largest, most
+    if largest >= max(_FAR_ABOVE * float(rest.max()), _FAR_M):
+        return same, largest, most
+    return none
+
+
+def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list[str]]:
+    """Returns which of the known depths (N,) are no depth, and lines for a person."""
+    values = np.asarray(depth, np.float64)
+    far, largest, most = _far_plane(values)
+    total = f"{np.count_nonzero(far):,} of {len(values):,}"
+    if far.any():
+        return far, [
+            f"{total} depths are of the sky or a far plane, at {metres(largest)} {unit}, where 98 %"
+            f" of the others are at most {metres(most)} {unit}; taken as unknown"
+        ]
+    if len(values) < _FEW:
+        return far, []
+    median = float(np.median(values))
+    far = values > _FAR * median
+    return far, [
+        f"dropped {np.count_nonzero(far):,} of {len(values):,} points more than {_FAR:,.0f} times"
+        f" as far as the median of {metres(median)} {unit}; the farthest was at"
+        f" {metres(float(values.max()))} {unit}"
+    ] * bool(far.any())
+
+
+def plausible_map(
+    values: NDArray[np.float32], reading: Reading, what: str, option: str, scale: float | None
+) -> tuple[NDArray[np.float32], list[str]]:
+    """Returns a depth map (H, W) in metres without what is no depth, and lines for a person.
+
+    Args:
+        values: (H, W), 0 where unknown.
+        reading: How they were read.
+        what: As of `divisor_to_metres`, like `option` and `scale`.
+
+    Raises:
+        InputError: The depths are implausible in metres.
+    """
+    known = values > 0
+    far, notes = far_values(values[known])
+    if far.any():
+        values = values.copy()
+        values[known] = np.where(far, np.float32(0), values[known])
+    # a scale of integers that is assumed is compared with the other file of the frame instead
+    stated = scale or reading.scale
+    divisor, lines = divisor_to_metres(values[values > 0], reading, what, option, stated)
+    values = values if divisor == 1 else (values / np.float32(divisor)).astype(np.float32)
+    return values, [*(f"{what}: {note}" for note in notes), *lines]
+
+
+def divisor_to_metres(
+    depth: NDArray[np.floating],
+    reading: Reading,
+    what: str,
+    option: str,
+    scale: float | None,
+    medians: tuple[float, float] = MAPS,
+) -> tuple[float, list[str]]:
+    """Returns what depths are divided by to be metres, mostly 1, and lines for a person.
+
+    A float file holds metres. A scale that the user states counts only where that cannot be.
+
+    Args:
+        depth: (N,) known depths, or ranges, as they were read.
+        reading: How; integers have been divided by its scale.
+        what: Name of the depths in lines for a person.
+        option: Option of the scale.
+        scale: What the user states by it. None: nothing.
+        medians: The smallest and the largest that is plausible.
+
+    Raises:
+        InputError: They are implausible, and nothing that the user states explains it.
+    """
+    if not depth.size:
+        return 1.0, []
+    low, high = medians
+    median, floats = float(np.median(depth)), reading.scale is None
+    many = floats and median >= _CODES and depth.size >= _FEW
+    codes = many and bool((np.rint(depth) == depth).all())
+    if low <= median <= high and not codes:
+        return 1.0, []
+    if floats and scale is not None and scale != 1 and low <= median / scale <= high:
+        return scale, [f"{what}: ÷ {scale:g}, as {metres(median)} m are implausible"]
+    kind = " of whole numbers" if codes else ""
+    fact = f"{what}: median{kind} {metres(median)} m is implausible, the scale is probably wrong"
+    now, (low_m, high_m) = reading.scale or 1.0, _COMMON_M
+    better = next((s for s in _COMMON_SCALES if low_m <= median * now / s <= high_m), None)
+    if better is None or better == now:
+        advice = f"give numbers per metre with {option} (now {now:g})"
+    else:
+        made = metres(median * now / better)
+        advice = f"{option} {better:g} (now {now:g}) would make it {made} m"
+    stated = scale is not None or not (floats or reading.assumed)
+    if stated:
+        return 1.0, [f"warning: {fact}: {advice}"]
+    raise InputError(f"{fact}: {advice}, {option} {now:g} keeps it")
+
+
+def check_same_scale(
+    sparse: NDArray[np.float32], gt: NDArray[np.float32], readings: Mapping[str, Reading | None]
+) -> list[str]:
+    """Returns a warning if ground truth and sparse depth (H, W) differ by a factor.
+
+    Raises:
+        InputError: A scale that was assumed explains it.
+    """
+    both = (sparse > 0) & (gt > 0)
+    if int(both.sum()) < _FEW:
+        return []
+    ratio = float(np.median(gt[both] / sparse[both]))
+    if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
+        return []
+    scale_warning("sparse points", 1 / ratio, readings)
+    return [
+        f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
+        f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give"
+        " --depth-scale, or a list with gt_scale"
+    ]
+
+
+def check_pixels(path: Path, xy: NDArray[Any], size: tuple[int, int]) -> tuple[Mask, list[str]]:
+    """Returns which points (N, 2) of a list lie in an image (H, W), and lines for a person.
+
+    Raises:
+        FileFormatError: The coordinates are no pixels.
+        SizeError: They are those of an image that was turned.
+        NoPointsError: None lies in the image.
+    """
+    (height, width), inside = size, np.asarray(in_frame(xy, size))
+    outside = len(xy) - int(np.count_nonzero(inside))
+    if len(xy) >= _FEW and bool((np.abs(xy) <= 1).all()) and min(size) > 2:
+        low = "−1" if bool((xy < 0).any()) else "0"
+        raise FileFormatError(
+            f"{path}: the coordinates of all {len(xy):,} points are within {low}…1, so they are"
+            f" relative to the image; multiply them by {width} and {height} to make them pixels"
+        )
+    if outside > _SWAPPED * len(xy) and bool(in_frame(xy, (width, height)).all()):
+        raise SizeError(
+            f"{path}: {outside:,} of {len(xy):,} points are outside the {width}×{height} image,"
+            f" but all are inside {height}×{width}: swap x and y, or turn the image by 90°"
+        )
+    below = int((xy < -0.5).any(axis=1).sum())
+    if len(xy) >= _FEW and below > _BELOW_ZERO * len(xy):
+        raise FileFormatError(
+            f"{path}: {below:,} of {len(xy):,} points have coordinates below 0, down to"
+            f" {xy.min():.3g}, which are no pixels; if these are x y z of a scan, give --calib"
+        )
+    if not inside.any():
+        raise NoPointsError(f"{path}: none of its {len(xy)} points lies in the image")
+    notes = [f"sparse: {outside:,} points outside the image"] if outside else []
+    right, down = (xy.max(axis=0) + 1) / (width, height)
+    corner = max(right, down) < _CORNER and min(right, down) > 0.9 * max(right, down)
+    at_origin = bool((xy.min(axis=0) < 0.1 * xy.max(axis=0)).all())
+    if len(xy) >= _MANY and corner and at_origin:
+        notes.append(
+            f"warning: all {len(xy):,} points of {path} are in the upper left corner, up to"
+            f" {xy[:, 0].max():.0f}, {xy[:, 1].max():.0f} of {width}×{height} pixels; if these are"
+            " pixels of a smaller image, scale them to this one"
+        )
+    return inside, notes

@@ -1,0 +1,202 @@
+"""Numbers from sensors that were read wrongly without a word, made from the samples by formula.
+
+The right points are computed here: P2 · (Tr · x) of the calibration for a scan, the file's own
+codes for a map.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from pnpdepth_cli.commands.evaluation.evaluate import evaluate
+from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.commands.sparse.make import SparseTarget, sample_depth
+from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.read_frame import read_frame
+from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
+from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.sensors import SamplePattern
+
+STREET = Path(__file__).parents[2] / "samples" / "street"
+INDOOR = STREET.parent / "indoor"
+SIZE = (375, 1242)
+Rows = NDArray[np.float32]
+
+
+@pytest.fixture(scope="module")
+def scan() -> Rows:
+    """(N, 4) x y z reflectance of every fourth point of the sample."""
+    return np.fromfile(STREET / "000000.bin", "<f4").reshape(-1, 4)[::4]
+
+
+def matrix(name: str) -> NDArray[np.float64]:
+    lines = (STREET / "calib.txt").read_text().splitlines()
+    line = next(line for line in lines if line.startswith(f"{name}:"))
+    return np.array(line.split()[1:], float).reshape(3, 4)
+
+
+def seen(xyz: NDArray[Any]) -> NDArray[np.float64]:
+    """(M, 3) u, v and z of all points in the image, the nearest of each pixel, sorted by pixel."""
+    camera = xyz @ matrix("Tr_velo_to_cam")[:, :3].T + matrix("Tr_velo_to_cam")[:, 3]
+    homogeneous = camera @ matrix("P2")[:, :3].T + matrix("P2")[:, 3]
+    uv, z = homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
+    pixel = np.floor(uv + 0.5)
+    inside = (z > 0) & (pixel >= 0).all(axis=1) & (pixel < SIZE[::-1]).all(axis=1)
+    rows = np.column_stack([uv, z])[inside]
+    index = pixel[inside] @ (1, SIZE[1])
+    order = np.lexsort((rows[:, 2], index))
+    return rows[order][np.unique(index[order], return_index=True)[1]]
+
+
+def read(sparse: Path, calib: Path | None = STREET / "calib.txt", **options: Any) -> Frame:
+    scan = ScanOptions(calib=calib, keep_occluded=True)
+    files = FrameFiles(image=STREET / "rgb.png", sparse=sparse)
+    return read_frame(files, ReadOptions(scan=scan, **options))
+
+
+def points_of(frame: Frame) -> NDArray[np.float64]:
+    rows = np.column_stack([frame.points.xy.numpy(), frame.points.depth.numpy()])
+    return rows[np.argsort(np.floor(rows[:, :2] + 0.5) @ (1, SIZE[1]))]
+
+
+def same_points(sparse: Path, xyz: NDArray[Any], **changes: Any) -> None:
+    got = points_of(read(sparse, **changes))
+    np.testing.assert_allclose(got, seen(np.asarray(xyz, float)), rtol=1e-4, atol=2e-3)
+
+
+FIELDS = {
+    3: [],
+    4: ["reflectance"],
+    5: ["intensity", "ring"],
+    6: ["tanh", "elongation", "zero"],  # Waymo as mmdetection3d writes it
+    7: ["reflectance", "red", "green", "blue"],
+    8: ["one", "reflectance", "ring", "time", "zero"],  # as PCL pads points
+}
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+@pytest.mark.parametrize("cut", [0, 1, 2, 3])
+@pytest.mark.parametrize("count", FIELDS)
+def test_a_bin_of_any_number_of_fields_has_the_same_points(
+    tmp_path: Path, scan: Rows, count: int, cut: int, shuffled: bool
+) -> None:
+    scan = scan[cut:]  # so that other counts divide its size
+    rng = np.random.default_rng(0)
+    number = np.arange(len(scan))
+    fields = {
+        "reflectance": scan[:, 3],
+        "intensity": np.rint(255 * scan[:, 3]),
+        "tanh": np.tanh(scan[:, 3]),
+        "ring": number // 175 % 64,
+        "elongation": rng.gamma(0.3, 0.3, len(scan)),
+        "zero": 0 * number,
+        "one": 1 + 0 * number,
+        "time": number * 2.3e-6,
+        **{colour: rng.integers(0, 256, len(scan)) for colour in ("red", "green", "blue")},
+    }
+    rows = np.column_stack([scan[:, :3], *(fields[name] for name in FIELDS[count])])
+    order = rng.permutation(len(scan)) if shuffled else number
+    rows[order].astype("<f4").tofile(tmp_path / "a.bin")
+    assert rows.shape[1] == count
+    same_points(tmp_path / "a.bin", scan[:, :3])
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.txt", "a.csv"])
+@pytest.mark.parametrize("columns", [3, 4])
+def test_a_list_of_x_y_z_with_a_calibration_is_a_scan_in_every_format(
+    tmp_path: Path, scan: Rows, name: str, columns: int
+) -> None:
+    rows = scan[:, :columns]
+    if name == "a.npy":
+        np.save(tmp_path / name, rows)
+    else:
+        np.savetxt(tmp_path / name, rows, delimiter="," if name == "a.csv" else " ")
+    same_points(tmp_path / name, scan[:, :3])
+    with pytest.raises(FileFormatError, match="--calib"):
+        read(tmp_path / name, calib=None)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.txt"])
+def test_a_list_of_pixels_with_the_cameras_calibration_stays_one(tmp_path: Path, name: str) -> None:
+    rows = np.random.default_rng(0).uniform(1, 300, (50, 3))
+    (np.save if name == "a.npy" else np.savetxt)(tmp_path / name, rows)
+    got = read(tmp_path / name)
+    np.testing.assert_allclose(got.points.xy, rows[:, :2], rtol=1e-6)
+
+
+SILENT = {"zeros": 0.0, "nan": np.nan, "one place": [1.2, 0.0, 0.9], "far": [0.0, 0.0, 1e10]}
+
+
+@pytest.mark.parametrize("kind", SILENT)
+@pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.ply", "a.txt"])
+def test_beams_without_return_are_no_points_and_are_counted(
+    tmp_path: Path, scan: Rows, kind: str, name: str
+) -> None:
+    rows = np.concatenate([scan, np.full((9000, 4), [*np.broadcast_to(SILENT[kind], 3), 0])])
+    rows = rows[np.random.default_rng(0).permutation(len(rows))].astype("<f4")
+    path = tmp_path / name
+    if name == "a.bin":
+        rows.tofile(path)
+    elif name == "a.npy":
+        np.save(path, rows)
+    elif name == "a.txt":
+        np.savetxt(path, rows)
+    else:
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
+        header += "".join(f"property float {n}\n" for n in "xyzi") + "end_header\n"
+        path.write_bytes(header.encode() + rows.tobytes())
+    same_points(path, scan[:, :3])
+    frame = read(path)
+    assert 9000 in frame.sources["sparse"]["dropped"].values()
+    assert any("9,000 of" in note for note in frame.notes)
+
+
+def test_a_scan_in_millimetres_stops_and_is_read_by_the_option(tmp_path: Path, scan: Rows) -> None:
+    np.save(tmp_path / "a.npy", 1000 * scan[:, :3])
+    with pytest.raises(InputError, match="--depth-scale 1000"):
+        read(tmp_path / "a.npy")
+    same_points(tmp_path / "a.npy", scan[:, :3], depth_scale=1000.0)
+
+
+def codes_of(path: Path) -> NDArray[np.float64]:
+    return np.asarray(Image.open(path)).astype(np.float64)
+
+
+@pytest.mark.parametrize("far", [1e10, 65504, 10000, 1000])
+def test_a_far_plane_of_ground_truth_is_neither_scored_nor_sampled(
+    tmp_path: Path, far: float
+) -> None:
+    truth = codes_of(STREET / "gt.png") / 256
+    prediction = np.where(truth > 0, truth + 0.25, 50)
+    np.save(tmp_path / "prediction.npy", prediction.astype(np.float32))
+    np.save(tmp_path / "gt.npy", np.where(truth > 0, truth, far).astype(np.float32))
+    request = EvalRequest(prediction=tmp_path / "prediction.npy", ground_truth=tmp_path / "gt.npy")
+    result = evaluate(request)
+    assert result.mean["mae"] == pytest.approx(0.25, abs=1e-5)
+    assert result.frames[0].pixels == np.count_nonzero(truth)
+    assert any(f"{np.count_nonzero(truth == 0):,} of" in note for note in result.notes)
+    target = SparseTarget(output=tmp_path / "sparse.npy")
+    record = sample_depth(tmp_path / "gt.npy", target, SamplePattern(count=3000))
+    assert record["points"]["farthest"] <= truth.max()
+
+
+@pytest.mark.parametrize("far", [1e10, 65504, 10000, 1000])
+def test_a_far_plane_of_sparse_depth_is_no_point(tmp_path: Path, far: float) -> None:
+    sparse = codes_of(STREET / "sparse.png") / 256
+    known = np.count_nonzero(sparse)
+    with_sky = sparse.copy()
+    with_sky[:40, ::7] = far
+    np.save(tmp_path / "a.npy", with_sky.astype(np.float32))
+    frame = read(tmp_path / "a.npy")
+    assert len(frame.points) == np.count_nonzero(sparse[40:]) + np.count_nonzero(
+        np.delete(sparse[:40], np.s_[::7], axis=1)
+    )
+    assert known >= len(frame.points)
+    assert float(frame.points.depth.max()) == pytest.approx(sparse.max())
