@@ -410,6 +410,11 @@ TABLE = {measure.key: measure for measure in ON_REQUEST}
 """The measures that are computed on request alone."""
 
 
+def parse_keys(text: str) -> tuple[str, ...]:
+    """Returns the keys in a text such as `rmse,mae`."""
+    return tuple(dict.fromkeys(text.split(",")))
+
+
 def chosen_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> tuple[Measure, ...]:
     """Returns the measures with these keys, in their order; all for None.
 

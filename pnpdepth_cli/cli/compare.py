@@ -10,14 +10,14 @@ import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.streams import print_json
-from pnpdepth_cli.commands.evaluation.request import parse_names
+from pnpdepth_cli.measures import parse_keys
 
 _LABEL_LETTERS = 36
 
 
 columns = click.option(
     "--columns",
-    type=parse_names,
+    type=parse_keys,
     metavar="KEY,…",
     help="Measures of the tables, in this order, such as rmse,mae,delta1.",
 )

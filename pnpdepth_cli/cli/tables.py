@@ -150,6 +150,7 @@ def print_batch(summary: Mapping[str, Any]) -> None:
     mean, counts, beside = summary["mean"], summary["counts"], summary["linear"]
     if any(mean.values()):
         print_table(means_table(summary), err=True)
+    print_notes(summary["notes"])
     if summary["baselines"]:
         print_table(baselines_table(summary["baselines"], summary["unit"]), err=True)
     parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pnpdepth_cli.commands.tables import Cell, Style, Table
@@ -51,19 +51,22 @@ def errors_by_basis(errors: Mapping[str, Any]) -> dict[str, dict[str, Mapping[st
     return found
 
 
-def error_table(title: str, errors: Mapping[str, Any], unit: str) -> Table:
+def error_table(
+    title: str, errors: Mapping[str, Any], unit: str, keys: Sequence[str] | None = None
+) -> Table:
     """Returns a row for each measure: before, after and change, and linear interpolation beside.
 
     Args:
         title: Of the table.
         errors: As of `errors_by_basis`.
         unit: Of the depths.
+        keys: Of the measures, in this order; None for all.
     """
     rows = []
     for basis, sides in errors_by_basis(errors).items():
         before, after = sides["before"], sides["after"]
         count = f"{after['points']:,} " if "points" in after else ""
-        for key in (key for key in _MEASURES if key in before):
+        for key in (key for key in keys or _MEASURES if key in before):
             name = _title(key)
             values = [side.get(key) for side in (before, after, sides["linear"])]
             shown = [format_error(key, value, unit) for value in values]
@@ -81,7 +84,8 @@ def means_table(summary: Mapping[str, Any]) -> Table:
     """Returns the mean errors of a batch."""
     means = summary["mean"] | {"linear": summary["linear"]}
     counts = (f"{frames_of(e):,} {BASES[basis]}" for basis, e in errors_by_basis(means).items())
-    return error_table(f"means over frames: {', '.join(counts)}", means, summary["unit"])
+    title = f"means over frames: {', '.join(counts)}"
+    return error_table(title, means, summary["unit"], summary.get("columns"))
 
 
 def frames_of(errors: Mapping[str, Any]) -> int:

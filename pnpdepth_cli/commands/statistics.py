@@ -51,6 +51,15 @@ class Clusters:
         """Returns text such as `12 groups of frames`."""
         return f"{self.count:,} {self.unit}"
 
+    def notes(self) -> list[str]:
+        """Returns that frames are not independent, unless each of them is a cluster."""
+        if self.count == len(self.ids):
+            return []
+        return [
+            f"frames of one sequence are not independent: {len(self.ids):,} frames count as"
+            f" {self.describe()}"
+        ]
+
 
 def find_clusters(groups: Sequence[str], series: Floats, *, grouped: bool = True) -> Clusters:
     """Returns the groups; for a single group with correlated errors, blocks of it.

@@ -307,6 +307,8 @@ class _Batch:
                 "with_warnings": tally.warned,
             },
             "unit": tally.unit,
+            "columns": request.columns,
+            "notes": tally.notes(),
             **tally.means(),
             "unmatched": [str(each) for each in found.unmatched],
         }

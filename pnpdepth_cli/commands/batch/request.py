@@ -12,6 +12,7 @@ from pnpdepth_cli.choices import LAYOUTS, PROTOCOLS
 from pnpdepth_cli.commands.refinement.request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.measures import MEASURES, chosen_measures, parse_keys
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.settings import option
 
@@ -125,6 +126,12 @@ class BatchRequest(FrameSelection):
         "With --html: also show every frame as a point cloud, before, after and ground truth; adds"
         " up to 2.5 MB a frame.",
     )
+    columns: tuple[str, ...] | None = option(
+        None,
+        "Measures of the tables, in this order, such as rmse,mae,delta1.",
+        metavar="KEY,…",
+        parse=parse_keys,
+    )
     shard: tuple[int, int] | None = option(
         None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
     )
@@ -143,6 +150,7 @@ class BatchRequest(FrameSelection):
             raise UsageError("--adapt does not go with --shard; weights are learnt in one process")
         if self.html_3d and self.html is None:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
+        chosen_measures(MEASURES, self.columns)
 
 
 class RayWorkers(NamedTuple):

@@ -8,6 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+
+from pnpdepth_cli.commands.statistics import find_clusters
+from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.csv_text import write_csv
 from pnpdepth_cli.io.record import plain
@@ -25,6 +29,7 @@ _MEASURED = {
     "held_out_error": _POINT_ERRORS,
     "scores": _SCORES,
 }
+_MAIN = tuple(measure.key for measure in MEASURES if measure.main)
 _OF_LINEAR = ("scores", "held_out_error")
 _BASELINE = "baseline"
 _RUN_STAGES = ("read", "refine", "write")
@@ -83,6 +88,10 @@ class Tally:
         self._units: set[str] = set()
         self._compared, self._worse = 0, 0
         self._weights: defaultdict[str, list[float]] = defaultdict(list)
+        # names, groups and main errors of the frames with ground truth
+        self._names: list[str] = []
+        self._groups: list[str | None] = []
+        self._scores: list[list[float | None]] = []
         # by kind and stage
         self._errors: defaultdict[tuple[str, str], FrameMeans] = defaultdict(FrameMeans)
 
@@ -96,6 +105,10 @@ class Tally:
             self._errors[key].add(values)
         for name, weight in (row.get("weights") or {}).items():
             self._weights[name].append(weight)
+        if row["scores"]:
+            self._names.append(row["name"])
+            self._groups.append(row.get("group"))
+            self._scores.append([row["scores"]["after"].get(key) for key in _MAIN])
         worse = (row.get("linear") or {}).get("worse")
         self._compared += worse is not None
         self._worse += bool(worse)
@@ -104,6 +117,15 @@ class Tally:
     def unit(self) -> str:
         """The unit of all depths."""
         return " and ".join(sorted(self._units)) or "m"
+
+    def notes(self) -> list[str]:
+        """Returns how many of the frames with ground truth count as independent."""
+        by_name = groups_by_name(self._names)
+        groups = [own or name for own, name in zip(self._groups, by_name, strict=True)]
+        if len(groups) < 2:
+            return []
+        clusters = find_clusters(groups, np.array(self._scores, np.float64))
+        return clusters.notes()
 
     @property
     def baselines(self) -> list[str]:
@@ -193,12 +215,13 @@ def write_summaries(
             file.write(f"{',' if number else ''}\n    {line.removesuffix(chr(10))}")
         file.write("\n  ]\n}\n")
     with atomic_path(folder / CSV) as path, path.open("w", **TEXT) as file:
-        header = list(_columns(failed_row("", {}, ""), baselines))
+        header = list(_columns(failed_row("", {}, ""), baselines, head["columns"]))
         rows.seek(0)
-        write_csv(file, header, ([*_columns(json.loads(r), baselines).values()] for r in rows))
+        cells = (_columns(json.loads(row), baselines, head["columns"]).values() for row in rows)
+        write_csv(file, header, map(list, cells))
 
 
-def _columns(row: Row, baselines: Sequence[str]) -> dict[str, Any]:
+def _columns(row: Row, baselines: Sequence[str], keys: Sequence[str] | None) -> dict[str, Any]:
     """The cells of a row by the name of their column; None where a row has no value."""
     points, seconds, measured = row.get("points") or {}, row.get("seconds") or {}, _measured(row)
     cells = {
@@ -211,9 +234,10 @@ def _columns(row: Row, baselines: Sequence[str]) -> dict[str, Any]:
     }
     for kind, measures in _MEASURED.items():
         start = "" if kind == "scores" else f"{kind}_"
+        shown = measures if keys is None else [k for k in (*keys, "coverage") if k in measures]
         for stage in ("before", "after"):
             values = measured.get((kind, stage), {})
-            cells |= {f"{start}{name}_{stage}": values.get(name) for name in measures}
+            cells |= {f"{start}{name}_{stage}": values.get(name) for name in shown}
     cells["warnings"] = "; ".join(row.get("warnings") or ())
     cells |= {f"seconds_{stage}": seconds.get(stage) for stage in _RUN_STAGES}
     for name in baselines:

@@ -142,6 +142,7 @@ def compare(
         "notes": [
             *_notes(runs, names),
             *_lacking(names, measures, known),
+            *clusters.notes(),
             *_cluster_notes(clusters, len(names), tests),
         ],
     }

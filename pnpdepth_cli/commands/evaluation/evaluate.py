@@ -176,6 +176,7 @@ def evaluate(
     mean = FrameMeans(row.values for row in scored).means()
     if request.is_devkit:
         mean = dict(zip(mean, devkit_mean(values).tolist(), strict=True))
+    notes += clusters.notes()
     if len(scored) > 1 and clusters.count < MIN_CLUSTERS:
         notes.append(
             f"no interval: {clusters.describe()} are too few to tell how sure the means are;"

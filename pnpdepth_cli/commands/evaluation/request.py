@@ -10,7 +10,7 @@ from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.measures import MEASURES, Measure, by_depth
+from pnpdepth_cli.measures import MEASURES, Measure, by_depth, parse_keys
 from pnpdepth_cli.protocols import KITTI_DEVKIT, Protocol, find_protocol
 from pnpdepth_cli.settings import option
 
@@ -27,11 +27,6 @@ def parse_thresholds(text: str) -> tuple[float, float, float]:
         return first, first**2, first**3
     except (ValueError, OverflowError):
         raise UsageError(f"--delta {text!r} is no number such as 1.25") from None
-
-
-def parse_names(text: str) -> tuple[str, ...]:
-    """Returns the names in a text such as `rmse,mae`."""
-    return tuple(dict.fromkeys(text.split(",")))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +59,7 @@ class ScoringRules:
         f"More measures, for dense ground truth: {', '.join(choices.MEASURES)}.",
         flag="--measures",
         metavar="KEY,…",
-        parse=parse_names,
+        parse=parse_keys,
     )
     depth_limits: tuple[float, float] | None = option(
         None,

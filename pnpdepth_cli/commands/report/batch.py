@@ -229,11 +229,11 @@ def _notes(row: Row, basis: str | None) -> list[str]:
 
 
 def _head(summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str, str]]) -> Head:
-    unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), []
+    unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), [*summary["notes"]]
     means = summary["mean"] | {"linear": summary["linear"]}
     best = next(iter(errors_by_basis(means)), USED)
     if unmatched:
-        notes = [f"warning: {unmatched:,} files are in no frame; summary.json has them"]
+        notes.append(f"warning: {unmatched:,} files are in no frame; summary.json has them")
     if first is not None and best == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
     columns = _columns(best, unit)

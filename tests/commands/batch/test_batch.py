@@ -325,6 +325,37 @@ def test_the_summary_has_the_mean_and_the_range_of_each_weight() -> None:
     assert list(weights) == ["net", "other"]
 
 
+def test_the_summary_says_that_frames_of_one_sequence_are_not_independent_as_compare_does() -> None:
+    scores = {"before": {}, "after": {"rmse": 1.0, "mae": 1.0, "mre": 0.1, "delta1": 0.9}}
+    tally = Tally()
+    for number in range(6):
+        name = f"{'ab'[number % 2]}/{number:04}"
+        tally.add(failed_row(name, {}, "") | {"scores": scores})
+    (note,) = tally.notes()
+    assert note == (
+        "frames of one sequence are not independent: 6 frames count as 2 groups of frames"
+    )
+    alone = Tally()
+    alone.add(failed_row("a/0000", {}, "") | {"scores": scores})
+    assert alone.notes() == []
+
+
+def test_columns_choose_the_measures_of_the_tables_of_a_batch(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    print_batch(batch(root, columns=("delta1", "mae"), limit=1).summary)
+    text = capsys.readouterr().err
+    assert text.index("δ1") < text.index("MAE")
+    assert "RMSE" not in text
+    header = (root / "out/summary.csv").read_text().splitlines()[0].split(",")
+    assert [name for name in header if name.endswith("_after")] == [
+        *("sparse_error_mae_after", "held_out_error_mae_after"),
+        *("delta1_after", "mae_after", "coverage_after"),
+    ]
+    with pytest.raises(UsageError, match="--columns"):
+        batch(root, columns=("mse",))
+
+
 def test_a_record_that_lacks_what_the_summary_needs_is_an_error_that_names_it(root: Path) -> None:
     batch(root)
     path = root / "out/c.json"
