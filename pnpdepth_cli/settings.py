@@ -96,7 +96,8 @@ class Settings:
     layer: str | None = option(
         None,
         "Layer to cut at: the name of a submodule (NAME#2: its second call, NAME[KEY]: one of its"
-        " outputs), or a fraction of the network's depth, 0 the shallowest layer.",
+        " outputs), or a fraction of the network, 0 the layer nearest to the image, 1 to the"
+        " depth.",
         metavar="NAME|0..1",
     )
     iterations: int = option(None, "Number of updates; 0 is no refinement.", metavar="K")

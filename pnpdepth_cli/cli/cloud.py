@@ -26,8 +26,8 @@ from pnpdepth_cli.cli import options
 @click.option(
     "--poses",
     type=options.FILE,
-    help="Camera poses of a folder's files in their order (KITTI or TUM rows).  [default: the"
-    " records']",
+    help="Camera poses of a folder's files: TUM rows are joined by time, KITTI rows by"
+    " order.  [default: the records']",
 )
 @options.depth_scale
 @click.option("--max-depth", type=float, default=math.inf, metavar="M", help="Drop farther pixels.")

@@ -16,6 +16,7 @@ from rich.table import Table as RichTable
 from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.commands.error_tables import (
     baselines_table,
+    held_out_table,
     mean_weights_text,
     means_table,
     refinement_table,
@@ -118,6 +119,8 @@ def print_refinement(record: Mapping[str, Any]) -> None:
     """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
     print_notes(record["notes"])
     print_table(refinement_table(record), err=True)
+    if record["method"]["kind"] == "default" and record["held_out_error"]:
+        print_table(held_out_table(record), err=True)
     if record["linear"]["worse"]:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
     if record["baselines"] is not None:
@@ -164,6 +167,12 @@ def print_batch(summary: Mapping[str, Any]) -> None:
         parts.append(f"{worse} worse than linear interpolation")
     console = _Console(stderr=True, highlight=False)
     console.print(", ".join(parts))
+    for each in summary.get("warnings", ()):
+        more = "" if each["frames"] <= len(each["first"]) else ", …"
+        names = f"{', '.join(each['first'])}{more}"
+        count = "1 frame" if each["frames"] == 1 else f"{each['frames']:,} frames"
+        note = each["note"].removeprefix("warning: ")
+        console.print(escape(f"warning in {count} ({names}): {note}"), soft_wrap=True)
     if summary["weights"]:
         mean_weights = mean_weights_text(summary["weights"])
         console.print(escape(f"mean weights in the result: {mean_weights}"), soft_wrap=True)

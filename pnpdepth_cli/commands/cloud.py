@@ -25,7 +25,7 @@ from pnpdepth_cli.dataset.frame_camera import (
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud
-from pnpdepth_cli.io.poses import read_poses
+from pnpdepth_cli.io.poses import poses_of_frames
 from pnpdepth_cli.io.record import plain, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.point_cloud import (
@@ -78,14 +78,14 @@ def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
     """
     _check(request)
     frames = result_frames(request.depth)
-    poses = _poses(request, frames)
+    notes: list[str] = []
+    poses = _poses(request, frames, notes)
     if request.min_views > 1 and (poses[0] is None or len(frames) < request.min_views):
         raise UsageError(
             f"--min-views {request.min_views} needs as many frames with poses; give a folder of"
             " results, and --poses"
         )
     coloured = all(request.image or frame.image for frame in frames)
-    notes: list[str] = []
     parts = _parts(request, frames, poses, coloured, notes)
     make_folder(request.output.parent)
     points = write_cloud(request.output, _merged(request, parts, coloured))
@@ -130,10 +130,12 @@ def _check(request: CloudRequest) -> None:
         raise UsageError(f"--voxel must be a length above 0, got {request.voxel:g}")
 
 
-def _poses(request: CloudRequest, frames: list[ResultFrame]) -> list[Pose | None]:
-    """The pose of each frame: of the file that is given, else of the records."""
+def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -> list[Pose | None]:
+    """The pose of each frame: of the file that is given, which adds a note, else of the records."""
     if request.poses is not None:
-        return list(read_poses(request.poses, len(frames), "depth files"))
+        rows, how = poses_of_frames(request.poses, [frame.name for frame in frames])
+        notes.append(f"poses: {request.poses}, {how}")
+        return list(rows)
     poses = [frame.camera_and_pose[1] for frame in frames]
     without = [f.depth for f, pose in zip(frames, poses, strict=True) if pose is None]
     if without and len(without) < len(frames):

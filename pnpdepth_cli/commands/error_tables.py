@@ -104,6 +104,12 @@ def refinement_table(record: Mapping[str, Any]) -> Table:
     return error_table(title, record, record["unit"])
 
 
+def held_out_table(record: Mapping[str, Any]) -> Table:
+    """Returns the errors of a record at its held-out points."""
+    only = {**dict.fromkeys((GT, USED)), HELD_OUT: record[HELD_OUT], "linear": record["linear"]}
+    return error_table("held-out points, which nothing used", only, record["unit"])
+
+
 def _stages_table(record: Mapping[str, Any]) -> Table:
     """The stages of the default method: scores on the ground truth, or at validation points."""
     beside, names = record["linear"], record["method"]["networks"]

@@ -98,14 +98,13 @@ def result_frames(root: Path) -> list[ResultFrame]:
 
 
 def _frame(name: str, depth: Path) -> ResultFrame:
-    record = _beside(depth, ".json")
-    return ResultFrame(
-        name=name,
-        depth=depth,
-        sigma=_beside(depth, f"_sigma{depth.suffix}"),
-        valid=_beside(depth, "_valid.png"),
-        record={} if record is None else read_json(record),
-    )
+    path = _beside(depth, ".json")
+    record = {} if path is None else read_json(path)
+    files = {"sigma": f"_sigma{depth.suffix}", "valid": "_valid.png"}
+    if isinstance(written := record.get("outputs"), dict):  # others are of other runs
+        files = {kind: ending for kind, ending in files.items() if written.get(kind)}
+    companions = {kind: _beside(depth, ending) for kind, ending in files.items()}
+    return ResultFrame(name=name, depth=depth, record=record, **companions)
 
 
 def _beside(depth: Path, ending: str) -> Path | None:

@@ -129,17 +129,23 @@ def find_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path]
     """Returns the files with one of these suffixes, by relative path without suffix, and problems.
 
     Links are followed, except into a folder that they lie in. Hidden files and folders are skipped.
-    Files are sorted by path. Problems are folders that cannot be read, and files that differ in
-    suffix only, which are left out. The folder need not exist.
+    Files are in natural order of their paths. Problems are folders that cannot be read, and files
+    that differ in suffix only, which are left out. The folder need not exist.
     """
     problems: list[Unmatched] = []
-    paths = sorted(_walk(folder, frozenset(), problems)) if folder.is_dir() else []
+    paths = list(_walk(folder, frozenset(), problems)) if folder.is_dir() else []
+    paths.sort(key=lambda path: natural_order(path.as_posix()))
     files, ambiguous = one_of_each(
         (path.relative_to(folder).with_suffix("").as_posix(), path)
         for path in paths
         if path.suffix.lower() in suffixes
     )
     return files, problems + ambiguous
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Returns the key by which names are sorted as a person does: a2 before a10."""
+    return [(int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def one_of_each(

@@ -9,6 +9,8 @@ the first packet.
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +25,8 @@ from pnpdepth_cli.io.file_bytes import read_bytes
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 
+LONGEST_GAP_S = 0.02
+"""Between a frame and its pose, as in the tools of the TUM RGB-D benchmark."""
 PACKETS = "oxts/data"
 """Folder of the packets in a drive."""
 IMU_CALIBRATION = "calib_imu_to_velo.txt"
@@ -32,26 +36,57 @@ _FIELDS = 30
 Floats = NDArray[np.float64]
 
 
-def read_poses(path: Path, count: int | None = None, what: str = "") -> Floats:
+def read_poses(path: Path) -> Floats:
     """Returns the poses (N, 3, 4) from each camera's frame to the world's, in file order.
 
-    Args:
-        path: Rows of 12 numbers, a 3×4 matrix (KITTI odometry), or of 8 numbers, time, position
-            and quaternion x y z w (TUM RGB-D benchmark); `#` begins a comment.
-        count: Number of poses that are needed; None for any.
-        what: What they are of, in the plural.
+    Rows are 12 numbers, a 3×4 matrix (KITTI odometry), or 8 numbers, time, position and quaternion
+    x y z w (TUM RGB-D benchmark); `#` begins a comment.
 
     Raises:
         FileFormatError: A row has other numbers, or its rotation is none.
-        InputError: The file has another number of poses, or cannot be read.
+        InputError: The file cannot be read.
     """
-    poses = [pose for _, _, pose in _rows(path)]
-    if count is not None and len(poses) != count:
-        raise InputError(
-            f"{path} has {len(poses)} poses for {count} {what}; it needs one row for each, in"
-            " their order"
-        )
-    return np.stack(poses)
+    return np.stack([pose for _, _, pose in _rows(path)])
+
+
+def poses_of_frames(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
+    """Returns the poses (N, 3, 4) of the frames of these names, and how they were joined.
+
+    Names that are times in seconds take the row of the nearest time, at most LONGEST_GAP_S away, as
+    evo joins trajectories. Else there is a row for each frame, in their order; or, with more rows
+    than frames, the number in a name is the number of its row from 0.
+
+    Raises:
+        FileFormatError: As of `read_poses`.
+        InputError: The rows do not fit the frames.
+    """
+    rows = _rows(path)
+    poses = np.stack([pose for _, _, pose in rows])
+    numbers = [_last_number(name) for name in names]
+    if None not in numbers and all(len(values) == _TUM_COLUMNS for _, values, _ in rows):
+        times_s, wanted_s = np.array([v[0] for _, v, _ in rows]), np.array(numbers, np.float64)
+        order = np.argsort(times_s)
+        after = np.searchsorted(times_s[order], wanted_s).clip(1, max(1, len(rows) - 1))
+        pair = order[np.stack([after - 1, np.minimum(after, len(rows) - 1)])]
+        gaps = np.abs(times_s[pair] - wanted_s)
+        nearest = np.where(gaps[0] <= gaps[1], *pair)
+        if (largest := float(gaps.min(axis=0).max())) <= LONGEST_GAP_S:
+            return poses[nearest], f"joined by time, at most {1000 * largest:.0f} ms apart"
+    if len(rows) == len(names):
+        return poses, "row by row, in the order of the frames"
+    indices = [int(number) for number in numbers if number is not None]
+    if len(indices) == len(names) and max(indices) < len(rows):
+        return poses[indices], "the number in a name is that of its row, from 0"
+    raise InputError(
+        f"{path} has {len(rows)} poses for {len(names)} frames; it needs one row for each, in their"
+        " order, or a time that is the frame's name"
+    )
+
+
+def _last_number(name: str) -> float | None:
+    """The number at the end of a frame's name; None without one."""
+    found = re.search(r"\d+(?:\.\d+)?$", name)
+    return None if found is None else float(found[0])
 
 
 def _rows(path: Path) -> list[tuple[int, Floats, Floats]]:

@@ -151,8 +151,9 @@ class ModelDefinition:
     """Up to what they are right: "metric" (nothing), a "scale", "affine" (a scale and a shift), or
     "unknown". What is missing is fitted to the points."""
     layers: tuple[str, ...] = ()
-    """Names of the submodules worth cutting at, from shallow to deep; `pnpdepth layers` lists all.
-    Without any, they are suggested by the shapes of the feature maps."""
+    """Names of the submodules worth cutting at, from the image to the depth.
+
+    `pnpdepth layers` lists all. Without any, the shapes of the feature maps suggest them."""
     defaults: Settings = Settings()
     """Its settings of refinement where no option sets them."""
     checkpoint: Path | None = None

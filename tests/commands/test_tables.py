@@ -11,6 +11,7 @@ from pnpdepth_cli.commands.error_tables import (
     baselines_table,
     change,
     format_error,
+    held_out_table,
     refinement_table,
 )
 from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
@@ -98,6 +99,14 @@ def test_errors_stand_by_what_they_are_measured_on_and_validation_points_count_o
     assert table.title == "net cut at middle"
     validated = ["error at 12 validation points, MAE", "4.0000 m", "1.0000 m", "-75.0%"]
     assert table.rows == [[*validated, "2.0000 m", "-50.0%"], at_used]
+
+
+def test_held_out_points_have_a_table_of_their_own() -> None:
+    at = {"before": {"mae": 0.5}, "after": {"mae": 1.0, "points": 1000}}
+    record = {"held_out_error": at, "linear": {"held_out_error": {"mae": 2.0}}, "unit": "m"}
+    (row,) = held_out_table(record).rows
+    assert row[0] == "error at 1,000 held-out points, MAE"
+    assert row[1:] == ["0.5000 m", "1.0000 m", "+100.0%", "2.0000 m", "-50.0%"]
 
 
 def test_baselines_are_sorted_and_have_ground_truth_where_one_of_them_has() -> None:

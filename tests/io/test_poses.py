@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.poses import read_oxts_poses, read_poses, read_trajectory
+from pnpdepth_cli.io.poses import poses_of_frames, read_oxts_poses, read_poses, read_trajectory
 from tests.kitti_drives import write_calibrations, write_packet
 
 HALF = float(np.sqrt(0.5))
@@ -25,8 +25,40 @@ def test_rows_of_kitti_are_matrices_and_rows_of_tum_quaternions(tmp_path: Path) 
     (pose,) = read_poses(path)
     assert pose[:, :3] @ [1, 0, 0] == pytest.approx([0, 0, -1])
     assert pose[:, 3].tolist() == [1, 2, 3]
-    with pytest.raises(InputError, match="has 1 poses for 2 frames; it needs one row for each"):
-        read_poses(path, 2, "frames")
+
+
+def tum_row(time_s: float, x: float) -> str:
+    return f"{time_s} {x} 0 0 0 0 0 1\n"
+
+
+def kitti_row(x: float) -> str:
+    return f"1 0 0 {x} 0 1 0 0 0 0 1 0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "expected"),
+    [
+        # rows in any order, and more of them than frames
+        (tum_row(12.51, 3) + tum_row(10.0, 1) + tum_row(11.0, 2), ["10.005", "12.5"], [1, 3]),
+        (tum_row(0, 1) + tum_row(1, 2) + tum_row(10, 3), ["a/0", "a/10"], [1, 3]),
+        # times that are no names: the order counts
+        (tum_row(100.0, 1) + tum_row(100.1, 2), ["0", "1"], [1, 2]),
+        (kitti_row(1) + kitti_row(2), ["x", "y"], [1, 2]),
+        (kitti_row(1) + kitti_row(2) + kitti_row(3), ["000000", "000002"], [1, 3]),
+    ],
+)
+def test_poses_are_joined_by_time_else_by_order_or_number(
+    tmp_path: Path, text: str, names: list[str], expected: list[float]
+) -> None:
+    (tmp_path / "poses.txt").write_text(text)
+    poses, _ = poses_of_frames(tmp_path / "poses.txt", names)
+    assert poses[:, 0, 3].tolist() == expected
+
+
+def test_poses_that_fit_no_frames_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text(kitti_row(1) + kitti_row(2))
+    with pytest.raises(InputError):
+        poses_of_frames(tmp_path / "poses.txt", ["x", "y", "z"])
 
 
 @pytest.mark.parametrize(

@@ -314,6 +314,8 @@ class _Batch:
         }
         if request.varied:
             head["varied"] = dict(request.varied)
+        if tally.warnings:
+            head["warnings"] = tally.warnings
         if tally.unsure:
             head["unsure"] = list(tally.unsure)
         if request.sequence != SequenceOptions():

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.batch.frames import Task
 from pnpdepth_cli.commands.batch.summary import CSV, JSON, Row, failed_row, row_of
-from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs
+from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs, stale_outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
@@ -124,6 +124,8 @@ class Records:
         """
         planned = task.outputs
         _remove(task.record)
+        for path in stale_outputs(self.output, task.name, planned):
+            _remove(path)
         outcome = write({kind: path for kind, path in planned.items() if kind != "record"})
         written = [*outcome.outputs, "record"]
         entry = {

@@ -75,8 +75,8 @@ class SequenceOptions:
     )
     poses: Path | None = option(
         None,
-        "Camera poses of the frames in their order (KITTI or TUM rows).  [default: the layout's,"
-        " else estimated]",
+        "Camera poses of the frames: TUM rows are joined by time, KITTI rows by order."
+        "  [default: the layout's, else estimated]",
         metavar="FILE",
     )
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Neighbour, groups_by_name
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.poses import read_oxts_poses, read_poses
+from pnpdepth_cli.io.poses import poses_of_frames, read_oxts_poses
 
 KnownPose = tuple[NDArray[np.float64], str]
 """(3, 4) from the camera's frame to the world's in metres, and where it is from."""
@@ -39,7 +39,7 @@ def with_neighbours(
     Args:
         frames: All frames of the data set.
         reach: Number of frames to each side.
-        poses: A file with a row for each frame. None: the frames' own poses; where a frame has
+        poses: A file of `poses_of_frames`. None: the frames' own poses; where a frame has
             none, the motion is to be estimated.
 
     Raises:
@@ -94,7 +94,8 @@ def _neighbour(
 def _poses(frames: Sequence[FrameFiles], path: Path | None) -> list[KnownPose | None]:
     """The pose of each frame; None where it is unknown."""
     if path is not None:
-        return [(row, str(path)) for row in read_poses(path, len(frames), "frames")]
+        rows, how = poses_of_frames(path, [frame.name for frame in frames])
+        return [(row, f"{path}, {how}") for row in rows]
     poses = [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
     for sequence in sequences_of(frames).values():
         packets = [frames[index].oxts for index in sequence]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,9 @@ _BASELINE = "baseline"
 _RUN_STAGES = ("read", "refine", "write")
 _CHECKED = ("aligned", "result", "linear")
 """Stages whose errors at validation points are averaged."""
+_NUMBER = re.compile(r"\d[\d.,]*")
+_NAMED = 3
+"""Names of frames that are listed with a warning."""
 _EFFECTIVE = ("layer", "iterations", "lr", "step", "loss", "update", "align")
 
 
@@ -77,12 +81,21 @@ def failed_row(name: str, inputs: Mapping[str, str], message: str) -> dict[str, 
     }
 
 
+class Warned(NamedTuple):
+    """The frames with one kind of warning."""
+
+    note: str
+    """The warning of the first frame."""
+    names: list[str]
+
+
 class Tally:
     """Counts rows and adds up their scores; the rows are not kept."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter({"done": 0, "diverged": 0, "failed": 0})
         self.warned = 0
+        self._warnings: dict[str, Warned] = {}  # by the text without its numbers
         self.unsure: dict[str, None] = {}
         """What was guessed of the network and may be wrong, each once."""
         self._units: set[str] = set()
@@ -98,7 +111,11 @@ class Tally:
     def add(self, row: Row) -> None:
         """Adds one row."""
         self.counts[row["status"]] += 1
-        self.warned += bool(row.get("warnings"))
+        warnings = row.get("warnings") or ()
+        self.warned += bool(warnings)
+        for note in warnings:
+            kind = _NUMBER.sub("", note)
+            self._warnings.setdefault(kind, Warned(note=note, names=[])).names.append(row["name"])
         self.unsure |= dict.fromkeys(row.get("unsure", ()))
         self._units |= {row["unit"]} if "unit" in row else set()
         for key, values in _measured(row).items():
@@ -112,6 +129,14 @@ class Tally:
         worse = (row.get("linear") or {}).get("worse")
         self._compared += worse is not None
         self._worse += bool(worse)
+
+    @property
+    def warnings(self) -> list[dict[str, Any]]:
+        """The kinds of warnings: frames, the first names, and the note of the first."""
+        return [
+            {"frames": len(each.names), "first": each.names[:_NAMED], "note": each.note}
+            for each in self._warnings.values()
+        ]
 
     @property
     def unit(self) -> str:

@@ -39,6 +39,14 @@ def outputs_in(folder: Path, name: str, request: RefineRequest) -> dict[str, Pat
     return {kind: folder / f"{name}{ending}" for kind, ending in endings.items() if ending}
 
 
+def stale_outputs(folder: Path, name: str, planned: Mapping[str, Path]) -> list[Path]:
+    """Returns the files that a run with other options has left beside a result."""
+    endings = [f"_{kind}{suffix}" for kind in ("depth", "sigma") for suffix in DEPTH_SUFFIXES]
+    endings += ["_sigma_preview.png", "_valid.png", "_preview.png", "_improvement.png"]
+    paths = (folder / f"{name}{ending}" for ending in (*endings, "_view.json"))
+    return [path for path in paths if path not in planned.values() and path.is_file()]
+
+
 def plan_outputs(request: RefineRequest) -> dict[str, Path]:
     """Returns the paths of the results: `-o FILE.exr` for the depth alone, a folder for all.
 

@@ -77,7 +77,7 @@ def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:
     known = np.isfinite(frame.after) & (frame.after > 0)
     beyond, below = known & (frame.after > farthest), known & (frame.after < 0.5 / scale)
     notes = [
-        f"output: {int(mask.sum()):,} of {mask.size:,} pixels clipped to {metres(float(limit))} m,"
+        f"warning: {int(mask.sum()):,} of {mask.size:,} pixels clipped to {metres(float(limit))} m,"
         f" the {extreme} depth of a 16-bit PNG with {scale:g} codes per metre; --format exr holds"
         " every depth"
         for mask, limit, extreme in ((beyond, farthest, "largest"), (below, nearest, "smallest"))

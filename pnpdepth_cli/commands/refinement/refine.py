@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs
+from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs, stale_outputs
 from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
@@ -122,6 +122,10 @@ def write_refined(
     """
     frame = within_range(outputs, inputs, frame)
     record = record_of(request, refiner, inputs, frame)
+    stale = list[Path]()
+    if "record" in outputs:
+        record_path = outputs["record"]
+        stale = stale_outputs(record_path.parent, record_path.stem, outputs)
     with all_or_none(outputs.values()):
         with watch("write"):
             record |= write_outputs(outputs, inputs, frame)
@@ -129,6 +133,8 @@ def write_refined(
         record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
         if "record" in outputs:
             write_json(outputs["record"], record)
+    for path in stale:  # of a run with other options
+        path.unlink(missing_ok=True)
     return RefineOutcome(record=record, outputs=outputs, diverged=frame.diverged)
 
 

@@ -14,6 +14,7 @@ from pnpdepth_cli.dataset.frame_files import (
     FrameFiles,
     Unmatched,
     find_files,
+    natural_order,
     one_of_each,
 )
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
@@ -73,11 +74,7 @@ class _FilePart:
             for path in paths
             if (match := pattern.fullmatch(path.name)) and path.is_file()
         )
-        return {stem: files[stem] for stem in sorted(files, key=_by_numbers)}, ambiguous
-
-
-def _by_numbers(stem: str) -> list[tuple[int, str]]:
-    return [(int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", stem)]
+        return {stem: files[stem] for stem in sorted(files, key=natural_order)}, ambiguous
 
 
 def row(

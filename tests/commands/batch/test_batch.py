@@ -20,6 +20,7 @@ from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import _SCORES, Tally, failed_row
 from pnpdepth_cli.commands.refinement.refine import read_requested
 from pnpdepth_cli.commands.report.batch import write_batch_report
+from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.io.depth import read_depth
@@ -517,3 +518,34 @@ def test_an_unsure_guess_of_the_input_range_is_repeated_at_the_end(root: Path) -
     listener = RecordingListener()
     assert batch(root, listener, limit=2).summary["unsure"] == [note]
     assert listener.messages[-1] == f"warning: {note}"
+
+
+def test_files_of_a_run_with_other_options_do_not_stay_beside_new_ones(root: Path) -> None:
+    batch(root, refine={"uncertainty": True, "format": "exr"})
+    (root / "out" / "a_mine.png").write_bytes(b"the user's own")
+    batch(root)
+    left = {path.name for path in (root / "out").iterdir()}
+    shutil.rmtree(root / "out")
+    batch(root)
+    assert left == {path.name for path in (root / "out").iterdir()} | {"a_mine.png"}
+
+
+def test_results_are_in_the_order_of_their_numbers(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    for name in ("0", "1", "10", "11", "2"):
+        shutil.copy(root / "gt/a.png", tmp_path / "out" / f"{name}_depth.png")
+    assert [frame.name for frame in result_frames(tmp_path / "out")] == ["0", "1", "2", "10", "11"]
+
+
+def test_warnings_are_printed_once_a_kind_with_the_frames(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tally = Tally()
+    for name, count in (("a", 7), ("b", 1200), ("c", 3), ("d", 5)):
+        note = f"warning: {count:,} of 9,000 pixels clipped"
+        tally.add(failed_row(name, {}, "") | {"warnings": [note]})
+    (warned,) = tally.warnings
+    assert (warned["frames"], warned["first"]) == (4, ["a", "b", "c"])
+    batch(root)
+    print_batch(summary(root) | {"warnings": tally.warnings})
+    assert "warning in 4 frames (a, b, c, …): 7 of 9,000 pixels" in capsys.readouterr().err
