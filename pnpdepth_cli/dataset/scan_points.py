@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.dataset.plausible import scan_returns
@@ -22,8 +25,9 @@ from pnpdepth_cli.io.record import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.points import SparsePoints, in_frame
-from pnpdepth_cli.sensors import describe_dropped, edge_agreement, project_velodyne
-from pnpdepth_cli.sensors.lens import pixels_of
+from pnpdepth_cli.sensors import Points, describe_dropped, edge_agreement, project_velodyne
+from pnpdepth_cli.sensors.lens import pixels_of, unproject
+from pnpdepth_cli.sensors.projection import agreement_at, edge_ranks, near_jumps
 
 _MORE_IF_INVERTED = 3.0  # times as many points in the image with inverted extrinsics: a warning
 _NEXT_TO_NONE = 0.05  # of them; fewer points with the extrinsics themselves are an error
@@ -32,6 +36,13 @@ _AHEAD_DEG = 15.0  # angle to the camera's axis below which points are expected 
 _MOST_OUTSIDE = 1 / 3  # of these points; more outside the image give a warning
 _OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
 _CLEARLY_BETTER = 0.03  # in `edge_agreement`, of a camera that replaces the one that is named
+_CAMERAS = 4  # of KITTI; more of a calibration are not tried
+_TURNS_DEG = (-4, -2, -1, 0, 1, 2, 4)
+# In edge agreement; mirrored and other cameras are better by 0.03 at most where the calibration is
+# right, and the best of the turns by 0.08 (18 frames of KITTI).
+_OTHER_READING, _OTHER_TURN = 0.06, 0.1
+_AGREES = 0.08  # edge agreement that is not by chance
+_MANY_POINTS = 1000  # fewer tell too little
 _FEW_INSIDE = 0.5  # of the most points in the image; a camera with fewer is ruled out
 
 
@@ -103,6 +114,8 @@ def read_scan_points(
         warnings += check_direction(xyz, camera, scanner, size)
     points = project_velodyne(xyz, camera, scanner, size, keep_occluded=options.keep_occluded)
     warnings += _outside_warning(scanner.moved(xyz), camera, size)
+    if image is not None and not calibration.rectified:
+        warnings += _better_reading(points, calibration, _other_cameras(named, options), image)
     reading = Reading(f"{scan.source} of {len(xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
     if lost := describe_dropped(points.dropped):
@@ -227,6 +240,63 @@ def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: tuple[int,
         f"warning: {outside:,} of the {len(ahead):,} scan points within {_AHEAD_DEG:g}° of the"
         " camera's axis fall outside the image; check that the intrinsics belong to this image,"
         " such as those of a rectified one"
+    ]
+
+
+def _other_cameras(named: Path, options: ScanOptions) -> dict[str, Calibration]:
+    """The other cameras of a calibration, by the option that chooses them."""
+    cameras = dict[str, Calibration]()
+    if options.extrinsics is None:
+        for number in range(_CAMERAS):
+            with suppress(UsageError):  # there is no such camera
+                cameras[f"--camera {number}"] = read_calibration(named, number)
+    return cameras
+
+
+def _better_reading(
+    points: Points, own: Calibration, others: Mapping[str, Calibration], image: Path
+) -> list[str]:
+    """A warning if jumps of depth meet the image's edges clearly better in another reading.
+
+    The jumps of the scan's points in the image are projected anew for each reading.
+    """
+    rgb, scanner = read_rgb(image).values, own.scanner
+    assert scanner is not None
+    if len(points) < _MANY_POINTS or rgb.shape[:2] != points.size:
+        return []
+    ranks, jumps = edge_ranks(rgb), near_jumps(points)
+    seen = unproject(own.camera, points.xy, points.depth)
+    xyz = scanner.inverse().moved(seen)
+
+    def agreement(moved: NDArray[np.float64], camera: Camera) -> float:
+        ahead = moved[:, 2] > 0
+        xy = pixels_of(camera, moved[ahead])
+        inside = in_frame(xy, points.size)
+        if np.count_nonzero(inside) < _FEW_INSIDE * len(points):
+            return -1.0
+        return agreement_at(ranks, xy[inside], jumps[ahead][inside])
+
+    found = agreement(seen, own.camera)
+    readings = dict[str, tuple[float, float]]()  # how much better it must be, and its agreement
+    for axis, name in ((1, "y"), (2, "z")):
+        flipped = xyz * np.where(np.arange(3) == axis, -1, 1)
+        text = f"with {name} of the scan negated, as of left-handed ones (CARLA, Unity)"
+        readings[text] = _OTHER_READING, agreement(scanner.moved(flipped), own.camera)
+    for option, other in others.items():
+        if other.scanner is not None:
+            of_other = agreement(other.scanner.moved(xyz), other.camera)
+            readings[f"with {option}"] = _OTHER_READING, of_other
+    for down, right in itertools.product(_TURNS_DEG, _TURNS_DEG):
+        turn = Rotation.from_euler("xy", (down, right), degrees=True).as_matrix()
+        text = f"with the extrinsics turned by {down}° about the camera's x and {right}° about y"
+        readings[text] = _OTHER_TURN, agreement(seen @ turn.T, own.camera)
+    text = max(readings, key=lambda text: readings[text][1] - readings[text][0])
+    needed, best = readings[text]
+    if best - found < needed or best < _AGREES:
+        return []
+    return [
+        f"warning: the image's edges meet the scan's jumps of depth better {text}: {best:+.2f}"
+        f" instead of {found:+.2f}, where 0 is chance; check the calibration"
     ]
 
 

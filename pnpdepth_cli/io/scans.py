@@ -99,30 +99,47 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     """
     numbers = np.frombuffer(data, "<f4", len(data) // 4).astype(np.float64)
     numbers = np.where(np.isfinite(numbers), numbers, 0)
-    with np.errstate(divide="ignore"):
-        size = np.log10(np.abs(numbers) + _SMALLEST)
     # by sign, order of magnitude, and whether it is a whole number, such as the index of a laser
+    size = np.log10(np.abs(numbers) + _SMALLEST)
     features = np.stack([np.sign(numbers), size, numbers == np.rint(numbers)])
-    features = features[features.var(axis=1) > 0]
-    explained = {count: _explained(features, count) for count in _FIELD_COUNTS}
+    counts = ~_in_long_runs(numbers == 0)  # beams without return say nothing
+    explained = {count: _explained(features, counts, count) for count in _FIELD_COUNTS}
     most = max(explained.values())
-    count = next(n for n, fraction in explained.items() if fraction >= _AS_MUCH * most)
     if most < _LEAST_EXPLAINED:
         raise FileFormatError(
             f"{path}: its content does not tell how many numbers a point has"
             f" ({', '.join(map(str, _FIELD_COUNTS))} are tried); save its x, y, z as NPY (N, 3)"
         )
-    return count
+    return next(n for n, fraction in explained.items() if fraction >= _AS_MUCH * most)
 
 
-def _explained(features: NDArray[np.float64], count: int) -> float:
-    """Mean fraction of the variance of features (F, N) that N modulo `count` explains, 0…1."""
+def _explained(features: NDArray[np.float64], counted: NDArray[np.bool_], count: int) -> float:
+    """Mean fraction of the variance of features (F, N) that N modulo `count` explains, 0…1.
+
+    Of the numbers that are counted, (N,) bool.
+    """
     rows = features.shape[1] // count
-    if rows < 2 or not len(features):
+    fields = features[:, : rows * count].reshape(len(features), rows, count)
+    weight = counted[: rows * count].reshape(rows, count).astype(np.float64)
+    number = weight.sum(axis=0)
+    if (number < 2).any():
         return 0.0
-    whole = features[:, : rows * count].reshape(len(features), rows, count)
-    within = whole.var(axis=1, ddof=1).mean(axis=1)
-    return float((1 - within / features.var(axis=1)).mean())
+    mean = (fields * weight).sum(axis=1) / number
+    within = ((fields - mean[:, None]) ** 2 * weight).sum(axis=1) / (number - 1)
+    total = features[:, counted].var(axis=1)
+    varies = total > 0
+    fractions = 1 - (within * number).sum(axis=1)[varies] / number.sum() / total[varies]
+    return float(fractions.mean()) if varies.any() else 0.0
+
+
+def _in_long_runs(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(N,) true where a mask is true more often in a row than a point has numbers."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    starts, stops = ends[::2], ends[1::2]
+    long = stops - starts > max(_FIELD_COUNTS)
+    steps = np.zeros(len(mask) + 1, np.int8)
+    steps[starts[long]], steps[stops[long]] = 1, -1
+    return np.cumsum(steps[:-1]) > 0
 
 
 def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:

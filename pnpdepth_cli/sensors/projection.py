@@ -41,6 +41,7 @@ between scan lines, as foreground is measured only on them."""
 _STRETCH = 1.5  # multiple of half the parallax that is added to the margin
 _REACH_DEG = 0.8  # to each side, in which foreground is searched
 
+_RANKED = 7  # of so many pixels, one is sorted, which takes less time
 _JUMP = 1.3  # ratio of depths across an edge,
 _JUMP_NEIGHBOURS = 6  # looked for among so many nearest points,
 _BESIDE_PX = 3  # and compared with the image's gradient in a square of this side
@@ -106,17 +107,31 @@ def edge_agreement(points: Points, rgb: NDArray[np.float32]) -> float:
     That is the mean rank of the gradient of rgb, (H, W, 3) in 0..1, beside the points at the near
     side of a jump, less that at all points. It tells calibrations of the same scan apart.
     """
-    from scipy.spatial import cKDTree
-
     if len(points) <= _JUMP_NEIGHBOURS:
         return 0.0
+    return agreement_at(edge_ranks(rgb), points.xy, near_jumps(points))
+
+
+def edge_ranks(rgb: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Returns (H, W) the rank, 0…1, of the gradient beside each pixel of rgb (H, W, 3) in 0..1."""
     grey = cv2.GaussianBlur(rgb.mean(axis=2), (0, 0), 1.0)
     gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
-    beside = cv2.dilate(gradient, np.ones((_BESIDE_PX, _BESIDE_PX), np.uint8)).ravel()
-    at_points = beside[pixel_index(points.xy, points.size)]
-    rank = np.searchsorted(np.sort(beside), at_points) / beside.size
+    beside = cv2.dilate(gradient, np.ones((_BESIDE_PX, _BESIDE_PX), np.uint8))
+    some = np.sort(beside.ravel()[::_RANKED])
+    return np.searchsorted(some, beside) / some.size
+
+
+def near_jumps(points: Points) -> Mask:
+    """Returns (N,) true for points at the near side of a jump of depth, of more than a few."""
+    from scipy.spatial import cKDTree
+
     _, near = cKDTree(points.xy).query(points.xy, k=_JUMP_NEIGHBOURS)
-    jumps = points.depth[near].max(axis=1) > _JUMP * points.depth
+    return np.asarray(points.depth[near].max(axis=1) > _JUMP * points.depth)
+
+
+def agreement_at(ranks: NDArray[np.float64], xy: NDArray[np.floating], jumps: Mask) -> float:
+    """Returns the agreement of edges of `edge_ranks` and of jumps at pixels (N, 2) inside."""
+    rank = ranks.ravel()[pixel_index(xy, (ranks.shape[0], ranks.shape[1]))]
     return float(rank[jumps].mean() - rank.mean()) if jumps.any() else 0.0
 
 

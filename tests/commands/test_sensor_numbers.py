@@ -200,3 +200,46 @@ def test_a_far_plane_of_sparse_depth_is_no_point(tmp_path: Path, far: float) -> 
     )
     assert known >= len(frame.points)
     assert float(frame.points.depth.max()) == pytest.approx(sparse.max())
+
+
+def warnings_of(sparse: Path, image: Path = STREET / "rgb.png", **scan: Any) -> list[str]:
+    scan_options = ScanOptions(calib=STREET / "calib.txt", **scan)
+    frame = read_frame(FrameFiles(image=image, sparse=sparse), ReadOptions(scan=scan_options))
+    return [note for note in frame.notes if note.startswith("warning: ")]
+
+
+def test_a_scan_that_the_image_contradicts_is_warned_of_with_the_better_reading(
+    tmp_path: Path,
+) -> None:
+    whole = np.fromfile(STREET / "000000.bin", "<f4").reshape(-1, 4)
+    assert warnings_of(STREET / "000000.bin") == []
+    for axis, name in ((1, "y"), (2, "z")):
+        mirrored = whole.copy()
+        mirrored[:, axis] *= -1
+        mirrored.tofile(tmp_path / "mirrored.bin")
+        (warning,) = warnings_of(tmp_path / "mirrored.bin")
+        assert f"with {name} of the scan negated" in warning
+    (warning,) = warnings_of(STREET / "000000.bin", camera=1)
+    assert "with --camera 2" in warning
+    sine, cosine = np.sin(np.radians(2)), np.cos(np.radians(2))
+    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # about the camera's y
+    pose = matrix("Tr_velo_to_cam")
+    np.savetxt(tmp_path / "turned.txt", np.column_stack([turn @ pose[:, :3], pose[:, 3]]))
+    (warning,) = warnings_of(STREET / "000000.bin", extrinsics=tmp_path / "turned.txt")
+    assert "turned by 0° about the camera's x and -2° about y" in warning
+
+
+def test_a_matrix_that_mirrors_is_named_as_one(tmp_path: Path) -> None:
+    mirrored = matrix("Tr_velo_to_cam") * (1, -1, 1, 1)
+    np.savetxt(tmp_path / "mirrored.txt", mirrored)
+    with pytest.raises(FileFormatError, match="determinant −1"):
+        warnings_of(STREET / "000000.bin", extrinsics=tmp_path / "mirrored.txt")
+
+
+def test_a_valid_calibration_is_not_doubted_for_beams_without_return(tmp_path: Path) -> None:
+    whole = np.fromfile(STREET / "000000.bin", "<f4").reshape(-1, 4)
+    silent = np.concatenate([np.zeros((300_000, 4), "<f4"), whole])
+    silent.tofile(tmp_path / "silent.bin")
+    pose = np.column_stack([matrix("Tr_velo_to_cam")[:, :3], matrix("Tr_velo_to_cam")[:, 3]])
+    np.savetxt(tmp_path / "pose.txt", pose)
+    assert warnings_of(tmp_path / "silent.bin", extrinsics=tmp_path / "pose.txt") == []
