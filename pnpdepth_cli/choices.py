@@ -177,7 +177,7 @@ LAYOUTS = Table(
     noun="layout",
     names=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
-        *("tum", "7scenes", "colmap", "void", "diode", "ibims", "scannet"),
+        *("tum", "7scenes", "eth3d", "colmap", "void", "diode", "ibims", "scannet"),
         *("arkitscenes", "pairs", "image-depth", "nyu-h5"),
     ),
 )

@@ -28,20 +28,28 @@ class FramePart:
 
     halved: bool = False
     """Whether every second pixel in both directions (nearest neighbour) is used."""
+    blocks: int = 1
+    """Side of the blocks of pixels whose known values are averaged to one pixel."""
     crop: tuple[int, int] | None = None
-    """(H, W) of the crop after halving; None for the whole image."""
+    """(H, W) of the crop after halving or averaging; None for the whole image."""
     anchor: Literal["centre", "bottom"] = "centre"
     """Vertical position of the crop, which is centred horizontally."""
 
     def __str__(self) -> str:
         size = "all" if self.crop is None else f"{self.crop[1]}×{self.crop[0]} at the {self.anchor}"
-        return f"{size} of the {'halved ' * self.halved}frame"
+        averaged = f", averaged over {self.blocks}×{self.blocks} pixels" * (self.blocks > 1)
+        return f"{size} of the {'halved ' * self.halved}frame{averaged}"
+
+    @property
+    def factor(self) -> int:
+        """How many pixels of a row become one."""
+        return 2 if self.halved else self.blocks
 
     def apply(self, image: NDArray[Any]) -> NDArray[Any]:
         """Returns the part of an image (H, W) or (H, W, C). Raises SizeError if it is too small."""
         top, left, height, width = self._window((image.shape[0], image.shape[1]))
         # nearest neighbour at half the size: the pixel whose area holds the new pixel's centre
-        small = image[1::2, 1::2] if self.halved else image
+        small = image[1::2, 1::2] if self.halved else _block_means(image, self.blocks)
         return small[top : top + height, left : left + width]
 
     def in_crop(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
@@ -49,32 +57,44 @@ class FramePart:
         import numpy as np
 
         top, left, _, _ = self._window(size)
-        moved = (np.asarray(xy, np.float64) + 0.5) / 2 - 0.5 if self.halved else xy
+        moved = (np.asarray(xy, np.float64) + 0.5) / self.factor - 0.5
         return np.asarray(moved - np.array([left, top]), np.float32)
 
     def camera_in_crop(self, camera: Camera, size: tuple[int, int]) -> Camera:
         """Returns the camera of that part, from that of the whole image of (H, W)."""
         top, left, height, width = self._window(size)
         intrinsics = camera.intrinsics.copy()
-        if self.halved:  # x becomes (x + 0.5) / 2 - 0.5
-            intrinsics[:2] /= 2
-            intrinsics[:2, 2] -= 0.25
+        intrinsics[:2] /= self.factor  # x becomes (x + 0.5) / factor - 0.5
+        intrinsics[:2, 2] -= 0.5 - 0.5 / self.factor
         intrinsics[:2, 2] -= (left, top)
         return replace(camera, intrinsics=intrinsics, size=(height, width))
 
     def _window(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
-        """(top, left, height, width) after halving."""
-        height, width = (side // 2 for side in size) if self.halved else size
+        """(top, left, height, width) after halving or averaging."""
+        height, width = (side // self.factor for side in size)
         if self.crop is None:
             return 0, 0, height, width
         rows, columns = self.crop
         if rows > height or columns > width:
             raise SizeError(
                 f"the protocol needs {columns}×{rows} pixels but the frame has"
-                f" {width}×{height}{' after halving' if self.halved else ''}"
+                f" {width}×{height}{f' at 1/{self.factor}' * (self.factor > 1)}"
             )
         top = height - rows if self.anchor == "bottom" else (height - rows) // 2
         return top, (width - columns) // 2, rows, columns
+
+
+def _block_means(image: NDArray[Any], side: int) -> NDArray[Any]:
+    """The means of blocks of an image (H, W, C), of depth (H, W) over those above 0."""
+    if side == 1:
+        return image
+    import numpy as np
+
+    height, width = (length // side for length in image.shape[:2])
+    whole = image[: height * side, : width * side]
+    blocks = whole.reshape(height, side, width, side, *image.shape[2:])
+    known = (blocks > 0).sum(axis=(1, 3)) if image.ndim == 2 else side**2
+    return np.asarray(blocks.sum(axis=(1, 3)) / np.maximum(known, 1), np.float32)
 
 
 WHOLE = FramePart()
@@ -125,6 +145,8 @@ class Protocol:
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
     missing: str = "skip"
     """Empty predictions: "skip", or "min", scored as the lower bound."""
+    exclude_sparse: bool = False
+    """Whether pixels with a sparse point are not scored."""
 
 
 # The reference codes (monodepth2's evaluate_depth.py, BTS's eval) clamp predictions with
@@ -138,6 +160,7 @@ _EIGEN = Protocol(
     clip=True,
     missing="min",
 )
+_NOT_FOUND = "which pixels the paper draws, with which seed, size and bounds, was not found"
 _RESAMPLED = "the paper halves frames by interpolation; here every second pixel is taken"
 
 PROTOCOLS = {
@@ -180,6 +203,38 @@ PROTOCOLS = {
             note=f"the paper names no seed of its points; {_RESAMPLED}",
         ),
         Protocol(name="omni-dc-kitti", part=FramePart(crop=(256, 1216), anchor="bottom")),
+        Protocol(
+            name="omni-dc-eth3d",
+            part=FramePart(blocks=8, crop=(480, 640)),
+            sample="2150",
+            seed=0,
+            note="the paper names no seed of its points, and interpolates images, which are"
+            " averaged here; it has other numbers and patterns of points too",
+        ),
+        Protocol(
+            name="capa-100",
+            part=WHOLE,
+            sample="100",
+            seed=0,
+            exclude_sparse=True,
+            note=f"100 points on ScanNet and 7-Scenes; {_NOT_FOUND}",
+        ),
+        Protocol(
+            name="streamtto-rings",
+            part=WHOLE,
+            sample="lines:8",
+            seed=0,
+            exclude_sparse=True,
+            note=f"the 8 rings are evenly spaced rows of the image here; {_NOT_FOUND}",
+        ),
+        Protocol(
+            name="streamtto-pixels",
+            part=WHOLE,
+            sample="10%",
+            seed=0,
+            exclude_sparse=True,
+            note=f"10 % of the pixels with ground truth; {_NOT_FOUND}",
+        ),
     )
 }
 """All protocols by name."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.dataset.arrays import depth_of
-from pnpdepth_cli.dataset.frame_files import FrameFiles, Hdf5Array
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import read_depth
@@ -147,6 +147,16 @@ def nyu_mat(root: Path) -> None:
         file["depths"] = np.tile(np.arange(640, dtype=np.float32)[:, None] + 1, (4, 1, 480))
 
 
+def eth3d(root: Path, height: int = HEIGHT, width: int = WIDTH) -> None:
+    """A frame of 2 m in the left half, without a return in the right one."""
+    image(root / "office/images/dslr_images/DSC_0219.JPG", height, width)
+    depth = np.full((height, width), 2, "<f4")
+    depth[:, width // 2 :] = np.inf
+    path = root / "office/ground_truth_depth/dslr_images/DSC_0219.JPG"
+    path.parent.mkdir(parents=True)
+    depth.tofile(path)
+
+
 def read_frames(root: Path, name: str | None = None) -> list[FrameFiles]:
     """The frames of a data set, all of which are complete."""
     _, listing = list_frames(root, name)
@@ -158,7 +168,7 @@ def read_frames(root: Path, name: str | None = None) -> list[FrameFiles]:
 def ground_truth(frame: FrameFiles) -> np.ndarray:
     """The ground truth (H, W) of a frame in metres, cut as its protocol says."""
     assert frame.gt is not None
-    if isinstance(frame.gt, Hdf5Array):
+    if not isinstance(frame.gt, Path):
         return frame.part.apply(depth_of(frame.gt))
     return frame.part.apply(read_depth(frame.gt, scale=frame.gt_scale).values)
 
@@ -168,6 +178,7 @@ BENCHMARKS: dict[str, tuple[Maker, list[str]]] = {
     "void": (void, ["data/desktop/1553.25"]),
     "diode": (diode, ["indoors/scene_00019/scan_00183/00019_00183_indoors_000_010"]),
     "ibims": (ibims, ["corridor_01"]),
+    "eth3d": (eth3d, ["office/DSC_0219"]),
     "scannet": (scannet, [f"scene000{s}_00/{n}" for s in (0, 1) for n in (0, 2, 10)]),
     "arkitscenes": (arkitscenes, ["41069021/41069021_305.244"]),
 }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,9 +19,9 @@ from pnpdepth_cli.commands.refinement.refine import read_requested
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.protocols import PROTOCOLS
+from pnpdepth_cli.protocols import PROTOCOLS, FramePart
 from pnpdepth_cli.sensors import behind_foreground
-from tests.data_sets import SELECTED, image, nyu_h5, void
+from tests.data_sets import SELECTED, eth3d, image, nyu_h5, void
 
 KITTI = (352, 1216)
 
@@ -72,6 +74,11 @@ BY_HAND: dict[str, tuple[Callable[[Path], None], int, int, int]] = {
     # the near point stays, and removes the four around it
     "marigold-dc-lidar": (kitti, 1, 63 * 304 + 1 - 4, 252 * 1216),
     "omni-dc-kitti": (kitti, 1, 63 * 304 + 1, 252 * 1216),
+    "omni-dc-eth3d": (partial(eth3d, height=3840, width=5120), 1, 2150, 480 * 320),
+    # input points are excluded
+    "capa-100": (scannet, 1, 100, 480 * 640 - 100),
+    "streamtto-rings": (scannet, 1, 8 * 640, 472 * 640),
+    "streamtto-pixels": (scannet, 1, 48 * 640, 432 * 640),
 }
 
 
@@ -83,7 +90,11 @@ def inputs_of(root: Path, protocol: str) -> list[Frame]:
     ]
 
 
-@pytest.mark.parametrize("name", BY_HAND)
+LARGE = pytest.param("omni-dc-eth3d", marks=pytest.mark.slow)
+"""Of 20 megapixels."""
+
+
+@pytest.mark.parametrize("name", [*sorted(BY_HAND.keys() - {"omni-dc-eth3d"}), LARGE])
 def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_path: Path) -> None:
     maker, frames, points, pixels = BY_HAND[name]
     root = tmp_path / "data"
@@ -99,12 +110,24 @@ def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_p
         path = tmp_path / "out" / f"{frame.name}_depth.npy"
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, np.full(each.gt.shape, 2.0, np.float32))
+        record = json.dumps({"inputs": {"sparse": each.sources["sparse"]}})
+        path.with_name(path.name.replace("_depth.npy", ".json")).write_text(record)
     found = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=root, protocol=name))
     assert [frame.pixels for frame in found.frames] == [pixels] * frames
 
 
 def test_every_protocol_of_a_completion_paper_is_worked_out() -> None:
-    assert {name for name in PROTOCOLS if "-dc-" in name} == BY_HAND.keys()
+    own = {"paper", "whole", "nyu", "kitti-odometry", "kitti", "kitti-devkit"}
+    assert PROTOCOLS.keys() - {*own, "nyu-eigen", "eigen", "garg"} == BY_HAND.keys()
+
+
+def test_blocks_of_pixels_are_averaged_over_those_with_depth() -> None:
+    part = FramePart(blocks=2, crop=(1, 2))
+    depth = np.array([[1, 3, 0, 0, 9], [0, 5, 0, 0, 9], [9, 9, 9, 9, 9]], np.float32)
+    assert part.apply(depth).tolist() == [[3, 0]]
+    image = np.stack([depth] * 3, axis=2)
+    assert part.apply(image)[0, :, 0].tolist() == [9 / 4, 0]
+    assert part.in_crop(np.array([[0.5, 0.5], [2, 0]]), (3, 5)).tolist() == [[0, 0], [0.75, -0.25]]
 
 
 def test_the_points_of_ibims_are_those_that_marigold_dc_draws(tmp_path: Path) -> None:

@@ -63,6 +63,8 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     paper         all known ground truth; mean over images
     whole, nyu, kitti-odometry, marigold-dc-…, omni-dc-…
                   the same, of the part of the frames that `batch` refines by this name
+    capa-…, streamtto-…
+                  the same, without the pixels of sparse points
     nyu-eigen     0.001–10 m, predictions clipped to it, Eigen's crop of 640×480
     kitti         measures and units of the KITTI depth completion benchmark
     kitti-devkit  figures of KITTI's development kit: missing depth filled in, metres, 1/m

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, Hdf5Array, Source
+from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, Hdf5Array, RawDepth, Source
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
-from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.rgb import read_rgb, sizes_of
 
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
@@ -105,8 +105,16 @@ def rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
     return pixels.astype(np.float32) / np.float32(255)
 
 
-def depth_of(source: Hdf5Array) -> NDArray[np.float32]:
+def depth_of(source: Hdf5Array | RawDepth) -> NDArray[np.float32]:
     """Returns (H, W) float32 metres, 0 where unknown, of floats. Raises InputError for others."""
+    if isinstance(source, RawDepth):
+        _, size = sizes_of(source.image)
+        if size_of_regular_file(source.path) != 4 * math.prod(size):
+            raise FileFormatError(
+                f"{source} does not hold 4 bytes for each pixel of {source.image}; unpack it again"
+            )
+        check_value_count(source.path, math.prod(size), value_bytes=4)
+        return known_metres(np.fromfile(source.path, "<f4").reshape(size))
     metres = _read(source)
     if metres.dtype.kind != "f" or metres.ndim != 2:
         raise FileFormatError(f"{source} is {metres.dtype} of shape {metres.shape}, not depth")

@@ -39,10 +39,21 @@ class Hdf5Array:
         return f"{self.path}[{self.name}{'' if self.index is None else f', {self.index}'}]"
 
 
+@dataclass(frozen=True, kw_only=True)
+class RawDepth:
+    """Float32 metres, row by row, of the size of an image, in a file without a header (ETH3D)."""
+
+    path: Path
+    image: Path
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+
 Source = Path | Hdf5Array
 
 
-def file_of(source: Source) -> Path:
+def file_of(source: Source | RawDepth) -> Path:
     """Returns the file that a source lies in."""
     return source if isinstance(source, Path) else source.path
 
@@ -76,7 +87,7 @@ class FrameFiles:
     sparse: Path | None = None
     """A depth file, a list of points, a scan, or the folder of a COLMAP model. None where points
     are sampled from `gt`."""
-    gt: Source | None = None
+    gt: Source | RawDepth | None = None
     calib: Path | None = None  # the calibration, as `read_calibration` takes it
     camera: int | None = None  # which camera of the calibration
     sparse_scale: float | None = None  # codes per metre of integer sparse depth

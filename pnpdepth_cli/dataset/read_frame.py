@@ -24,6 +24,7 @@ from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
     Hdf5Array,
+    RawDepth,
     Source,
     file_of,
 )
@@ -208,7 +209,10 @@ def _read_image(files: FrameFiles, source: Source) -> tuple[ImageArray, str | No
 
 
 def _read_ground_truth(
-    files: FrameFiles, options: ReadOptions, source: Source, size: tuple[int, int] | None
+    files: FrameFiles,
+    options: ReadOptions,
+    source: Source | RawDepth,
+    size: tuple[int, int] | None,
 ) -> tuple[DepthFile, dict[str, Any], list[str]]:
     """The ground truth of an image (H, W), what a record keeps of it, and lines for a person."""
     scale = options.depth_scale or files.gt_scale
@@ -217,8 +221,8 @@ def _read_ground_truth(
         scan = read_scan_points(source, of_scan, size, files.image_file, scale=scale)
         truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
         return truth, scan.record, [note.replace("sparse:", "gt:", 1) for note in scan.notes]
-    if isinstance(source, Hdf5Array):
-        truth = DepthFile(values=depth_of(source), reading=Reading("HDF5"))
+    if not isinstance(source, Path):
+        truth = DepthFile(values=depth_of(source), reading=Reading(f"{source.path.suffix} array"))
     else:
         truth = read_depth(source, scale=scale)
     values = masked(truth.values, files.masks)
@@ -230,7 +234,7 @@ def _read_ground_truth(
     return replace(truth, values=values), record, [f"gt: {described}", *notes]
 
 
-def _file_record(source: Source) -> dict[str, Any]:
+def _file_record(source: Source | RawDepth) -> dict[str, Any]:
     return {"path": str(source), "sha256": fingerprint(file_of(source)).sha256}
 
 

@@ -17,6 +17,7 @@ from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
+    RawDepth,
     Source,
     Unmatched,
     file_of,
@@ -176,7 +177,7 @@ def _reads_scan(files: FrameFiles, scan: ScanOptions) -> bool:
     )
 
 
-def _is_scan_file(source: Source | None) -> bool:
+def _is_scan_file(source: Source | RawDepth | None) -> bool:
     return isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES
 
 

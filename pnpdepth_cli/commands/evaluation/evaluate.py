@@ -308,7 +308,7 @@ def _scales(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str
 def _given_points(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:
     """Scored pixels at which the network was given a depth."""
     given = sum(row.given or 0 for row in scored)
-    if given and not request.exclude_sparse:
+    if given and not request.rules.exclude_sparse:
         fraction = given / sum(row.pixels for row in scored if row.given is not None)
         yield (
             f"{given:,} of the scored pixels ({fraction:.2%}) have a point of the sparse input;"

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.dataset.arrays import depth_of, masked, read_image
-from pnpdepth_cli.dataset.frame_files import Hdf5Array
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import (
@@ -84,17 +83,18 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
     """
     frame = pair.frame
     scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
-    if isinstance(frame.gt, Hdf5Array):
-        whole = DepthFile(values=depth_of(frame.gt), reading=Reading("HDF5 array"))
+    assert frame.gt is not None
+    if not isinstance(frame.gt, Path):
+        reading = Reading(f"{frame.gt.path.suffix} array")
+        whole = DepthFile(values=depth_of(frame.gt), reading=reading)
     else:
-        assert frame.gt is not None
         whole = _read(frame.gt, scale, request)
     masked_gt = masked(whole.values, frame.masks)
     values, notes = plausible_map(masked_gt, whole.reading, "gt", "--gt-scale", scale)
     gt = np.ascontiguousarray(frame.part.apply(values))
-    given = _given_points(pair, gt, required=request.exclude_sparse)
+    given = _given_points(pair, gt, required=request.rules.exclude_sparse)
     scored = _scored_mask(gt, request.rules)
-    if request.exclude_sparse:
+    if request.rules.exclude_sparse:
         if given is None:
             raise InputError(
                 f"frame {pair.name} has no sparse depth file to exclude: neither the record beside"

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.dataset.frame_files import (
     FrameFiles,
+    RawDepth,
     Source,
     find_files,
     groups_by_name,
@@ -58,7 +59,7 @@ class FramePair:
     image: Source | None = None
 
     @property
-    def paths(self) -> dict[str, Source | None]:
+    def paths(self) -> dict[str, Source | RawDepth | None]:
         """The files of the frame."""
         files = {"prediction": self.prediction, "truth": self.frame.gt}
         return files | {"sparse": self.sparse, "image": self.image}

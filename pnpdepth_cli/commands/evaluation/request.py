@@ -116,11 +116,12 @@ class EvalRequest(ScoringRules):
 
     @cached_property
     def rules(self) -> Protocol:
-        """The protocol with the bounds and thresholds that the user changes."""
+        """The protocol with what the user changes of it."""
         own = find_protocol(self.protocol)
         return replace(
             own,
             max_depth=own.max_depth if self.max_depth is None else self.max_depth,
+            exclude_sparse=own.exclude_sparse or self.exclude_sparse,
             thresholds=self.thresholds or own.thresholds,
         )
 
@@ -152,7 +153,7 @@ class EvalRequest(ScoringRules):
             f"{rules.name}{changed}: all known ground truth{bounds}": True,
             "no crop" if rules.crop == "none" else f"crop {rules.crop}": True,
             "predictions clipped to the same range": rules.clip,
-            "without the pixels of sparse points": self.exclude_sparse,
+            "without the pixels of sparse points": rules.exclude_sparse,
             f"predictions resized ({self.resize})": self.resize,
             "predictions are disparity": self.prediction_kind == "disparity",
             f"each image scaled by {self.scale_by}": self.scale_by != "none",
@@ -165,17 +166,14 @@ class EvalRequest(ScoringRules):
 
     def scoring(self) -> dict[str, Any]:
         """Returns what decides the figures; equal for two evaluations that can be compared."""
-        return scoring_of(self.rules, self.scale_by, exclude_sparse=self.exclude_sparse)
+        return scoring_of(self.rules, self.scale_by)
 
 
-def scoring_of(
-    rules: Protocol, scale_by: str = "none", *, exclude_sparse: bool = False
-) -> dict[str, Any]:
+def scoring_of(rules: Protocol, scale_by: str = "none") -> dict[str, Any]:
     """Returns the rules that decide figures, by their names."""
-    names = ("min_depth", "max_depth", "clip", "crop", "missing")
+    names = ("min_depth", "max_depth", "clip", "crop", "missing", "exclude_sparse")
     return {name: getattr(rules, name) for name in names} | {
         "thresholds": list(rules.thresholds),
         "scale_by": scale_by,
-        "exclude_sparse": exclude_sparse,
         "definitions": KITTI_DEVKIT if rules.name == KITTI_DEVKIT else "usual",
     }

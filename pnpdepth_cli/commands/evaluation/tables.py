@@ -41,7 +41,7 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
         if intervals is not None:
             row.append(" … ".join(measure.text(end) for end in intervals.get(measure.key, ())))
         rows.append(row)
-    title += _without_sparse(evaluation.request.exclude_sparse)
+    title += _without_sparse(evaluation.request.rules.exclude_sparse)
     return Table(title=title, columns=columns, rows=rows)
 
 
@@ -67,7 +67,7 @@ def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
         title = f"The {_FRAMES_SHOWN} worst by RMSE; --csv has all"
     shown = keys or [measure.key for measure in evaluation.request.measures[:_FRAME_COLUMNS]]
     table = frames_table(found, keys).only(["name", *shown, COVERAGE.key])
-    return replace(table, title=title + _without_sparse(evaluation.request.exclude_sparse))
+    return replace(table, title=title + _without_sparse(evaluation.request.rules.exclude_sparse))
 
 
 def worst(evaluation: Evaluation, key: str) -> list[FrameScores]:

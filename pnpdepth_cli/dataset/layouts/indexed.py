@@ -4,9 +4,10 @@
 associations.txt (of TUM's associate.py, or of ICL-NUIM) pairs them itself: a time and a path twice
 per line. Poses are those of groundtruth.txt beside them, at the times of the images.
 
-`colmap`: a COLMAP project, images/ and sparse/0/, or sparse/, or a model beside images/. The images
-of dense/, which COLMAP undistorts, are a project of their own: dense/images/ and dense/sparse/. Of
-several models, sparse/0 to sparse/N, the one with the most images is used.
+`colmap`: a COLMAP project, images/ and sparse/0/, or sparse/, or a model beside images/, as that of
+ETH3D's undistorted images in dslr_calibration_undistorted/. The images of dense/, which COLMAP
+undistorts, are a project of their own: dense/images/ and dense/sparse/. Of several models, sparse/0
+to sparse/N, the one with the most images is used.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from pnpdepth_cli.io.colmap_model import model_files, read_model
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.poses import read_trajectory
 
+_OF_ETH3D = "dslr_calibration_undistorted"
 _ASSOCIATIONS = "associations.txt"
 _LONGEST_GAP_S = 0.02
 """As TUM's own tool associates them."""
@@ -126,7 +128,8 @@ def _colmap_models(root: Path) -> list[Path]:
     sparse = root / "sparse"
     inside = [p for p in sparse.iterdir() if p.name.isdigit()] if sparse.is_dir() else []
     numbered = sorted(inside, key=lambda p: int(p.name))
-    found = [folder for folder in (*numbered, sparse, root) if model_files(folder)]
+    folders = (*numbered, sparse, root, root / _OF_ETH3D)
+    found = [folder for folder in folders if model_files(folder)]
     return found if (root / "images").is_dir() else []
 
 

@@ -22,6 +22,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pnpdepth_cli.dataset.frame_files import RawDepth
 from pnpdepth_cli.dataset.layouts.layout import Files, Layout, row
 from pnpdepth_cli.io.file_bytes import read_bytes
 
@@ -43,6 +44,10 @@ def _of_void(place: Path) -> Callable[[Files], Mapping[str, Any] | None]:
     words = read_bytes(split).decode("utf-8", "replace").split()
     wanted = {path.stem for path in map(Path, words) if path.parts[-3:-2] == (place.name,)}
     return lambda files: {} if files["image"].stem in wanted else None
+
+
+def _raw_truth(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+    return lambda files: {"gt": RawDepth(path=files["gt"], image=files["image"])}
 
 
 ROWS: dict[str, Layout] = {
@@ -71,6 +76,13 @@ ROWS: dict[str, Layout] = {
         below="|*/|*/*/|*/*/*/|*/*/*/*/",
         marks=("*_depth_mask.npy", "*_depth.npy"),
         name=_below,
+    ),
+    "eth3d": row(
+        {"image": "images/dslr_images/*.JPG", "gt": "ground_truth_depth/dslr_images/*.JPG"},
+        below="|*/|*/*/",
+        marks=("ground_truth_depth",),
+        name=_joined("/"),
+        more=_raw_truth,
     ),
     "ibims": row(
         {

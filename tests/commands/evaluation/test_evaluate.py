@@ -386,7 +386,7 @@ def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Pa
     result = scored(tmp_path, protocol="nyu-eigen")
     error = (predictions - depths)[:, 45:471, 41:601].astype(np.float64)
     expected = np.sqrt((error**2).mean(axis=(1, 2))).mean()
-    assert "gt: HDF5 array" in result.notes
+    assert "gt: .mat array" in result.notes
     assert result.mean["rmse"] == pytest.approx(expected, rel=1e-6)
     assert scored(tmp_path, protocol="nyu-eigen").mean == result.mean
     with pytest.raises(InputError, match=r"no frame could be scored; the first: .*304×228"):

@@ -14,11 +14,12 @@ from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine import read_requested
 from pnpdepth_cli.commands.refinement.request import RefineRequest, sample_pattern
 from pnpdepth_cli.dataset.arrays import masked, moved_to
-from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.frame_files import FrameFiles, file_of
 from pnpdepth_cli.dataset.layouts import LAYOUTS, find_layout, list_frames
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.protocols import NYU_PART, ODOMETRY_PART, FramePart, find_protocol
+from tests.colmap_models import write_text_model
 from tests.data_sets import (
     BENCHMARKS,
     DRIVE,
@@ -29,6 +30,7 @@ from tests.data_sets import (
     WIDTH,
     arkitscenes,
     codes,
+    eth3d,
     image,
     mask,
     read_frames,
@@ -276,9 +278,9 @@ def test_depth_is_read_in_metres_where_it_is_valid(name: str, tmp_path: Path) ->
     np.testing.assert_allclose(inputs.points.depth, 2, rtol=1e-3)
     assert inputs.image is not None
     assert inputs.image.shape[:2] == inputs.gt.shape == inputs.points.size
-    with_mask = name in ("diode", "ibims")
-    assert int(known.sum()) == HEIGHT * WIDTH // (2 if with_mask else 1)
-    assert not (with_mask and known[:, WIDTH // 2 :].any())
+    half = name in ("diode", "ibims", "eth3d")
+    assert int(known.sum()) == HEIGHT * WIDTH // (2 if half else 1)
+    assert not (half and known[:, WIDTH // 2 :].any())
 
 
 def test_the_low_resolution_depth_of_arkitscenes_keeps_its_points(tmp_path: Path) -> None:
@@ -286,6 +288,27 @@ def test_the_low_resolution_depth_of_arkitscenes_keeps_its_points(tmp_path: Path
     inputs = inputs_of(read_frames(tmp_path)[0], tmp_path)
     assert len(inputs.points) == HEIGHT * WIDTH // 16
     assert inputs.points.xy[0].tolist() == [1.5, 1.5]
+
+
+def test_the_points_of_eth3ds_model_are_sparse_depth_of_its_undistorted_images(
+    tmp_path: Path,
+) -> None:
+    photo = tmp_path / "images/dslr_images_undistorted/DSC_0219.JPG"
+    image(photo)
+    model = tmp_path / "dslr_calibration_undistorted"
+    write_text_model(model, names=("dslr_images_undistorted/DSC_0219.JPG",))
+    (frame,) = read_frames(tmp_path)
+    assert (frame.image, frame.sparse) == (photo, model)
+    assert len(inputs_of(frame, tmp_path).points) > 0
+
+
+def test_raw_depth_of_eth3d_that_does_not_fit_its_image_is_refused(tmp_path: Path) -> None:
+    eth3d(tmp_path)
+    (frame,) = read_frames(tmp_path)
+    assert frame.gt is not None
+    file_of(frame.gt).write_bytes(b"0" * 12)
+    with pytest.raises(InputError, match="does not hold 4 bytes for each pixel"):
+        inputs_of(frame, tmp_path)
 
 
 def test_all_of_void_is_taken_without_a_list_of_the_test_split(tmp_path: Path) -> None:
