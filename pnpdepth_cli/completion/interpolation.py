@@ -20,7 +20,6 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from torch import Tensor
 
@@ -107,6 +106,8 @@ def morphological(points: SparsePoints) -> Tensor:
     with fewer points the grid is coarser in proportion. Holes that they fill by a 31 × 31 dilation
     and by each column's topmost value are filled with the nearest depth here, which is better.
     """
+    from scipy.ndimage import distance_transform_edt
+
     points = distinct(points)
     height, width = points.size
     shrink = min(1.0, math.sqrt(len(points) / (FILL_SHARE * height * width)))

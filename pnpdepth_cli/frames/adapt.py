@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import ttest_1samp
 from torch import Tensor
 from torch.func import functional_call
 
@@ -66,6 +65,8 @@ class Learnt:
     @property
     def is_better(self) -> bool:
         """Whether the loss fell beyond chance."""
+        from scipy.stats import ttest_1samp
+
         fell = ttest_1samp(np.log(self.after / self.before), 0, alternative="less")
         return bool(self.after.mean() < self.before.mean() and fell.pvalue < SIGNIFICANT)
 

@@ -45,7 +45,7 @@ def network(monkeypatch: pytest.MonkeyPatch) -> pnp.Network:
 def test_learnt_weights_are_used_while_the_refiner_is_open(
     network: pnp.Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(adapt, "ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.01))
+    monkeypatch.setattr("scipy.stats.ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.01))
     before = copy.deepcopy(network.module.state_dict())
     own = pnp.refine(network, *FRAMES[0], SETTINGS)
     with pnp.Refiner(network, SETTINGS, adapt=FRAMES) as refiner:
@@ -80,7 +80,7 @@ def test_without_proof_the_weights_of_the_network_stay(
     p_value: float,
     why: str,
 ) -> None:
-    monkeypatch.setattr(adapt, "ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=p_value))
+    monkeypatch.setattr("scipy.stats.ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=p_value))
     own = pnp.refine(network, *FRAMES[0], SETTINGS)
     with pnp.Refiner(network, SETTINGS, adapt=frames) as refiner:
         refined = refiner.refine(*FRAMES[0])
