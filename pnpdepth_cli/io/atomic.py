@@ -24,15 +24,14 @@ _OF_THE_NAME = {errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL, errno.EISDIR, er
 def atomic_path(path: Path) -> Iterator[Path]:
     """Replaces `path` by what is written to the yielded path; untouched if anything fails.
 
-    The yielded path is an empty file in the same folder with the same suffix. A link is
-    followed, so the file it points to is the one replaced. OSErrors become OutputErrors.
+    The yielded path is an empty file in the same folder with the same suffix. A link is not
+    followed: it is replaced itself. OSErrors become OutputErrors.
     """
-    target = Path(os.path.realpath(path))
-    _check_target(target, named=path)
-    temporary = _empty_file_beside(target, named=path)
+    _check_target(path)
+    temporary = _empty_file_beside(path)
     try:
         yield temporary
-        temporary.replace(target)
+        temporary.replace(path)
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
@@ -83,8 +82,21 @@ def all_or_none(paths: Iterable[Path]) -> Iterator[None]:
         raise
 
 
-def make_folder(folder: Path) -> None:
-    """Creates the folder and those above it. Raises OutputError if that fails."""
+def make_folder(folder: Path, *, below: Path | None = None) -> None:
+    """Creates the folder and those above it.
+
+    Args:
+        folder: The folder.
+        below: The folder that the user named; none between the two may be a link.
+
+    Raises:
+        OutputError: It cannot be created, or a link leads out of the folder that the user named.
+    """
+    inside = () if below is None else folder.relative_to(below).parts
+    for count in range(1, len(inside) + 1):
+        path = Path(below or "", *inside[:count])
+        if path.is_symlink():
+            raise OutputError(f"{path} is a link; remove it, as outputs stay in {below}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -111,27 +123,27 @@ def cannot_write(path: Path, error: OSError) -> OutputError:
     return kind(f"{path} cannot be written ({reason}); {room}choose another output folder")
 
 
-def _check_target(target: Path, *, named: Path) -> None:
+def _check_target(target: Path) -> None:
     try:
-        mode = target.stat().st_mode
+        mode = target.stat().st_mode  # behind a link: nobody wants /dev/stdout replaced
     except FileNotFoundError:
         return
     except OSError as error:
-        raise cannot_write(named, error) from error
+        raise cannot_write(target, error) from error
     if stat.S_ISDIR(mode):
-        raise OutputError(f"{named} is a folder; give the name of a file to write")
+        raise OutputError(f"{target} is a folder; give the name of a file to write")
     if not stat.S_ISREG(mode):
-        raise OutputError(f"{named} is not a regular file; choose another output file")
+        raise OutputError(f"{target} is not a regular file; choose another output file")
 
 
-def _empty_file_beside(target: Path, *, named: Path) -> Path:
+def _empty_file_beside(target: Path) -> Path:
     # The name does not contain the target's, so a name of the longest length still works.
     temporary = target.with_name(f".{secrets.token_hex(6)}{target.suffix}")
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
         if not target.parent.exists():
-            message = f"{named}: its folder does not exist; create it first"
+            message = f"{target}: its folder does not exist; create it first"
             raise OutputError(message) from error
-        raise cannot_write(named, error) from error
+        raise cannot_write(target, error) from error
     return temporary

@@ -127,7 +127,7 @@ def check_report_folder(
 def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
     """Creates the report's folder, known by what it is made of; returns its folder for images."""
     images = folder / IMAGES
-    make_folder(images)
+    make_folder(images, below=images.parent)
     write_json(folder / _MADE_OF, made_of)
     return images
 

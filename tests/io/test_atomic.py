@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import InputError, OutputError
-from pnpdepth_cli.io.atomic import atomic_folder, atomic_path, remove_leftovers
+from pnpdepth_cli.io.atomic import atomic_folder, atomic_path, make_folder, remove_leftovers
 from pnpdepth_cli.io.depth import write_depth
 
 
@@ -51,14 +51,27 @@ def test_a_failure_leaves_the_old_file_and_no_other(error: BaseException, tmp_pa
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_a_link_is_followed_and_kept(tmp_path: Path) -> None:
+def test_a_link_is_replaced_and_what_it_points_to_stays(tmp_path: Path) -> None:
+    (tmp_path / "real").write_bytes(b"precious")
+    for name, target in (("link.json", "real"), ("broken.json", "missing")):
+        (tmp_path / name).symlink_to(tmp_path / target)
+        with atomic_path(tmp_path / name) as temporary:
+            temporary.write_bytes(b"x")
+        assert not (tmp_path / name).is_symlink()
+        assert (tmp_path / name).read_bytes() == b"x"
+    assert (tmp_path / "real").read_bytes() == b"precious"
+    assert not (tmp_path / "missing").exists()
+
+
+def test_a_folder_in_the_output_is_no_link_but_the_output_itself_may_be(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
-    link = tmp_path / "link.json"
-    link.symlink_to(tmp_path / "real" / "file.json")
-    with atomic_path(link) as temporary:
-        temporary.write_bytes(b"x")
-    assert link.is_symlink()
-    assert (tmp_path / "real" / "file.json").read_bytes() == b"x"
+    (tmp_path / "out").symlink_to(tmp_path / "real")
+    make_folder(tmp_path / "out/a/b", below=tmp_path / "out")
+    assert (tmp_path / "real/a/b").is_dir()
+    (tmp_path / "real/planted").symlink_to(tmp_path)
+    with pytest.raises(OutputError):
+        make_folder(tmp_path / "out/planted/c", below=tmp_path / "out")
+    assert not (tmp_path / "c").exists()
 
 
 @pytest.mark.parametrize(

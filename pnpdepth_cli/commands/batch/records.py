@@ -123,6 +123,7 @@ class Records:
             write: Writes all but the record to the paths that it is given.
         """
         planned = task.outputs
+        make_folder(task.record.parent, below=self.output)
         _remove(task.record)
         for path in stale_outputs(self.output, task.name, planned):
             _remove(path)
@@ -140,7 +141,7 @@ class Records:
     def fail(self, task: Task, message: str) -> Row:
         """Writes a record that says why a frame failed; returns the summary's row."""
         entry = {"settings": self._digest(task), "failed": message}
-        make_folder(task.record.parent)
+        make_folder(task.record.parent, below=self.output)
         write_json(task.record, {_ENTRY: entry})
         return _row(task, {}, entry)
 

@@ -170,7 +170,7 @@ def written_before(request: FramesRequest) -> bool:
 def _clear(request: FramesRequest) -> None:
     """Removes the frames that were written before, and records that these are incomplete."""
     for name in _FOLDERS:
-        make_folder(request.output / name)
+        make_folder(request.output / name, below=request.output)
         for path in (request.output / name).iterdir():
             path.unlink()
     for name in ("calib.txt", POSES_FILE):

@@ -28,7 +28,7 @@ _LONGEST_HEADER = 1 << 14
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _HEADER_ERRORS = (
     *(ValueError, TypeError, LookupError, SyntaxError, ArithmeticError, EOFError, struct.error),
-    *(tokenize.TokenError, RecursionError, MemoryError),
+    *(tokenize.TokenError, RecursionError),
 )
 """What NumPy raises as it evaluates a damaged header, or one of another version of the format."""
 _ARCHIVE_ERRORS = (

@@ -7,6 +7,7 @@ Memory stays bounded by the size of the file.
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from mmap import ACCESS_READ, mmap
@@ -44,9 +45,24 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
     _check_entries(entries)
     if any(i.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for i in entries):
         raise BrokenFileError("it is compressed as numpy never does")
+    with zipfile.ZipFile(path) as archive:
+        for info in entries:
+            _check_member(archive, info)
     with np.load(path, allow_pickle=False) as arrays:
         # TensorFlow writes the number of an operation's output behind its name.
         return {name.removesuffix(":0"): _tensor(arrays[name], name) for name in arrays.files}
+
+
+def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
+    """Raises BrokenFileError if an array of the archive claims more bytes than are stored."""
+    with archive.open(info) as member:
+        version = npy.read_magic(member)
+        header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, _, dtype = header(member)
+    claimed = math.prod(shape) * dtype.itemsize
+    check_claim(
+        f"{info.filename} has {claimed:,} bytes", claimed, info.file_size, error=BrokenFileError
+    )
 
 
 def _read_pickled_dict(path: Path) -> dict[str, Tensor]:

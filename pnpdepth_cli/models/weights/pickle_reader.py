@@ -51,7 +51,7 @@ class BrokenFileError(Exception):
 
 CONTENT_ERRORS = (
     *(BrokenFileError, OSError, EOFError, zipfile.BadZipFile, zlib.error, struct.error),
-    *(ValueError, TypeError, LookupError, ArithmeticError, RuntimeError, MemoryError),
+    *(ValueError, TypeError, LookupError, ArithmeticError, RuntimeError),
     *(SyntaxError, tokenize.TokenError),  # NumPy evaluates its headers
 )
 """What the readers of weights and programs raise on content that is not what it should be."""

@@ -549,3 +549,14 @@ def test_warnings_are_printed_once_a_kind_with_the_frames(
     batch(root)
     print_batch(summary(root) | {"warnings": tally.warnings})
     assert "warning in 4 frames (a, b, c, …): 7 of 9,000 pixels" in capsys.readouterr().err
+
+
+def test_results_are_not_written_through_a_planted_link(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    add_frame(root, "room/e")
+    batch(root, limit=1)
+    (root / "out/room").symlink_to(tmp_path / "elsewhere")
+    (root / "out/b_depth.png").symlink_to(tmp_path / "elsewhere/stolen.png")
+    with pytest.raises(OutputError):
+        batch(root)
+    assert list((tmp_path / "elsewhere").iterdir()) == []

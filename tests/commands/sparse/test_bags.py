@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -155,3 +156,15 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
         peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
     assert len(list((tmp_path / "frames_2000" / "rgb").iterdir())) == 2000
     assert peaks[1] - peaks[0] < 60
+
+
+def test_files_behind_a_planted_link_are_not_removed(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / KINDS[0])
+    written(bag, tmp_path / "frames")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/precious.txt").write_text("mine")
+    shutil.rmtree(tmp_path / "frames/sparse")
+    (tmp_path / "frames/sparse").symlink_to(tmp_path / "mine")
+    with pytest.raises(OutputError):
+        written(bag, tmp_path / "frames", overwrite=True)
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["precious.txt"]
