@@ -23,7 +23,14 @@ from pnpdepth_cli.settings import Settings
     cls=grouped_help.GroupedCommand,
     common=grouped_help.COMMON,
     groups={
-        "Input": ("--sparse", "--gt", ScanOptions, ReadOptions),
+        "Input": (
+            "--sparse",
+            "--sparse-mask",
+            "--min-confidence",
+            "--gt",
+            ScanOptions,
+            ReadOptions,
+        ),
         "Network": (NetworkChoice,),
         "Method": (Settings, HoldOut),
         "Output": ("--output", OutputOptions, "--json"),
@@ -36,6 +43,17 @@ from pnpdepth_cli.settings import Settings
     required=True,
     help="Sparse depth: a map (16-bit PNG, EXR, NPY, …), points x y depth (NPY, CSV), a LiDAR scan"
     " with --calib (BIN, NPY, PCD, PLY), or the folder of a COLMAP model.",
+)
+@click.option(
+    "--sparse-mask",
+    type=options.FILE,
+    help="Confidence of the sparse depth, or a mask: image or array of its size or the image's.",
+)
+@click.option(
+    "--min-confidence",
+    type=float,
+    metavar="N",
+    help="Least value of the mask, such as 2 of 0…2, whose depth is used.  [default: above 0]",
 )
 @click.option("--gt", type=options.FILE, help="Ground truth depth to score against.")
 @click.option(

@@ -32,14 +32,24 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     Raises:
         InputError: The file holds no mask.
     """
+    return np.asarray(read_levels(path) > 0)
+
+
+def read_levels(path: Path) -> NDArray[Any]:
+    """Returns (H, W) the numbers of an array, or the largest code of the channels of an image.
+
+    Raises:
+        InputError: The file holds no mask.
+    """
     if path.suffix.lower() in IMAGE_SUFFIXES:
-        return np.asarray(read_rgb(path).values.max(axis=2) > 0)
+        image = read_rgb(path)
+        return np.asarray(np.rint(image.values.max(axis=2) * image.white))
     values = load_stored(path).values
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[:, :, 0]
     if values.ndim != 2:
         raise FileFormatError(f"{path}: a mask is (H, W), not of shape {values.shape}")
-    return np.asarray(values > 0)
+    return values
 
 
 def masked(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[np.float32]:

@@ -87,6 +87,9 @@ class FrameFiles:
     sparse: Path | None = None
     """A depth file, a list of points, a scan, or the folder of a COLMAP model. None where points
     are sampled from `gt`."""
+    sparse_mask: Path | None = None
+    """An image or array, how sure each pixel of `sparse` or of the image is; 0 is no depth."""
+    min_confidence: float | None = None  # least value of `sparse_mask` whose depth is used
     gt: Source | RawDepth | None = None
     calib: Path | None = None  # the calibration, as `read_calibration` takes it
     camera: int | None = None  # which camera of the calibration
@@ -104,7 +107,8 @@ class FrameFiles:
     group: str | None = None  # the sequence it belongs to; None derives it from the name
 
     def __post_init__(self) -> None:
-        for source in (self.image, self.sparse, self.gt, self.calib, *self.masks):
+        paths = (self.image, self.sparse, self.sparse_mask, self.gt, self.calib, *self.masks)
+        for source in paths:
             if source is not None:
                 _check_no_nul(file_of(source))
 

@@ -16,6 +16,7 @@ from pnpdepth_cli.dataset.arrays import (
     masked,
     moved_note,
     moved_to,
+    read_levels,
     rgb_of,
 )
 from pnpdepth_cli.dataset.colmap_points import read_colmap_points
@@ -56,6 +57,7 @@ from pnpdepth_cli.settings import Settings
 
 ImageArray = NDArray[np.float32]
 
+_FEW_LEVELS = 4  # of confidence; their counts are listed
 _LEAK_FRACTION = 0.5  # of the ground truth's pixels equal to the sparse depth gives a warning
 
 
@@ -135,6 +137,13 @@ def read_frame(
         by_option = {"--depth-scale": readings["sparse"], "gt_scale of a list": readings["gt"]}
         notes += check_same_scale(depth, gt, by_option)
     notes += (*of_camera, *lost)
+    if files.masks and files.gt is None:
+        notes.append(
+            f"mask {files.masks[0]} is of ground truth, of which there is none, so it is not used;"
+            " a mask of the sparse depth is --sparse-mask, or sparse_mask in a list"
+        )
+    if files.min_confidence is not None and files.sparse_mask is None:
+        raise UsageError("--min-confidence needs --sparse-mask, the confidence of the sparse depth")
     if neighbours:
         sources["neighbours"] = neighbours
     return Frame(
@@ -286,6 +295,8 @@ def _read_sparse(
         sparse = read_scan_points(path, options.scan.over(files), size, image, scale=scale)
     else:
         sparse = _read_points(files, options, path, size)
+    if files.sparse_mask is not None:
+        sparse = _confident(sparse, files.sparse_mask, files.min_confidence)
     points = sparse.points.tensors()
     # an array of the image's size that takes no memory, to find the size of the part
     part = files.part.apply(np.broadcast_to(np.False_, points.size)).shape
@@ -296,6 +307,34 @@ def _read_sparse(
         if not len(points):
             raise NoPointsError(f"{path}: none of its {len(whole)} points lies in the image")
     return replace(sparse, points=points)
+
+
+def _confident(sparse: SparseDepth, path: Path, least: float | None) -> SparseDepth:
+    """The points whose confidence is at least `least`, above 0 for None."""
+    levels, points = read_levels(path), sparse.points.tensors()
+    size = (levels.shape[0], levels.shape[1])
+    check_same_view(str(path), size, points.size)
+    xy = points.resized(*size).xy.numpy()
+    column, row = np.floor(xy + 0.5).astype(np.intp).T
+    own = levels[row.clip(0, size[0] - 1), column.clip(0, size[1] - 1)]
+    kept = own > 0 if least is None else own >= least
+    values, counts = np.unique(own, return_counts=True)
+    listing = ", ".join(f"{n:,} of {v:g}" for v, n in zip(values, counts, strict=True))
+    note = (
+        f"sparse: {np.count_nonzero(kept):,} of {len(own):,} points have a confidence"
+        f" {'above 0' if least is None else f'of {least:g} or more'} in {path}"
+        + (f" ({listing})" if len(values) <= _FEW_LEVELS else "")
+    )
+    if not kept.any():
+        raise NoPointsError(f"{note.removeprefix('sparse: ')}; lower --min-confidence")
+    record = sparse.record | {"mask": _file_record(path) | {"least": least}}
+    record["dropped"] = {**record.get("dropped", {}), "of low confidence": int((~kept).sum())}
+    return replace(
+        sparse,
+        points=points.select(torch.from_numpy(kept)),
+        record=record,
+        notes=(*sparse.notes, note),
+    )
 
 
 def _read_points(

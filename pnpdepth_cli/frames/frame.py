@@ -292,7 +292,7 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
             f" {shape}"
         )
     values = values[:, :, :3].repeat(3 if values.shape[2] == 1 else 1, axis=2)
-    if values.dtype in FULL_SCALE:
+    if values.dtype in FULL_SCALE and (values.dtype == np.uint8 or values.max() > 255):
         return (values / FULL_SCALE[values.dtype]).astype(np.float32)
     if values.min() >= 0 and _OVERSHOOT < values.max() <= 255:
         return (values / 255).astype(np.float32)

@@ -43,6 +43,7 @@ class RgbImage:
 
     values: NDArray[np.float32]  # (H, W, 3) in 0..1, sRGB-encoded
     note: str | None  # what was assumed or changed, for a person; None if nothing was
+    white: float = 255.0  # the stored number that is 1; that of an EXR is unknown
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
@@ -73,14 +74,16 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
                 f"{path} is a {facts.bits}-bit {facts.number} TIFF; save the image with 8 or 16"
                 " bits"
             )
-    note = None
+    note, white = None, 255.0
     with opened_image(path, data, kind) as image:
         wide = ";16" in raw_mode(image)  # until the EXIF of a PNG is asked for, which decodes it
         if not wide:
             image.load()  # which applies the orientation of a TIFF
         orientation = orientation_of(image)
         if wide:
-            values = _decode_16_bit(path, data, kind)
+            values, white = _decode_16_bit(path, data, kind)
+            if white == 255:
+                note = "16-bit numbers up to 255 are read as of 8 bits"
             if kind == "TIFF":  # OpenCV applies the orientation of a TIFF, not that of a PNG
                 orientation = 1
         else:
@@ -94,7 +97,7 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
         values = _turn_upright(values, orientation)
     elif orientation in range(2, 9):
         note = "EXIF rotation not applied, as COLMAP reads the photo"
-    return RgbImage(values=np.ascontiguousarray(values), note=note)
+    return RgbImage(values=np.ascontiguousarray(values), note=note, white=white)
 
 
 @functools.cache
@@ -126,16 +129,19 @@ def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
         return (height, width), (height, width)
 
 
-def _decode_16_bit(path: Path, data: bytes, kind: str) -> NDArray[np.float32]:
-    """(H, W, 3) in 0..1, decoded by OpenCV because Pillow cuts colours to 8 bits."""
+def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float32], float]:
+    """(H, W, 3) in 0..1, decoded by OpenCV because Pillow cuts colours to 8 bits; and white.
+
+    That is 255 where no number is larger: other such images would be black.
+    """
     pixels = decode_with_opencv(path, data, kind)
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.shape[2] in (1, 2):
         pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
-    largest = np.float32(np.iinfo(pixels.dtype).max)
     rgb = pixels[:, :, 2::-1]  # OpenCV has blue first
-    return np.asarray(np.divide(rgb, largest, dtype=np.float32))
+    white = 255 if 1 < rgb.max() <= 255 else int(np.iinfo(pixels.dtype).max)
+    return np.asarray(np.divide(rgb, np.float32(white), dtype=np.float32)), float(white)
 
 
 def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -20,8 +21,9 @@ from pnpdepth_cli.commands.sparse.make import SparseTarget, sample_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
-from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, UsageError
+from pnpdepth_cli.frames.frame import Frame, frame_of_arrays
+from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors import SamplePattern
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
@@ -243,3 +245,53 @@ def test_a_valid_calibration_is_not_doubted_for_beams_without_return(tmp_path: P
     pose = np.column_stack([matrix("Tr_velo_to_cam")[:, :3], matrix("Tr_velo_to_cam")[:, 3]])
     np.savetxt(tmp_path / "pose.txt", pose)
     assert warnings_of(tmp_path / "silent.bin", extrinsics=tmp_path / "pose.txt") == []
+
+
+def indoor(sparse: Path, mask: Path | None, least: float | None = None, **options: Any) -> Frame:
+    asked = {"sparse": sparse, "sparse_mask": mask, "min_confidence": least}
+    return read_frame(FrameFiles(image=INDOOR / "rgb.png", **asked, **options), ReadOptions())
+
+
+@pytest.mark.parametrize("suffix", [".png", ".npy"])
+@pytest.mark.parametrize("of", [2, 255])
+def test_only_sparse_depth_of_enough_confidence_is_used(
+    tmp_path: Path, suffix: str, of: int
+) -> None:
+    rng, truth = np.random.default_rng(0), codes_of(INDOOR / "gt.png") / 1000
+    small = truth[1::4, 1::4].copy()  # of a phone, a quarter of the image's size
+    confidence = rng.integers(0, 3, small.shape)
+    small[confidence < 2] *= rng.uniform(0.5, 2, (confidence < 2).sum())
+    np.save(tmp_path / "sparse.npy", small.astype(np.float32))
+    stored = (confidence * of // 2).astype(np.uint8)
+    path = tmp_path / f"confidence{suffix}"
+    np.save(path, stored) if suffix == ".npy" else Image.fromarray(stored).save(path)
+    frame = indoor(tmp_path / "sparse.npy", path, of)
+    assert len(frame.points) == np.count_nonzero((confidence == 2) & (small > 0))
+    column, row = frame.points.xy.numpy().round().astype(int).T
+    expected = truth[1::4, 1::4][row // 4, column // 4]
+    np.testing.assert_allclose(frame.points.depth, expected, rtol=1e-6)
+    count = np.count_nonzero(confidence > 0)
+    assert len(indoor(tmp_path / "sparse.npy", path).points) == count
+    assert len(indoor(tmp_path / "sparse.npy", path, 0).points) == np.count_nonzero(small)
+    assert any(f"{len(frame.points):,} of" in note for note in frame.notes)
+    with pytest.raises(NoPointsError):
+        indoor(tmp_path / "sparse.npy", path, of + 1)
+    with pytest.raises(UsageError):
+        indoor(tmp_path / "sparse.npy", None, of)
+
+
+def test_a_mask_of_ground_truth_that_is_not_there_is_said_not_to_be_used(tmp_path: Path) -> None:
+    Image.fromarray(np.ones((480, 640), np.uint8)).save(tmp_path / "mask.png")
+    frame = indoor(INDOOR / "sparse.png", None, masks=(tmp_path / "mask.png",))
+    assert any("sparse_mask" in note for note in frame.notes)
+
+
+def test_an_image_of_16_bits_that_holds_8_is_read_as_of_8(tmp_path: Path) -> None:
+    pixels = np.asarray(Image.open(INDOOR / "rgb.png")).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "rgb.png"), pixels[:, :, ::-1])
+    image = read_rgb(tmp_path / "rgb.png")
+    np.testing.assert_allclose(image.values, pixels / 255, atol=1e-6)
+    assert image.note is not None
+    frame = frame_of_arrays(pixels, codes_of(INDOOR / "sparse.png") / 1000)
+    assert frame.image is not None
+    np.testing.assert_allclose(frame.image, pixels / 255, atol=1e-6)

@@ -173,7 +173,7 @@ def _reads_scan(files: FrameFiles, scan: ScanOptions) -> bool:
     return (
         _is_scan_file(files.gt)
         or _is_scan_file(files.sparse)
-        or (suffix == ".npy" and scan.calib is not None)
+        or (suffix in (".npy", ".csv", ".txt") and scan.over(files).calib is not None)
     )
 
 
@@ -188,7 +188,8 @@ def source_files(frame: FrameFiles) -> list[Path]:
 
 
 def _input_files(files: FrameFiles, reading: ReadOptions) -> Iterator[tuple[str, Path]]:
-    parts = (("image", files.image), ("sparse", files.sparse), ("gt", files.gt))
+    parts = [("image", files.image), ("sparse", files.sparse), ("gt", files.gt)]
+    parts += [("sparse mask", files.sparse_mask)] if files.sparse is not None else []
     for part, source in parts:
         path = None if source is None else file_of(source)
         if path is not None and part == "sparse" and path.is_dir():  # a COLMAP model

@@ -85,6 +85,7 @@ class OutputOptions:
 _NOT_IN_DIGEST = frozenset(
     {
         *("name", "group", "image", "sparse", "gt", "calib", "pose", "oxts", "masks"),
+        "sparse_mask",
         *("model", "checkpoint", "output", "overwrite", "view_3d"),
     }
 )

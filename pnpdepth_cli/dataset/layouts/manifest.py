@@ -1,10 +1,12 @@
 """`manifest`: a CSV with a header line, or JSON lines, of frames whose files lie anywhere.
 
-Columns or keys: image, sparse, gt, calib, mask, camera, sparse_scale, gt_scale, gt_size_ok, name,
-group, protocol; all may be left out or empty but one of image and sparse. Paths are relative to the
-manifest. Where the mask is 0, the ground truth is unknown; with gt_size_ok, it may have another
-size than the image. A frame without a name is called by its image's stem; if stems come twice, by
-its path below the folder that all of the images are in. Frames of one group are of one sequence.
+Columns or keys: image, sparse, sparse_mask, gt, calib, mask, camera, sparse_scale, min_confidence,
+gt_scale, gt_size_ok, name, group, protocol; all may be left out or empty but one of image and
+sparse. Paths are relative to the manifest. Sparse depth is used where its sparse_mask is at least
+min_confidence, else above 0. Where the mask is 0, the ground truth is unknown; with gt_size_ok, it
+may have another size than the image. A frame without a name is called by its image's stem; if stems
+come twice, by its path below the folder that all of the images are in. Frames of one group are of
+one sequence.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
-_PATHS = ("image", "sparse", "gt", "calib", "mask")
+_PATHS = ("image", "sparse", "sparse_mask", "gt", "calib", "mask")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 
 
@@ -37,6 +39,7 @@ def _flag(text: str) -> bool:
 _VALUES: dict[str, Callable[[str], Any]] = {
     "camera": int,
     "sparse_scale": float,
+    "min_confidence": float,
     "gt_scale": float,
     "gt_size_ok": _flag,
     "name": lambda text: PurePosixPath(text).as_posix(),

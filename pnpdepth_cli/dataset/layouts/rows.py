@@ -2,7 +2,7 @@
 
 `7scenes`: frame-000000.color.png and frame-000000.depth.png, in the folder or in its seq-*/.
 `arkitscenes`: the upsampling set, <video>/ with wide/ (color/, lowres_wide/), the phone's
-lowres_depth/ and the laser scanner's highres_depth/, in millimetres.
+lowres_depth/ with confidence/, and the laser scanner's highres_depth/, in millimetres.
 `diode`: NAME.png, NAME_depth.npy in metres and NAME_depth_mask.npy in <scene>/<scan>/.
 `ibims`: iBims-1 as images: rgb/ depth/ mask_invalid/ mask_transp/; a depth of 65535 is 50 m.
 `image-depth`: image/ (or images/) and depth/, ground truth; a calib.txt beside them is of all.
@@ -12,8 +12,9 @@ them are searched too: rgb/drive_1/000.png belongs to sparse/drive_1/000.png. ca
 per frame; a calib.txt beside the folders applies to all.
 `scannet`: exported scans, color/ depth/ intrinsic/ in one or more scene*/; depth in millimetres,
 smaller than the images.
-`void`: <sequence>/ with image/ sparse_depth/ ground_truth/ and K.txt, below a sequence, data/, a
-density or the release; where test_image.txt lists the test split, only its frames.
+`void`: <sequence>/ with image/ sparse_depth/ validity_map/ ground_truth/ and K.txt, below a
+sequence, data/, a density or the release; where test_image.txt lists the test split, only its
+frames.
 """
 
 from __future__ import annotations
@@ -63,6 +64,7 @@ ROWS: dict[str, Layout] = {
         {
             "image": "wide|color|lowres_wide/*.png",
             "sparse": "lowres_depth/*.png",
+            "sparse_mask": "confidence/*.png?",
             "gt": "highres_depth/*.png?",
         },
         below="|*/|*/*/",
@@ -128,6 +130,7 @@ ROWS: dict[str, Layout] = {
         {
             "image": "image/*.png",
             "sparse": "sparse_depth/*.png",
+            "sparse_mask": "validity_map/*.png?",
             "gt": "ground_truth/*.png?",
         },
         below="|*/|data/*/|*/data/*/",
