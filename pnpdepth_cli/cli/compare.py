@@ -25,9 +25,6 @@ columns = click.option(
 
 @click.command(short_help="Compare runs that eval or batch scored.")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN RUN…")
-@click.option(
-    "--no-groups", is_flag=True, help="Treat all frames as independent, also those of a sequence."
-)
 @options.table_files(
     csv="Write the table as CSV.",
     latex="Write a tabular of runs × measures: the best in bold, * where p < 0.05.",
@@ -42,7 +39,6 @@ columns = click.option(
 )
 def compare(
     runs: tuple[str, ...],
-    no_groups: bool,
     columns: tuple[str, ...] | None,
     plot: Path | None,
     **table_files: Any,
@@ -68,7 +64,7 @@ def compare(
 
     files = TableFiles(**table_files)
     files.check([Path(run) for run in runs])
-    comparison = compare_runs(runs, grouped=not no_groups, columns=columns)
+    comparison = compare_runs(runs, columns=columns)
     if plot is not None:
         plot_comparison(comparison, plot, overwrite=files.overwrite)
     print_notes(comparison["notes"])

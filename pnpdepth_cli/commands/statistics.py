@@ -61,19 +61,18 @@ class Clusters:
         ]
 
 
-def find_clusters(groups: Sequence[str], series: Floats, *, grouped: bool = True) -> Clusters:
+def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
     """Returns the groups; for a single group with correlated errors, blocks of it.
 
     Args:
         groups: The sequence of each of N frames.
         series: (N, M) what is averaged, in the order of the frames.
-        grouped: False makes every frame a cluster.
     """
     names, frames = list(dict.fromkeys(groups)), len(groups)
-    if grouped and 1 < len(names) < frames:
+    if 1 < len(names) < frames:
         ids = np.array([names.index(group) for group in groups])
         return Clusters(ids=ids, unit="groups of frames")
-    length = block_length(series) if grouped and len(names) == 1 else 1
+    length = block_length(series) if len(names) == 1 else 1
     if length == 1:
         return Clusters(ids=np.arange(frames), unit="frames")
     blocks = max(1, min(MAX_BLOCKS, frames // length))

@@ -8,8 +8,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -100,7 +99,7 @@ def check_report_folder(
     Args:
         folder: The report's folder.
         inputs: Files and folders that are read.
-        made_of: What an earlier report in it was made of, as given to `begin_report`.
+        made_of: What an earlier report in it was made of, as given to `write_report`.
         overwrite: Whether any other content may be replaced.
     """
     there = next((path for path in (folder, *folder.parents) if path.exists()), folder)
@@ -124,25 +123,6 @@ def check_report_folder(
         )
 
 
-def begin_report(folder: Path, made_of: Mapping[str, Any]) -> Path:
-    """Creates the report's folder, known by what it is made of; returns its folder for images."""
-    images = folder / IMAGES
-    make_folder(images, below=images.parent)
-    write_json(folder / _MADE_OF, made_of)
-    return images
-
-
-@contextmanager
-def whole_report(folder: Path) -> Iterator[Path]:
-    """Yields a folder for a report that replaces the one in `folder`, which stays if it fails."""
-    remove_leftovers(folder)  # of a writer that was killed
-    with atomic_folder(folder) as temporary:
-        yield temporary
-        images = {path.name for path in (temporary / IMAGES).iterdir()}
-        images |= {VIEWER} if (temporary / VIEWER).exists() else set()
-    _remove_unused(folder, images)
-
-
 def image_key(name: str) -> str:
     """Returns the start of a frame's image names: fit for a file, and of this name alone."""
     return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:20]
@@ -154,17 +134,36 @@ def visible(text: str) -> str:
 
 
 def write_report(
-    folder: Path, head: Head, frames: Iterable[Mapping[str, Any]], *, viewer: bool = False
+    folder: Path,
+    made_of: Mapping[str, Any],
+    head: Head,
+    frames: Callable[[Path], Iterable[Mapping[str, Any]]],
+    *,
+    viewer: bool = False,
 ) -> None:
-    """Writes the page.
+    """Writes a report that replaces the one in `folder`, which stays if it fails.
 
     Args:
         folder: The report's folder.
+        made_of: By which the report is known later.
         head: What the page shows of all frames.
-        frames: A mapping per frame, taken one by one, as report.js shows it; its `key` is that of
-            its images, or None.
+        frames: From the folder for images to a mapping per frame, taken one by one, as report.js
+            shows it; its `key` is that of its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
     """
+    remove_leftovers(folder)  # of a writer that was killed
+    with atomic_folder(folder) as temporary:
+        images = temporary / IMAGES
+        make_folder(images, below=temporary)
+        write_json(temporary / _MADE_OF, made_of)
+        _write_page(temporary, head, frames(images), viewer=viewer)
+        used = {path.name for path in images.iterdir()}
+    _remove_unused(folder, used | ({VIEWER} if viewer else set()))
+
+
+def _write_page(
+    folder: Path, head: Head, frames: Iterable[Mapping[str, Any]], *, viewer: bool
+) -> None:
     style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
     data = {
         "columns": head.columns,
@@ -180,10 +179,7 @@ def write_report(
         head=head, data=plain(data), frames=map(plain, frames), style=Markup(style),
         script=Markup(script), policy=_policy(style, script, viewer=viewer), version=__version__,
     )  # fmt: skip
-    with (
-        atomic_path(folder / PAGE) as temporary,
-        temporary.open("w", encoding="utf-8", newline="\n") as file,
-    ):
+    with (folder / PAGE).open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(parts)
     if viewer:
         _write_text(folder / VIEWER, _source("../three/three.min.js") + "\n" + _source(VIEWER))

@@ -7,7 +7,7 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,11 @@ from hypothesis import strategies as st
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.report import (
     Head,
-    begin_report,
     check_report_folder,
     image_key,
     link_image,
     save_view_3d,
     visible,
-    whole_report,
     write_report,
 )
 from tests.commands.report_pages import page_data
@@ -45,10 +43,13 @@ def frame(name: str, key: str | None = None) -> dict[str, Any]:
     return {"name": name, "key": key, "values": []}
 
 
+def written(folder: Path, head: Head, frames: Iterable[dict[str, Any]]) -> None:
+    write_report(folder, {"command": "eval"}, head, lambda images: frames)
+
+
 def test_names_are_data_whatever_they_say(tmp_path: Path) -> None:
-    begin_report(tmp_path, {"command": "eval"})
     head = Head(kind="Test", title=NAMES[0], without=[(n, n) for n in NAMES], labels=LABELS)
-    write_report(tmp_path, head, (frame(name) for name in NAMES))
+    written(tmp_path, head, (frame(name) for name in NAMES))
     data = page_data(tmp_path)
     assert data["title"] == NAMES[0]
     assert [each["name"] for each in data["frames"]] == NAMES
@@ -60,17 +61,15 @@ def test_names_are_data_whatever_they_say(tmp_path: Path) -> None:
 @given(st.text(st.characters(codec=None)))
 def test_text_ends_no_element_and_opens_none(text: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        begin_report(Path(folder), {})
         head = Head(kind=text, title="t", facts=[("a", text)], notes=[text], labels={"map": text})
-        write_report(Path(folder), head, [frame(text)])
+        written(Path(folder), head, [frame(text)])
         page = (Path(folder) / "index.html").read_bytes()
     ends = (f"</{each}>".encode() for each in ("script", "li", "dt", "dd", "h1", "td"))
     assert [page.count(each) for each in ends] == [2, 1, 1, 1, 1, 0]
 
 
 def test_the_page_names_no_address_and_lets_nothing_run_but_itself(tmp_path: Path) -> None:
-    begin_report(tmp_path, {})
-    write_report(tmp_path, HEAD, [])
+    written(tmp_path, HEAD, [])
     text = (tmp_path / "index.html").read_text()
     addresses = set(re.findall(r"\w+://[^\s\"']*", text))
     assert addresses == {"http://www.w3.org/2000/svg"}  # the name of SVG's elements
@@ -84,7 +83,6 @@ def test_the_page_names_no_address_and_lets_nothing_run_but_itself(tmp_path: Pat
 
 
 def test_frames_are_taken_one_by_one(tmp_path: Path) -> None:
-    begin_report(tmp_path, {})
     seen: list[int] = []
 
     def frames() -> Iterator[dict[str, Any]]:
@@ -92,18 +90,22 @@ def test_frames_are_taken_one_by_one(tmp_path: Path) -> None:
             seen.append((tmp_path / "index.html").exists())
             yield frame(f"{number:04}")
 
-    write_report(tmp_path, HEAD, frames())
+    written(tmp_path, HEAD, frames())
     assert not any(seen)
     assert len(page_data(tmp_path)["frames"]) == 3000
 
 
 def test_images_of_the_report_before_are_removed_and_nothing_else(tmp_path: Path) -> None:
-    images = begin_report(tmp_path, {})
-    kept, stale = image_key("a"), image_key("b")
+    written(tmp_path, HEAD, [])
+    kept, stale, images = image_key("a"), image_key("b"), tmp_path / "images"
     for name in (f"{kept}_map.jpg", f"{stale}_map.jpg", "mine.jpg", f"{stale}.txt"):
         (images / name).write_bytes(b"x")
-    with whole_report(tmp_path) as temporary:
-        (begin_report(temporary, {}) / f"{kept}_map.jpg").write_bytes(b"y")
+
+    def frames(images: Path) -> list[dict[str, Any]]:
+        (images / f"{kept}_map.jpg").write_bytes(b"y")
+        return []
+
+    write_report(tmp_path, {}, HEAD, frames)
     left = {path.name: path.read_bytes() for path in images.iterdir()}
     assert left == {f"{kept}_map.jpg": b"y", "mine.jpg": b"x", f"{stale}.txt": b"x"}
 
@@ -134,15 +136,14 @@ def test_a_3d_view_becomes_a_script_of_a_known_size(
 
 
 def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:
-    begin_report(tmp_path, {})
-    write_report(tmp_path, HEAD, [frame("old")])
+    written(tmp_path, HEAD, [frame("old")])
 
     def broken() -> Iterator[dict[str, Any]]:
         yield frame("new")
         raise OutputError("no")
 
     with pytest.raises(OutputError):
-        write_report(tmp_path, HEAD, broken())
+        written(tmp_path, HEAD, broken())
     assert [each["name"] for each in page_data(tmp_path)["frames"]] == ["old"]
     assert {p.name for p in tmp_path.iterdir()} == {"index.html", "images", "report.json"}
 

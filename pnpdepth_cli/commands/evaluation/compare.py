@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.pairing import some_names
 from pnpdepth_cli.commands.evaluation.request import scoring_of
 from pnpdepth_cli.commands.statistics import (
-    LEVEL,
     MIN_CLUSTERS,
     Clusters,
     find_clusters,
@@ -71,9 +70,7 @@ class Run(NamedTuple):
         return sum(frame.pixels for frame in frames) / known if known else math.nan
 
 
-def compare(
-    paths: Sequence[str], *, grouped: bool = True, columns: Sequence[str] | None = None
-) -> dict[str, Any]:
+def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> dict[str, Any]:
     """Returns the runs on the frames that all of them scored, compared with the first.
 
     A measure that a frame lacks in one of the runs is averaged and tested over the other frames.
@@ -84,7 +81,6 @@ def compare(
 
     Args:
         paths: Files as `read_run` takes them; the first is the reference.
-        grouped: False if every frame counts as independent.
         columns: Keys of the measures to compare by, instead of the main ones.
 
     Raises:
@@ -111,7 +107,7 @@ def compare(
     # the tests, over frames that count as independent
     groups = [runs[0].frames[name].group for name in names]
     differences = np.concatenate(list(values[1:] - values[0]), axis=1)
-    clusters = find_clusters(groups, differences, grouped=grouped)
+    clusters = find_clusters(groups, differences)
     gains, exact = _gains(values, measures, clusters)
     tests = len(gains) * len(measures)
     record = {
@@ -133,11 +129,9 @@ def compare(
             for name, run, of_run in zip(_names(runs), runs, values, strict=True)
         ],
         "gains": gains,
-        "level": LEVEL,
         "clusters": {"count": clusters.count, "unit": clusters.unit},
         "exact_p_values": exact,
         "permutations": PERMUTATIONS,
-        "seed": SEED,
         "tests": tests,
         "notes": [
             *_notes(runs, names),

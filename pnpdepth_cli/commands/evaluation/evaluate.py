@@ -146,22 +146,15 @@ def evaluate(
         on_frame: Called with (done, of) after each frame.
 
     Raises:
-        PnpDepthError: For two single files whatever is wrong with them, for folders only what
-            concerns all frames.
+        PnpDepthError: For what concerns all frames, or if none could be scored.
     """
     pairs, notes = pair_frames(request.prediction, request.ground_truth, part=request.rules.part)
-    single = request.prediction.is_file()
 
     def score(pair: FramePair) -> FrameScores:
         try:
-            row = score_pair(pair, request)
+            return score_pair(pair, request)
         except PnpDepthError as error:
-            if single:
-                raise
             return FrameScores(pair=pair, error=str(error))
-        if single and row.error is not None:
-            raise InputError(row.error)
-        return row
 
     rows: list[FrameScores] = []
     for row in in_order(score, pairs, THREADS):

@@ -63,19 +63,18 @@ def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns the chosen or first measures of each frame, or of the worst of many."""
     title, found = "Frames", evaluation
     if len(evaluation.frames) > _FRAMES_SHOWN:
-        found = replace(evaluation, frames=tuple(worst(evaluation, "rmse")[:_FRAMES_SHOWN]))
+        found = replace(evaluation, frames=worst(evaluation)[:_FRAMES_SHOWN])
         title = f"The {_FRAMES_SHOWN} worst by RMSE; --csv has all"
     shown = keys or [measure.key for measure in evaluation.request.measures[:_FRAME_COLUMNS]]
     table = frames_table(found, keys).only(["name", *shown, COVERAGE.key])
     return replace(table, title=title + _without_sparse(evaluation.request.rules.exclude_sparse))
 
 
-def worst(evaluation: Evaluation, key: str) -> list[FrameScores]:
-    """Returns the scored frames by one measure, worst first, those with NaN at the very end."""
-    (measure,) = (m for m in evaluation.request.measures if m.key == key)
-    values = ((frame, frame.values[key]) for frame in evaluation.scored)
-    ordered = sorted(values, key=lambda of: (math.isnan(of[1]), measure.sign * of[1]))
-    return [frame for frame, _ in ordered]
+def worst(evaluation: Evaluation) -> tuple[FrameScores, ...]:
+    """Returns the scored frames by RMSE, worst first, those with NaN at the very end."""
+    rmse = {frame.name: frame.values["rmse"] for frame in evaluation.scored}
+    order = sorted(evaluation.scored, key=lambda f: (math.isnan(rmse[f.name]), -rmse[f.name]))
+    return tuple(order)
 
 
 def calibration_tables(evaluation: Evaluation) -> list[Table]:

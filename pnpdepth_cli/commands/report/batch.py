@@ -8,7 +8,7 @@ where their panels are. So a report also has the frames of earlier runs.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,13 +31,11 @@ from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.report import (
     IMAGES,
     Head,
-    begin_report,
     check_report_folder,
     column,
     image_key,
     link_image,
     save_view_3d,
-    whole_report,
     write_report,
 )
 from pnpdepth_cli.measures import MEASURES, Measure
@@ -109,14 +107,13 @@ def write_batch_report(
             failed.append((row["name"], row["message"]))
     mixed = len(bases - {None}) > 1
     head = _head(summary, first, failed)
-    with whole_report(folder) as temporary:
-        begin_report(temporary, _source(request, folder))
-        entries = (
-            _entry(row, head.columns, mixed) | _views(row, request, temporary)
-            for row in rows()
-            if row["outputs"]
-        )
-        write_report(temporary, head, entries, viewer=request.html_3d)
+
+    def entries(images: Path) -> Iterator[dict[str, Any]]:
+        for row in rows():
+            if row["outputs"]:
+                yield _entry(row, head.columns, mixed) | _views(row, request, images)
+
+    write_report(folder, _source(request, folder), head, entries, viewer=request.html_3d)
 
 
 def _source(request: BatchRequest, folder: Path) -> dict[str, Any]:
@@ -139,7 +136,7 @@ def _entry(row: Row, columns: Sequence[Mapping[str, Any]], mixed: bool) -> dict[
     }
 
 
-def _views(row: Row, request: BatchRequest, folder: Path) -> dict[str, Any]:
+def _views(row: Row, request: BatchRequest, images: Path) -> dict[str, Any]:
     """Links the images of the row's frame; returns the page's entry of them.
 
     There are none of a result whose images were deleted.
@@ -153,14 +150,18 @@ def _views(row: Row, request: BatchRequest, folder: Path) -> dict[str, Any]:
     except (KeyError, InputError):
         return {"key": None}
     for kind, figure in figures.items():
-        name = f"{IMAGES}/{key}_{kind}.png"
-        link_image(files[kind], folder / name)
+        name = f"{key}_{kind}.png"
+        link_image(files[kind], images / name)
         for title, box in figure["panels"].items():
             if title in _PANELS:
-                views[_PANELS[title]] = {"src": name, "box": box, "size": figure["size"]}
+                views[_PANELS[title]] = {
+                    "src": f"{IMAGES}/{name}",
+                    "box": box,
+                    "size": figure["size"],
+                }
     view_mb = None
     if request.html_3d and "view" in files:
-        view_mb = save_view_3d(files["view"], folder / IMAGES / f"{key}_view.js")
+        view_mb = save_view_3d(files["view"], images / f"{key}_view.js")
     return {
         "key": key,
         "views": views,

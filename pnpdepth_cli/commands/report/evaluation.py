@@ -17,18 +17,14 @@ from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
     Head,
-    begin_report,
     check_report_folder,
     column,
     image_key,
     save_views,
-    whole_report,
     write_report,
 )
 from pnpdepth_cli.io.visualisation import error_map
 from pnpdepth_cli.measures import COVERAGE, chosen_measures
-
-_SOURCE = {"command": "eval"}
 
 
 def check_eval_report(folder: Path, inputs: list[Path], *, overwrite: bool) -> None:
@@ -58,18 +54,12 @@ def write_eval_report(
     scored = evaluation.scored
 
     def entries(images: Path) -> Iterator[dict[str, Any]]:
-        drawn = in_order(
-            lambda frame: _entry(frame, evaluation, columns, images),
-            scored,
-            THREADS,
-        )
+        drawn = in_order(lambda frame: _entry(frame, evaluation, columns, images), scored, THREADS)
         for done, entry in enumerate(drawn, start=1):
             yield entry
             on_frame(done, len(scored))
 
-    with whole_report(folder) as temporary:
-        images = begin_report(temporary, _SOURCE)
-        write_report(temporary, _head(evaluation, keys, columns), entries(images))
+    write_report(folder, {"command": "eval"}, _head(evaluation, keys, columns), entries)
 
 
 def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[dict[str, Any]]:
