@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.camera import Camera, Extrinsics
+from pnpdepth_cli.camera import SAME_FRAME, Camera, Extrinsics
 from pnpdepth_cli.dataset.plausible import scan_returns
 from pnpdepth_cli.dataset.read_options import METRES, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
@@ -92,7 +92,8 @@ def read_scan_points(
         )
     calibration = read_calibration(named, options.camera)
     if options.extrinsics is not None:
-        calibration = replace(calibration, scanner=read_extrinsics(options.extrinsics))
+        pose = calibration.rectification @ read_extrinsics(options.extrinsics)
+        calibration = replace(calibration, scanner=pose)
     if calibration.scanner is None:
         raise UsageError(
             f"{named} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or"
@@ -110,7 +111,12 @@ def read_scan_points(
         warnings.append(note)
     camera, scanner = calibration.camera, calibration.scanner
     assert scanner is not None
-    if not camera.source.startswith("KITTI"):  # whose pose has one direction
+    if options.extrinsics is not None and calibration.rectification is not SAME_FRAME:
+        warnings.append(
+            f"extrinsics: in the frame of the unrectified camera 0; the rotation and offset that"
+            f" {named} rectifies with are applied"
+        )
+    if options.extrinsics is not None or not camera.source.startswith("KITTI"):  # one direction
         warnings += check_direction(xyz, camera, scanner, size)
     points = project_velodyne(xyz, camera, scanner, size, keep_occluded=options.keep_occluded)
     warnings += _outside_warning(scanner.moved(xyz), camera, size)

@@ -10,8 +10,9 @@ separate, and a value may continue over several lines:
     lens: radial-tangential                    # or fisheye: OpenCV's k1 k2 k3 k4
     size: [1242, 375]                          # optional: width and height
 
-Nine bare numbers are K alone. YAML is OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain,
-with the intrinsics of the raw image; a matrix T_camera_lidar there is the pose of the scanner.
+Bare numbers are K alone: 9, 16 of a 4×4 matrix (ScanNet), or fx fy cx cy [width height]. YAML is
+OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain, with the intrinsics of the raw image; a
+matrix T_camera_lidar there is the pose of the scanner. A folder is KITTI's raw data or KITTI-360.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from pnpdepth_cli.io.yaml_file import parse_yaml
 CAMERA = 2
 """KITTI's left colour camera, whose images the benchmarks have."""
 
+_KITTI_360_FILES = ("perspective.txt", "calib_cam_to_velo.txt")
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
 _YAML_MARKS = ("camera_matrix:", "distortion_model:", "camera_model:", "distortion_coeffs:")
@@ -59,7 +61,9 @@ _COEFFICIENTS = {
     "radial-tangential": (0, 4, 5, 8, 12, 14),
     "fisheye": (0, 4),
 }
-_FIELD = re.compile(r"^\s*([A-Za-z_]\w*)\s*:(.*)$")
+_FIELD = re.compile(r"^\s*([A-Za-z_]\w*)(?:\s*:|\s+(?=[-+.\d]))(.*)$")
+"""A name and its value; KITTI's tracking set has names without a colon."""
+
 _LARGEST = 1e9
 """Of the numbers of a calibration, in pixels or metres; beyond it, products overflow."""
 
@@ -72,6 +76,9 @@ class Calibration:
 
     camera: Camera
     scanner: Extrinsics | None = None  # None: the file does not state its pose
+    rectification: Extrinsics = SAME_FRAME
+    """Pose, in the camera's frame, of the camera that poses of the scanner refer to: of KITTI's
+    unrectified camera 0 in a rectified one."""
     rectified: Mapping[str, tuple[Camera, Extrinsics]] = field(default_factory=dict)
     """Cameras of rectified images by what they are made of, where `camera` is of raw images, each
     with the pose of `camera` in its frame."""
@@ -90,6 +97,9 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         InputError: The file cannot be read.
         UsageError: There is no such camera.
     """
+    folder = path if path.is_dir() else path.parent
+    if path == folder / _KITTI_360_FILES[0] or (folder == path and _is_kitti_360(path)):
+        return _kitti_360(folder, camera)
     if path.is_dir() or path.name in _RAW_FILES:
         return _kitti_raw(path if path.is_dir() else path.parent, camera)
     text = _text(path)
@@ -105,7 +115,7 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     elif re.search(r"[A-Za-z_]\w*\s*:", text):
         fields = _fields(path, text)
     else:
-        fields = {"K": text}
+        fields = _bare_intrinsics(path, text)
     if any(re.fullmatch(r"P\d", str(name)) for name in fields):
         return _kitti(path, fields, camera)
     unknown = sorted(set(fields) - set(_PLAIN))
@@ -180,12 +190,15 @@ def _rectified_cameras(
 
 
 def _kitti(path: Path, fields: Mapping[str, Any], camera: int | None) -> Calibration:
-    """KITTI's object set (R0_rect, Tr_velo_to_cam) and odometry set (Tr, already rectified)."""
+    """KITTI's object set (R0_rect, Tr_velo_to_cam), tracking set (R_rect, Tr_velo_cam) and odometry
+    set (Tr, already rectified)."""
     number = _camera(path, camera, [int(n[1:]) for n in fields if re.fullmatch(r"P\d", n)])
     odometry = "Tr" in fields
-    scanner = _matrix(path, fields, "Tr" if odometry else "Tr_velo_to_cam", (3, 4))
+    turn = "R_rect" if "R_rect" in fields else "R0_rect"
+    velodyne = "Tr_velo_cam" if "Tr_velo_cam" in fields else "Tr_velo_to_cam"
+    scanner = _matrix(path, fields, "Tr" if odometry else velodyne, (3, 4))
     pose = checked_pose(path, "rotation of the scanner", scanner[:, :3], scanner[:, 3])
-    rectify = np.eye(3) if odometry else _matrix(path, fields, "R0_rect", (3, 3))
+    rectify = np.eye(3) if odometry else _matrix(path, fields, turn, (3, 3))
     projection = _matrix(path, fields, f"P{number}", (3, 4))
     return _rectified(path, projection, rectify, pose, f"KITTI calibration, camera {number}")
 
@@ -213,6 +226,38 @@ def _kitti_raw(folder: Path, camera: int | None) -> Calibration:
     )
 
 
+def _is_kitti_360(folder: Path) -> bool:
+    return all((folder / name).is_file() for name in _KITTI_360_FILES)
+
+
+def _kitti_360(folder: Path, camera: int | None) -> Calibration:
+    """KITTI-360's perspective cameras 0 and 1; its Velodyne file maps camera 0 to the scanner."""
+    cameras, scanner = (folder / name for name in _KITTI_360_FILES)
+    fields = _fields(cameras, _text(cameras))
+    numbers = [int(name[-2:]) for name in fields if re.fullmatch(r"P_rect_\d\d", name)]
+    number = _camera(cameras, camera or 0, numbers)
+    pose = numbers_in(_text(scanner)) if scanner.is_file() else None
+    return _rectified(
+        cameras,
+        _matrix(cameras, fields, f"P_rect_{number:02}", (3, 4)),
+        _matrix(cameras, fields, "R_rect_00", (3, 3)),
+        None if pose is None else pose_of_matrix(scanner, "the matrix", pose).inverse(),
+        f"KITTI-360 calibration, camera {number}",
+        _height_width(cameras, _numbers(cameras, fields, f"S_rect_{number:02}", 2)),
+    )
+
+
+def _bare_intrinsics(path: Path, text: str) -> dict[str, Any]:
+    """K, and the size if it is there, of numbers without names."""
+    numbers = numbers_in(text) or []
+    if len(numbers) == 16:  # ScanNet's, by rows
+        return {"K": [numbers[i] for i in (0, 1, 2, 4, 5, 6, 8, 9, 10)]}
+    if len(numbers) in (4, 6):
+        fx, fy, cx, cy, *size = numbers
+        return {"K": [fx, 0, cx, 0, fy, cy, 0, 0, 1]} | ({"size": size} if size else {})
+    return {"K": text}
+
+
 def _rectified(
     path: Path,
     projection: Floats,
@@ -228,6 +273,7 @@ def _rectified(
     return Calibration(
         camera=Camera(intrinsics=intrinsics, size=size, source=source),
         scanner=None if scanner is None else rectify_pose @ scanner,
+        rectification=rectify_pose,
     )
 
 

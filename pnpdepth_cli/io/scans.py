@@ -7,6 +7,7 @@ header claims, and pypcd4 takes 0.7 s to import and decompresses to the size tha
 from __future__ import annotations
 
 import io
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,9 @@ _PLY_KINDS = {
 }  # fmt: skip
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 _LONGEST_HEADER = 1 << 16
+_MOST_COMPRESSED = 100
+"""Times as many bytes as compressed ones; three bytes of LZF make at most 264."""
+
 _MOST_DIGITS = 18
 """Of a count; Python refuses to convert thousands of them."""
 
@@ -162,7 +166,7 @@ Column = tuple[str, str, int]
 
 
 def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
-    """x y z of a PCD, ASCII or binary."""
+    """x y z of a PCD, ASCII, binary or compressed."""
     header, body = _header(path, data, "PCD", b"DATA")
     entries = {words[0].upper(): words[1:] for words in header if not words[0].startswith("#")}
     missing = [k for k in ("FIELDS", "SIZE", "TYPE", "POINTS", "DATA") if not entries.get(k)]
@@ -177,16 +181,61 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
         for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True)
     ]
     number, stored = _whole(path, entries["POINTS"][0]), entries["DATA"][0].lower()
-    if stored not in ("ascii", "binary"):
-        raise FileFormatError(
-            f"{path} is a PCD with {stored} data; save it as binary or ascii"
-            " (pcl_convert_pcd_ascii_binary does it)"
-        )
-    points = _xyz(path, "PCD", columns, number, body, "<" if stored == "binary" else None)
+    if stored not in ("ascii", "binary", "binary_compressed"):
+        raise FileFormatError(f"{path} is a PCD with {stored} data; save it as binary or ascii")
+    if stored == "binary_compressed":
+        body = _decompressed_rows(path, columns, number, body)
+    points = _xyz(path, "PCD", columns, number, body, None if stored == "ascii" else "<")
     source = f"{stored} PCD"
     if entries.get("VIEWPOINT", []) not in ([], ["0", "0", "0", "1", "0", "0", "0"]):
         source += ", its VIEWPOINT not applied"
     return points, source
+
+
+def _decompressed_rows(path: Path, columns: list[Column], number: int, body: bytes) -> bytes:
+    """The rows of a compressed PCD: two sizes, then all numbers of each field, compressed."""
+    sizes = [np.dtype(kind).itemsize * count for _, kind, count in columns if "?" not in kind]
+    packed, claimed = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, 0)
+    whole = len(sizes) == len(columns) and claimed == number * sum(sizes)
+    if not whole or packed > len(body) - 8 or claimed > _MOST_COMPRESSED * (packed + 1):
+        raise damaged(path, "PCD", "is cut short, or no compressed one")
+    data = _lzf(body[8 : 8 + packed])
+    if data is None or len(data) != claimed:
+        raise damaged(path, "PCD", "cannot be decompressed")
+    ends = np.cumsum([0, *sizes]) * number
+    fields = [
+        np.frombuffer(data, np.uint8, number * size, ends[index]).reshape(number, size)
+        for index, size in enumerate(sizes)
+    ]
+    return np.concatenate(fields, axis=1).tobytes()
+
+
+def _lzf(packed: bytes) -> bytes | None:
+    """Decompresses LZF: literals, and copies of what is already there; None for other bytes.
+
+    A byte below 32 is followed by that many literals and one. Any other byte has the length of a
+    copy, less 2, in its first 3 bits (7: the next byte is added), and 13 bits of the distance back,
+    less 1, in the rest and the next byte.
+    """
+    out, at, end = bytearray(), 0, len(packed)
+    while at < end:
+        control = packed[at]
+        at += 1
+        if control < 32:
+            out += packed[at : at + control + 1]
+            at += control + 1
+            continue
+        length = control >> 5
+        if length == 7 and at < end:
+            length += packed[at]
+            at += 1
+        start = len(out) - ((control & 31) << 8) - (packed[at] if at < end else 0) - 1
+        at += 1
+        if start < 0:
+            return None
+        copied = out[start : start + length + 2]  # shorter where a copy repeats itself
+        out += (copied * (length + 2))[: length + 2]
+    return bytes(out)
 
 
 def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:

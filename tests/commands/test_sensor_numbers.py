@@ -295,3 +295,23 @@ def test_an_image_of_16_bits_that_holds_8_is_read_as_of_8(tmp_path: Path) -> Non
     frame = frame_of_arrays(pixels, codes_of(INDOOR / "sparse.png") / 1000)
     assert frame.image is not None
     np.testing.assert_allclose(frame.image, pixels / 255, atol=1e-6)
+
+
+def test_extrinsics_with_a_calibration_of_kitti_are_rectified_as_its_own_are(
+    tmp_path: Path, scan: Rows
+) -> None:
+    turn = cv2.Rodrigues(np.array([0.02, -0.03, 0.01]))[0]
+    np.savetxt(tmp_path / "pose.txt", turn.T @ matrix("Tr_velo_to_cam"))  # of the unrectified one
+    rows = {
+        "P2": matrix("P2").ravel(),
+        "R0_rect": turn.ravel(),
+        "Tr_velo_to_cam": np.eye(4)[:3].ravel(),  # another sensor's
+    }
+    lines = [f"{name}: {' '.join(map(repr, row.tolist()))}" for name, row in rows.items()]
+    (tmp_path / "calib.txt").write_text("\n".join(lines))
+    np.save(tmp_path / "a.npy", scan[:, :3])
+    files = FrameFiles(image=STREET / "rgb.png", sparse=tmp_path / "a.npy")
+    of_scan = {"calib": tmp_path / "calib.txt", "extrinsics": tmp_path / "pose.txt"}
+    options = ReadOptions(scan=ScanOptions(keep_occluded=True, **of_scan))
+    got = points_of(read_frame(files, options))
+    np.testing.assert_allclose(got, seen(scan[:, :3].astype(float)), rtol=1e-4, atol=2e-3)

@@ -13,6 +13,7 @@ import pytest
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.extrinsics import read_extrinsics
+from pnpdepth_cli.sensors.lens import pixels_of
 
 pytest.importorskip("yaml")
 
@@ -141,6 +142,64 @@ def test_kittis_odometry_file_has_the_scanner_in_tr(tmp_path: Path) -> None:
     odometry = "\n".join([*lines[:2], lines[3].replace("Tr_velo_to_cam", "Tr")])
     got, want = (read_calibration(write(tmp_path, text)) for text in (odometry, KITTI))
     assert np.array_equal(got.scanner.square(), want.scanner.square())
+
+
+def test_kittis_tracking_file_has_names_without_a_colon(tmp_path: Path) -> None:
+    text = KITTI.replace("R0_rect:", "R_rect").replace("Tr_velo_to_cam:", "Tr_velo_cam")
+    text = text.replace("Tr_imu_to_velo:", "Tr_imu_velo")
+    tracking, detection = (read_calibration(write(tmp_path, each)) for each in (text, KITTI))
+    assert facts(tracking) == facts(detection)
+
+
+def test_kitti_360_maps_camera_0_to_the_scanner_and_has_one_rectification(tmp_path: Path) -> None:
+    turn = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
+    to_scanner = np.column_stack([np.linalg.inv(np.array(TURN, float)), [0.77, 0.29, -0.16]])
+    offset = -328.7142
+    numbers = {
+        "S_rect": [1408, 376],
+        "R_rect": turn.ravel(),
+        "P_rect": [552.554, 0, 682.05, 0, 0, 552.554, 238.77, 0, 0, 0, 1, 0],
+    }
+    lines = ["calib_time: 03-Apr-2018 18:47:03", "corner_dist: 0.100000"]
+    for camera in (0, 1):
+        numbers["P_rect"][3] = camera * offset
+        lines += [
+            f"{k}_{camera:02}: {' '.join(map(repr, map(float, v)))}" for k, v in numbers.items()
+        ]
+    (tmp_path / "perspective.txt").write_text("\n".join(lines))
+    np.savetxt(tmp_path / "calib_cam_to_velo.txt", to_scanner.reshape(1, 12))
+    point = np.array([12.0, -3.0, 0.5])  # in the scanner's frame
+    in_camera = np.linalg.solve(to_scanner[:, :3], point - to_scanner[:, 3])
+    for camera in (0, 1):
+        u, v, w = (
+            np.array([[552.554, 0, 682.05], [0, 552.554, 238.77], [0, 0, 1]]) @ turn @ in_camera
+        )
+        expected = [(u + camera * offset) / w, v / w, w]
+        for path in (tmp_path, tmp_path / "perspective.txt"):
+            calibration = read_calibration(path, camera or None)
+            assert calibration.scanner is not None
+            seen = calibration.scanner.moved(point[None])
+            pixel = pixels_of(calibration.camera, seen)[0]
+            np.testing.assert_allclose([*pixel, seen[0, 2]], expected)
+            assert calibration.camera.size == (376, 1408)
+    with pytest.raises(UsageError, match="no camera 2"):
+        read_calibration(tmp_path, 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [
+        ("500.5 0 320 0\n0 501 240 0\n0 0 1 0\n0 0 0 1\n", None),
+        ("500.5 501 320 240", None),
+        ("500.5, 501, 320, 240, 640, 480", (480, 640)),
+    ],
+)
+def test_intrinsics_of_scannet_and_of_one_line_are_read(
+    tmp_path: Path, text: str, size: tuple[int, int] | None
+) -> None:
+    camera = read_calibration(write(tmp_path, text)).camera
+    assert camera.intrinsics.tolist() == K
+    assert camera.size == size
 
 
 def test_kittis_cameras_are_read_without_their_scanner(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -34,6 +35,29 @@ def pcd_bytes(points: NDArray[np.float32], stored: str = "binary") -> bytes:
     return header.encode() + rows.tobytes()
 
 
+def compressed_pcd_bytes(points: NDArray[np.float32]) -> bytes:
+    """The same fields one after the other, as LZF: literals, but for n, which copies itself."""
+    header = pcd_bytes(points).partition(b"DATA")[0] + b"DATA binary_compressed\n"
+    literal = bytes(len(points)) + points.T.astype("<f4").tobytes()
+    packed = b"".join(
+        bytes([len(part) - 1]) + part
+        for part in (literal[at : at + 32] for at in range(0, len(literal), 32))
+    )
+    packed += b"\x00\x00"  # one byte of n; the others are copies from one byte back
+    left = 8 * len(points) - 1
+    while left:
+        length = min(left, 264)
+        if length < 3:
+            packed += bytes([length - 1]) + bytes(length)
+        elif length < 9:
+            packed += bytes([(length - 2) << 5, 0])
+        else:
+            packed += bytes([7 << 5, length - 9, 0])
+        left -= length
+    claimed = len(points) * (1 + 12 + 8)
+    return header + struct.pack("<II", len(packed), claimed) + packed
+
+
 def ply_bytes(points: NDArray[np.float32], stored: str = "binary_little_endian") -> bytes:
     """Vertices of doubles with a colour before them, and a face after them."""
     header = (
@@ -60,6 +84,7 @@ FILES = {
     "kitti.bin": bin_bytes,
     "scan.npy": npy_bytes,
     "binary.pcd": pcd_bytes,
+    "compressed.pcd": compressed_pcd_bytes,
     "ascii.pcd": lambda points: pcd_bytes(points, "ascii"),
     "little.ply": ply_bytes,
     "big.ply": lambda points: ply_bytes(points, "binary_big_endian"),
@@ -116,7 +141,11 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
         ("a.pcd", b"FIELDS x y z\nDATA ascii\n", "has no SIZE"),
         ("a.pcd", pcd_bytes(POINTS).replace(b" y ", b" w "), "without one y"),
         ("a.pcd", pcd_bytes(POINTS).replace(b"COUNT 1 1", b"COUNT 1"), "another number of fields"),
-        ("a.pcd", pcd_bytes(POINTS).replace(b"DATA binary", b"DATA binary_compressed"), "convert"),
+        (
+            "a.pcd",
+            pcd_bytes(POINTS).replace(b"DATA binary", b"DATA binary_compressed"),
+            "compressed",
+        ),
         ("a.ply", b"ply\nend_header\n", "does not begin with ply and its format"),
         ("a.ply", ply_bytes(POINTS)[4:], "does not begin with ply and its format"),
         ("a.ply", b"ply\nformat\nelement vertex 1\nend_header\n", "unknown format ''"),

@@ -123,6 +123,7 @@ ROWS: dict[str, Layout] = {
         below="|*/|*/*/",
         marks=("intrinsic",),
         name=_joined("/"),
+        calib="intrinsic/intrinsic_color.txt",
         gt_scale=1000.0,
         gt_other_size=True,
     ),
