@@ -74,9 +74,6 @@ class Head:
     notes: Sequence[str] = ()
     tables: Sequence[Any] = ()
     """Each has title, headings and texts, as `commands.tables.Table`."""
-    charts: Sequence[Mapping[str, Any]] = ()
-    """Each has caption, x_title, y_title and lines over fractions from 0 to 1, the last one dashed:
-    (x, y) by the name of the line."""
     without_title: str = ""
     without: Sequence[tuple[str, str]] = ()
     columns: Sequence[Mapping[str, Any]] = ()

@@ -33,7 +33,6 @@ def page_data(folder: Path) -> dict[str, Any]:
         "tables": [
             _table(each) for each in re.findall('(?s)<table class="means">(.*?)</table>', head)
         ],
-        "charts": re.findall('<figure class="lines">', head),
     }
 
 

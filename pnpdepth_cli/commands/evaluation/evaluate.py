@@ -182,7 +182,15 @@ def evaluate(
         interval=_intervals(request.measures, values, clusters),
         clusters=clusters,
         uncertainty=summarise_uncertainty([row.uncertainty for row in scored if row.uncertainty]),
-        notes=(*notes, *_reading_notes(rows), *_warnings(rows, request)),
+        notes=(
+            *notes,
+            *_reading_notes(rows),
+            *_unscored(rows),
+            *_ground_truth(rows),
+            *_empty_pixels(scored, request),
+            *_scales(scored, request),
+            *_given_points(scored, request),
+        ),
     )
 
 
@@ -216,22 +224,6 @@ def _reading_notes(rows: Sequence[FrameScores]) -> list[str]:
         if texts:
             lines.append(f"{side}: {some_names(texts)}")
     return lines
-
-
-def _warnings(rows: Sequence[FrameScores], request: EvalRequest) -> list[str]:
-    """The warnings of an evaluation, each one line.
-
-    Raises:
-        InputError: If a scale that was assumed is wrong by a factor between those in use.
-    """
-    scored = [row for row in rows if row.scored]
-    return [
-        *_unscored(rows),
-        *_ground_truth(rows),
-        *_empty_pixels(scored, request),
-        *_scales(scored, request),
-        *_given_points(scored, request),
-    ]
 
 
 def _unscored(rows: Sequence[FrameScores]) -> Iterator[str]:
@@ -276,7 +268,11 @@ def _empty_pixels(scored: Sequence[FrameScores], request: EvalRequest) -> Iterat
 
 
 def _scales(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:
-    """How predictions were scaled, and what looks like a wrong scale."""
+    """How predictions were scaled, and what looks like a wrong scale.
+
+    Raises:
+        InputError: If a scale that was assumed is wrong by a factor between those in use.
+    """
     if factors := [row.fit.factor for row in scored if row.fit is not None]:
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan

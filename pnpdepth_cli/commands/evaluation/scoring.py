@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +28,6 @@ from pnpdepth_cli.measures import Formula
 
 Floats = NDArray[np.float64]
 
-ONE_SIGMA, TWO_SIGMA = (2 * NormalDist().cdf(k) - 1 for k in (1, 2))
-LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, ONE_SIGMA, 0.8, 0.9, TWO_SIGMA, 0.99)
-"""Probabilities of intervals."""
 REMOVED = tuple(n / 20 for n in range(20))
 """Fractions of the pixels."""
 
@@ -40,8 +36,8 @@ class FrameUncertainty(NamedTuple):
     """What one frame contributes, over pixels with prediction, ground truth and deviation."""
 
     pixels: int
-    within: Floats
-    """(LEVELS,) how many errors lie within the interval of each probability."""
+    within: tuple[int, int]
+    """How many errors are at most one and two standard deviations."""
     sparsification: Floats
     """(REMOVED,) mean absolute error, metres, without the most uncertain pixels."""
     oracle: Floats
@@ -154,7 +150,6 @@ def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty
         return None
     error = np.abs(depth[known].astype(np.float64) - gt[known])
     deviation = sigma[known].astype(np.float64)
-    limits = [NormalDist().inv_cdf((1 + level) / 2) for level in LEVELS]
     kept = np.maximum(1, np.round((1 - np.array(REMOVED)) * len(error))).astype(int)
 
     def curve(order: NDArray[np.intp]) -> Floats:
@@ -162,7 +157,7 @@ def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty
 
     return FrameUncertainty(
         pixels=len(error),
-        within=np.searchsorted(np.sort(error / deviation), limits, side="right").astype(np.float64),
+        within=(int((error <= deviation).sum()), int((error <= 2 * deviation).sum())),
         sparsification=curve(np.argsort(deviation, kind="stable")),
         oracle=curve(np.argsort(error)),
     )
@@ -171,28 +166,22 @@ def frame_uncertainty(depth: Depth, gt: Depth, sigma: Depth) -> FrameUncertainty
 def summarise_uncertainty(frames: Sequence[FrameUncertainty]) -> dict[str, Any] | None:
     """Returns the calibration and sparsification of all frames; None without any.
 
-    Calibration is over the pixels of all frames: `observed` is the fraction of errors within the
-    interval of each probability `expected`. Sparsification is the mean of the frames by fraction of
-    pixels `removed`; `ause` is the area between `sparsification` and `oracle` in units of the error
-    of all pixels, 0 is best.
+    Calibration is over the pixels of all frames: the fractions of errors within one and two
+    standard deviations. `ause` is the area between the curves of sparsification and of the oracle,
+    which are means over frames, in units of the error of all pixels; 0 is best.
     """
     from scipy.integrate import trapezoid
 
     if not frames:
         return None
     pixels, within, by_sigma, by_error = zip(*frames, strict=True)
-    observed = np.sum(within, axis=0) / sum(pixels)
+    one, two = (np.sum(within, axis=0) / sum(pixels)).tolist()
     sparsification, oracle = np.mean(by_sigma, axis=0), np.mean(by_error, axis=0)
-    area = float(trapezoid(sparsification - oracle, REMOVED))
+    area, whole = float(trapezoid(sparsification - oracle, REMOVED)), float(sparsification[0])
     return {
         "frames": len(frames),
         "pixels": sum(pixels),
-        "within_1_sigma": float(observed[LEVELS.index(ONE_SIGMA)]),
-        "within_2_sigma": float(observed[LEVELS.index(TWO_SIGMA)]),
-        "ause": area / float(sparsification[0]) if sparsification[0] else 0.0,
-        "expected": LEVELS,
-        "observed": observed.tolist(),
-        "removed": REMOVED,
-        "sparsification": sparsification.tolist(),
-        "oracle": oracle.tolist(),
+        "within_1_sigma": one,
+        "within_2_sigma": two,
+        "ause": area / whole if whole else 0.0,
     }

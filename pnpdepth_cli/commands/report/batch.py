@@ -98,20 +98,20 @@ def write_batch_report(
         summary: The batch's summary without its frames.
         rows: Gives the summary's rows, each time anew.
     """
-    bases, failed, first = set[str | None](), [], None
+    failed, first = [], None
     for row in rows():
-        if row["outputs"]:
-            first = first or row
-            bases.add(_basis(row))
-        else:
+        if not row["outputs"]:
             failed.append((row["name"], row["message"]))
-    mixed = len(bases - {None}) > 1
-    head = _head(summary, first, failed)
+        elif first is None:
+            first = row
+    means = summary["mean"] | {"linear": summary["linear"]}
+    basis = next(iter(errors_by_basis(means)), USED)
+    head = _head(summary, basis, first, failed)
 
     def entries(images: Path) -> Iterator[dict[str, Any]]:
         for row in rows():
             if row["outputs"]:
-                yield _entry(row, head.columns, mixed) | _views(row, request, images)
+                yield _entry(row, basis, head.columns) | _views(row, request, images)
 
     write_report(folder, _source(request, folder), head, entries, viewer=request.html_3d)
 
@@ -122,16 +122,16 @@ def _source(request: BatchRequest, folder: Path) -> dict[str, Any]:
     return {"command": "batch", "output": output}
 
 
-def _entry(row: Row, columns: Sequence[Mapping[str, Any]], mixed: bool) -> dict[str, Any]:
-    basis = _basis(row)
-    values = _values(row, basis)
-    if basis == USED and columns[0]["signed"]:
-        values = {}  # others have a change that means something
-    tag = BASES[basis] if mixed and basis else ""
+def _entry(row: Row, basis: str, columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A frame's values on the basis of all frames; where it has none, what it has instead."""
+    errors = errors_by_basis(row)
+    values = _values(row, errors[basis]) if basis in errors else {}
+    own = basis if basis in errors else next(iter(errors), "")
+    tag = BASES[own] if own not in ("", basis) else ""
     return {
         "name": row["name"],
         "values": [values.get(shown["key"]) for shown in columns],
-        "notes": _notes(row, basis),
+        "notes": _notes(row, own),
         "tag": "diverged" if row["status"] == "diverged" else tag,
     }
 
@@ -176,11 +176,6 @@ def _holds_results(path: Path, output: Path, folder: Path) -> bool:
     return folder.is_relative_to(output) and output.is_relative_to(path.resolve())
 
 
-def _basis(row: Row) -> str | None:
-    """What the errors of a row are measured on."""
-    return next(iter(errors_by_basis(row)), None)
-
-
 def _measures(basis: str) -> tuple[str, ...]:
     return ("mae",) if basis == VALIDATION else ("rmse", "mae")
 
@@ -204,10 +199,7 @@ def _columns(best: str, unit: str) -> list[dict[str, Any]]:
     return columns
 
 
-def _values(row: Row, basis: str | None) -> dict[str, float | None]:
-    if basis is None:
-        return {}
-    errors = errors_by_basis(row)[basis]
+def _values(row: Row, errors: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
     values: dict[str, float | None] = {"improved": row.get("improved_fraction")}
     for key in ("rmse", "mae"):
         before, after = (errors[stage].get(key) for stage in ("before", "after"))
@@ -216,9 +208,9 @@ def _values(row: Row, basis: str | None) -> dict[str, float | None]:
     return values
 
 
-def _notes(row: Row, basis: str | None) -> list[str]:
+def _notes(row: Row, basis: str) -> list[str]:
     notes = [row["message"]] if row["message"] else []
-    if basis is not None:
+    if basis:
         after = errors_by_basis(row)[basis]["after"]
         count = f"{after['pixels']:,} pixels" if basis == GT else f"{after['points']:,} points"
         notes.append(f"Errors are {BASES[basis]}, {count}.")
@@ -229,15 +221,15 @@ def _notes(row: Row, basis: str | None) -> list[str]:
     return [*notes, *row["warnings"]]
 
 
-def _head(summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str, str]]) -> Head:
+def _head(
+    summary: Mapping[str, Any], basis: str, first: Row | None, failed: list[tuple[str, str]]
+) -> Head:
     unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), [*summary["notes"]]
-    means = summary["mean"] | {"linear": summary["linear"]}
-    best = next(iter(errors_by_basis(means)), USED)
     if unmatched:
         notes.append(f"warning: {unmatched:,} files are in no frame; summary.json has them")
-    if first is not None and best == USED:
+    if first is not None and basis == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
-    columns = _columns(best, unit)
+    columns = _columns(basis, unit)
     tables = [means_table(summary)] if first is not None else []
     if summary.get("baselines"):
         tables.append(baselines_table(summary["baselines"], unit))
@@ -250,7 +242,7 @@ def _head(summary: Mapping[str, Any], first: Row | None, failed: list[tuple[str,
         without_title=f"Not refined: {len(failed):,}",
         without=failed,
         columns=columns,
-        sort_by="rmse_after" if best == USED else columns[0]["key"],
+        sort_by="rmse_after" if basis == USED else columns[0]["key"],
         labels=_LABELS,
         thumb="second",
         map_colours=hex_colours(signed_bar("gain", 9)),

@@ -86,7 +86,6 @@ def _head(
         ],
         notes=evaluation.notes,
         tables=[means_table(evaluation, keys), *calibration_tables(evaluation)],
-        charts=_charts(evaluation),
         without_title=f"Not scored: {evaluation.unscored()}",
         without=without,
         columns=columns,
@@ -97,33 +96,6 @@ def _head(
         },
         map_colours=hex_colours(signed_bar("error", 9)),
     )  # fmt: skip
-
-
-def _charts(evaluation: Evaluation) -> list[dict[str, Any]]:
-    """The calibration plot and the sparsification curve of the predicted standard deviation."""
-    found = evaluation.uncertainty
-    if found is None:
-        return []
-    frames = f"{found['frames']:,} frames"
-    observed = list(zip(found["expected"], found["observed"], strict=True))
-    charts: list[dict[str, Any]] = [{
-        "caption": f"Calibration, {frames}",
-        "x_title": "errors within the interval if normal",
-        "y_title": "observed",
-        "lines": {"observed": observed, "normal": [(0, 0), (1, 1)]},
-    }]  # fmt: skip
-    if whole := found["sparsification"][0]:
-        by_sigma, by_error = (
-            [(part, mae / whole) for part, mae in zip(found["removed"], curve, strict=True)]
-            for curve in (found["sparsification"], found["oracle"])
-        )
-        charts.append({
-            "caption": f"Sparsification, {frames}: AUSE {found['ause']:.4f}",
-            "x_title": "pixels removed",
-            "y_title": "MAE of the others",
-            "lines": {"by σ": by_sigma, "by error (oracle)": by_error},
-        })  # fmt: skip
-    return charts
 
 
 def _entry(

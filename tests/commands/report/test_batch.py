@@ -158,7 +158,7 @@ def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
     frames = frames_of(report)
     assert frames["a"]["values"]["rmse_change"] is not None
     assert set(frames["b"]["values"].values()) == {None}
-    assert (frames["a"]["tag"], frames["b"]["tag"]) == ("against ground truth", "at points used")
+    assert (frames["a"]["tag"], frames["b"]["tag"]) == ("", "at points used")
 
 
 def test_a_frame_without_depth_at_any_point_has_no_figures(root: Path, report: Path) -> None:

@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.integrate import trapezoid
 
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.commands.report.evaluation import _charts, write_eval_report
+from pnpdepth_cli.commands.report.evaluation import write_eval_report
 from pnpdepth_cli.errors import StorageError
 from pnpdepth_cli.io.depth import write_depth
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
@@ -107,26 +106,16 @@ def test_the_image_is_shown_where_the_predictions_record_names_one(root: Path) -
     assert panel(root, "a", "image").mean((0, 1)) == pytest.approx([255, 0, 0], abs=3)
 
 
-def test_a_standard_deviation_has_a_calibration_plot_and_a_sparsification_curve(root: Path) -> None:
-    rng = np.random.default_rng(1)
+def test_a_standard_deviation_has_a_table_of_its_calibration(root: Path) -> None:
     for name in NAMES:
         gt = np.load(root / "gt" / f"{name}.npy")
-        sigma = rng.uniform(0.05, 0.5, gt.shape).astype(np.float32)
         (root / "out" / f"{name}.npy").unlink()
-        depth = gt + sigma * rng.normal(size=gt.shape)
-        write_depth(root / "out" / f"{name}_depth.npy", np.maximum(depth, 0.1).astype(np.float32))
-        np.save(root / "out" / f"{name}_sigma.npy", sigma)
-    result = reported(root)
-    assert result.uncertainty is not None
-    assert len(page_data(root / "report")["charts"]) == 2
-    calibration, sparsification = _charts(result)
-    observed = calibration["lines"]["observed"]
-    assert observed == [(x, pytest.approx(x, abs=0.02)) for x, _ in observed]
-    by_sigma, by_error = map(dict, sparsification["lines"].values())
-    assert by_sigma[0] == by_error[0] == 1
-    assert 1 > by_sigma[0.5] > by_error[0.5] > 0
-    area = trapezoid([by_sigma[x] - by_error[x] for x in by_sigma], list(by_sigma))
-    assert area == pytest.approx(result.uncertainty["ause"])
+        write_depth(root / "out" / f"{name}_depth.npy", gt + np.float32(0.15))
+        np.save(root / "out" / f"{name}_sigma.npy", np.full_like(gt, 0.1))
+    reported(root)
+    _, table = page_data(root / "report")["tables"]
+    within = [row[:2] for row in table["rows"][:2]]
+    assert within == [["errors within 1σ", "0.0%"], ["errors within 2σ", "100.0%"]]
 
 
 def test_what_the_development_kit_fills_in_is_shown_filled(root: Path) -> None:
