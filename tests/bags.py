@@ -45,13 +45,14 @@ def write_bag(
     poses: str = "",
     compression: Any = None,
     view: View | None = None,
+    clock_s: float = 0.0,
 ) -> Path:
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.
     With `poses`, base moves 0.3 m along x from one image to the next: "odometry" or "tf", or the
     camera does: "pose". `compression` is rosbags' of the chunks. `view` replaces image, scan and
-    camera_info.
+    camera_info. `clock_s` is added to the stamps of the scans.
     """
     ros1 = path.suffix == ".bag"
     store = message_types(ros1=ros1)
@@ -80,7 +81,7 @@ def write_bag(
             pixels[:, : WIDTH // 2, 0] = 200
             pixels, topic = (pixels, IMAGES) if view is None else (view.pixels, view.topic)
             yield _image(make, header(time_ns, "camera"), pixels, time_ns, topic, compressed)
-            cloud = _cloud(make, header(time_ns + 4_000_000, "lidar"), view)
+            cloud = _cloud(make, header(time_ns + 4_000_000 + round(clock_s * 1e9), "lidar"), view)
             yield POINTS, time_ns + 5_000_000, cloud
         if poses:
             last = header(start + step * frames - step // 2, "odom")

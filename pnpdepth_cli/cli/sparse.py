@@ -189,6 +189,12 @@ def simulate(
     metavar="SECONDS",
     help="Largest time between an image and its scan.",
 )
+@click.option(
+    "--clock-offset",
+    type=float,
+    metavar="SECONDS",
+    help="Added to the times of the points.  [default: 0; by the times of the log if above 1 s]",
+)
 @click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first N frames.")
 @options.overwrite
 def frames(bag: Path, output: Path, **values: Any) -> None:

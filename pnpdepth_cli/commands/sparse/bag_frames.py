@@ -57,6 +57,13 @@ POSES_FILE = "poses.txt"
 RECORD = "frames.json"
 _FOLDERS = ("rgb", "sparse")
 _COMPARED_FRAMES = 5
+_KINDS = {"images": True, "points": False}
+_DELAYS = 20
+"""Messages of each topic whose delay is measured."""
+
+_SLOWEST_S = 1.0
+"""Difference of delays from which it is that of two clocks."""
+
 _LONGEST_GAP_S = 0.5
 """Between two poses that one is interpolated from."""
 
@@ -74,6 +81,8 @@ class FramesRequest:
     """Of images, of points (PointCloud2) and of poses; else the only one of its kind."""
     tolerance: float = 0.05
     """Largest time between an image and its scan, seconds."""
+    clock_offset: float | None = None
+    """Seconds that are added to the times of scans. None: by the log, where it is large."""
     limit: int | None = None
     overwrite: bool = False
 
@@ -90,6 +99,7 @@ class FramesRequest:
             "bag_files": {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths},
             "topics": list(self.topics),
             "tolerance": self.tolerance,
+            "clock_offset": self.clock_offset,
             "limit": self.limit,
         }
 
@@ -118,7 +128,10 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         lost, times, poses = 0, list[float](), None
         dropped = Counter[str]()
         frames = "", ""
-        for image, scan in nearest_pairs(_stream(bag, *topics), tolerance):
+        offset = request.clock_offset
+        if offset is None:
+            offset = _clock_offset(bag, topics, say)
+        for image, scan in nearest_pairs(_stream(bag, *topics, offset), tolerance):
             if scan is None:
                 lost += 1
                 continue
@@ -144,11 +157,13 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
     if not times:
         raise InputError(
             f"{request.bag}: no image of {topics[0]} has a scan of {topics[1]} within"
-            f" {tolerance:g} s; check the clocks, or give a larger --tolerance"
+            f" {tolerance:g} s; {_first_times(request.bag, topics)}; if their clocks differ, give"
+            " --clock-offset, else a larger --tolerance"
         )
     record = request.identity() | {
         "image_topic": topics[0],
         "points_topic": topics[1],
+        "seconds_added_to_points": offset,
         "complete": True,
         "frames": len(times),
         "poses": poses,
@@ -178,9 +193,50 @@ def _clear(request: FramesRequest) -> None:
     write_json(request.output / RECORD, request.identity() | {"complete": False})
 
 
-def _stream(bag: Bag, images: str, points: str) -> Iterator[tuple[bool, Stamped]]:
+def _stream(
+    bag: Bag, images: str, points: str, offset: float = 0.0
+) -> Iterator[tuple[bool, Stamped]]:
+    """Yields whether it is an image, and the message; `offset` is added to times of points."""
     for topic, logged_ns, message in bag.messages([images, points]):
-        yield topic == images, Stamped(seconds_of(message, logged_ns), message)
+        is_image = topic == images
+        time_s = seconds_of(message, logged_ns) + (0.0 if is_image else offset)
+        yield is_image, Stamped(time_s, message)
+
+
+def _clock_offset(bag: Bag, topics: tuple[str, str], say: Say) -> float:
+    """Seconds to add to the times of points: 0, or a large one by which two clocks differ.
+
+    One clock times the log of both, so that their delays from stamp to log differ by the offset,
+    and by how long each message took, which is less than a second.
+    """
+    delays: dict[str, list[float]] = {topic: [] for topic in topics}
+    for topic, logged_ns, message in bag.messages(topics):
+        delays[topic].append(1e-9 * logged_ns - seconds_of(message, logged_ns))
+        if min(map(len, delays.values())) >= _DELAYS or len(delays[topic]) >= 10 * _DELAYS:
+            break
+    if not all(delays.values()):
+        return 0.0
+    of_images, of_points = (float(np.median(delays[topic])) for topic in topics)
+    offset = round(of_points - of_images, 6)
+    if abs(offset) <= _SLOWEST_S:
+        return 0.0
+    say(
+        f"warning: by the times of the log, {topics[0]} and {topics[1]} have two clocks;"
+        f" {offset:+.3f} s are added to the times of points (--clock-offset gives another number)"
+    )
+    return offset
+
+
+def _first_times(path: Path, topics: tuple[str, str]) -> str:
+    """When the images and the points begin, for a person."""
+    first = dict[bool, float]()
+    with open_bag(path) as bag:
+        for is_image, each in _stream(bag, *topics):
+            first.setdefault(is_image, each.time_s)
+            if len(first) == 2:
+                break
+    times = [f"{name} begin at {first[key]:.3f} s" for name, key in _KINDS.items() if key in first]
+    return ", ".join(times) or "there is none"
 
 
 def _write_frame(folder: Path, topic: str, image: Stamped, xyz: NDArray[np.float32]) -> None:

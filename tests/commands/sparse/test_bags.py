@@ -86,13 +86,32 @@ def test_a_batch_takes_a_bag_and_writes_its_frames_once(
 
 def test_topics_can_be_named_and_images_without_a_scan_in_time_are_none(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "drive.mcap")
-    with pytest.raises(PnpDepthError, match=r"within 0\.001 s; check the clocks"):
+    with pytest.raises(PnpDepthError, match=r"within 0\.001 s; images begin at 1700000000"):
         written(bag, tmp_path / "none", tolerance=0.001)
     with pytest.raises(UsageError, match="--tolerance must be >= 0, got -1"):
         FramesRequest(bag=bag, output=tmp_path, tolerance=-1)
     with pytest.raises(UsageError, match=r"no topic /rear .* there are /front/image_raw, /lidar"):
         written(bag, tmp_path / "frames", topics=("/rear",))
     assert len(written(bag, tmp_path / "frames", topics=(POINTS, IMAGES))) == 3
+
+
+@pytest.mark.parametrize("clock_s", [-1_699_999_000.5, 37.25, -2.0])
+@pytest.mark.parametrize("kind", ["ros1.bag", "drive.mcap"])
+def test_two_clocks_are_brought_together_by_the_log_and_that_is_said(
+    kind: str, clock_s: float, tmp_path: Path
+) -> None:
+    bag = write_bag(tmp_path / kind, clock_s=clock_s)
+    messages = written(bag, tmp_path / "frames", tolerance=0.01)
+    assert any(message.startswith("warning: the clock of") for message in messages)
+    record = json.loads((tmp_path / "frames" / RECORD).read_text())
+    # points are stamped 4 ms after their image and logged 1 ms later, images at once
+    assert record["seconds_added_to_points"] == pytest.approx(0.001 - clock_s, abs=1e-6)
+    assert (record["frames"], record["images_without_scan"]) == (3, 0)
+    written(bag, tmp_path / "given", tolerance=0.01, clock_offset=-clock_s)
+    for name in ("frames", "given"):
+        assert len(list((tmp_path / name / "sparse").iterdir())) == 3
+    with pytest.raises(PnpDepthError, match="--clock-offset"):
+        written(bag, tmp_path / "none", clock_offset=0.0)
 
 
 def test_a_bag_without_calibration_gets_a_note_that_names_it(tmp_path: Path) -> None:
