@@ -110,8 +110,8 @@ def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_p
         path = tmp_path / "out" / f"{frame.name}_depth.npy"
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, np.full(each.gt.shape, 2.0, np.float32))
-        record = json.dumps({"inputs": {"sparse": each.sources["sparse"]}})
-        path.with_name(path.name.replace("_depth.npy", ".json")).write_text(record)
+        record = {"inputs": {"sparse": each.sources["sparse"]}, "size": each.gt.shape[::-1]}
+        path.with_name(path.name.replace("_depth.npy", ".json")).write_text(json.dumps(record))
     found = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=root, protocol=name))
     assert [frame.pixels for frame in found.frames] == [pixels] * frames
 

@@ -163,7 +163,7 @@ def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
     """
     size = gt.shape[0], gt.shape[1]
     try:
-        if pair.drawn is not None:
+        if pair.drawn is not None and pair.drawn.size == size:
             image = image_of(pair, size) if pair.drawn.pattern.kind == "features" else None
             xy = sample_points(gt, pair.drawn.pattern, pair.drawn.seed, image=image).xy
         elif pair.sparse is not None:

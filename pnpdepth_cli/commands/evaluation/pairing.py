@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pnpdepth_cli.commands.results import result_frames
+from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.frame_files import (
     FrameFiles,
     RawDepth,
@@ -33,10 +33,11 @@ _LISTED = 5
 
 
 class DrawnPoints(NamedTuple):
-    """The pattern and the random seed of points that were drawn from ground truth."""
+    """The pattern and the random seed of points that were drawn from ground truth of (H, W)."""
 
     pattern: SamplePattern
     seed: int
+    size: tuple[int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,10 +117,7 @@ def pair_frames(
         )
     groups = groups_by_name([frame.name for frame in frames])
     return [
-        replace(
-            _pair(frame, predictions.get(frame.name)),
-            group=group if frame.group is None else frame.group,
-        )
+        _pair(frame, predictions.get(frame.name), group)
         for frame, group in zip(frames, groups, strict=True)
     ], notes
 
@@ -141,54 +139,62 @@ def _true_frames(
     return frames, [note + (f", of which {cuts} is used" if cuts else "")]
 
 
-def _pair(frame: FrameFiles, prediction: Path | None) -> FramePair:
+def _pair(frame: FrameFiles, prediction: Path | None, group: str) -> FramePair:
     """The frame with what the record of a refinement, beside its depth, says of its inputs."""
-    record: Mapping[str, Any] = {}
-    sigma: Path | None = None
+    result: ResultFrame | None = None
     if prediction is not None:
         with contextlib.suppress(PnpDepthError):
             (result,) = result_frames(prediction)
-            record, sigma = result.record, result.sigma
-    inputs = _dict(record.get("inputs"))
-    known = frame.sparse
-    if known is not None and known.suffix.lower() not in DEPTH_SUFFIXES:
-        known = None
-    return FramePair(
+    pair = FramePair(
         name=frame.name,
         prediction=prediction,
         frame=frame,
-        sparse=_input(inputs, "sparse") or known,
-        drawn=_drawn_points(_dict(inputs.get("sparse"))),
-        sigma=sigma,
-        image=_input(inputs, "image") or frame.image,
-        unit=str(record.get("unit", METRES)),
+        group=group if frame.group is None else frame.group,
+        sparse=_not_a_scan(frame.sparse),
+        image=frame.image,
+    )
+    if result is None:
+        return pair
+    return replace(
+        pair,
+        sparse=_sparse_file(result.record) or pair.sparse,
+        drawn=_drawn_points(result.record),
+        sigma=result.sigma,
+        image=result.image or pair.image,
+        unit=result.unit,
     )
 
 
-def _drawn_points(entry: Mapping[str, Any]) -> DrawnPoints | None:
-    """The points that a record says were drawn from the ground truth; None if it does not."""
-    if "sampled_from" not in entry:
-        return None
-    with contextlib.suppress(KeyError, TypeError, ValueError, UsageError):
-        pattern = SamplePattern(**{name: entry[name] for name in ("kind", "count", "fraction")})
-        return DrawnPoints(pattern, int(entry["seed"]))
-    return None
+def _not_a_scan(path: Path | None) -> Path | None:
+    """The path; None for a scan, of which the file does not say which points the network saw."""
+    return path if path is not None and path.suffix.lower() in DEPTH_SUFFIXES else None
 
 
-def _input(inputs: Mapping[str, Any], part: str) -> Path | None:
-    """A file of a record's inputs, if it still exists.
-
-    None for a scan, as the file does not say which of its points the network saw.
-    """
-    entry = _dict(inputs.get(part))
+def _sparse_file(record: Mapping[str, Any]) -> Path | None:
+    """The sparse depth that a record names, if it exists and is no projected scan."""
+    entry = _sparse_entry(record)
     path = entry.get("path")
     if not isinstance(path, str) or "calibration" in entry or not Path(path).is_file():
         return None
     return Path(path)
 
 
-def _dict(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
+def _drawn_points(record: Mapping[str, Any]) -> DrawnPoints | None:
+    """The points that a record says were drawn from the ground truth; None if it does not."""
+    entry = _sparse_entry(record)
+    if "sampled_from" not in entry:
+        return None
+    with contextlib.suppress(KeyError, TypeError, ValueError, UsageError):
+        pattern = SamplePattern(**{name: entry[name] for name in ("kind", "count", "fraction")})
+        width, height = record["size"]
+        return DrawnPoints(pattern, int(entry["seed"]), (height, width))
+    return None
+
+
+def _sparse_entry(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    inputs = record.get("inputs")
+    entry = inputs.get("sparse") if isinstance(inputs, dict) else None
+    return entry if isinstance(entry, dict) else {}
 
 
 def frame_name(stem: str) -> str:

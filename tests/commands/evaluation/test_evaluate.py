@@ -311,12 +311,14 @@ def test_points_that_were_drawn_from_the_ground_truth_are_drawn_again_to_be_excl
     depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", np.where(drawn > 0, gt, gt + 1))
     entry = {"sampled_from": "gt", "kind": "uniform", "count": 30, "fraction": None, "seed": 7}
-    (tmp_path / "out" / "a.json").write_text(json.dumps({"inputs": {"sparse": entry}}))
+    record = {"inputs": {"sparse": entry}, "size": [10, 10]}
+    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
     assert scored(tmp_path).frames[0].given == 30
     without = scored(tmp_path, exclude_sparse=True)
     assert (without.frames[0].known, without.mean["mae"]) == (70, pytest.approx(1))
-    (tmp_path / "out" / "a.json").write_text('{"inputs": {"sparse": {"sampled_from": "gt"}}}')
-    assert scored(tmp_path).frames[0].given is None
+    for unknown in ({"inputs": {"sparse": {"sampled_from": "gt"}}}, record | {"size": [9, 9]}):
+        (tmp_path / "out" / "a.json").write_text(json.dumps(unknown))
+        assert scored(tmp_path).frames[0].given is None
 
 
 def test_a_sparse_file_that_cannot_be_read_hides_only_how_many_points_were_given(two: Path) -> None:
