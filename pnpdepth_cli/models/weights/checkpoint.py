@@ -7,6 +7,7 @@ takes the tensors out and runs nothing.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,10 @@ from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
 from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_torch_file
 
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
+_PREFIXES = ("module.", "_orig_mod.", "model.")
+"""Of torch's DataParallel, torch.compile, and modules that hold the network, as Lightning's."""
+
+_WRAPPED = re.compile(f"^(?:{'|'.join(map(re.escape, _PREFIXES))})+")
 _INDEX = ".index"  # of a TensorFlow checkpoint
 _READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     ".safetensors": ("safetensors file", load_file),
@@ -76,9 +81,8 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     """
     stored, notes = _read(path)
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
-    if not _all_in_module(own):
-        stored, prefix_notes = _without_module(stored, path)
-        notes = [*notes, *prefix_notes]
+    stored, prefix_notes = _without_prefixes(stored, path, own)
+    notes = [*notes, *prefix_notes]
     try:
         state = _fitted(definition, own, stored, path)
     except CheckpointError:
@@ -164,17 +168,26 @@ def _networks_it_fits(stored: Mapping[str, Tensor], path: Path, wanted: str) -> 
     return sorted(fitting, key=lambda name: name.rpartition("-")[2] != ending)
 
 
-def _all_in_module(state: Mapping[str, Any]) -> bool:
-    return bool(state) and all(name.startswith("module.") for name in state)
+def _prefix(state: Mapping[str, Any]) -> str | None:
+    """The one of `_PREFIXES` that all names have."""
+    names = list(state)
+    return next((p for p in _PREFIXES if names and all(n.startswith(p) for n in names)), None)
 
 
-def _without_module(state: dict[str, Tensor], path: Path) -> tuple[dict[str, Tensor], list[str]]:
-    """The tensors without the prefix of torch's DataParallel, and a note if there was one."""
-    notes = []
-    while _all_in_module(state):
-        state = {name.removeprefix("module."): tensor for name, tensor in state.items()}
-        notes = [f"checkpoint {path.name}: prefix 'module.' of every key stripped"]
-    return state, notes
+def _without_prefixes(
+    state: dict[str, Tensor], path: Path, own: Mapping[str, Any] | None = None
+) -> tuple[dict[str, Tensor], list[str]]:
+    """The tensors without prefixes of wrappers that a network's own names lack, and a note."""
+    own, stripped = own or {}, list[str]()
+    while (prefix := _prefix(state)) is not None and prefix != _prefix(own):
+        if prefix == "model." and own.keys().isdisjoint(_WRAPPED.sub("", name) for name in state):
+            break  # part of the names of a published file
+        state = {name.removeprefix(prefix): tensor for name, tensor in state.items()}
+        stripped += [] if prefix in stripped else [prefix]
+    listing = " and ".join(map(repr, stripped))
+    return state, [f"checkpoint {path.name}: prefix {listing} of every key stripped"] * bool(
+        listing
+    )
 
 
 def _some(names: list[str], between: str = ", ") -> str:
@@ -221,7 +234,8 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     if isinstance(arguments, Mapping) and isinstance(data := arguments.get("data"), str):
         # Weights for other data may fit all the same.
         notes.append(f"checkpoint {path.name}: trained with data {_short(data)}")
-    return _state_in(content, path), notes
+    state, several = _state_in(content, path)
+    return state, [*notes, *several]
 
 
 def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
@@ -238,24 +252,35 @@ def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
     state = {}
     for file in files:
         part, file_notes = _read(file)
-        part, stripped = _without_module(part, file)
+        part, stripped = _without_prefixes(part, file)
         state |= {f"{file.name.partition('.')[0]}.{name}": tensor for name, tensor in part.items()}
         notes += [*file_notes, *stripped]
     return state, notes
 
 
-def _state_in(content: Any, path: Path) -> dict[str, Tensor]:
-    """The state dict in what a torch file holds."""
+def _state_in(content: Any, path: Path) -> tuple[dict[str, Tensor], list[str]]:
+    """The state dict in what a torch file holds, and a note where there are several."""
     if is_module(content):
-        return module_state(content)
+        return module_state(content), []
     if not isinstance(content, Mapping):
         kind = _short(content.path) if isinstance(content, StandIn) else type(content).__name__
         raise CheckpointError(f"checkpoint {path} holds a {kind}, not named tensors")
-    for candidate in (content, *(content.get(key) for key in _STATE_KEYS)):
-        if is_module(candidate):
-            return module_state(candidate)
-        if isinstance(candidate, Mapping) and candidate and _only_tensors(candidate):
-            return dict(candidate)
+    if content and _only_tensors(content):
+        return dict(content), []
+    states = dict[str, dict[str, Tensor]]()
+    for name, value in content.items():
+        if is_module(value):
+            states[str(name)] = module_state(value)
+        elif isinstance(value, Mapping) and value and _only_tensors(value):
+            states[str(name)] = dict(value)
+    key = next((key for key in _STATE_KEYS if key in states), None)
+    if key is not None:
+        others = [repr(_short(name)) for name in states if name != key]
+        note = (
+            f"checkpoint {path.name}: {key!r} is read, not {_some(others)}; to use another, save it"
+            " as a file of its own"
+        )
+        return states[key], [note] * bool(others)
     names = _some([str(key) for key in content]) or "nothing"
     raise CheckpointError(f"checkpoint {path} has no state dict of plain tensors; it holds {names}")
 

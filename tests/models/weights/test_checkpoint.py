@@ -125,6 +125,32 @@ def test_a_prefix_of_every_key_is_stripped_and_reported(prefix: str, tmp_path: P
     assert notes == ["checkpoint w.pth: prefix 'module.' of every key stripped"]
 
 
+@pytest.mark.parametrize(
+    "prefix", ["_orig_mod.", "model.", "module._orig_mod.", "model._orig_mod."]
+)
+def test_prefixes_of_compiled_and_of_lightning_modules_are_stripped(
+    prefix: str, tmp_path: Path
+) -> None:
+    torch.save(
+        {"state_dict": {f"{prefix}{k}": v for k, v in weights().items()}}, tmp_path / "w.ckpt"
+    )
+    state, (note,) = loaded(tmp_path / "w.ckpt")
+    assert equal(state, weights())
+    assert all(repr(f"{part}.") in note for part in prefix.split(".")[:-1])
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_several_state_dictionaries_the_one_that_is_read_is_named(
+    order: int, tmp_path: Path
+) -> None:
+    averaged = {name: 2 * tensor for name, tensor in weights().items()}
+    states = {"model": weights(), "ema": averaged, "epoch": 7}
+    torch.save(dict(list(states.items())[::order]), tmp_path / "w.pth")
+    state, (note,) = loaded(tmp_path / "w.pth")
+    assert equal(state, weights())
+    assert "'model' is read, not 'ema'" in note
+
+
 def test_a_prefix_of_some_keys_or_of_the_network_itself_is_kept(tmp_path: Path) -> None:
     first, *others = weights().items()
     torch.save(dict([first, *((f"module.{k}", v) for k, v in others)]), tmp_path / "w.pth")
