@@ -23,7 +23,6 @@ from pnpdepth_cli.frames.fuse import (
     fitted_weights,
     judge_of,
     predictions,
-    propagation_of,
     refined_by,
     scanner_shares,
     weighs_points,
@@ -66,7 +65,7 @@ def refine_default(networks: OpenNetworks, frame: Frame, *, seed: int = 0) -> Re
     fused = weighted_mean([(each.dense, weights[each.name]) for each in experts])
     # The residual at the inliers is propagated to every pixel.
     inliers = without_far_points(networks, inliers, judged)
-    depth = _propagated(fused, inliers)
+    depth = _propagated(fused, inliers, split.propagation)
     # On scan lines, a completion network of that scanner has most of the result.
     shares = scanner_shares(experts, split, weights)
     depth = _with_shares(depth, {each.name: each.dense for each in experts}, shares)
@@ -80,7 +79,7 @@ def refine_default(networks: OpenNetworks, frame: Frame, *, seed: int = 0) -> Re
         diverged=_user(experts).diverged,
         alignment=_user(experts).alignment,
         notes=(*_user(experts).notes, *_notes(frame, inliers, split, experts, weights), *warnings),
-        stages={} if frame.gt is None else _stages(experts, inliers),
+        stages={} if frame.gt is None else _stages(experts, inliers, split.propagation),
         validation=_validation(experts, split, shares) if len(split.points) else None,
         weights=weights,
     )
@@ -144,9 +143,8 @@ def check_fixed(
     )
 
 
-def _propagated(depth: Tensor, frame: Frame) -> Tensor:
+def _propagated(depth: Tensor, frame: Frame, kind: str) -> Tensor:
     """Depth (H, W) with its residual at the points propagated."""
-    kind = propagation_of(frame.points)
     return propagate(depth, frame.points, frame.rgb, kind=kind).depth
 
 
@@ -167,12 +165,14 @@ def _alone(experts: Sequence[Expert]) -> Expert | None:
     return next((e for e in experts[1:] if e.user is None and e.network is not None), None)
 
 
-def _stages(experts: Sequence[Expert], frame: Frame) -> dict[str, DepthMap]:
+def _stages(experts: Sequence[Expert], frame: Frame, kind: str) -> dict[str, DepthMap]:
     """The user's network after each step of its own, and the network that takes a prior alone."""
     user, alone, own = _user(experts), _alone(experts), experts[0].dense
-    propagated = own if experts[0].of_scanner else _propagated(own, frame)
+    propagated = own if experts[0].of_scanner else _propagated(own, frame, kind)
     stages = {ALIGNED: user.before, UPDATED: user.after, PROPAGATED: propagated.numpy()}
-    return stages if alone is None else stages | {ALONE: _propagated(alone.dense, frame).numpy()}
+    return (
+        stages if alone is None else stages | {ALONE: _propagated(alone.dense, frame, kind).numpy()}
+    )
 
 
 def _validation(

@@ -149,30 +149,32 @@ class Refined:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Validation:
+class ValidationPoints:
+    """Points that predictions from the other points are compared with."""
+
+    points: SparsePoints  # the M validation points; none of a frame with few points
+    weights: Tensor  # (M,) 0…1, how consistent each is with its neighbours
+
+    def error(self, at: Tensor) -> float:
+        """Returns the weighted mean absolute error in metres of a prediction (M,).
+
+        A point without prediction counts as far off as a depth of 0 is.
+        """
+        error = (at - self.points.depth).abs()
+        return float((error * self.weights).sum() / self.weights.sum())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validation(ValidationPoints):
     """Depth at validation points, predicted from the other points.
 
     Networks that take points predict without updates of z.
     """
 
-    points: SparsePoints  # the M validation points
     kept: SparsePoints  # all other points that were given
     network: Tensor  # (H, W) metres, 0 = unknown: the user's network, aligned with the other points
-    weights: Tensor  # (M,) 0…1, how consistent each validation point is with its neighbours
     predicted: Mapping[str, Tensor]
     """(M,) metres at the validation points, by stage; also linear interpolation and the result."""
-
-    def with_prediction(self, name: str, depth: Tensor) -> Validation:
-        """Returns the same with a prediction (M,) metres at the validation points added."""
-        return replace(self, predicted={**self.predicted, name: depth})
-
-    def error(self, name: str) -> float:
-        """Returns the weighted mean absolute error of a prediction in metres.
-
-        A point without prediction counts as far off as a depth of 0 is.
-        """
-        error = (self.predicted[name] - self.points.depth).abs()
-        return float((error * self.weights).sum() / self.weights.sum())
 
 
 def registration_to_make(registration: Registration, settings: Settings) -> Register:

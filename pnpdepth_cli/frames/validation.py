@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -9,8 +10,9 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.folds import spatial_folds
 from pnpdepth_cli.completion.outliers import inlier_weights
-from pnpdepth_cli.frames.frame import Frame, Refined, no_points
+from pnpdepth_cli.frames.frame import Frame, Refined, ValidationPoints, no_points
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.scan_pattern import scan_pattern
 
 FOLDS = 5
 """One of so many folds of the points is for validation."""
@@ -21,13 +23,26 @@ MOST_VALIDATION_POINTS = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
-class ValidationSplit:
+class ValidationSplit(ValidationPoints):
     """A frame with all its inliers, and without its validation points."""
 
     whole: Frame
     kept: Frame
-    points: SparsePoints  # the M validation points; none of a frame with few points
-    weights: Tensor  # (M,) 0…1, how consistent each is with its neighbours
+
+    @functools.cached_property
+    def has_scan_lines(self) -> bool:
+        """Whether the points are those of a scanner."""
+        points = self.whole.points
+        return scan_pattern(points.xy.cpu().numpy(), points.size).has_scan_lines
+
+    @property
+    def propagation(self) -> str:
+        """How the residual at the points is propagated, a name in `choices.PROPAGATIONS`.
+
+        Of scan lines by "local": on even KITTI frames its MAE is 1.9 % and its RMSE 1.7 % below
+        those of "gp", which is 0 to 28 % below it with points at random pixels.
+        """
+        return "local" if self.has_scan_lines else "gp"
 
     def gain(self, at: Tensor, other: Tensor) -> float:
         """Returns by how many standard errors one prediction (M,) is better than another.
@@ -39,11 +54,6 @@ class ValidationSplit:
         mean = (share * gain).sum()
         error = (share.square() * (gain - mean).square()).sum().sqrt()
         return float(mean / error.clamp_min(1e-12))
-
-    def error(self, at: Tensor) -> float:
-        """Returns the weighted mean absolute error in metres of a prediction (M,)."""
-        error = (at - self.points.depth).abs()
-        return float((error * self.weights).sum() / self.weights.sum())
 
 
 def split_frame(frame: Frame, judged: Refined, seed: int) -> ValidationSplit:

@@ -262,9 +262,9 @@ def _compared_with_linear(
         if own is not None and result is not None:
             compared["held_out_error"] = own
             worse.append(result["mae"] > own["mae"])
-    if frame.validation is not None:
-        errors = {name: frame.validation.error(name) for name in frame.validation.predicted}
-        compared["validation"] = {"points": len(frame.validation.points), **errors}
+    if (validation := frame.validation) is not None:
+        errors = {name: validation.error(at) for name, at in validation.predicted.items()}
+        compared["validation"] = {"points": len(validation.points), **errors}
         worse.append(errors[RESULT] > errors[LINEAR])
     return compared | {"worse": worse[0] if worse else None}
 
@@ -284,7 +284,7 @@ def _baseline_scores(
             error = None
             if validation is not None:
                 at = baseline.at(validation.points.xy, validation.kept, validation.network)
-                error = validation.with_prediction(name, at).error(name)
+                error = validation.error(at)
             metrics = None
             if gt is not None:
                 metrics = _scores(baseline.depth(given, before).numpy(), gt)
@@ -292,6 +292,6 @@ def _baseline_scores(
             continue
         scores[name] = {"validation_mae": error, "scores": metrics}
     for name, stage, depth in (("network", ALIGNED, frame.before), ("result", RESULT, frame.after)):
-        error = None if validation is None else validation.error(stage)
+        error = None if validation is None else validation.error(validation.predicted[stage])
         scores[name] = {"validation_mae": error, "scores": _scores(depth, gt)}
     return scores
