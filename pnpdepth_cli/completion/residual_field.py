@@ -115,11 +115,11 @@ def _sampled(features: tuple[Tensor, ...], points: SparsePoints) -> Tensor:
     return torch.stack([points.sample(one) for one in features], dim=1)
 
 
-@functools.lru_cache(maxsize=1)
+@functools.lru_cache(maxsize=2)
 def _colour(rgb: Tensor) -> Tensor:
     """CIELAB (3, H, W), its mean 0 and its standard deviation over the image about 1.
 
-    Remembered for the last image, whose residuals are propagated several times.
+    Remembered for the last image, whose residuals are propagated several times, and for a grey one.
     """
     lab = cielab(rgb)
     lab = lab - lab.mean(dim=(1, 2), keepdim=True)

@@ -97,7 +97,9 @@ def predictions(networks: OpenNetworks, split: ValidationSplit, judged: Refined)
         experts.append(replace(each, weight=0.0 if each.of_scanner else OWN * share))
         if share > 0:
             name = f"{fusing.name} with {each.name}"
-            guided = _expert(networks, fusing, split, name, prior=each, user=each.user)
+            guided = _expert(
+                networks, fusing, split, name, prior=each, user=each.user, updates=False
+            )
             with_prior.append(replace(guided, weight=WITH_PRIOR * share))
     rest = 1 - sum(each.weight for each in (*experts, *with_prior))
     return [*experts, *with_prior, replace(alone, weight=rest), _interpolation(split)]
@@ -154,7 +156,7 @@ def without_doubt(
     networks.next_image()
     grey = torch.full_like(rgb, 0.5)
     blind = replace(split, whole=replace(split.whole, rgb=grey), kept=replace(split.kept, rgb=grey))
-    expert = _expert(networks, fusing, blind, f"{fusing.name} without the image")
+    expert = _expert(networks, fusing, blind, f"{fusing.name} without the image", updates=False)
     experts = [*experts, replace(expert, weight=WITHOUT_IMAGE)]
     if (of_linear + split.gain(at[fusing.name], expert.at)) / 2 >= NO_GAIN:
         return experts, ()
@@ -299,6 +301,7 @@ def _expert(
     known: Refined | None = None,
     prior: Expert | None = None,
     user: Member | None = None,
+    updates: bool = True,
 ) -> Expert:
     """The predictions of one network, without a prior weight yet.
 
@@ -310,14 +313,14 @@ def _expert(
         known: The frame refined from all points, where that was done already.
         prior: The expert whose depth is the network's prior.
         user: The user's network whose depth it is, or has as a prior.
+        updates: Whether z is updated with all points, which takes as long as all else.
     """
     whole, kept = split.whole, split.kept
     if prior is not None:
         assert prior.refined is not None
         whole = replace(whole, prior=torch.from_numpy(prior.refined.before))
         kept = replace(kept, prior=prior.aligned)
-    # Updates with a prior too would take as long as everything else.
-    refined = known or refined_by(networks, member, whole, updates=prior is None)
+    refined = known or refined_by(networks, member, whole, updates=updates)
     aligned = torch.from_numpy(refined.before)
     updated = at = torch.empty(0)
     if len(split.points):
