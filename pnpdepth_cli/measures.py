@@ -117,7 +117,7 @@ class Measure:
     title: str
     unit: str = ""
     """Unit in files."""
-    better: Literal["lower", "higher"] = "lower"
+    better: Literal["lower", "higher", "neither"] = "lower"
     decimals: int = 4
     percent: bool = False
     """True for a fraction of 1 that tables show in per cent."""
@@ -140,12 +140,13 @@ class Measure:
     def heading(self) -> str:
         """A title such as `RMSE [m] ↓`."""
         unit = f" [{self.table_unit}]" if self.table_unit else ""
-        return f"{self.title}{unit} {'↑' if self.better == 'higher' else '↓'}"
+        arrow = {"lower": " ↓", "higher": " ↑", "neither": ""}[self.better]
+        return f"{self.title}{unit}{arrow}"
 
     @property
     def sign(self) -> int:
-        """1 if higher is better, else −1."""
-        return 1 if self.better == "higher" else -1
+        """1 if higher is better, −1 if lower is, 0 if neither."""
+        return {"lower": -1, "higher": 1, "neither": 0}[self.better]
 
     def text(self, value: float | None, unit: str = "") -> str:
         """Returns the value as tables show it, followed by a unit; – for NaN and None."""
@@ -408,6 +409,75 @@ ON_REQUEST = (
 )
 TABLE = {measure.key: measure for measure in ON_REQUEST}
 """The measures that are computed on request alone."""
+
+
+def within_sigma(predicted: Image, truth: Image, sigma: Image, factor: int) -> float:
+    """Returns the fraction of errors that are at most `factor` standard deviations.
+
+    Args:
+        predicted: (H, W) metres, 0 where unknown.
+        truth: (H, W) metres, 0 where unknown.
+        sigma: (H, W) standard deviation of the prediction in metres, 0 where unknown.
+        factor: How many standard deviations.
+
+    Returns:
+        NaN if no pixel has all three.
+    """
+    errors, deviations = _errors_with_sigma(predicted, truth, sigma)
+    return float((errors <= factor * deviations).mean()) if len(errors) else math.nan
+
+
+def sparsification_error(predicted: Image, truth: Image, sigma: Image) -> float:
+    """Returns the area under the sparsification error in units of the MAE, 0 is best.
+
+    Sparsification is the MAE of the pixels that remain when the most uncertain ones are removed;
+    its error is the difference from removing those of the largest error (Ilg et al., ECCV 2018).
+
+    Args:
+        predicted: As of `within_sigma`.
+        truth: As of `within_sigma`.
+        sigma: As of `within_sigma`.
+    """
+    import numpy as np
+
+    errors, deviations = _errors_with_sigma(predicted, truth, sigma)
+    if not len(errors):
+        return math.nan
+    removed = np.arange(20) / 20
+    kept = np.maximum(1, np.round((1 - removed) * len(errors))).astype(int)
+    by_sigma, by_error = (
+        np.cumsum(errors[order])[kept - 1] / kept
+        for order in (np.argsort(deviations, kind="stable"), np.argsort(errors))
+    )
+    difference = by_sigma - by_error
+    area = (difference[1:] + difference[:-1]).sum() / 2 / 20  # trapezia
+    return float(area / by_sigma[0]) if by_sigma[0] else 0.0
+
+
+def _errors_with_sigma(predicted: Image, truth: Image, sigma: Image) -> tuple[Any, Any]:
+    """(N,) absolute errors and standard deviations, float64, of the pixels with all three."""
+    import numpy as np
+
+    known = (truth > 0) & (predicted > 0) & (sigma > 0)
+    errors = np.abs(predicted[known].astype(np.float64) - truth[known])
+    return errors, sigma[known].astype(np.float64)
+
+
+OF_SIGMA = (
+    *(
+        Measure(
+            key=f"within_{factor}_sigma",
+            title=f"errors within {factor}σ (normal: {normal})",
+            better="neither",
+            percent=True,
+            decimals=1,
+            formula=partial(within_sigma, factor=factor),
+        )
+        for factor, normal in ((1, "68.3 %"), (2, "95.4 %"))
+    ),
+    Measure(key="ause", title="AUSE of σ", formula=sparsification_error),
+)
+"""The measures of a predicted standard deviation, which frames with one have."""
 
 
 def parse_keys(text: str) -> tuple[str, ...]:

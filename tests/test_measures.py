@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import trapezoid
 
 from pnpdepth_cli.choices import MEASURES as ON_REQUEST
 from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.measures import TABLE, FrameMeans, by_depth
+from pnpdepth_cli.measures import OF_SIGMA, TABLE, FrameMeans, by_depth
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 LIMITS = np.linspace(1.05, 1.25, 10)
@@ -127,3 +128,40 @@ def test_a_mean_is_over_the_frames_that_have_the_value() -> None:
     means.add({"mae": None, "rmse": None, "mre": None})
     assert means.means() == {"mae": 1.5, "rmse": 4.0, "mre": None}
     assert (means.frames, FrameMeans().frames) == (2, 0)
+
+
+def sigma_measures(depth: np.ndarray, gt: np.ndarray, sigma: np.ndarray) -> list[float]:
+    """The fractions within one and two standard deviations, and AUSE."""
+    images = [np.asarray(each, np.float32) for each in (depth, gt, sigma)]
+    return [measure.value(*images) for measure in OF_SIGMA]
+
+
+def test_a_right_deviation_is_calibrated_and_one_of_half_the_size_is_not() -> None:
+    rng = np.random.default_rng(0)
+    gt, sigma = rng.uniform(2, 6, (300, 300)), rng.uniform(0.02, 0.2, (300, 300))
+    depth = gt + sigma * rng.normal(size=gt.shape)
+    right, half = (sigma_measures(depth, gt, sigma * factor) for factor in (1, 0.5))
+    assert (right[:2], half[0]) == (
+        [pytest.approx(0.683, abs=0.01), pytest.approx(0.954, abs=0.01)],
+        pytest.approx(0.383, abs=0.01),
+    )
+
+
+def test_the_area_under_the_sparsification_error_is_by_definition() -> None:
+    gt, error = np.full((1, 20), 10.0), np.arange(1.0, 21)[None]
+    worst = sigma_measures(gt + error, gt, error[:, ::-1])[2]
+    by_sigma, by_error = (
+        [part.mean() for part in parts]
+        for parts in ([error[0, n:] for n in range(20)], [error[0, : 20 - n] for n in range(20)])
+    )
+    area = trapezoid(np.subtract(by_sigma, by_error), np.arange(20) / 20)
+    assert worst == pytest.approx(area / error.mean())
+    assert sigma_measures(gt + error, gt, error)[2] == 0
+
+
+def test_a_pixel_without_sigma_prediction_or_ground_truth_is_in_no_measure_of_sigma() -> None:
+    gt, depth, sigma = np.array(
+        [[[0.5, 10, 10, 10, 0]], [[1.5, 0, 12, 13, 8]], [[1, 1, 0, 1.5, 1]]]
+    )
+    assert sigma_measures(depth, gt, sigma)[:2] == [0.5, 1.0]  # errors of 1 and 3 m
+    assert np.isnan(sigma_measures(depth, gt, np.zeros_like(gt))).all()

@@ -74,7 +74,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     from pnpdepth_cli.commands.evaluation import tables
     from pnpdepth_cli.commands.evaluation.evaluate import evaluate as run_evaluation
     from pnpdepth_cli.commands.report import evaluation as report_eval
-    from pnpdepth_cli.measures import chosen_measures
+    from pnpdepth_cli.measures import OF_SIGMA, chosen_measures
 
     files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
     files.check((prediction, ground_truth))
@@ -82,7 +82,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     if html is not None:
         report_eval.check_eval_report(html, [prediction, ground_truth], overwrite=files.overwrite)
     request = EvalRequest(prediction=prediction, ground_truth=ground_truth, **values)
-    chosen_measures(request.measures, keys)
+    chosen_measures((*request.measures, *OF_SIGMA), keys)
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
     print_notes([f"protocol {request.describe()}", *evaluation.notes])

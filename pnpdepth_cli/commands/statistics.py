@@ -128,11 +128,11 @@ def gain(before: Floats, after: Floats, better: Floats) -> Floats:
     Args:
         before: (…, M)
         after: (…, M)
-        better: (M,) 1 for measures of which higher is better, else −1.
+        better: (M,) `Measure.sign`.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         change = np.where(before == after, 0.0, 100 * better * (after - before) / np.abs(before))
-    return np.where(np.isfinite(change), change, math.nan)
+    return np.where(np.isfinite(change) & (better != 0), change, math.nan)
 
 
 def interval(

@@ -83,6 +83,7 @@ def test_the_gain_is_in_per_cent_of_the_first_and_its_interval_narrows_with_equa
     assert (low < value - 1).all()
     assert (value + 1 < high).all()
     assert np.isnan(gain(np.zeros(2), np.array([1.0, np.nan]), better)).all()
+    assert np.isnan(gain(np.ones(1), np.array([2.0]), np.zeros(1))).all()  # neither is better
 
 
 def p_value_of(changes: np.ndarray, resamples: int) -> tuple[float, bool]:

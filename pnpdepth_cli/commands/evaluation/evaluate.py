@@ -17,7 +17,6 @@ from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.scoring import (
     FrameScores,
     score_pair,
-    summarise_uncertainty,
 )
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.commands.statistics import (
@@ -34,7 +33,7 @@ from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.measures import FrameMeans, Measure
+from pnpdepth_cli.measures import OF_SIGMA, FrameMeans, Measure
 
 _LISTED = 3
 _OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
@@ -47,12 +46,13 @@ class Evaluation:
     request: EvalRequest
     frames: tuple[FrameScores, ...]
     """A row for each frame of the ground truth, in its order."""
+    measures: tuple[Measure, ...]
+    """Those of the request, and those of the standard deviation where a frame has one."""
     mean: dict[str, float | None]
     """Of each measure; None where no frame has it."""
     interval: dict[str, tuple[float, float]] | None
     """The ends of the 95 % interval of each mean; None with too few independent frames."""
     clusters: Clusters
-    uncertainty: dict[str, Any] | None
     notes: tuple[str, ...]
 
     @property
@@ -95,7 +95,7 @@ class Evaluation:
             "protocol": request.protocol,
             "described": request.describe(),
             "scoring": request.scoring(),
-            "measures": [measure.to_json() for measure in request.measures],
+            "measures": [measure.to_json() for measure in self.measures],
             "counts": {
                 "frames": len(self.frames),
                 "scored": len(self.scored),
@@ -107,7 +107,6 @@ class Evaluation:
             "interval": self.interval,
             "level": LEVEL,
             "clusters": {"count": self.clusters.count, "unit": self.clusters.unit},
-            "uncertainty": self.uncertainty,
             "frames": [frame_record(frame) for frame in self.frames],
             "notes": self.notes,
         }
@@ -164,11 +163,14 @@ def evaluate(
     if not scored:
         raise InputError(f"no frame could be scored; the first: {rows[0].error}")
     # means, and how sure they are over frames that count as independent
-    values = np.array([[row.values[measure.key] for measure in request.measures] for row in scored])
-    clusters = find_clusters([row.pair.group for row in scored], values)
+    of_sigma = [m for m in OF_SIGMA if any(m.key in row.values for row in scored)]
+    measures = (*request.measures, *of_sigma)
+    values = np.array([[row.values.get(m.key, math.nan) for m in measures] for row in scored])
     mean = FrameMeans(row.values for row in scored).means()
+    clusters = find_clusters([row.pair.group for row in scored], values)
     if request.is_devkit:
-        mean = dict(zip(mean, devkit_mean(values).tolist(), strict=True))
+        exact = devkit_mean(values[:, : len(request.measures)]).tolist()
+        mean |= dict(zip((m.key for m in request.measures), exact, strict=True))
     notes += clusters.notes()
     if len(scored) > 1 and clusters.count < MIN_CLUSTERS:
         notes.append(
@@ -178,10 +180,10 @@ def evaluate(
     return Evaluation(
         request=request,
         frames=tuple(rows),
+        measures=measures,
         mean=mean,
-        interval=_intervals(request.measures, values, clusters),
+        interval=_intervals(measures, values, clusters),
         clusters=clusters,
-        uncertainty=summarise_uncertainty([row.uncertainty for row in scored if row.uncertainty]),
         notes=(
             *notes,
             *_reading_notes(rows),

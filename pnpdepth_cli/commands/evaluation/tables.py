@@ -20,9 +20,9 @@ _STARS = (0.05, 0.01, 0.001)
 
 
 def text_tables(evaluation: Evaluation, keys: Sequence[str] | None) -> list[Table]:
-    """Returns what the terminal shows: the means, the frames or the worst of them, calibration."""
+    """Returns what the terminal shows: the means, and the frames or the worst of them."""
     frames = [worst_frames(evaluation, keys)] if len(evaluation.frames) > 1 else []
-    return [means_table(evaluation, keys), *frames, *calibration_tables(evaluation)]
+    return [means_table(evaluation, keys), *frames]
 
 
 def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
@@ -36,7 +36,7 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
         title += f"; 95 % interval over {evaluation.clusters.describe()}"
     rows = []
     mean = evaluation.mean | {COVERAGE.key: evaluation.coverage}
-    for measure in (*chosen_measures(evaluation.request.measures, keys), COVERAGE):
+    for measure in (*chosen_measures(evaluation.measures, keys), COVERAGE):
         row = [measure.heading, measure.text(mean[measure.key])]
         if intervals is not None:
             row.append(" … ".join(measure.text(end) for end in intervals.get(measure.key, ())))
@@ -47,7 +47,7 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
 
 def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
-    measures = chosen_measures(evaluation.request.measures, keys)
+    measures = chosen_measures(evaluation.measures, keys)
     records = [plain(frame_record(frame)) for frame in evaluation.frames]
     facts = [name for name in records[0] if name not in ("scores", "error")]
     rows = []
@@ -65,7 +65,7 @@ def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     if len(evaluation.frames) > _FRAMES_SHOWN:
         found = replace(evaluation, frames=worst(evaluation)[:_FRAMES_SHOWN])
         title = f"The {_FRAMES_SHOWN} worst by RMSE; --csv has all"
-    shown = keys or [measure.key for measure in evaluation.request.measures[:_FRAME_COLUMNS]]
+    shown = keys or [measure.key for measure in evaluation.measures[:_FRAME_COLUMNS]]
     table = frames_table(found, keys).only(["name", *shown, COVERAGE.key])
     return replace(table, title=title + _without_sparse(evaluation.request.rules.exclude_sparse))
 
@@ -75,21 +75,6 @@ def worst(evaluation: Evaluation) -> tuple[FrameScores, ...]:
     rmse = {frame.name: frame.values["rmse"] for frame in evaluation.scored}
     order = sorted(evaluation.scored, key=lambda f: (math.isnan(rmse[f.name]), -rmse[f.name]))
     return tuple(order)
-
-
-def calibration_tables(evaluation: Evaluation) -> list[Table]:
-    """Returns how right the predicted standard deviation is, if there is one."""
-    found = evaluation.uncertainty
-    if found is None:
-        return []
-    rows = [
-        ["errors within 1σ", f"{found['within_1_sigma']:.1%}", "68.3%"],
-        ["errors within 2σ", f"{found['within_2_sigma']:.1%}", "95.4%"],
-        ["AUSE (MAE, normalised)", f"{found['ause']:.4f}", "0"],
-    ]
-    count = found["frames"]
-    title = f"Standard deviation of {count:,} frame{'' if count == 1 else 's'}"
-    return [Table(title=title, columns=["", "observed", "calibrated"], rows=rows)]
 
 
 def comparison_table(comparison: Mapping[str, Any]) -> Table:
@@ -138,7 +123,7 @@ def methods_table(comparison: Mapping[str, Any]) -> Table:
         p_values = [1.0, *(gains[measure.key]["p_adjusted"] for gains in comparison["gains"])]
         for row, mean, p in zip(rows, means, p_values, strict=True):
             stars = "*" * sum(p is not None and p < limit for limit in _STARS)
-            is_best = mean is not None and measure.text(mean) == best
+            is_best = mean is not None and measure.text(mean) == best and measure.sign != 0
             row.append(Cell(measure.text(mean) + stars, "bold" if is_best else ""))
     return Table(
         title=(

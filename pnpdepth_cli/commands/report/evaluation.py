@@ -11,7 +11,7 @@ import numpy as np
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
 from pnpdepth_cli.commands.evaluation.frames import image_of, load_frame
 from pnpdepth_cli.commands.evaluation.scoring import FrameScores, filled
-from pnpdepth_cli.commands.evaluation.tables import calibration_tables, means_table
+from pnpdepth_cli.commands.evaluation.tables import means_table
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
@@ -63,7 +63,7 @@ def write_eval_report(
 
 
 def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[dict[str, Any]]:
-    measures = chosen_measures(evaluation.request.measures, keys)
+    measures = chosen_measures(evaluation.measures, keys)
     return [
         *(column(measure, listed=measure.main or keys is not None) for measure in measures),
         column(COVERAGE),
@@ -85,7 +85,7 @@ def _head(
             ("Protocol", request.describe()),
         ],
         notes=evaluation.notes,
-        tables=[means_table(evaluation, keys), *calibration_tables(evaluation)],
+        tables=[means_table(evaluation, keys)],
         without_title=f"Not scored: {evaluation.unscored()}",
         without=without,
         columns=columns,

@@ -6,16 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import trapezoid
 
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.frames import scaled
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.commands.evaluation.scoring import (
-    FrameUncertainty,
-    frame_uncertainty,
-    summarise_uncertainty,
-)
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import write_depth
 
@@ -78,53 +72,6 @@ def test_a_constant_prediction_and_too_few_pixels_are_refused() -> None:
         scaled(GT, np.zeros_like(GT), "depth", "median")
 
 
-def uncertain(factor: float) -> FrameUncertainty:
-    """A frame whose standard deviation is off by a factor."""
-    gt = RNG.uniform(2, 6, (200, 200)).astype(np.float32)
-    sigma = RNG.uniform(0.02, 0.2, gt.shape).astype(np.float32)
-    depth = (gt + sigma * RNG.normal(size=gt.shape)).astype(np.float32)
-    result = frame_uncertainty(depth, gt, sigma * np.float32(factor))
-    assert result is not None
-    return result
-
-
-def test_a_right_deviation_is_calibrated_and_one_of_half_the_size_is_not() -> None:
-    right = summarise_uncertainty([uncertain(1.0) for _ in range(3)])
-    half = summarise_uncertainty([uncertain(0.5)])
-    assert right is not None
-    assert half is not None
-    assert (right["frames"], right["pixels"]) == (3, 3 * 200 * 200)
-    within = right["within_1_sigma"], right["within_2_sigma"], half["within_1_sigma"]
-    assert within == pytest.approx((0.683, 0.954, 0.383), abs=0.01)
-
-
-def test_sparsification_is_by_definition() -> None:
-    gt = np.full((1, 20), 10, np.float32)
-    error = np.arange(1, 21)[None].astype(np.float32)
-    worst = frame_uncertainty(gt + error, gt, error[:, ::-1].copy())
-    best = frame_uncertainty(gt + error, gt, error)
-    assert worst is not None
-    assert best is not None
-    kept = [error[0, : 20 - n].mean() for n in range(20)]
-    assert best.oracle.tolist() == best.sparsification.tolist() == pytest.approx(kept)
-    assert worst.sparsification.tolist() == pytest.approx([error[0, n:].mean() for n in range(20)])
-    total, none = summarise_uncertainty([worst]), summarise_uncertainty([best])
-    assert total is not None
-    assert none is not None
-    area = trapezoid(worst.sparsification - worst.oracle, np.arange(20) / 20)
-    assert (total["ause"], none["ause"]) == pytest.approx((area / error.mean(), 0))
-
-
-def test_a_pixel_without_sigma_prediction_or_ground_truth_is_not_scored() -> None:
-    gt, depth, sigma = np.array(
-        [[[0.5, 10, 10, 10, 0]], [[1.5, 0, 12, 13, 8]], [[1, 1, 0, 1, 1]]], np.float32
-    )
-    frame = frame_uncertainty(depth, gt, sigma)
-    assert frame is not None
-    assert frame.oracle[0] == frame.sparsification[0] == 2
-    assert frame_uncertainty(depth, gt, np.zeros_like(gt)) is None
-
-
 def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
     for folder in ("out", "gt"):
         (tmp_path / folder).mkdir()
@@ -132,10 +79,9 @@ def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
     write_depth(tmp_path / "out" / "a_depth.npy", (GT + RNG.normal(0, 0.1, GT.shape)).astype("f4"))
     write_depth(tmp_path / "out" / "a_sigma.npy", np.full(GT.shape, 0.1, np.float32))
     result = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "gt"))
-    assert result.uncertainty is not None
-    assert result.uncertainty["within_1_sigma"] == pytest.approx(0.683, abs=0.03)
+    assert result.mean["within_1_sigma"] == pytest.approx(0.683, abs=0.03)
     assert not any("have no ground truth" in note for note in result.notes)
     write_depth(tmp_path / "out" / "a_sigma.npy", np.ones((2, 2), np.float32))
-    assert evaluate(result.request).uncertainty is None
+    assert "ause" not in evaluate(result.request).mean
     (tmp_path / "out" / "a_sigma.npy").write_bytes(b"no deviation")
-    assert evaluate(result.request).uncertainty is None
+    assert "ause" not in evaluate(result.request).mean
