@@ -110,7 +110,7 @@ class FrameFiles:
         paths = (self.image, self.sparse, self.sparse_mask, self.gt, self.calib, *self.masks)
         for source in paths:
             if source is not None:
-                _check_no_nul(file_of(source))
+                _check_path(file_of(source))
 
     @property
     def image_file(self) -> Path | None:
@@ -127,17 +127,21 @@ class Unmatched:
     spare: bool = False  # false for a file of a frame that lacks a part, or cannot be read
 
     def __post_init__(self) -> None:
-        _check_no_nul(self.path)
+        _check_path(self.path)
 
     def __str__(self) -> str:
         return f"{self.path} {self.why}"
 
 
-def _check_no_nul(path: Path) -> None:
+def _check_path(path: Path) -> None:
     """Raises FileFormatError for a path that no file can have: an index file may hold any text."""
-    if "\0" in str(path):
-        name = str(path).replace("\0", "\\0")
-        raise FileFormatError(f"{name}: a file name holds a NUL character; correct the file's list")
+    try:
+        encoded = os.fsencode(path)
+    except UnicodeEncodeError:
+        encoded = b"\0"
+    if b"\0" in encoded:
+        name = str(path).encode("unicode_escape").decode()
+        raise FileFormatError(f"{name}: no file can have this name; correct the list of files")
 
 
 def find_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path], list[Unmatched]]:
@@ -203,6 +207,10 @@ def name_problem(name: str) -> str | None:
     """
     if "\0" in name:
         return "holds a NUL character"
+    try:
+        os.fsencode(name)
+    except UnicodeEncodeError:
+        return "holds a character that no file name has"
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts:
         return "leads out of the output folder"

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import SAME_FRAME, Camera, Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.extrinsics import checked_pose, numbers_in, pose_of_matrix
-from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import check_pixel_count, check_text_size, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.yaml_file import parse_yaml
 
@@ -112,7 +112,7 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         except (ValueError, RecursionError) as error:
             reason = one_line(error)
             raise FileFormatError(f"{path} is not valid JSON ({reason}); correct it") from error
-    elif re.search(r"[A-Za-z_]\w*\s*:", text):
+    elif re.search(r"\b[A-Za-z_]\w*\s*:", text):
         fields = _fields(path, text)
     else:
         fields = _bare_intrinsics(path, text)
@@ -359,6 +359,7 @@ def _size(path: Path, fields: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def _text(path: Path) -> str:
+    check_text_size(path)
     data = read_bytes(path)
     if kind_of(data) is None and b"\0" not in data:
         try:
@@ -372,7 +373,7 @@ def _text(path: Path) -> str:
 
 def _fields(path: Path, text: str) -> dict[str, Any]:
     """`name: value`; a line without a name continues the value before it."""
-    fields: dict[str, Any] = {}
+    fields: dict[str, list[str]] = {}
     name = None
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.split("#", 1)[0]
@@ -381,15 +382,15 @@ def _fields(path: Path, text: str) -> dict[str, Any]:
             name = match[1]
             if name in fields:
                 raise FileFormatError(f"{path}, line {number}: {name} occurs twice; keep one")
-            fields[name] = match[2]
+            fields[name] = [match[2]]
         elif content.strip() and content.strip() != "---":
             if name is None:
                 raise FileFormatError(
                     f"{path}, line {number}: {one_line(content)[:60]!r} has no name before it;"
                     " write NAME: NUMBERS"
                 )
-            fields[name] += f" {content}"
-    return fields
+            fields[name].append(content)
+    return {name: " ".join(parts) for name, parts in fields.items()}
 
 
 def _numbers(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import check_text_size, one_line, read_bytes
 from pnpdepth_cli.io.yaml_file import parse_yaml
 
 Floats = NDArray[np.float64]
@@ -37,6 +37,7 @@ def read_extrinsics(path: Path) -> Extrinsics:
     Raises:
         FileFormatError: The file holds no pose.
     """
+    check_text_size(path)
     text = read_bytes(path).decode("utf-8", "replace")
     numbers = numbers_in(re.sub(r"#.*", "", text))
     if numbers is None:

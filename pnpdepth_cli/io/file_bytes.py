@@ -8,6 +8,8 @@ from pathlib import Path
 from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.errors import FileFormatError, InputError
 
+_LONGEST_TEXT = 1 << 20
+"""Bytes of a calibration or a pose; one has a few thousand."""
 _SMALLER = "make it smaller, or allow more with --max-pixels"
 
 
@@ -27,6 +29,12 @@ def read_bytes(path: Path) -> bytes:
     if not data:
         raise FileFormatError(f"{path} is empty (0 bytes); copy or create it again")
     return data
+
+
+def check_text_size(path: Path) -> None:
+    """Raises FileFormatError if a calibration or the like is larger than any is."""
+    size = size_of_regular_file(path)
+    check_claim(f"{path} has {size:,} bytes", size, _LONGEST_TEXT, way_out="give another file")
 
 
 def size_of_regular_file(path: Path) -> int:

@@ -69,7 +69,7 @@ def test_a_device_a_pipe_and_a_sparse_file_of_terabytes_are_refused_unread(
     with huge.open("wb") as file:
         file.truncate(1 << 42)
     if read not in (sha256_of, read_scan):
-        with pytest.raises(FileFormatError, match=r"\b4,398,046,511,104 bytes, more.*--max-pixels"):
+        with pytest.raises(FileFormatError, match=r"\b4,398,046,511,104 bytes, more than"):
             read(huge)
 
 

@@ -409,3 +409,11 @@ def test_extrinsics_are_read_in_each_form(form: str, tmp_path: Path) -> None:
 def test_what_is_no_pose_is_one_line(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=rf"\A.*{message}.*\Z"):
         read_extrinsics(write(tmp_path, text))
+
+
+@pytest.mark.parametrize("text", ["a" * 60_000, "a: b\nb\n" + "1\n" * 400_000, "1 " * 2_000_000])
+def test_a_long_text_that_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
+    """Where the time grows with the square of the length, each of them takes a minute."""
+    (tmp_path / "calib.txt").write_text(text)
+    with pytest.raises(FileFormatError):
+        read_calibration(tmp_path / "calib.txt")

@@ -170,6 +170,7 @@ def test_an_exr_of_one_long_row_is_converted_in_64_bytes_a_pixel(tmp_path: Path)
 
 
 SHAPES = ["(\n", "(6, 8", "(True, 5)", "(2, 10**9)", "(-1, 8)", "[6, 8]", "(6, 8.0)", "(1" * 900]
+SHAPES += [f"(0, {10**30})", f"({'1, ' * 100})"]
 DTYPES = ["f999", "<q8", ",", "i4, i4", "M8[x]", "\x00f4"]
 
 

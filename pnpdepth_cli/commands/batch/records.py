@@ -255,7 +255,7 @@ def _entry(record: Mapping[str, Any]) -> dict[str, Any]:
 
 def _content(path: Path) -> bytes | None:
     try:
-        return path.read_bytes()
+        return path.read_bytes() if path.is_file() else None  # no pipe, which never ends
     except OSError:
         return None
 

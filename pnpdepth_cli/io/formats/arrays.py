@@ -7,6 +7,7 @@ import lzma
 import math
 import re
 import struct
+import sys
 import threading
 import tokenize
 import zipfile
@@ -37,6 +38,8 @@ _ARCHIVE_ERRORS = (
     RuntimeError,  # encrypted, or of another version
 )
 """What zipfile raises on damaged archives."""
+_MOST_AXES = 32
+"""Of an array of NumPy 1."""
 _LOCK = threading.Lock()
 """NumPy evaluates a header as Python, and threads of CPython 3.11 that do so at once may fail."""
 
@@ -64,6 +67,8 @@ def _npy_header(
             shape, is_fortran, dtype = _HEADERS[npy.read_magic(stream)](stream)
         if min(shape, default=0) < 0 or any(isinstance(side, bool) for side in shape):
             raise ValueError(f"a shape of {shape}")
+        if len(shape) > _MOST_AXES or max(shape, default=0) > sys.maxsize:
+            raise ValueError("a shape that no array has")
     except _HEADER_ERRORS as error:
         raise damaged(path, kind, f"cannot be read ({type(error).__name__}: {error})") from error
     if dtype.hasobject:
