@@ -43,27 +43,6 @@ _SMALL = 480  # smaller views are enlarged by a whole number, so that their pixe
 _QUALITY = 85
 
 
-def column(measure: Measure, *, signed: bool = False, listed: bool = True) -> dict[str, Any]:
-    """Returns how the page shows a measure of each frame.
-
-    Args:
-        measure: Of the frames.
-        signed: Whether values below 0 are better and above 0 worse.
-        listed: Whether the list of frames has it, not only a frame's own view.
-    """
-    return {
-        "key": measure.key,
-        "title": measure.title,
-        "unit": measure.table_unit,
-        "decimals": measure.decimals,
-        "factor": measure.shown_factor,
-        "percent": measure.percent,
-        "higher_is_better": measure.better == "higher",
-        "signed": signed,
-        "listed": listed,
-    }
-
-
 @dataclass(frozen=True, kw_only=True)
 class Head:
     """What a page shows of all frames together."""
@@ -76,8 +55,10 @@ class Head:
     """Each has title, headings and texts, as `commands.tables.Table`."""
     without_title: str = ""
     without: Sequence[tuple[str, str]] = ()
-    columns: Sequence[Mapping[str, Any]] = ()
-    """As `column` returns them."""
+    columns: Sequence[Measure] = ()
+    """Of the values of a frame; the main ones are in the list of frames."""
+    signed: Sequence[str] = ()
+    """Keys of the columns whose values below 0 are better and above 0 worse."""
     sort_by: str = ""
     """Key of the column that the page is sorted by at first."""
     labels: Mapping[str, str]
@@ -163,8 +144,9 @@ def _write_page(
 ) -> None:
     style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
     data = {
-        "columns": head.columns,
-        "sort_by": next((n for n, c in enumerate(head.columns) if c["key"] == head.sort_by), 0),
+        "columns": [measure.to_json() for measure in head.columns],
+        "signed": head.signed,
+        "sort_by": next((n for n, c in enumerate(head.columns) if c.key == head.sort_by), 0),
         "labels": head.labels,
         "thumb": head.thumb,
         "unit": head.unit,

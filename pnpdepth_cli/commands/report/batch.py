@@ -32,7 +32,6 @@ from pnpdepth_cli.io.report import (
     IMAGES,
     Head,
     check_report_folder,
-    column,
     image_key,
     link_image,
     save_view_3d,
@@ -49,7 +48,10 @@ _PANELS = {
     "Image": "image",
     "Sparse depth": "sparse",
 }
-_IMPROVED = Measure(key="improved", title="Improved", better="higher", percent=True, decimals=1)
+_CHANGE = "_change"
+_IMPROVED = Measure(
+    key="improved", title="Improved", better="higher", percent=True, decimals=1, main=True
+)
 _SETTINGS = (
     *("model", "layer", "iterations", "lr", "loss", "update", "align", "propagate", "holdout"),
     "seed",
@@ -122,7 +124,7 @@ def _source(request: BatchRequest, folder: Path) -> dict[str, Any]:
     return {"command": "batch", "output": output}
 
 
-def _entry(row: Row, basis: str, columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _entry(row: Row, basis: str, columns: Sequence[Measure]) -> dict[str, Any]:
     """A frame's values on the basis of all frames; where it has none, what it has instead."""
     errors = errors_by_basis(row)
     values = _values(row, errors[basis]) if basis in errors else {}
@@ -130,7 +132,7 @@ def _entry(row: Row, basis: str, columns: Sequence[Mapping[str, Any]]) -> dict[s
     tag = BASES[own] if own not in ("", basis) else ""
     return {
         "name": row["name"],
-        "values": [values.get(shown["key"]) for shown in columns],
+        "values": [values.get(measure.key) for measure in columns],
         "notes": _notes(row, own),
         "tag": "diverged" if row["status"] == "diverged" else tag,
     }
@@ -176,26 +178,20 @@ def _holds_results(path: Path, output: Path, folder: Path) -> bool:
     return folder.is_relative_to(output) and output.is_relative_to(path.resolve())
 
 
-def _measures(basis: str) -> tuple[str, ...]:
-    return ("mae",) if basis == VALIDATION else ("rmse", "mae")
-
-
-def _columns(best: str, unit: str) -> list[dict[str, Any]]:
-    """Errors before and after on the best basis; with changes unless it is the points used."""
+def _columns(basis: str, unit: str) -> list[Measure]:
+    """Errors before and after on a basis; with changes unless it is the points used."""
     columns = []
-    for measure in MEASURES:
-        if measure.key not in _measures(best):
-            continue
-        change = replace(measure, title=f"{measure.title} change", unit="", percent=True)
-        if best != USED:
-            columns.append(
-                column(replace(change, key=f"{measure.key}_change", decimals=1), signed=True)
-            )
+    shown = [m for m in MEASURES if m.key == "mae" or (m.key == "rmse" and basis != VALIDATION)]
+    for measure in shown:
+        key, title = measure.key, measure.title
+        if basis != USED:
+            change = replace(measure, key=f"{key}{_CHANGE}", title=f"{title} change", unit="")
+            columns.append(replace(change, percent=True, decimals=1))
         for stage in ("before", "after"):
-            key, title = f"{measure.key}_{stage}", f"{measure.title} {stage}"
-            columns.append(column(replace(measure, key=key, title=title, unit=unit)))
-    if best != VALIDATION:  # the map is then of the points used
-        columns.append(column(_IMPROVED))
+            before_or_after = replace(measure, key=f"{key}_{stage}", title=f"{title} {stage}")
+            columns.append(replace(before_or_after, unit=unit))
+    if basis != VALIDATION:  # the map is then of the points used
+        columns.append(_IMPROVED)
     return columns
 
 
@@ -204,7 +200,7 @@ def _values(row: Row, errors: Mapping[str, Mapping[str, Any]]) -> dict[str, floa
     for key in ("rmse", "mae"):
         before, after = (errors[stage].get(key) for stage in ("before", "after"))
         change = after / before - 1 if before and after is not None else None
-        values |= {f"{key}_before": before, f"{key}_after": after, f"{key}_change": change}
+        values |= {f"{key}_before": before, f"{key}_after": after, f"{key}{_CHANGE}": change}
     return values
 
 
@@ -242,7 +238,8 @@ def _head(
         without_title=f"Not refined: {len(failed):,}",
         without=failed,
         columns=columns,
-        sort_by="rmse_after" if basis == USED else columns[0]["key"],
+        signed=[measure.key for measure in columns if measure.key.endswith(_CHANGE)],
+        sort_by="rmse_after" if basis == USED else columns[0].key,
         labels=_LABELS,
         thumb="second",
         map_colours=hex_colours(signed_bar("gain", 9)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,12 @@ from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_ba
 from pnpdepth_cli.io.report import (
     Head,
     check_report_folder,
-    column,
     image_key,
     save_views,
     write_report,
 )
 from pnpdepth_cli.io.visualisation import error_map
-from pnpdepth_cli.measures import COVERAGE, chosen_measures
+from pnpdepth_cli.measures import COVERAGE, Measure, chosen_measures
 
 
 def check_eval_report(folder: Path, inputs: list[Path], *, overwrite: bool) -> None:
@@ -62,17 +62,13 @@ def write_eval_report(
     write_report(folder, {"command": "eval"}, _head(evaluation, keys, columns), entries)
 
 
-def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[dict[str, Any]]:
+def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[Measure]:
     measures = chosen_measures(evaluation.measures, keys)
-    return [
-        *(column(measure, listed=measure.main or keys is not None) for measure in measures),
-        column(COVERAGE),
-    ]
+    chosen = measures if keys is None else [replace(each, main=True) for each in measures]
+    return [*chosen, replace(COVERAGE, main=True)]
 
 
-def _head(
-    evaluation: Evaluation, keys: Sequence[str] | None, columns: list[dict[str, Any]]
-) -> Head:
+def _head(evaluation: Evaluation, keys: Sequence[str] | None, columns: list[Measure]) -> Head:
     request = evaluation.request
     without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
     fill = " (filled in)" if request.is_devkit else ""
@@ -89,7 +85,7 @@ def _head(
         without_title=f"Not scored: {evaluation.unscored()}",
         without=without,
         columns=columns,
-        sort_by=columns[0]["key"],
+        sort_by=columns[0].key,
         labels={
             "first": f"Prediction{fill}", "second": "Ground truth", "map": "Error",
             "image": "Image",
@@ -99,7 +95,7 @@ def _head(
 
 
 def _entry(
-    frame: FrameScores, evaluation: Evaluation, columns: list[dict[str, Any]], images: Path
+    frame: FrameScores, evaluation: Evaluation, columns: list[Measure], images: Path
 ) -> dict[str, Any]:
     values = frame.values | {"coverage": frame.coverage}
     notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
@@ -113,7 +109,7 @@ def _entry(
         drawn = {"key": None}
     return {
         "name": frame.name,
-        "values": [values.get(shown["key"]) for shown in columns],
+        "values": [values.get(measure.key) for measure in columns],
         "notes": notes,
         "tag": "",
         **drawn,

@@ -3,7 +3,10 @@
 // #data, and goes onto the page as text, never as markup.
 
 const { head: data, frames } = JSON.parse(document.getElementById("data").textContent);
-const { columns } = data;
+const columns = data.columns.map((measure) => ({
+  ...measure, unit: measure.shown_unit || measure.unit, factor: measure.shown_factor,
+  higher_is_better: measure.better === "higher", signed: data.signed.includes(measure.key),
+}));
 const NAME = -1; // the "column" of the names
 const PAGE = 1000; // rows that are made at once
 const BINS = 24;
@@ -215,7 +218,7 @@ function makeRow(index) {
   if (frame.tag) button.after(make("span", { class: "tag", text: frame.tag }));
   const row = make("tr", { "data-index": String(index) }, cell);
   columns.forEach((column, i) => {
-    if (!column.listed) return;
+    if (!column.main) return;
     const value = frame.values[i];
     const text = shown(column, value);
     const kind = !column.signed || !/[1-9]/.test(text) ? "" : value < 0 ? "better" : "worse";
@@ -235,7 +238,7 @@ function fillHeader() {
     return make("th", { scope: "col", "data-column": String(index) }, button);
   };
   byId("head").append(cellOf("Frame", NAME));
-  columns.forEach((column, i) => { if (column.listed) byId("head").append(cellOf(titled(column), i)); });
+  columns.forEach((column, i) => { if (column.main) byId("head").append(cellOf(titled(column), i)); });
   const choices = () => columns.map((c, i) => make("option", { value: String(i), text: titled(c) }));
   byId("sort-column").append(...choices(), make("option", { value: String(NAME), text: "Name" }));
   byId("chart-column").append(...choices());

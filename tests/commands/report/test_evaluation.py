@@ -51,7 +51,7 @@ def test_the_page_has_the_units_of_the_protocol(root: Path) -> None:
     data = page_data(root / "report")
     assert data["tables"][0]["rows"][0][:2] == ["RMSE [mm] ↓", "200.0"]
     (rmse,) = (column for column in data["columns"] if column["key"] == "rmse")
-    assert (rmse["unit"], rmse["factor"]) == ("mm", 1000)
+    assert (rmse["shown_unit"], rmse["shown_factor"]) == ("mm", 1000)
 
 
 def test_unscored_frames_are_listed_with_their_reason(root: Path) -> None:
