@@ -179,6 +179,16 @@ def test_every_unambiguous_form_of_an_image_is_read_alike(
         assert frame_of_arrays(rgb, sparse).points.xy.tolist() == [[1, 2]]
 
 
+def test_rows_that_are_no_points_of_the_image_are_counted() -> None:
+    rgb = np.zeros((6, 8, 3), np.uint8)
+    good, outside = [[1.0, 2, 3], [2, 2, 4]], [[8.0, 2, 3], [1, -3, 3], [100, 100, 1]]
+    none = [[1.0, 2, -3], [1, 2, np.nan], [np.nan, 2, 3], [1, 2, 0]]
+    frame = frame_of_arrays(rgb, [*good, *outside, *none])
+    assert frame.points.depth.tolist() == [3, 4]
+    assert [note.split()[1] for note in frame.notes] == ["3", "4"]
+    assert frame_of_arrays(rgb, good).notes == ()
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

@@ -266,12 +266,18 @@ def frame_of_arrays(
     """
     rgb = None if image is None else _rgb(image)
     size = None if rgb is None else (rgb.shape[0], rgb.shape[1])
-    points = _points(sparse, size, unit)
+    points, unknown = _points(sparse, size, unit)
     points = points.resized(*size) if size else points
     inside = points.cropped(0, 0, *points.size)
     if not len(inside):
         raise NoPointsError(f"none of the {len(points)} sparse points lies in the image")
-    return Frame(rgb=None if rgb is None else tensor_of(rgb), points=inside, register=register)
+    lost = {"outside the image": len(points) - len(inside), "without a depth above 0": unknown}
+    return Frame(
+        rgb=None if rgb is None else tensor_of(rgb),
+        points=inside,
+        register=register,
+        notes=tuple(f"sparse: {n:,} points {why} are not used" for why, n in lost.items() if n),
+    )
 
 
 _CHANNELS = (1, 3, 4)  # grey, RGB, RGBA
@@ -308,10 +314,12 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
 
 def _points(
     sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None, unit: Unit | None
-) -> SparsePoints:
-    """The points in their own frame, which is the image's for rows of x, y, depth."""
+) -> tuple[SparsePoints, int]:
+    """The points in their own frame, which is the image's for rows of x, y, depth; and how many
+    rows are none."""
+    unknown = 0
     if isinstance(sparse, SparsePoints):
-        return sparse.tensors()
+        return sparse.tensors(), unknown
     values = _numbers(sparse, "sparse depth")
     shape = values.shape
     if values.ndim in (3, 4):
@@ -324,6 +332,7 @@ def _points(
         column = in_metres(values[:, 2], "the sparse depth", unit)
         known = np.isfinite(values).all(axis=1) & (column > 0)
         xy, depth = values[known, :2].astype(np.float32), column[known]
+        unknown = int(np.count_nonzero(~known))
     else:
         if size is not None and values.shape != size:
             raise SizeError(f"the sparse depth map is {values.shape} but the image is {size}")
@@ -336,4 +345,4 @@ def _points(
         depth = values[rows, columns]
     if not len(depth):
         raise NoPointsError("the sparse depth has no value above 0")
-    return SparsePoints(xy=xy, depth=depth, size=size).tensors()
+    return SparsePoints(xy=xy, depth=depth, size=size).tensors(), unknown

@@ -164,8 +164,9 @@ class Refiner:
             InputError: Image or points cannot be used.
             DivergedError: The loss became non-finite; `last_good` is the Refined before that.
         """
-        refined = self.refine_frame(frame_of_arrays(image, sparse, self._register, unit))
-        refined = replace(refined, notes=(*self.network.notes, *refined.notes))
+        frame = frame_of_arrays(image, sparse, self._register, unit)
+        refined = self.refine_frame(frame)
+        refined = replace(refined, notes=(*self.network.notes, *frame.notes, *refined.notes))
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
         return refined

@@ -180,7 +180,8 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
                 output = network.module(*prepared.arguments)
             points = prepared.points.tensors()
             at_points = points.sample(network.raw_of(output).cpu())
-            errors.append(align(at_points, points, spaces, "auto").error)
+            lost = 1 - float(at_points.isfinite().float().mean())  # each counts as quite wrong
+            errors.append(align(at_points, points, spaces, "auto").error + lost)
         except NoPointsError:
             continue
         except ModelError:
