@@ -1,0 +1,102 @@
+"""The gate says nothing of good inputs, of the samples and of real frames, in all formats."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.plausible import plausible_map
+from pnpdepth_cli.dataset.read_frame import read_frame
+from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.scans import read_scan
+from tests.io.test_scans import compressed_pcd_bytes, npy_bytes, pcd_bytes, ply_bytes
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+SCALES = {
+    "tum_fr": 5000.0, "icl_nuim": 5000.0, "7scenes": 1000.0, "realsense": 1000.0,
+    "metric3d": 1000.0, "kitti": 256.0, "nyu": None, "samples": None,
+}  # fmt: skip
+SPOKEN = ("warning", "without return", "that is none", "far plane", "1,000 times", "implausible")
+"""What the lines of the gate's rules have, but not the line of a good file."""
+
+
+def words(path: Path) -> list[str]:
+    """What the gate says of one depth map, as sparse depth, as ground truth, and as a list."""
+    scale = next(value for name, value in SCALES.items() if name in str(path))
+    depth = read_depth(path, scale=scale)
+    values, notes = plausible_map(depth.values, depth.reading, "gt", "--gt-scale", scale)
+    np.testing.assert_array_equal(values, depth.values)
+    files = FrameFiles(sparse=path, sparse_scale=scale)
+    frame = read_frame(files, ReadOptions(scan=ScanOptions(keep_occluded=True)))
+    return [*notes, *_spoken(frame.notes)]
+
+
+def _spoken(notes: tuple[str, ...]) -> list[str]:
+    return [note for note in notes if any(word in note for word in SPOKEN)]
+
+
+def maps(root: Path) -> Iterator[Path]:
+    for pattern in ("**/depth/*.png", "**/*.depth.png", "**/sparse/*.png", "**/gt/*.png"):
+        yield from root.glob(pattern)
+    for pattern in ("**/velodyne_raw/*.png", "**/groundtruth/*.png", "**/sync_depth*.png"):
+        yield from root.glob(pattern)
+    for pattern in ("**/gt.png", "**/sparse.png", "**/image_02/*.npz", "**/depth.npy"):
+        yield from root.glob(pattern)
+
+
+@pytest.mark.slow
+def test_nothing_is_said_of_the_samples_in_any_format(tmp_path: Path) -> None:
+    for path in maps(SAMPLES):
+        assert words(path) == [], path
+    values = read_depth(SAMPLES / "street" / "sparse.png").values
+    rows, columns = np.nonzero(values)
+    listed = np.column_stack([columns, rows, values[rows, columns]])
+    np.save(tmp_path / "list.npy", listed)
+    np.savetxt(tmp_path / "list.txt", listed)
+    for suffix in (".npy", ".exr", ".tiff", ".pfm", ".npz"):
+        write_depth(tmp_path / f"map{suffix}", values)
+    image = SAMPLES / "street" / "rgb.png"
+    for path in sorted(tmp_path.iterdir()):
+        files = FrameFiles(image=image, sparse=path, calib=SAMPLES / "street" / "calib.txt")
+        frame = read_frame(files, ReadOptions(scan=ScanOptions(keep_occluded=True)))
+        assert _spoken(frame.notes) == [], path
+        assert len(frame.points) == len(listed)
+
+
+def scans(root: Path) -> Iterator[tuple[Path, Path, Path]]:
+    """The image, the scan and the calibration of each frame."""
+    yield tuple(SAMPLES / "street" / n for n in ("rgb.png", "000000.bin", "calib.txt"))  # type: ignore[misc]
+    for scan in sorted((root / "kitti_object" / "velodyne").glob("*.bin")):
+        folder = scan.parents[1]
+        image = folder / "image_2" / f"{scan.stem}.png"
+        yield image, scan, folder / "calib" / f"{scan.stem}.txt"
+
+
+def test_nothing_is_said_of_real_frames(shared_data: Path) -> None:
+    paths = sorted(set(maps(shared_data)))
+    assert len(paths) > 120
+    for path in paths:
+        assert words(path) == [], path
+
+
+def test_nothing_is_said_of_scans_in_any_format(shared_data: Path, tmp_path: Path) -> None:
+    for image, scan, calib in scans(shared_data):
+        xyz = read_scan(scan).points
+        whole = np.column_stack([xyz, np.ones((len(xyz), 3))]).astype("<f4")
+        formats = {
+            "a.npy": npy_bytes(xyz),
+            "a.pcd": pcd_bytes(xyz),
+            "b.pcd": compressed_pcd_bytes(xyz),
+            "a.ply": ply_bytes(xyz),
+            "6.bin": whole.tobytes(),
+        }
+        for name, content in formats.items():
+            (tmp_path / name).write_bytes(content)
+        for path in (scan, *(tmp_path / name for name in formats)):
+            frame = read_frame(FrameFiles(image=image, sparse=path, calib=calib), ReadOptions())
+            assert _spoken(frame.notes) == [], path
