@@ -70,7 +70,8 @@ def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
     """
     names, frames = list(dict.fromkeys(groups)), len(groups)
     if 1 < len(names) < frames:
-        ids = np.array([names.index(group) for group in groups])
+        number = {name: index for index, name in enumerate(names)}
+        ids = np.array([number[group] for group in groups])
         return Clusters(ids=ids, unit="groups of frames")
     length = block_length(series) if len(names) == 1 else 1
     if length == 1:

@@ -135,7 +135,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> di
         "tests": tests,
         "notes": [
             *_notes(runs, names),
-            *_lacking(names, measures, known),
+            *_lacking(measures, known),
             *clusters.notes(),
             *_cluster_notes(clusters, len(names), tests),
         ],
@@ -229,19 +229,12 @@ def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
     return lines
 
 
-def _lacking(
-    names: Sequence[str], measures: Sequence[Measure], known: NDArray[np.bool_]
-) -> list[str]:
-    """A line for each set of measures that some frames lack."""
-    titles: dict[tuple[str, ...], list[str]] = {}
-    for measure, has in zip(measures, known.T, strict=True):
-        lacking = tuple(np.array(names, object)[~has])
-        titles.setdefault(lacking, []).append(measure.title)
+def _lacking(measures: Sequence[Measure], known: NDArray[np.bool_]) -> list[str]:
+    """A line for each measure that some frames lack."""
     return [
-        f"{', '.join(of)}: over {len(names) - len(lacking):,} frames; {len(lacking):,} lack it in"
-        f" a run: {some_names(lacking)}"
-        for lacking, of in titles.items()
-        if lacking
+        f"{measure.title}: over {has.sum():,} of {len(has):,} frames; the others lack it in a run"
+        for measure, has in zip(measures, known.T, strict=True)
+        if not has.all()
     ]
 
 
