@@ -33,7 +33,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     data = read_bytes(path)
     try:
-        content = json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
+        content = parse_json(data)
     except (ValueError, RecursionError) as error:
         raise FileFormatError(
             f"{path} is not valid JSON ({one_line(error)}); create it again"
@@ -84,5 +84,17 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a JSON number")
+def parse_json(data: bytes) -> Any:
+    """Returns the content of a JSON text. Raises ValueError or RecursionError if it is none.
+
+    NaN, infinity and numbers that are too large to be finite are no JSON numbers.
+    """
+    text = data.decode("utf-8-sig")
+    return json.loads(text, parse_constant=_finite, parse_float=_finite)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:20]} is not a JSON number")
+    return number

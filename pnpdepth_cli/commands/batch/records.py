@@ -27,7 +27,7 @@ from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.file_bytes import cannot_read
 from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
-from pnpdepth_cli.io.record import plain, sha256_of, write_json
+from pnpdepth_cli.io.record import parse_json, plain, sha256_of, write_json
 from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def _row(task: Task, record: Mapping[str, Any], entry: Mapping[str, Any]) -> Row
 def _record(path: Path) -> dict[str, Any]:
     """The content of a record; empty if there is none, or it is no JSON object."""
     try:
-        record = json.loads(_content(path) or b"")
+        record = parse_json(_content(path) or b"")
     except (ValueError, RecursionError):
         return {}
     return record if isinstance(record, dict) else {}

@@ -560,3 +560,16 @@ def test_results_are_not_written_through_a_planted_link(root: Path, tmp_path: Pa
     with pytest.raises(OutputError):
         batch(root)
     assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+@pytest.mark.parametrize("number", ["NaN", "1e999", "-Infinity"])
+def test_a_record_with_numbers_that_are_none_is_written_again(root: Path, number: str) -> None:
+    batch(root)
+    record = root / "out/b.json"
+    written = record.read_text()
+    record.write_text(
+        written.replace('"improved_fraction": ', f'"improved_fraction": {number}, "": ')
+    )
+    listener = RecordingListener()
+    batch(root, listener)
+    assert listener.names == ["b"]
