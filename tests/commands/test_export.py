@@ -265,7 +265,7 @@ def change(path: Path, **entries: Any) -> None:
         ({"inputs": {"sparse": {"image": "b.png"}}}, InputError, "two frames have one image name"),
         ({"size": [9, 9]}, SizeError, "--protocol whole"),
         *(
-            (entries, FileFormatError, r"out/a\.")
+            (entries, FileFormatError, r"a(_depth\.exr|\.json)")
             for entries in (
                 {"points": None},
                 {"points": {"farthest": 10**400}},
