@@ -83,6 +83,7 @@ def npy_bytes(points: NDArray[np.float32], dtype: type = np.float64) -> bytes:
 FILES = {
     "kitti.bin": bin_bytes,
     "scan.npy": npy_bytes,
+    "scan.txt": lambda points: "".join(f"{x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in points).encode(),
     "binary.pcd": pcd_bytes,
     "compressed.pcd": compressed_pcd_bytes,
     "ascii.pcd": lambda points: pcd_bytes(points, "ascii"),
@@ -112,7 +113,7 @@ def test_points_that_are_no_numbers_are_left_to_the_gate_in_every_format(
     np.testing.assert_array_equal(read_scan(tmp_path / name).points, bad)
 
 
-@pytest.mark.parametrize("name", sorted(set(FILES) - {"kitti.bin", "scan.npy"}))
+@pytest.mark.parametrize("name", sorted(set(FILES) - {"kitti.bin", "scan.npy", "scan.txt"}))
 @pytest.mark.parametrize("count", ["9037", "9" * 5000, "9" * 12, "-1", "1e3"])
 def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
     tmp_path: Path, name: str, count: str

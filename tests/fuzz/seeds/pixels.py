@@ -13,26 +13,17 @@ from tests.fuzz.seeds.seed import HEIGHT, OUT, WIDTH, Seed
 
 def write_seeds(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
     """Returns depth in every format, sparse points, and images."""
-    return [*_depths(folder, depth, rng), *_images(folder, rng)]
+    return [*_depths(folder, depth), *_images(folder, rng)]
 
 
-def _depths(folder: Path, depth: np.ndarray, rng: np.random.Generator) -> list[Seed]:
+def _depths(folder: Path, depth: np.ndarray) -> list[Seed]:
     names = [f"depth.{suffix}" for suffix in ("png", "exr", "npy", "npz", "pfm", "tif")]
     for name in names:
         write_depth(folder / name, depth)
     cv2.imwrite(str(folder / "double.tif"), depth.astype(np.float64))
-    points = np.column_stack([rng.uniform(0, 20, (30, 2)), rng.uniform(1, 9, 30)])
-    np.savetxt(folder / "points.csv", points, delimiter=",", header="x,y,depth", comments="")
-    np.save(folder / "points.npy", points)
     return [
-        *(
-            Seed(file=name, command=("sample", name, "--count", "20", *OUT))
-            for name in (*names, "double.tif")
-        ),
-        *(
-            Seed(file=name, command=("eval", "gt.npy", "gt.npy", "--sparse", name))
-            for name in ("points.csv", "points.npy")
-        ),
+        Seed(file=name, command=("sample", name, "--count", "20", *OUT))
+        for name in (*names, "double.tif")
     ]
 
 
