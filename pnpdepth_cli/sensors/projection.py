@@ -91,7 +91,8 @@ def project_velodyne(
     if not len(xy):
         raise NoPointsError(
             f"none of the scan's {len(xyz):,} points lies in the image ({drops}); check that"
-            " scan and calibration belong to this camera"
+            " scan and calibration belong to this camera, the scanner's translation is in metres,"
+            " and a quaternion has w last"
         )
     return Points(
         xy=xy.astype(np.float32),
