@@ -62,13 +62,13 @@ def refine_default(networks: OpenNetworks, frame: Frame, *, seed: int = 0) -> Re
     experts, warnings = without_doubt(networks, split, experts)
     # The weights that predict the validation points best, close to prior weights, fuse the depths.
     weights = fitted_weights(experts, split)
-    fused = weighted_mean([(each.dense, weights[each.name]) for each in experts])
+    fused = weighted_mean([(e.dense(), weights[e.name]) for e in experts if weights[e.name] > 0])
     # The residual at the inliers is propagated to every pixel.
     inliers = without_far_points(networks, inliers, judged)
     depth = _propagated(fused, inliers, split.propagation)
     # On scan lines, a completion network of that scanner has most of the result.
     shares = scanner_shares(experts, split, weights)
-    depth = _with_shares(depth, {each.name: each.dense for each in experts}, shares)
+    depth = _with_shares(depth, {e.name: e.dense() for e in experts if e.name in shares}, shares)
     weights = {name: (1 - sum(shares.values())) * w for name, w in weights.items()} | shares
     return Refined(
         before=_user(experts).before,
@@ -167,11 +167,13 @@ def _alone(experts: Sequence[Expert]) -> Expert | None:
 
 def _stages(experts: Sequence[Expert], frame: Frame, kind: str) -> dict[str, DepthMap]:
     """The user's network after each step of its own, and the network that takes a prior alone."""
-    user, alone, own = _user(experts), _alone(experts), experts[0].dense
+    user, alone, own = _user(experts), _alone(experts), experts[0].dense()
     propagated = own if experts[0].of_scanner else _propagated(own, frame, kind)
     stages = {ALIGNED: user.before, UPDATED: user.after, PROPAGATED: propagated.numpy()}
     return (
-        stages if alone is None else stages | {ALONE: _propagated(alone.dense, frame, kind).numpy()}
+        stages
+        if alone is None
+        else stages | {ALONE: _propagated(alone.dense(), frame, kind).numpy()}
     )
 
 

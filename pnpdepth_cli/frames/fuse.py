@@ -8,8 +8,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -59,9 +60,10 @@ class Expert:
 
     name: str
     weight: float  # prior weight; with 0 it has no part
-    dense: Tensor  # (H, W) metres, 0 = unknown: from all points, the residual not propagated
+    dense: Callable[[], Tensor]
+    """(H, W) metres, 0 = unknown: from all points, the residual not propagated."""
     at: Tensor  # (M,) metres, 0 = unknown: at the validation points, from the others
-    aligned: Tensor  # (H, W) metres: from the points without the validation points, before updates
+    aligned: Tensor  # (H, W) metres: a network's, from the others, before updates
     updated: Tensor  # (M,) metres: `at` before the residual is propagated
     refined: Refined | None = None  # from all points. None without a network
     network: Member | None = None  # that predicts. None: linear interpolation
@@ -243,7 +245,7 @@ def scanner_shares(
         return {}
     limit = split.error(weighted_mean([(each.at, weights[each.name]) for each in experts]))
     points = split.whole.points
-    fit = [e for e in own if float((points.sample(e.dense) - points.depth).abs().mean()) <= limit]
+    fit = [e for e in own if float((points.sample(e.dense()) - points.depth).abs().mean()) <= limit]
     return {each.name: OWN_SCANNER / len(fit) for each in fit}
 
 
@@ -331,7 +333,7 @@ def _expert(
     return Expert(
         name=name,
         weight=0.0,
-        dense=torch.from_numpy(refined.after),
+        dense=partial(torch.from_numpy, refined.after),
         at=at,
         aligned=aligned,
         updated=updated,
@@ -344,6 +346,9 @@ def _expert(
 
 def _interpolation(split: ValidationSplit) -> Expert:
     """Linear interpolation of the inliers."""
-    at = linear(split.kept.points, split.points.xy) if len(split.points) else torch.empty(0)
-    dense = linear(split.whole.points)
-    return Expert(name=LINEAR, weight=WITHOUT_IMAGE, dense=dense, at=at, aligned=dense, updated=at)
+    at = none = torch.empty(0)
+    if len(split.points):
+        at = linear(split.kept.points, split.points.xy)
+    # Its dense depth takes long on a LiDAR's points, and often has no weight.
+    dense = partial(linear, split.whole.points)
+    return Expert(name=LINEAR, weight=WITHOUT_IMAGE, dense=dense, at=at, aligned=none, updated=at)

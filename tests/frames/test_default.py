@@ -81,7 +81,7 @@ def scan_frame() -> Frame:
 def expert(name: str, at: Tensor, weight: float = 1.0) -> Expert:
     """An expert with these predictions at the validation points."""
     dense = torch.ones(SIZE)
-    return Expert(name=name, weight=weight, dense=dense, at=at, aligned=dense, updated=at)
+    return Expert(name=name, weight=weight, dense=lambda: dense, at=at, aligned=dense, updated=at)
 
 
 def split_of(depth: Tensor) -> ValidationSplit:
