@@ -27,6 +27,8 @@ _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 
 LONGEST_GAP_S = 0.02
 """Between a frame and its pose, as in the tools of the TUM RGB-D benchmark."""
+POSES_FILE = "poses.txt"
+"""What `pnpdepth frames` writes: TUM rows, one for each frame in the order of their names."""
 PACKETS = "oxts/data"
 """Folder of the packets in a drive."""
 IMU_CALIBRATION = "calib_imu_to_velo.txt"

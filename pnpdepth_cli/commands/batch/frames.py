@@ -30,6 +30,7 @@ from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.lock import LOCKS
+from pnpdepth_cli.io.poses import POSES_FILE
 from pnpdepth_cli.protocols import find_protocol
 
 _IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"
@@ -78,27 +79,18 @@ class Task:
 def unpacked(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     """Returns the request with the frames of its bag as source; any other request as it is.
 
-    The frames are written to OUTPUT_frames, and stay there for the next run. Their poses are used
-    where points are accumulated and no others are given.
+    The frames are written to OUTPUT_frames, and stay there for the next run.
     """
     if not is_bag(request.source):
         return request
-    from pnpdepth_cli.commands.sparse.bag_frames import (
-        POSES_FILE,
-        FramesRequest,
-        write_frames,
-        written_before,
-    )
+    from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, write_frames, written_before
 
     folder = request.output.with_name(f"{request.output.name}_frames")
     frames = FramesRequest(bag=request.source, output=folder, limit=request.limit, overwrite=True)
     if not written_before(frames):
         record = write_frames(frames, say)
         say(f"bag: wrote {record['frames']:,} frames to {folder}")
-    sequence, poses = request.sequence, folder / POSES_FILE
-    if sequence.accumulate and sequence.poses is None and poses.is_file():
-        sequence = replace(sequence, poses=poses)
-    return replace(request, source=folder, sequence=sequence)
+    return replace(request, source=folder)
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:
@@ -131,7 +123,8 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             " draws so many points from the ground truth"
         )
     if sequence.accumulate:
-        frames = with_neighbours(frames, sequence.accumulate, sequence.poses)
+        poses = sequence.poses or _poses_beside(source, frames)
+        frames = with_neighbours(frames, sequence.accumulate, poses)
     number, of = request.shard or (1, 1)
     return BatchFrames(
         layout=layout,
@@ -140,6 +133,13 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         refused=refused,
         unmatched=tuple(unmatched),
     )
+
+
+def _poses_beside(source: Path, frames: Sequence[FrameFiles]) -> Path | None:
+    """The poses that `pnpdepth frames` wrote beside frames without poses of their own."""
+    path = source / POSES_FILE
+    known = any(frame.pose or frame.oxts for frame in frames)
+    return path if path.is_file() and not known else None
 
 
 def task_of(request: FrameSelection, frame: FrameFiles) -> Task:

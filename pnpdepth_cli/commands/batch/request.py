@@ -76,7 +76,7 @@ class SequenceOptions:
     poses: Path | None = option(
         None,
         "Camera poses of the frames: TUM rows are joined by time, KITTI rows by order."
-        "  [default: the layout's, else estimated]",
+        "  [default: the layout's or poses.txt, else estimated]",
         metavar="FILE",
     )
 

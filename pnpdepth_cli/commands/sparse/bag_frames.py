@@ -45,14 +45,11 @@ from pnpdepth_cli.io.bags.transforms import (
 )
 from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.cloud_files import write_points
-from pnpdepth_cli.io.poses import Trajectory
+from pnpdepth_cli.io.poses import POSES_FILE, Trajectory
 from pnpdepth_cli.io.record import plain, read_json, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors import describe_dropped
-
-POSES_FILE = "poses.txt"
-"""Rows as of the TUM RGB-D benchmark, one for each frame in the order of their names."""
 
 RECORD = "frames.json"
 _FOLDERS = ("rgb", "sparse")

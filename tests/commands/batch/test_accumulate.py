@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.batch.request import SequenceOptions
+from pnpdepth_cli.commands.batch.frames import find_frames
+from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
+from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.sensors import SamplePattern
@@ -159,7 +161,9 @@ def test_a_frame_is_done_again_when_the_image_of_its_motion_changes(tmp_path: Pa
 
 def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: Path) -> None:
     root, listener = drive_on_disk(tmp_path, frames=2), RecordingListener()
+    poses = (root / "poses.txt").rename(root / "kept.txt")
     accumulating(root, listener=listener, sequence=SequenceOptions(accumulate=1))
+    poses.rename(root / "poses.txt")
     shutil.rmtree(root / "calib")
     accumulating(root, listener=listener)
     ends = ["give --poses, or leave out --accumulate"] * 2 + ["needs the camera"] * 2
@@ -174,3 +178,18 @@ def test_neighbours_of_sampled_frames_are_sampled(tmp_path: Path) -> None:
     record = record_of(root, "drive_000")
     assert record["points"]["moved"] > 20
     assert record["inputs"]["neighbours"][0]["path"].endswith("gt/drive_001.png")
+
+
+def test_poses_that_lie_beside_the_frames_are_used(tmp_path: Path) -> None:
+    shutil.copytree(DRIVE, tmp_path / "drive")
+    request = BatchRequest(
+        source=tmp_path / "drive",
+        output=tmp_path / "out",
+        refine=RefineRequest(),
+        sequence=SequenceOptions(accumulate=1),
+    )
+    (first, *_) = find_frames(request).frames[0].neighbours
+    assert first.motion is not None
+    (tmp_path / "drive/poses.txt").unlink()
+    (first, *_) = find_frames(request).frames[0].neighbours
+    assert first.motion is None
