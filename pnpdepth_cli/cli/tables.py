@@ -127,7 +127,8 @@ def print_refinement(record: Mapping[str, Any]) -> None:
         print_table(baselines_table(record["baselines"], record["unit"]), err=True)
     console = _Console(stderr=True, highlight=False)
     if record["improved_fraction"] is not None:
-        where = "pixels with ground truth" if record["scores"] else "points"
+        where = "held-out points" if record["held_out_error"] else "points used"
+        where = "pixels with ground truth" if record["scores"] else where
         console.print(f"improved: {record['improved_fraction']:.1%} of the {where}")
     settings = record["settings"]
     updates = (
