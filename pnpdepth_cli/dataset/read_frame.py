@@ -234,6 +234,10 @@ def _read_ground_truth(
         truth = DepthFile(values=depth_of(source), reading=Reading(f"{source.path.suffix} array"))
     else:
         truth = read_depth(source, scale=scale)
+        has_scan = files.sparse is not None and _is_scan(files.sparse, files, options)
+        if has_scan and options.depth_scale is not None:
+            own = read_depth(source, scale=files.gt_scale)  # the option is that of the scan
+            truth = truth if own.reading.assumed else own
     values = masked(truth.values, files.masks)
     if files.gt_other_size and size is not None and values.shape != size:
         values = moved_to(file_of(source), values, size)

@@ -38,7 +38,7 @@ from pnpdepth_cli.io.yaml_file import parse_yaml
 CAMERA = 2
 """KITTI's left colour camera, whose images the benchmarks have."""
 
-_KITTI_360_FILES = ("perspective.txt", "calib_cam_to_velo.txt")
+_PERSPECTIVE = "perspective.txt"  # of KITTI-360
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
 _YAML_MARKS = ("camera_matrix:", "distortion_model:", "camera_model:", "distortion_coeffs:")
@@ -97,9 +97,8 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         InputError: The file cannot be read.
         UsageError: There is no such camera.
     """
-    folder = path if path.is_dir() else path.parent
-    if path == folder / _KITTI_360_FILES[0] or (folder == path and _is_kitti_360(path)):
-        return _kitti_360(folder, camera)
+    if path.name == _PERSPECTIVE or (path / _PERSPECTIVE).is_file():
+        return _kitti_360(path if path.is_dir() else path.parent, camera)
     if path.is_dir() or path.name in _RAW_FILES:
         return _kitti_raw(path if path.is_dir() else path.parent, camera)
     text = _text(path)
@@ -226,13 +225,9 @@ def _kitti_raw(folder: Path, camera: int | None) -> Calibration:
     )
 
 
-def _is_kitti_360(folder: Path) -> bool:
-    return all((folder / name).is_file() for name in _KITTI_360_FILES)
-
-
 def _kitti_360(folder: Path, camera: int | None) -> Calibration:
     """KITTI-360's perspective cameras 0 and 1; its Velodyne file maps camera 0 to the scanner."""
-    cameras, scanner = (folder / name for name in _KITTI_360_FILES)
+    cameras, scanner = folder / _PERSPECTIVE, folder / "calib_cam_to_velo.txt"
     fields = _fields(cameras, _text(cameras))
     numbers = [int(name[-2:]) for name in fields if re.fullmatch(r"P_rect_\d\d", name)]
     number = _camera(cameras, camera or 0, numbers)

@@ -106,8 +106,10 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     # by sign, order of magnitude, and whether it is a whole number, such as the index of a laser
     size = np.log10(np.abs(numbers) + _SMALLEST)
     features = np.stack([np.sign(numbers), size, numbers == np.rint(numbers)])
-    counts = ~_in_long_runs(numbers == 0)  # beams without return say nothing
-    explained = {count: _explained(features, counts, count) for count in _FIELD_COUNTS}
+    # beams without return say nothing: more zeros in a row than a point has numbers
+    zeros = np.convolve(numbers == 0, np.ones(max(_FIELD_COUNTS) + 1), "same")
+    counted = zeros <= max(_FIELD_COUNTS)
+    explained = {count: _explained(features, counted, count) for count in _FIELD_COUNTS}
     most = max(explained.values())
     if most < _LEAST_EXPLAINED:
         raise FileFormatError(
@@ -134,16 +136,6 @@ def _explained(features: NDArray[np.float64], counted: NDArray[np.bool_], count:
     varies = total > 0
     fractions = 1 - (within * number).sum(axis=1)[varies] / number.sum() / total[varies]
     return float(fractions.mean()) if varies.any() else 0.0
-
-
-def _in_long_runs(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(N,) true where a mask is true more often in a row than a point has numbers."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    starts, stops = ends[::2], ends[1::2]
-    long = stops - starts > max(_FIELD_COUNTS)
-    steps = np.zeros(len(mask) + 1, np.int8)
-    steps[starts[long]], steps[stops[long]] = 1, -1
-    return np.cumsum(steps[:-1]) > 0
 
 
 def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:

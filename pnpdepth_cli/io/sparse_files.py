@@ -62,26 +62,15 @@ def read_sparse(
     if path.suffix.lower() in _TEXT_SUFFIXES:
         data = read_bytes(path)
         if kind_of(data) is None:
-            rows_of_text, _ = read_rows(path, data)
-            if rows_of_text.shape[1] != 3:
-                raise FileFormatError(
-                    f"{path}: {rows_of_text.shape[1]} numbers a line are not x, y and depth; if"
-                    " they are x y z of a scan, give --calib"
-                )
-            return _from_rows(path, rows_of_text, "point list", size)
+            return _from_rows(path, read_rows(path, data)[0], "point list", size)
     stored = load_stored(path)
-    if not stored.is_image and stored.values.ndim == 2 and stored.values.shape[1] == 3:
-        if stored.values.dtype.kind != "f":
-            raise FileFormatError(
-                f"{path}: a point list of {stored.values.dtype}; save x, y, depth as float metres"
-            )
+    shape = stored.values.shape
+    if (
+        not stored.is_image
+        and len(shape) == 2
+        and (shape[1] == 3 or (3 < shape[1] <= _MOST_COLUMNS and shape[0] > _MANY_ROWS))
+    ):
         return _from_rows(path, stored.values, f"point list, {stored.reading.source}", size)
-    shape, is_list = stored.values.shape, not stored.is_image
-    if is_list and len(shape) == 2 and 3 < shape[1] <= _MOST_COLUMNS and shape[0] > _MANY_ROWS:
-        raise FileFormatError(
-            f"{path} holds {shape[0]:,} rows of {shape[1]} numbers, not x, y and depth; if they are"
-            " x y z of a scan, give --calib"
-        )
     image = depth_from_stored(path, stored, scale)
     rows, columns = np.nonzero(image.valid)
     if rows.size == 0:
@@ -95,17 +84,23 @@ def read_sparse(
 def _from_rows(
     path: Path, rows: NDArray[np.floating], source: str, size: tuple[int, int] | None
 ) -> tuple[Points, Reading]:
+    if rows.dtype.kind != "f":
+        raise FileFormatError(
+            f"{path}: a point list of {rows.dtype}; save x, y, depth as float metres"
+        )
+    if rows.shape[1] != 3:
+        raise FileFormatError(
+            f"{path}: {rows.shape[1]} numbers a row are not x, y and depth; if they are x y z of a"
+            " scan, give --calib"
+        )
     depth = known_metres(rows[:, 2])
-    known = depth > 0
+    known = (depth > 0) & np.isfinite(rows[:, :2]).all(axis=1)
     if not known.any():
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
     if size is None:
         raise SizeError(f"{path} is a list of points, which needs an image to say the frame's size")
-    known &= np.isfinite(rows[:, :2]).all(axis=1)
-    if not known.all():
-        source += (
-            f", without {np.count_nonzero(~known):,} rows that have no depth above 0 or no pixel"
-        )
+    if lost := len(rows) - int(np.count_nonzero(known)):
+        source += f", without {lost:,} rows that have no depth above 0 or no pixel"
     xy = rows[known, :2].astype(np.float32)
     return SparsePoints(xy=xy, depth=depth[known], size=size), Reading(source)
 
@@ -123,7 +118,7 @@ def holds_scan(path: Path) -> bool:
     if path.suffix.lower() in _TEXT_SUFFIXES and kind_of(data) is None:
         rows, header = read_rows(path, data)
         if header:
-            return header != _PIXELS
+            return header[:3] != _PIXELS
     else:
         stored = load_stored(path)
         rows = stored.values

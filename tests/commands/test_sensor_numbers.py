@@ -165,6 +165,15 @@ def test_a_scan_in_millimetres_stops_and_is_read_by_the_option(tmp_path: Path, s
     with pytest.raises(InputError, match="--depth-scale 1000"):
         read(tmp_path / "a.npy")
     same_points(tmp_path / "a.npy", scan[:, :3], depth_scale=1000.0)
+    files = FrameFiles(
+        image=STREET / "rgb.png",
+        sparse=tmp_path / "a.npy",
+        gt=STREET / "gt.png",  # which states its own scale
+        calib=STREET / "calib.txt",
+    )
+    gt = read_frame(files, ReadOptions(depth_scale=1000.0)).gt
+    assert gt is not None
+    np.testing.assert_allclose(gt, codes_of(STREET / "gt.png") / 256, rtol=1e-6)
 
 
 def codes_of(path: Path) -> NDArray[np.float64]:

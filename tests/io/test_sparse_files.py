@@ -117,10 +117,10 @@ NONE = (NoPointsError, "holds no depth above 0")
     ("name", "content", "error", "message"),
     [
         ("s.csv", "1 2 3\n4 5\n", FileFormatError, "line 2: '4 5' is not 3 numbers"),
-        ("s.csv", "1 2 3 4\n", FileFormatError, "4 numbers a line .* give --calib"),
+        ("s.csv", "1 2 3 4\n", FileFormatError, "4 numbers a row .* give --calib"),
         ("s.csv", "1 2 3\nx y depth\n", FileFormatError, "line 2: 'x y depth' is not"),
         ("s.csv", "u v w\n1 2 3\n", FileFormatError, "line 1"),
-        ("s.csv", "1,5;2,5;3,5\n", FileFormatError, "6 numbers a line"),
+        ("s.csv", "1,5;2,5;3,5\n", FileFormatError, "6 numbers a row"),
         ("s.csv", b"\xff\xfe1\x00", FileFormatError, "is not a text file"),
         ("s.csv", "1 2 3\n", SizeError, "which needs an image to say the frame's size"),
         ("none.csv", None, InputError, r"none\.csv: no such file"),
