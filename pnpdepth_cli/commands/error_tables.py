@@ -110,6 +110,22 @@ def held_out_table(record: Mapping[str, Any]) -> Table:
     return error_table("held-out points, which nothing used", only, record["unit"])
 
 
+def made_by(record: Mapping[str, Any]) -> tuple[str, str]:
+    """Returns what the depth before and the depth after of a record are of, in a few words."""
+    settings = record["settings"]
+    if record["method"]["kind"] == "default":
+        name, weights = record["method"]["networks"][0], record["weights"]
+        alone = all(weight == 0 for expert, weight in weights.items() if expert != name)
+        after = _STAGES["propagated" if alone else "result"]
+        before = _STAGES["aligned"].format(name=name)
+        return before, after.format(name=name, weights=weights_text(weights))
+    name, align = record["model"]["name"], settings["align"] != "none"
+    before = f"{name}, aligned with the points" if align else name
+    steps = [f"{settings['iterations']} updates of z"] if settings["iterations"] else []
+    steps += ["residual propagated"] if settings["propagate"] != "none" else []
+    return before, ", ".join([name, *steps])
+
+
 def _stages_table(record: Mapping[str, Any]) -> Table:
     """The stages of the default method: scores on the ground truth, or at validation points."""
     beside, names = record["linear"], record["method"]["networks"]

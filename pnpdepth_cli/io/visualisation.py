@@ -45,6 +45,7 @@ def preview(
     after: Depth,
     path: Path,
     unit: str = "m",
+    made_by: tuple[str, str] = ("", ""),
 ) -> Content:
     """Writes a PNG of image, sparse depth, depth before and after, and the signed change.
 
@@ -58,6 +59,7 @@ def preview(
         after: (H, W) after refinement.
         path: The PNG.
         unit: Name in the legend.
+        made_by: What the depth before and the depth after are of.
 
     Raises:
         SizeError: Image and depth differ in size.
@@ -78,8 +80,12 @@ def preview(
             remark="" if rgb is not None else "depth in grey",
         ),
         _points_panel(grey, sparse_xy, sparse_depth, scale, factor),
-        Panel(title="Depth before", pixels=resized(scale.paint(before), factor)),
-        Panel(title="Depth after", pixels=resized(scale.paint(after), factor)),
+        *(
+            Panel(title=title, pixels=resized(scale.paint(depth), factor), remark=remark)
+            for title, depth, remark in zip(
+                ("Depth before", "Depth after"), (before, after), made_by, strict=True
+            )
+        ),
         _change_panel(before, after, grey, factor),
     ]
     return save_depth_figure(path, panels, scale, unit, columns=columns)

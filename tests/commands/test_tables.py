@@ -12,6 +12,7 @@ from pnpdepth_cli.commands.error_tables import (
     change,
     format_error,
     held_out_table,
+    made_by,
     refinement_table,
 )
 from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
@@ -169,3 +170,19 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -
     assert "from 1,000 random swaps, over 2 frames" in comparison_table(comparison).title
     for table in (comparison_table(comparison), methods_table(comparison)):
         assert table.title.endswith("; without the pixels of sparse points")
+
+
+@pytest.mark.parametrize(
+    ("weights", "after"),
+    [
+        ({"net": 1.0}, "net, residual propagated"),
+        ({"net": 0.0, "compact": 1.0}, "fused (compact 100%)"),
+        ({"net": 0.25, "compact": 0.75}, "fused (net 25%, compact 75%)"),
+    ],
+)
+def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part(
+    weights: dict[str, float], after: str
+) -> None:
+    method = {"kind": "default", "networks": ["net", "compact"]}
+    record = {"method": method, "weights": weights, "settings": {}}
+    assert made_by(record) == ("net, aligned with the points", after)

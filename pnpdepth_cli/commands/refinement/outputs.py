@@ -89,8 +89,17 @@ def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:
     return replace(frame, after=after, notes=(*frame.notes, *notes))
 
 
-def write_outputs(outputs: Outputs, inputs: Frame, frame: Refined) -> dict[str, Any]:
-    """Writes the depth and its images. Returns their entries of the record."""
+def write_outputs(
+    outputs: Outputs, inputs: Frame, frame: Refined, made_by: tuple[str, str]
+) -> dict[str, Any]:
+    """Writes the depth and its images. Returns their entries of the record.
+
+    Args:
+        outputs: The files by kind.
+        inputs: The frame as it was read.
+        frame: The refined frame.
+        made_by: What the depth before and the depth after are of, for the preview.
+    """
     image = replace(inputs, register=frame.registration).registered().image
     make_folder(outputs["depth"].parent)
     write_depth(outputs["depth"], frame.after, scale=output_scale(inputs))
@@ -110,6 +119,7 @@ def write_outputs(outputs: Outputs, inputs: Frame, frame: Refined) -> dict[str, 
             frame.after,
             outputs["preview"],
             inputs.unit,
+            made_by,
         )
     if "improvement" in outputs:
         record["improved_fraction"], record["figures"]["improvement"] = _write_improvement(

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from pnpdepth_cli.choices import BASELINES
+from pnpdepth_cli.commands.error_tables import made_by
 from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs, stale_outputs
 from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
@@ -128,7 +129,7 @@ def write_refined(
         stale = stale_outputs(record_path.parent, record_path.stem, outputs)
     with all_or_none(outputs.values()):
         with watch("write"):
-            record |= write_outputs(outputs, inputs, frame)
+            record |= write_outputs(outputs, inputs, frame, made_by(record))
         record["seconds"] = watch.seconds
         record["peak_memory_mb"] = peak_memory_mb(refiner.network.device)
         if "record" in outputs:
