@@ -22,6 +22,7 @@ from pnpdepth_cli.dataset.frame_camera import (
     camera_of_fov,
     describe_pinhole,
 )
+from pnpdepth_cli.dataset.plausible import far_values
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud
@@ -157,7 +158,7 @@ def _parts(
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def view(index: int) -> View:
-        depth = _depth(request, frames[index])
+        depth = _depth(request, frames[index], notes)
         camera, found = _camera(request, frames[index], (depth.shape[0], depth.shape[1]))
         pose = poses[index]
         notes.extend(note for note in found if note not in notes)
@@ -193,9 +194,12 @@ def _merged(
         yield grid.cloud(coloured=coloured)
 
 
-def _depth(request: CloudRequest, frame: ResultFrame) -> NDArray[np.float32]:
-    """The depth of a frame (H, W), 0 where it is excluded."""
+def _depth(request: CloudRequest, frame: ResultFrame, notes: list[str]) -> NDArray[np.float32]:
+    """The depth of a frame (H, W), 0 where it is excluded. What is no depth is told in `notes`."""
     depth, keep = frame.read(request.depth_scale)
+    far, lines = far_values(depth[keep], frame.unit)
+    keep[keep] = ~far
+    notes.extend(f"{frame.depth}: {line}" for line in lines)
     keep &= depth <= request.max_depth
     if request.max_sigma is not None:
         if frame.sigma is None:

@@ -108,6 +108,15 @@ def test_pixels_beyond_the_limits_are_left_out(tmp_path: Path) -> None:
     assert not record["coloured"]
 
 
+def test_a_far_plane_is_no_part_of_a_cloud(tmp_path: Path) -> None:
+    depth = np.linspace(2, 8, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
+    depth[:5] = 1e10
+    write_depth(tmp_path / "d.exr", depth)
+    record = written(tmp_path / "d.exr", tmp_path / "d.ply")
+    assert record["points"] == (HEIGHT - 5) * WIDTH
+    assert any("far plane" in note for note in record["notes"])
+
+
 def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:
     path = frame(tmp_path, "a")
     valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
