@@ -210,6 +210,12 @@ def load_network(
                 " it"
             )
     elif path is not None:
+        if path.parent.parent.name == "model_zoo_defs" and not path.is_file():
+            raise CheckpointError(
+                f"checkpoint {path} does not exist: the package has the weights of compact and"
+                f" fcrn-tiny alone; take {path.name} from the repository, and name it with"
+                " --checkpoint"
+            )
         notes = load_checkpoint(module, definition, path)
     elif module.state_dict():
         raise CheckpointError(

@@ -43,7 +43,7 @@ def _listed(definition: ModelDefinition, family: str) -> dict[str, Any]:
     # On the meta device counting needs no memory.
     with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
-    defaults = definition.defaults.complete()
+    defaults, path = definition.defaults.complete(), definition.checkpoint
     return {
         "name": definition.name,
         "family": family,
@@ -54,7 +54,7 @@ def _listed(definition: ModelDefinition, family: str) -> dict[str, Any]:
         "size": _size(definition.size),
         "output_kind": definition.output_kind,
         "parameters": sum(parameter.numel() for parameter in module.parameters()),
-        "checkpoint": str(definition.checkpoint) if definition.checkpoint else None,
+        "checkpoint": str(path) if path and path.is_file() else None,
         "layers": definition.layers,
         "layer": definition.default_layer,
         "iterations": defaults.iterations,
