@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 import pytest
 import torch
 from hypothesis import settings
+from tqdm import tqdm
 
 if TYPE_CHECKING:
     from tests.commands.frames import FrameOnDisk
 
+tqdm.monitor_interval = 0  # beside its thread, what libraries print cannot be silenced
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.load_profile("steady")
 
