@@ -212,8 +212,8 @@ def load_network(
     elif path is not None:
         if path.parent.parent.name == "model_zoo_defs" and not path.is_file():
             raise CheckpointError(
-                f"checkpoint {path} does not exist: the package has the weights of compact and"
-                f" fcrn-tiny alone; take {path.name} from the repository, and name it with"
+                f"checkpoint {path} does not exist, as the package has the weights of few"
+                f" networks; take {path.name} from the repository, and name it with"
                 " --checkpoint"
             )
         notes = load_checkpoint(module, definition, path)
