@@ -225,7 +225,7 @@ NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mea
 PRECISIONS = ("fp32", "bf16", "fp16")  # of the network's convolutions and matrix products
 
 # Files and sensors
-REGISTRATIONS = ("auto", "off")  # whether the image is moved into the frame of the points
+REGISTRATIONS = ("auto", "off")  # whether the image is moved to the points
 PATTERNS = ("uniform", "shuffle", "grid", "lines", "features")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
 

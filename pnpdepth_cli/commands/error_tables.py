@@ -58,7 +58,7 @@ def error_table(
 
     Args:
         title: Of the table.
-        errors: As of `errors_by_basis`.
+        errors: Argument of `errors_by_basis`.
         unit: Of the depths.
         keys: Of the measures, in this order; None for all.
     """

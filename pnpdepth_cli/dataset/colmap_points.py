@@ -22,14 +22,13 @@ from pnpdepth_cli.io.colmap_model import (
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.formats import Reading
+from pnpdepth_cli.io.formats.depth_format import SATURATED_CODE
 from pnpdepth_cli.sensors import Points
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.pixels import DropCounter, describe_dropped
 
 _SIZES_IN_RANGE = 8.0
 """A 16-bit file in model units holds depths up to at least so many times the model's extent."""
-
-_LARGEST_CODE = 65535
 
 _LEAST_TRACK = 3
 """Points that fewer images observe are dropped: two rays meet anywhere along one of them."""
@@ -63,10 +62,10 @@ def read_colmap_points(
     check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
     points = _observed(model, name, unit_scale or 1.0)
     dropped = points.dropped
-    far, lines = far_values(points.depth, MODEL_UNITS if unit_scale is None else METRES)
+    unit = MODEL_UNITS if unit_scale is None else METRES
+    far, lines = far_values(points.depth, unit)
     points = points.select(~far)
     turn, shift = model.images[name].rotation.T, model.images[name].translation
-    unit = MODEL_UNITS if unit_scale is None else METRES
     reading = Reading(
         f"COLMAP model, image {name}, {camera.source}",
         scale=_output_scale(model) if unit == MODEL_UNITS else None,
@@ -147,4 +146,4 @@ def _output_scale(model: ColmapModel) -> float:
     poses = model.images.values()
     path = [np.linalg.norm(image.rotation.T @ image.translation + centre) for image in poses]
     farthest = _SIZES_IN_RANGE * max(extent, float(np.median(path)), 1e-9)
-    return float(2.0 ** np.floor(np.log2(_LARGEST_CODE / farthest)))
+    return float(2.0 ** np.floor(np.log2(SATURATED_CODE / farthest)))

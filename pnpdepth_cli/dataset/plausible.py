@@ -169,7 +169,7 @@ def plausible_map(
     Args:
         values: (H, W), 0 where unknown.
         reading: How they were read.
-        what: As of `divisor_to_metres`, like `option` and `scale`.
+        what: Argument of `divisor_to_metres`, like `option` and `scale`.
 
     Raises:
         InputError: The depths are implausible in metres.

@@ -81,6 +81,8 @@ def read_frame(
     Raises:
         InputError: A file cannot be used, or the files do not fit together.
     """
+    if files.min_confidence is not None and files.sparse_mask is None:
+        raise UsageError("--min-confidence needs --sparse-mask, the confidence of the sparse depth")
     crop = files.part.apply
     notes, sources = list[str](), dict[str, Any]()
     rgb: ImageArray | None = None
@@ -142,8 +144,6 @@ def read_frame(
             f"mask {files.masks[0]} is of ground truth, of which there is none, so it is not used;"
             " a mask of the sparse depth is --sparse-mask, or sparse_mask in a list"
         )
-    if files.min_confidence is not None and files.sparse_mask is None:
-        raise UsageError("--min-confidence needs --sparse-mask, the confidence of the sparse depth")
     if neighbours:
         sources["neighbours"] = neighbours
     return Frame(

@@ -90,7 +90,7 @@ class ReadOptions:
     )
     registration: str = option(
         "auto",
-        "Whether the image is moved into the frame of the points: auto, if their depth edges show"
+        "Whether the image is moved to the points: auto, if their depth edges show"
         " that it is not registered; or off.",
         choices=choices.REGISTRATIONS,
         show_default=True,

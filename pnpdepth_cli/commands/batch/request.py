@@ -137,8 +137,9 @@ class BatchRequest(FrameSelection):
     )
     adapt: bool = option(
         False,
-        "First let the weights learn from hidden points of each sequence (8 frames or more); its"
-        " frames are refined with them if they are better. The network must take points.",
+        "First let the weights learn from points that are left out of each sequence (8 frames or"
+        " more); its frames are refined with them if they are better. The network must take"
+        " points.",
     )
     sequence: SequenceOptions = field(default_factory=SequenceOptions)
     varied: Mapping[str, str] = field(default_factory=dict)

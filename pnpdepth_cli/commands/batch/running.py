@@ -35,7 +35,7 @@ from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
 
 Item = TypeVar("Item")
 REGISTERING = 16
-"""Frames that decide together how images are moved into the frame of the points."""
+"""Frames that decide together how images are moved to the points."""
 
 
 def read_task(task: Task, known: dict[str, Fingerprint] | None = None) -> Frame:
@@ -46,7 +46,7 @@ def read_task(task: Task, known: dict[str, Fingerprint] | None = None) -> Frame:
         known: Gets the fingerprints of the files, by part.
 
     Raises:
-        PnpDepthError: As of `read_frame`.
+        PnpDepthError: The errors of `read_frame`.
     """
     if known is not None:
         known |= {part: fingerprint(path) for part, path in task.inputs.items()}
@@ -61,7 +61,7 @@ class References(NamedTuple):
     others: Sequence[FrameFiles]
     """More frames, for input ranges where the network states none."""
     registering: Sequence[FrameFiles]
-    """Frames that decide how images are moved into the frame of the points."""
+    """Frames that decide how images are moved to the points."""
 
 
 def references_of(request: BatchRequest, frames: Sequence[FrameFiles]) -> References | None:

@@ -138,7 +138,7 @@ def project_scan(
         options: The calibration.
         target: Files to write.
         image: The camera's image, which gives the size and the ground of an overlay.
-        scale: Numbers of the scan per metre, as of `read_scan_points`.
+        scale: Numbers of the scan per metre, for `read_scan_points`.
     """
     target.check((scan, image, options.calib, options.extrinsics))
     rgb = read_rgb(image).values
