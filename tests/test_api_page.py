@@ -1,0 +1,131 @@
+"""docs/python-api.md: the signatures in it are those of the code.
+
+`python -m tests.test_api_page` writes them anew.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pnpdepth_cli
+
+PAGE = Path(__file__).parent.parent / "docs" / "python-api.md"
+BEGIN = "<!-- signatures, written by `python -m tests.test_api_page` -->\n"
+END = "<!-- end of the signatures -->\n"
+FOR_THE_PROGRAM = {
+    "Refiner": {"refine_frame", "decide", "share_registration"},
+    "Settings": {"fixed_by", "with_preset", "given", "opened", "over", "complete"},
+    "Split": {"static_graph", "in_half"},
+    "Network": {
+        *("image_of", "arguments_of", "synthetic_arguments", "verified", "depth_of", "raw_of"),
+    },
+}
+"""Methods that take or give what is not public."""
+WIDTH = 88
+
+
+def first_line(text: str | None) -> str:
+    """The first paragraph of a docstring, on one line, without the options' defaults."""
+    return " ".join((text or "").split("\n\n")[0].split()).split(" [default")[0]
+
+
+def arguments_of(node: ast.arguments) -> list[str]:
+    """The arguments of a function as its signature has them."""
+    text = re.sub(r"^(self|cls)\b[^,]*(, )?", "", ast.unparse(node))
+    parts = re.split(r", (?![^\[(]*[\])])", text) if text else []
+    return [re.sub(r"^(\w+: [^=]+)=(.*)$", r"\1 = \2", part) for part in parts]
+
+
+def call_lines(head: str, node: ast.FunctionDef, returns: str) -> Iterator[str]:
+    """A signature, an argument a line where it is long."""
+    arguments = arguments_of(node.args)
+    line = f"{head}({', '.join(arguments)}){returns}"
+    if len(line) <= WIDTH:
+        yield line
+    else:
+        yield from (f"{head}(", *(f"    {each}," for each in arguments), f"){returns}")
+
+
+def function_lines(node: ast.FunctionDef) -> Iterator[str]:
+    """A function, a method or a property, and the first line of its docstring."""
+    assert node.returns is not None
+    returns = ast.unparse(node.returns)
+    if any(ast.unparse(mark).endswith("property") for mark in node.decorator_list):
+        yield f"{node.name}: {returns}"
+    else:
+        yield from call_lines(f"def {node.name}", node, f" -> {returns}")
+    yield f'    """{first_line(ast.get_docstring(node))}"""'
+
+
+def field_lines(node: ast.AnnAssign, after: ast.stmt | None) -> Iterator[str]:
+    """A field of a dataclass with its type, its default and its description."""
+    described, default = None, node.value
+    if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+        described = str(after.value.value)
+    if isinstance(default, ast.Call) and ast.unparse(default.func) in ("option", "field"):
+        if len(default.args) > 1:  # option(default, help)
+            described = str(ast.literal_eval(default.args[1]))
+        default = default.args[0] if default.args else None
+    value = "" if default is None else f" = {ast.unparse(default)}"
+    yield f"{ast.unparse(node.target)}: {ast.unparse(node.annotation)}{value}"
+    if described:
+        yield f'    """{first_line(described)}"""'
+
+
+def class_lines(node: ast.ClassDef) -> Iterator[str]:
+    """A class, and its fields, properties and methods that a user needs."""
+    functions = [each for each in node.body if isinstance(each, ast.FunctionDef)]
+    private = {each.name for each in functions if each.name.startswith("_")}
+    hidden = private | FOR_THE_PROGRAM.get(node.name, set())
+    made_by = [each for each in functions if each.name == "__init__"]
+    yield from (
+        call_lines(f"class {node.name}", made_by[0], "") if made_by else (f"class {node.name}",)
+    )
+    yield f'    """{first_line(ast.get_docstring(node))}"""'
+    for each, after in zip(node.body, [*node.body[1:], None], strict=True):
+        lines: Iterator[str] = iter(())
+        if isinstance(each, ast.AnnAssign):
+            lines = field_lines(each, after)
+        elif isinstance(each, ast.FunctionDef) and each.name not in hidden:
+            lines = function_lines(each)
+        yield from (f"    {line}" for line in lines)
+
+
+def lines_of(name: str) -> Iterator[str]:
+    """What the page shows of a public name."""
+    module = importlib.import_module(getattr(pnpdepth_cli, name).__module__)
+    for node in ast.parse(inspect.getsource(module)).body:
+        if isinstance(node, ast.ClassDef) and node.name == name:
+            yield from class_lines(node)
+        elif isinstance(node, ast.FunctionDef) and node.name == name:
+            yield from function_lines(node)
+
+
+def signatures() -> str:
+    """All public names but the errors, as Markdown."""
+    values = {name: getattr(pnpdepth_cli, name) for name in pnpdepth_cli.__all__[1:]}
+    error = pnpdepth_cli.PnpDepthError
+    shown = [n for n, v in values.items() if not (isinstance(v, type) and issubclass(v, error))]
+    blocks = ("\n".join(lines_of(name)) for name in shown)
+    return "\n".join(f"```python\n{block}\n```\n" for block in blocks)
+
+
+def test_the_signatures_of_the_page_are_those_of_the_code() -> None:
+    shown = PAGE.read_text(encoding="utf-8").partition(BEGIN)[2].partition(END)[0]
+    assert shown.strip() == signatures().strip(), "run: python -m tests.test_api_page"
+
+
+def write() -> None:
+    """Writes the signatures into the page."""
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    text = f"{before}{BEGIN}\n{signatures()}\n{END}{rest.partition(END)[2]}"
+    PAGE.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write()
