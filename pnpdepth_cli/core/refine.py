@@ -68,7 +68,7 @@ def refine(
     Raises:
         DivergedError: The loss or its gradient is not finite; `last_good` is the Refinement until
             then.
-        ModelError: The first prediction is not finite at the points.
+        ModelError: The first prediction is not finite at any point.
         LayerError: The depth does not depend on z.
     """
     with torch.no_grad():
@@ -201,11 +201,19 @@ class _FrameRefinement:
             self.error = error
             return None
         at_points = self._points.sample(depth)
+        if not self.losses:  # a point has no part in L where f(x) is unknown, such as in the sky
+            known = at_points.isfinite()
+            if self._settings.iterations and not bool(known.any()):
+                self.error = ModelError(
+                    f"the network's prediction is not finite at any of {len(known):,} sparse"
+                    " points, before any update of z; are its weights, its input range (normalise)"
+                    " and precision right?"
+                )
+                return None
+            self._points, at_points = self._points.select(known), at_points[known]
         loss = self._loss(at_points, self._points.depth)
         if self._settings.iterations and not bool(loss.isfinite()):
             self.error = self._diverged("loss", len(self.losses))
-            if not self.losses and not bool(at_points.isfinite().all()):
-                self.error = bad_prediction(at_points)
             return None
         self.losses.append(float(loss.detach()))
         self._last = depth.detach()
@@ -243,12 +251,3 @@ class _FrameRefinement:
             f" (step {self._step:.3g}); try a smaller --lr or fewer --iterations",
             self.result() if self.losses else None,
         )
-
-
-def bad_prediction(at_points: Tensor) -> ModelError:
-    """Returns the error of a plain prediction (N,) at the points that is not finite."""
-    return ModelError(
-        f"the network's prediction is not finite at {int((~at_points.isfinite()).sum()):,} of"
-        f" {len(at_points):,} sparse points, before any update of z; are its weights, its input"
-        " range (normalise) and precision right?"
-    )

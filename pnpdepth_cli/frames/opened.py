@@ -184,8 +184,9 @@ class OpenNetwork:
             self._output = output
         depth = reader(output).detach()
         at_points = prepared.points.sample(depth)
-        loss = float(checked_loss(settings.loss)(at_points, prepared.points.depth))
-        return Refinement(before=depth, after=depth, losses=(loss,), step=0.0)
+        known = at_points.isfinite()
+        loss = checked_loss(settings.loss)(at_points[known], prepared.points.depth[known])
+        return Refinement(before=depth, after=depth, losses=(float(loss),), step=0.0)
 
 
 @contextmanager

@@ -18,6 +18,8 @@ _NO_BETTER = 0.98
 """Misfit over that of a constant from which on a network is said to know nothing of the scene."""
 _ENOUGH = 20
 """Fewer points do not say so."""
+_MOST_LOST = 0.5
+"""Fraction of the points that may lie where the prediction is unknown, without a warning."""
 
 
 class AlignedDepth:
@@ -30,21 +32,52 @@ class AlignedDepth:
         self._network, self._points, self._kind = network, points, kind
         stated = network.definition.output_kind
         self._spaces = (stated,) if stated in SPACES else ("depth", "inverse")
+        self._read = False
         self.alignment: Alignment | None = None
         self.notes: tuple[str, ...] = ()
 
     def __call__(self, output: Any) -> Tensor:
-        """Returns depth in metres, (1, 1, h, w), from the network's output."""
+        """Returns depth in metres, (1, 1, h, w), from the network's output; NaN where unknown."""
         if self._kind == "none":
             depth = self._network.depth_of(output)
-            self.notes = self.notes or self._plain_notes(depth)
+            self._note_first(depth.detach())
             return depth
         raw = self._network.raw_of(output)
-        if self.alignment is None:
-            at_points = self._points.sample(raw.detach())
-            self.alignment = align(at_points, self._points, self._spaces, self._kind)
-            self.notes = self._notes(self.alignment, raw.detach())
+        self._note_first(raw.detach())
+        assert self.alignment is not None
         return self.alignment.depth(raw)
+
+    def _note_first(self, raw: Tensor) -> None:
+        """Fits the alignment to the plain prediction, and notes what a person should know of it."""
+        if self._read:
+            return
+        self._read = True
+        at_points = self._points.sample(raw)
+        seen = at_points.isfinite()
+        self.notes = self._unknown_notes(raw, seen)
+        if bool(seen.any()):
+            self._points, at_points = self._points.select(seen), at_points[seen]
+        if self._kind == "none":
+            self.notes += self._plain_notes(at_points)
+            return
+        self.alignment = align(at_points, self._points, self._spaces, self._kind)
+        self.notes += self._notes(self.alignment, raw)
+
+    def _unknown_notes(self, raw: Tensor, seen: Tensor) -> tuple[str, ...]:
+        """Where the network says nothing, such as of the sky, and how many points lie there."""
+        unknown, lost = float(raw.isnan().double().mean()), int((~seen).sum())
+        if not unknown:
+            return ()
+        note = (
+            f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there; left"
+            f" {lost:,} of {len(seen):,} sparse points there out of the loss"
+        )
+        if lost <= _MOST_LOST * len(seen):
+            return (note,)
+        return (
+            f"warning: {note}; are the network's weights, input range (--normalise) and precision"
+            " right?",
+        )
 
     def _notes(self, fit: Alignment, raw: Tensor) -> tuple[str, ...]:
         decided = " (decided from the points)" if self._kind == "auto" else ""
@@ -78,10 +111,10 @@ class AlignedDepth:
         log_depth = self._points.depth.double().log()
         return float((log_depth - log_depth.median()).abs().clamp(max=1.0).mean())
 
-    def _plain_notes(self, depth: Tensor) -> tuple[str, ...]:
-        ratio = float((self._points.sample(depth.detach()) / self._points.depth).median())
+    def _plain_notes(self, at_points: Tensor) -> tuple[str, ...]:
+        ratio = float((at_points / self._points.depth).median())
         if ratio > 0 and abs(math.log(ratio)) < math.log(_OFF):
-            return ("",)
+            return ()
         return (
             f"warning: the prediction is {ratio:.3g} × the sparse depth at the median; --align auto"
             " fits its scale (and shift) to the points",

@@ -168,7 +168,9 @@ def _measure(
                 seconds = time.perf_counter() - start
                 cost = behind.get_total_flops() / whole_flops if whole_flops else None
             # On the raw output: where inverse depth is clamped, depth does not change.
-            field = influential_field(split, z, network.raw_of, enough)
+            field = influential_field(
+                split, z, lambda output: network.raw_of(output).nan_to_num(), enough
+            )
     except ModelError as error:
         return MeasuredLayer(name=name, problem=str(error))
     module = dict(network.module.named_modules())[LayerName.parse(name).module]

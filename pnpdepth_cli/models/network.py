@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -129,6 +130,8 @@ class Network:
     def raw_of(self, output: Any) -> Tensor:
         """Returns the prediction (1, 1, h, w) in float32, in the network's own numbers.
 
+        NaN where it is not finite, as networks say of the sky. No gradient comes from there.
+
         Raises:
             ModelError: It holds no prediction, or several tensors that `output` of the definition
                 does not choose from.
@@ -164,7 +167,28 @@ class Network:
                 f"network {name!r} gives a tensor of shape {tuple(chosen.shape)}, where one depth"
                 " map (1, 1, h, w) is expected; pick it by the definition's output"
             )
-        return tensor
+        known = tensor.isfinite()
+        if bool(known.all()):
+            return tensor
+        _read_nan_gradients_as_zero(tensor)
+        return torch.where(known, tensor, torch.nan)
+
+
+def _read_nan_gradients_as_zero(tensor: Tensor) -> None:
+    """Makes 0 of NaN in the gradients behind a tensor, which are 0 times an infinite slope."""
+    seen, nodes = set(), [tensor.grad_fn]
+    while nodes:
+        node = nodes.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        node.register_hook(
+            lambda gradients, _: tuple(
+                None if each is None else each.nan_to_num(0.0, math.inf, -math.inf)
+                for each in gradients
+            )
+        )
+        nodes += [before for before, _ in node.next_functions]
 
 
 def load_network(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, ModelError, NoPointsError
@@ -57,8 +59,45 @@ def test_a_frame_without_a_point_in_the_networks_view_is_an_error(network: Netwo
 
 def test_a_frame_whose_prediction_is_not_finite_is_an_error(network: Network) -> None:
     unknown = replace(frame_of(1), rgb=torch.full((3, 46, 62), float("nan")))
-    with pytest.raises(ModelError, match="not finite at 20 of 20 sparse points"):
+    with pytest.raises(ModelError, match="not finite at any of 20 sparse points"):
         refined(network, SETTINGS, unknown)
+
+
+class _Sky(nn.Module):
+    """A network whose depth is infinite in the upper 15 rows."""
+
+    def __init__(self, net: nn.Module, sky: Callable[[Tensor, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.net, self.sky = net, sky
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        depth = self.net(rgb)
+        return self.sky(depth, (torch.arange(depth.shape[2]) < 15)[:, None])
+
+
+@pytest.mark.parametrize(
+    "sky",
+    [
+        lambda depth, sky: torch.where(sky, torch.inf, depth),
+        lambda depth, sky: torch.where(sky, torch.nan, depth),
+        lambda depth, sky: 1 / (~sky / depth),  # infinite slope, too
+    ],
+    ids=["inf", "nan", "division by zero"],
+)
+@pytest.mark.parametrize("align", ["none", "scale"])
+def test_an_infinite_sky_is_unknown_and_its_points_have_no_part(
+    network: Network, sky: Callable[[Tensor, Tensor], Tensor], align: str
+) -> None:
+    frame, settings = frame_of(1, height=48, width=64), replace(SETTINGS, align=align)
+    below = frame.points.select(frame.points.xy[:, 1] >= 15)
+    lost = len(frame.points) - len(below)
+    right = refined(network, settings, frame.with_points(below))
+    infinite = replace(network, module=_Sky(network.module, sky))
+    result = refined(infinite, settings, frame, "net.middle")
+    assert not result.after[:15].any()
+    np.testing.assert_allclose(result.after[15:], right.after[15:], rtol=1e-5)
+    np.testing.assert_allclose(result.losses, right.losses, rtol=1e-4)
+    assert f"{lost} of {len(frame.points)} sparse points" in result.notes[0]
 
 
 def test_a_divergence_comes_with_its_last_good_depth(network: Network) -> None:

@@ -86,8 +86,8 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
 
     Returns:
         input, output: rows and columns. range: least and greatest value of the prediction as the
-        network returns it. layers: by name "ok", or why the network cannot be cut there. notes:
-        what was assumed, fitted or verified.
+        network returns it, where it is finite. layers: by name "ok", or why the network cannot be
+        cut there. notes: what was assumed, fitted or verified.
 
     Raises:
         ModelError: The network cannot be run or verified.
@@ -105,6 +105,7 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         notes = [*network.notes, *network.verified(arguments)]
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
+        known = raw[raw.isfinite()]
         layers = {name: _check_layer(network, name, arguments, raw) for name in definition.layers}
     return {
         "name": definition.name,
@@ -112,7 +113,7 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         "output": list(raw.shape[-2:]),
         "output_kind": definition.output_kind,
         "output_scale": definition.output_scale,
-        "range": [float(raw.min()), float(raw.max())],
+        "range": [float(known.min()), float(known.max())] if len(known) else [],
         "parameters": sum(p.numel() for p in network.module.parameters()),
         "layers": layers,
         "notes": notes,
@@ -143,8 +144,8 @@ def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], who
             with torch.no_grad():
                 z = split.front(*arguments)
             z.requires_grad_(True)
-            raw = network.raw_of(split.rear(z))
-            if not torch.equal(raw.detach(), whole):
+            raw = network.raw_of(split.rear(z)).nan_to_num()
+            if not torch.equal(raw.detach(), whole.nan_to_num()):
                 return "the cut network gives something else than the whole one"
             gradient = gradient_at(z, raw.sum())
     except ModelError as error:

@@ -255,6 +255,11 @@ def _deviation(actual: Tensor, expected: Tensor) -> float:
         return math.inf
     if not expected.numel():
         return 0.0
-    largest = float(expected.abs().max())
-    difference = float((actual.float() - expected).abs().max())
+    known = expected.isfinite()
+    both = known & actual.isfinite()  # a network may be inf or NaN in the sky
+    if int((known != actual.isfinite()).sum()) > MISMATCH * expected.numel():
+        return math.inf
+    actual, expected = actual[both].float(), expected[both]
+    largest = float(expected.abs().amax()) if len(expected) else 0.0
+    difference = float((actual - expected).abs().amax()) if len(expected) else math.inf
     return difference / largest if largest else difference
