@@ -178,7 +178,7 @@ LAYOUTS = Table(
     names=(
         *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
         *("tum", "7scenes", "eth3d", "colmap", "void", "diode", "ibims", "scannet"),
-        *("arkitscenes", "pairs", "image-depth", "nyu-h5"),
+        *("arkitscenes", "stray-scanner", "record3d", "pairs", "image-depth", "nyu-h5"),
     ),
 )
 """Data set layouts, in the order in which they are guessed (`dataset.layouts.Layout`)."""

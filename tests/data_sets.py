@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from pnpdepth_cli.dataset.arrays import depth_of
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
 from tests.colmap_models import write_text_model
 from tests.empty_files import touch, tree
 
@@ -115,6 +116,49 @@ def arkitscenes(root: Path) -> None:
     codes(video / "highres_depth/41069021_305.244.png", 2000)
 
 
+def stray_scanner(root: Path, frames: int = 3) -> None:
+    """A video of frames that get brighter, and depth of 2 m of which a quarter is of confidence 0.
+
+    The camera moves 0.1 m to the right from frame to frame.
+    """
+    for number in range(frames):
+        codes(root / f"depth/{number:06}.png", 2000, HEIGHT // 2, WIDTH // 2)
+        confidence = np.full((HEIGHT // 2, WIDTH // 2), 2, np.uint8)
+        confidence[:, : WIDTH // 8] = 0
+        (root / "confidence").mkdir(exist_ok=True)
+        cv2.imwrite(str(root / f"confidence/{number:06}.png"), confidence)
+    video(root / "rgb.mp4", [20 + 15 * number for number in range(frames)])
+    (root / "camera_matrix.csv").write_text(f"30.0, 0.0, {WIDTH / 2}\n0.0, 30.0, 12.0\n0, 0, 1")
+    rows = [f"{n / 60}, {n:06}, {n / 10}, 0, 0, 0, 0, 0, 1\n" for n in range(frames)]
+    header = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
+    (root / "odometry.csv").write_text(header + "".join(rows))
+
+
+def video(path: Path, levels: list[int]) -> None:
+    """A grey video with a frame of each level."""
+    size = (WIDTH, HEIGHT)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30, size)
+    for level in levels:
+        writer.write(np.full((HEIGHT, WIDTH, 3), level, np.uint8))
+    writer.release()
+
+
+def record3d(root: Path, frames: int = 3) -> None:
+    """Depth of 2 m, and the same motion in ARKit's axes."""
+    for number in range(frames):
+        image(root / f"rgb/{number}.jpg")
+        (root / "depth").mkdir(exist_ok=True)
+        write_depth(root / f"depth/{number}.exr", np.full((HEIGHT // 2, WIDTH // 2), 2, np.float32))
+    half_turn_about_x = [1, 0, 0, 0]  # from ARKit's axes, y up, to those of the world here
+    metadata = {
+        "K": [30, 0, 0, 0, 30, 0, WIDTH / 2, 12, 1],
+        "w": WIDTH,
+        "h": HEIGHT,
+        "poses": [[*half_turn_about_x, n / 10, 0, 0] for n in range(frames)],
+    }
+    (root / "metadata.json").write_text(json.dumps(metadata))
+
+
 def tum(root: Path) -> None:
     root.mkdir(exist_ok=True)
     (root / "rgb.txt").write_text(
@@ -189,6 +233,8 @@ MAKERS: dict[str, tuple[Maker, list[str]]] = {
         for name, (files, names) in TREES.items()
     },
     **BENCHMARKS,
+    "stray-scanner": (stray_scanner, ["000000", "000001", "000002"]),
+    "record3d": (record3d, ["0", "1", "2"]),
     "tum": (tum, ["1.000", "1.033"]),
     "colmap": (colmap, ["b", "left/a"]),
     "nyu-h5": (nyu_h5, ["official_00001", "official_00009"]),

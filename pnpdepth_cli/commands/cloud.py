@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
+from pnpdepth_cli.dataset.arrays import read_image
 from pnpdepth_cli.dataset.frame_camera import (
     Pose,
     camera_of_exif,
@@ -216,8 +217,8 @@ def _colours(
 ) -> NDArray[np.float32]:
     image = request.image or frame.image
     assert image is not None
-    rgb = read_rgb(image).values
-    if rgb.shape[:2] != depth.shape:  # of a photo that COLMAP read as it is stored
+    rgb = read_image(image)
+    if rgb.shape[:2] != depth.shape and isinstance(image, Path):  # COLMAP reads it as stored
         rgb = read_rgb(image, upright=False).values
     if rgb.shape[:2] != depth.shape:
         raise SizeError(
@@ -248,7 +249,7 @@ def _camera(
             )
         return of_record, [f"camera: {of_record.source} (from the record)"]
     image = request.image or frame.image
-    of_exif = None if image is None else camera_of_exif(image, size)
+    of_exif = camera_of_exif(image, size) if isinstance(image, Path) else None
     if of_exif is None:
         raise UsageError(
             f"a cloud needs the camera, and neither a record nor EXIF gives that of {frame.depth};"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_camera import Pose, camera_from_json
-from pnpdepth_cli.dataset.frame_files import find_files
+from pnpdepth_cli.dataset.frame_files import ImageSource, file_of, find_files, source_of
 from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
 from pnpdepth_cli.io.depth import read_depth
@@ -38,11 +38,11 @@ class ResultFrame:
     """The record beside the depth; empty if there is none."""
 
     @property
-    def image(self) -> Path | None:
+    def image(self) -> ImageSource | None:
         """The image that the record names, if it exists."""
-        entry = _entry(_entry(self.record, "inputs"), "image")
-        path = entry.get("path")
-        return Path(path) if isinstance(path, str) and Path(path).is_file() else None
+        text = _entry(_entry(self.record, "inputs"), "image").get("path")
+        image = source_of(text) if isinstance(text, str) else None
+        return image if image is not None and file_of(image).is_file() else None
 
     @property
     def unit(self) -> str:

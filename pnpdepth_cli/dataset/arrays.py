@@ -11,19 +11,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, Hdf5Array, RawDepth, Source
+from pnpdepth_cli.dataset.frame_files import (
+    IMAGE_SUFFIXES,
+    Hdf5Array,
+    ImageSource,
+    RawDepth,
+    VideoFrame,
+)
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
 from pnpdepth_cli.io.rgb import read_rgb, sizes_of
+from pnpdepth_cli.io.video import read_video_frame
 
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
 
 
-def read_image(source: Source) -> NDArray[np.float32]:
+def read_image(source: ImageSource) -> NDArray[np.float32]:
     """Returns (H, W, 3) float32 in 0..1. Raises InputError for a file or array that is no image."""
-    return rgb_of(source) if isinstance(source, Hdf5Array) else read_rgb(source).values
+    if isinstance(source, Path):
+        return read_rgb(source).values
+    if isinstance(source, VideoFrame):
+        return read_video_frame(source.path, source.index)
+    return _rgb_of(source)
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
@@ -107,8 +118,8 @@ def shape_of(path: Path, name: str) -> tuple[int, ...]:
         return tuple(array.shape)
 
 
-def rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
-    """Returns (H, W, 3) float32 in 0..1 of an array of bytes. Raises InputError for another."""
+def _rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
+    """(H, W, 3) float32 in 0..1 of an array of bytes. Raises InputError for another."""
     pixels = _read(source)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise FileFormatError(f"{source} is {pixels.dtype} of shape {pixels.shape}, not an image")

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".exr")
 SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
+VIDEO_SUFFIXES = (".mp4", ".mov")
 
 _LONGEST_PART = 255 - len("_improvement.png")
 """Bytes of a part of a name, so that the longest file name of a result has 255."""
@@ -50,10 +51,31 @@ class RawDepth:
         return str(self.path)
 
 
+@dataclass(frozen=True, kw_only=True)
+class VideoFrame:
+    """A frame of a video."""
+
+    path: Path
+    index: int
+    """From 0."""
+
+    def __str__(self) -> str:
+        return f"{self.path}[{self.index}]"
+
+
 Source = Path | Hdf5Array
+ImageSource = Source | VideoFrame
 
 
-def file_of(source: Source | RawDepth) -> Path:
+def source_of(text: str) -> Path | VideoFrame:
+    """Returns the image that a record names: a file, or a frame of a video."""
+    found = re.fullmatch(r"(.*)\[(\d{1,9})\]", text, re.DOTALL)
+    if found is None or not found[1].lower().endswith(VIDEO_SUFFIXES):
+        return Path(text)
+    return VideoFrame(path=Path(found[1]), index=int(found[2]))
+
+
+def file_of(source: ImageSource | RawDepth) -> Path:
     """Returns the file that a source lies in."""
     return source if isinstance(source, Path) else source.path
 
@@ -83,7 +105,7 @@ class FrameFiles:
 
     name: str = ""
     """Unique in its data set, and fit for a file name; slashes separate folders."""
-    image: Source | None = None
+    image: ImageSource | None = None
     sparse: Path | None = None
     """A depth file, a list of points, a scan, or the folder of a COLMAP model. None where points
     are sampled from `gt`."""
@@ -114,7 +136,7 @@ class FrameFiles:
 
     @property
     def image_file(self) -> Path | None:
-        """The file of the image; None for none, or for an array of a data set."""
+        """The file of the image; None for none, or for one in a data set's file."""
         return self.image if isinstance(self.image, Path) else None
 
 

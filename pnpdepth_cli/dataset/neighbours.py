@@ -10,7 +10,7 @@ import numpy as np
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.arrays import read_image
-from pnpdepth_cli.dataset.frame_files import FrameFiles, Source, file_of
+from pnpdepth_cli.dataset.frame_files import FrameFiles, ImageSource, file_of
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints
@@ -103,7 +103,7 @@ def _estimated(
 
 
 @functools.lru_cache(maxsize=_IN_MEMORY)
-def _keypoints(image: Source, part: FramePart, digest: str) -> Keypoints:
+def _keypoints(image: ImageSource, part: FramePart, digest: str) -> Keypoints:
     """The keypoints of an image whose file has this digest."""
     return keypoints_of(np.ascontiguousarray(part.apply(read_image(image))))
 

@@ -16,15 +16,15 @@ from pnpdepth_cli.dataset.arrays import (
     masked,
     moved_note,
     moved_to,
+    read_image,
     read_levels,
-    rgb_of,
 )
 from pnpdepth_cli.dataset.colmap_points import read_colmap_points
 from pnpdepth_cli.dataset.frame_camera import camera_of_frame
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
-    Hdf5Array,
+    ImageSource,
     RawDepth,
     Source,
     file_of,
@@ -159,7 +159,7 @@ def read_frame(
         notes=tuple(notes),
         unit=sparse.unit,
         camera=camera,
-        pose=sparse.pose,
+        pose=np.array(files.pose) if sparse.pose is None and files.pose else sparse.pose,
     )
 
 
@@ -209,10 +209,10 @@ def _points_of(
     return _sampled(files, options, rgb, gt, None, seed).points
 
 
-def _read_image(files: FrameFiles, source: Source) -> tuple[ImageArray, str | None]:
+def _read_image(files: FrameFiles, source: ImageSource) -> tuple[ImageArray, str | None]:
     """The image (H, W, 3), and what a person should know of it."""
-    if isinstance(source, Hdf5Array):
-        return rgb_of(source), None
+    if not isinstance(source, Path):
+        return read_image(source), None
     image = read_rgb(source, upright=files.sparse is None or not files.sparse.is_dir())
     return image.values, image.note
 
@@ -247,7 +247,7 @@ def _read_ground_truth(
     return replace(truth, values=values), record, [f"gt: {described}", *notes]
 
 
-def _file_record(source: Source | RawDepth) -> dict[str, Any]:
+def _file_record(source: ImageSource | RawDepth) -> dict[str, Any]:
     return {"path": str(source), "sha256": fingerprint(file_of(source)).sha256}
 
 

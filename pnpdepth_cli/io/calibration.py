@@ -10,7 +10,8 @@ separate, and a value may continue over several lines:
     lens: radial-tangential                    # or fisheye: OpenCV's k1 k2 k3 k4
     size: [1242, 375]                          # optional: width and height
 
-Bare numbers are K alone: 9, 16 of a 4×4 matrix (ScanNet), or fx fy cx cy [width height]. YAML is
+Bare numbers are K alone: 9, 16 of a 4×4 matrix (ScanNet), or fx fy cx cy [width height]. Record3D's
+metadata.json has K by columns. YAML is
 OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain, with the intrinsics of the raw image; a
 matrix T_camera_lidar there is the pose of the scanner. A folder is KITTI's raw data or KITTI-360.
 """
@@ -111,6 +112,10 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         except (ValueError, RecursionError) as error:
             reason = one_line(error)
             raise FileFormatError(f"{path} is not valid JSON ({reason}); correct it") from error
+        if {"K", "w", "h", "poses"} <= set(fields):  # Record3D's, with K by columns
+            by_rows = _matrix(path, fields, "K", (3, 3)).T.ravel().tolist()
+            fields = {"K": by_rows, "width": fields["w"], "height": fields["h"]}
+            return _single(path, fields, camera, "Record3D's metadata")
     elif re.search(r"\b[A-Za-z_]\w*\s*:", text):
         fields = _fields(path, text)
     else:
@@ -354,7 +359,8 @@ def _size(path: Path, fields: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def _text(path: Path) -> str:
-    check_text_size(path)
+    if path.suffix.lower() != ".json":  # Record3D's has the poses of all frames
+        check_text_size(path)
     data = read_bytes(path)
     if kind_of(data) is None and b"\0" not in data:
         try:

@@ -31,6 +31,8 @@ from pnpdepth_cli.io.formats import (
 
 _FARTHEST_INDOORS_M = 40.0
 """Below it, a map read by KITTI's scale may be a room in millimetres: 40 m are 10.2 m then."""
+_OTHER_SIZE_SCALE = 1000.0
+"""Codes per metre of a map of another size than its image: of phones, ARKitScenes and ScanNet."""
 # Quotients of codes per metre in use, which a wrong one gives, within a tenth.
 _SCALE_QUOTIENTS = (1000.0, 256.0, 100.0, 10.0, 1000.0 / 256.0, 5.0, 5000.0 / 256.0, 5000.0)
 _QUOTIENT_TOLERANCE = math.log(1.1)
@@ -69,10 +71,13 @@ def load_stored(path: Path) -> DepthFile:
     )
 
 
-def depth_from_stored(path: Path, stored: DepthFile, scale: float | None) -> DepthFile:
+def depth_from_stored(
+    path: Path, stored: DepthFile, scale: float | None, size: tuple[int, int] | None = None
+) -> DepthFile:
     """Returns the stored numbers as one channel of float32 metres, 0 where unknown.
 
-    Without a scale, integers have the file's own, or KITTI's.
+    Without a scale, integers have the file's own, else KITTI's, or millimetres if they are
+    not of the size (H, W) of their image.
 
     Raises:
         FileFormatError: The numbers are no image of one channel, or exceed the budget.
@@ -82,7 +87,8 @@ def depth_from_stored(path: Path, stored: DepthFile, scale: float | None) -> Dep
     if values.dtype.kind == "f":
         return DepthFile(values=known_metres(values), reading=Reading(stored.reading.source))
     own = stored.reading.scale
-    divisor = scale or own or KITTI_SCALE
+    assumed = KITTI_SCALE if size in (None, values.shape) else _OTHER_SIZE_SCALE
+    divisor = scale or own or assumed
     source = f"{stored.reading.source} ÷ {divisor:.12g}"
     if scale is None and own is not None:
         source += " (from the file)"

@@ -51,7 +51,8 @@ def read_sparse(
     NPZ, or text with one `x y depth` per line (.csv, .txt), in metres; its order is kept.
 
     Args:
-        size: (H, W) of the frame that a list belongs to; an image has its own.
+        size: (H, W) of the frame that a list belongs to. An image has its own; where they differ,
+            integers are millimetres unless a scale is known.
         scale: Codes per metre of an integer image.
 
     Raises:
@@ -71,7 +72,7 @@ def read_sparse(
         and (shape[1] == 3 or (3 < shape[1] <= _MOST_COLUMNS and shape[0] > _MANY_ROWS))
     ):
         return _from_rows(path, stored.values, f"point list, {stored.reading.source}", size)
-    image = depth_from_stored(path, stored, scale)
+    image = depth_from_stored(path, stored, scale, size)
     rows, columns = np.nonzero(image.valid)
     if rows.size == 0:
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")

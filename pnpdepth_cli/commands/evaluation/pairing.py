@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.frame_files import (
     FrameFiles,
+    ImageSource,
     RawDepth,
-    Source,
     find_files,
     groups_by_name,
 )
@@ -57,13 +57,17 @@ class FramePair:
     drawn: DrawnPoints | None = None
     """How the network's sparse input was drawn from the ground truth, by the run's record."""
     unit: str = METRES
-    image: Source | None = None
+    image: ImageSource | None = None
 
     @property
-    def paths(self) -> dict[str, Source | RawDepth | None]:
+    def paths(self) -> dict[str, ImageSource | RawDepth | None]:
         """The files of the frame."""
-        files = {"prediction": self.prediction, "truth": self.frame.gt}
-        return files | {"sparse": self.sparse, "image": self.image}
+        return {
+            "prediction": self.prediction,
+            "truth": self.frame.gt,
+            "sparse": self.sparse,
+            "image": self.image,
+        }
 
 
 def pair_frames(

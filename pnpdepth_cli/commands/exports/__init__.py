@@ -133,7 +133,7 @@ def export_results(
 
 def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     record, image, (camera, pose) = result.record, result.image, result.camera_and_pose
-    if camera is None or image is None:
+    if camera is None or not isinstance(image, Path):
         lacks = "its image; run this in the folder where it was refined, or refine it again"
         if camera is None:
             lacks = "a record with its camera; refine it with a COLMAP model or --calib"

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
-from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest, nyu, rows
+from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest, nyu, phones, rows
 from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import InputError
 
@@ -31,6 +31,8 @@ TABLE: dict[str, Layout] = {
     "kitti-raw": kitti.RAW,
     "tum": indexed.TUM,
     "colmap": indexed.COLMAP,
+    "stray-scanner": phones.STRAY_SCANNER,
+    "record3d": phones.RECORD3D,
 }
 """The layouts of this package, which `choices.LAYOUTS` lists in the order of guessing."""
 
@@ -58,6 +60,11 @@ def find_layout(root: Path, name: str | None = None) -> str:
     found = _match(root, name)
     if found is not None:
         return found
+    if root.suffix.lower() == ".r3d":
+        raise InputError(
+            f"{root}: the depth in it is compressed with LZFSE, which is not read; export 'EXR +"
+            " RGB' in Record3D, and give the folder EXR_RGBD"
+        )
     if name is not None:
         needed = ", ".join(LAYOUTS[name].needs)
         raise InputError(

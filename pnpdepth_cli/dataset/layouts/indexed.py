@@ -5,9 +5,9 @@ associations.txt (of TUM's associate.py, or of ICL-NUIM) pairs them itself: a ti
 per line. Poses are those of groundtruth.txt beside them, at the times of the images.
 
 `colmap`: a COLMAP project, images/ and sparse/0/, or sparse/, or a model beside images/, as that of
-ETH3D's undistorted images in dslr_calibration_undistorted/. The images of dense/, which COLMAP
-undistorts, are a project of their own: dense/images/ and dense/sparse/. Of several models, sparse/0
-to sparse/N, the one with the most images is used.
+ETH3D's undistorted images in dslr_calibration_undistorted/, or Nerfstudio's colmap/sparse/0/. The
+images of dense/, which COLMAP undistorts, are a project of their own: dense/images/ and
+dense/sparse/. Of several models, sparse/0 to sparse/N, the one with the most images is used.
 """
 
 from __future__ import annotations
@@ -125,10 +125,10 @@ TUM = Layout(matches=_is_tum, frames=_of_tum, needs=("rgb.txt", "depth.txt"))
 
 def _colmap_models(root: Path) -> list[Path]:
     """The folders of models, sparse/0 first; none without images."""
-    sparse = root / "sparse"
-    inside = [p for p in sparse.iterdir() if p.name.isdigit()] if sparse.is_dir() else []
+    parents = [path for path in (root / "sparse", root / "colmap/sparse") if path.is_dir()]
+    inside = [p for sparse in parents for p in sparse.iterdir() if p.name.isdigit()]
     numbered = sorted(inside, key=lambda p: int(p.name))
-    folders = (*numbered, sparse, root, root / _OF_ETH3D)
+    folders = (*numbered, *parents, root, root / _OF_ETH3D)
     found = [folder for folder in folders if model_files(folder)]
     return found if (root / "images").is_dir() else []
 

@@ -11,8 +11,10 @@ from typing import Any
 from pnpdepth_cli.dataset.frame_files import (
     IMAGE_SUFFIXES,
     SCAN_ONLY_SUFFIXES,
+    VIDEO_SUFFIXES,
     FrameFiles,
     Unmatched,
+    VideoFrame,
     find_files,
     natural_order,
     one_of_each,
@@ -60,6 +62,16 @@ class _FilePart:
         paths = [place / name for name in self.folders]
         return next((path for path in paths if path.is_dir()), paths[0])
 
+    def video(self, place: Path) -> Path | None:
+        """Returns the video that lies there instead of the folder of images."""
+        paths = [place / f"{name}{suffix}" for name in self.folders for suffix in VIDEO_SUFFIXES]
+        is_video = self._suffix == "IMAGE" and not self.path(place).is_dir()
+        return next((path for path in paths if path.is_file()), None) if is_video else None
+
+    def is_in(self, place: Path) -> bool:
+        """Returns whether the place has the folder, or the video."""
+        return self.path(place).is_dir() or self.video(place) is not None
+
     def files(self, place: Path) -> tuple[dict[str, Path], list[Unmatched]]:
         """Returns the files by stem, sorted by number, and what belongs to no frame."""
         folder, suffixes = self.path(place), _SUFFIXES.get(self._suffix, (f".{self._suffix}",))
@@ -97,7 +109,9 @@ def row(
         parts: By field of `FrameFiles`, or "mask…" for its masks, "folder|other folder/*.png": the
             names of its files in the first of these folders that exists in a place. `*`, or groups
             of a regular expression, make the stem; `**` are paths in the folder and all folders in
-            it. A part that ends with ? may be missing; every frame has the first.
+            it. Instead of images, a video of the folder's name may lie there (rgb.mp4), whose
+            frame, from 0, is the number at the end of a stem. A part that ends with ? may be
+            missing; every frame has the first.
         name: From root, place and stem to the name of a frame.
         below: Patterns of where the places are, below the root, with | between them.
         marks: Patterns of what else a place has. By the first, or the last part's folder, a place
@@ -119,7 +133,7 @@ def row(
         return sorted(
             place
             for place in found
-            if all(kind.path(place).is_dir() for kind in wanted)
+            if all(kind.is_in(place) for kind in wanted)
             and all(next(place.glob(mark), None) for mark in marks)
         )
 
@@ -129,16 +143,25 @@ def row(
         for place in find_places(root):
             fields_of = more(place)
             shared = {"calib": place / calib} if calib and (place / calib).is_file() else {}
-            for found in _joined(place, kinds, gaps):
+            videos = {field: path for field, kind in kinds.items() if (path := kind.video(place))}
+            others = {field: kind for field, kind in kinds.items() if field not in videos}
+            for found in _joined(place, others, gaps):
                 if isinstance(found, Unmatched):
                     yield found
                     continue
                 stem, files = found
+                number = re.search(r"\d+$", stem)
+                if videos and number is None:
+                    why = f"has no number of a frame of {next(iter(videos.values()))} in its name"
+                    yield Unmatched(path=next(iter(files.values())), why=why)
+                    continue
                 extra = fields_of(files)
                 if isinstance(extra, Unmatched):
                     yield extra
                 elif extra is not None:
                     values = {**shared, **files, **fields, **extra}
+                    for field, path in videos.items():
+                        values[field] = VideoFrame(path=path, index=int(number[0] if number else 0))
                     masks = tuple(values.pop(key) for key in files if key.startswith("mask"))
                     yield FrameFiles(name=name(root, place, stem), masks=masks, **values)
 
