@@ -17,6 +17,7 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
+from pnpdepth_cli.io.fingerprint import file_and_part
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.precision import dtype_of, lower
@@ -256,7 +257,7 @@ def load_network(
         definition=definition,
         module=module,
         device=torch_device,
-        checkpoint=path,
+        checkpoint=None if path is None else file_and_part(path)[0],
         precision=precision,
         notes=tuple(notes),
     )

@@ -25,7 +25,7 @@ from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.file_bytes import cannot_read
-from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
+from pnpdepth_cli.io.fingerprint import Fingerprint, file_and_part, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.record import parse_json, plain, sha256_of, write_json
 from pnpdepth_cli.settings import Settings
@@ -190,14 +190,13 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
 def model_identity(request: RefineRequest) -> dict[str, Any]:
     """Returns the program's version and the digests of the network's files and of code.
 
-    A file's name with its :ATTRIBUTE or :OUTPUT counts; its folder does not.
+    A file's name with its :ATTRIBUTE, :OUTPUT or :KEY counts; its folder does not.
     """
     network = request.network
-    identity = {
-        "version": __version__,
-        **_identity(network.model),
-        "checkpoint": None if network.checkpoint is None else sha256_of(network.checkpoint),
-    }
+    identity = {"version": __version__, **_identity(network.model), "checkpoint": None}
+    if network.checkpoint is not None:
+        file, key = file_and_part(network.checkpoint)
+        identity |= {"checkpoint": sha256_of(file)} | ({"state_dict": key} if key else {})
     more, code = [_identity(spec) for spec in network.more_models], code_digests(request.method)
     identity |= {"more_models": more} if more else {}
     return identity | ({"code": code} if code else {})
@@ -211,13 +210,10 @@ def code_digests(method: Settings) -> dict[str, str]:
 
 
 def _identity(spec: str) -> dict[str, Any]:
-    path, colon, choice = Path(spec), "", ""
-    if not path.exists() and ":" in spec:
-        start, colon, choice = spec.rpartition(":")
-        path = Path(start)
+    path, part = file_and_part(Path(spec))
     files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
     return {
-        "model": f"{path.name}{colon}{choice}" if files else spec,
+        "model": f"{path.name}:{part}".rstrip(":") if files else spec,
         "model_files": {p.name: sha256_of(p) for p in files},
     }
 

@@ -38,8 +38,8 @@ class NetworkChoice:
     """Further networks, with their own weights, which are fused with the first."""
     checkpoint: Path | None = option(
         None,
-        "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder. No code in"
-        " it is run.",
+        "Weights: a safetensors, torch, numpy or TensorFlow (.index) file, or a folder; FILE:KEY"
+        " chooses one of several state dictionaries. No code in it is run.",
     )
     normalise: str | None = option(
         None,

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.io.fingerprint import file_and_part
 from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
@@ -56,7 +57,7 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
         path: A torch, safetensors or numpy file, the PREFIX.index of a TensorFlow checkpoint, or a
             folder with several of these, such as encoder.pth and decoder.pth; then each name is
             preceded by the name of its file up to the first dot. In a torch file the tensors may
-            lie in an entry such as "state_dict" beside an epoch or an optimiser.
+            lie in an entry such as "state_dict" beside an epoch or an optimiser; FILE:KEY names it.
 
     Raises:
         CheckpointError: The file is missing or broken, or holds no named tensors.
@@ -202,6 +203,7 @@ def _short(word: str) -> str:
 
 def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     """The named tensors of a file or folder, and notes about it."""
+    path, key = file_and_part(path)
     if path.is_dir():
         return _read_folder(path)
     if not path.is_file():
@@ -224,6 +226,8 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
         reason = " ".join(f"{fact}{error}"[:1000].split())[:160]  # parts may come out of the file
         raise CheckpointError(f"checkpoint {path} cannot be read as a {kind} ({reason})") from None
     if isinstance(content, dict):
+        if key:
+            raise CheckpointError(f"checkpoint {path} is a {kind}, which has no {key!r} to choose")
         return content, []
     content, names = content
     notes = []
@@ -234,7 +238,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     if isinstance(arguments, Mapping) and isinstance(data := arguments.get("data"), str):
         # Weights for other data may fit all the same.
         notes.append(f"checkpoint {path.name}: trained with data {_short(data)}")
-    state, several = _state_in(content, path)
+    state, several = _state_in(content, path, key)
     return state, [*notes, *several]
 
 
@@ -258,14 +262,18 @@ def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:
     return state, notes
 
 
-def _state_in(content: Any, path: Path) -> tuple[dict[str, Tensor], list[str]]:
-    """The state dict in what a torch file holds, and a note where there are several."""
-    if is_module(content):
+def _state_in(content: Any, path: Path, key: str) -> tuple[dict[str, Tensor], list[str]]:
+    """The state dict in what a torch file holds, and a note where there are several.
+
+    Args:
+        key: Of the one to read. Empty: a usual one.
+    """
+    if not key and is_module(content):
         return module_state(content), []
     if not isinstance(content, Mapping):
         kind = _short(content.path) if isinstance(content, StandIn) else type(content).__name__
         raise CheckpointError(f"checkpoint {path} holds a {kind}, not named tensors")
-    if content and _only_tensors(content):
+    if not key and content and _only_tensors(content):
         return dict(content), []
     states = dict[str, dict[str, Tensor]]()
     for name, value in content.items():
@@ -273,16 +281,15 @@ def _state_in(content: Any, path: Path) -> tuple[dict[str, Tensor], list[str]]:
             states[str(name)] = module_state(value)
         elif isinstance(value, Mapping) and value and _only_tensors(value):
             states[str(name)] = dict(value)
-    key = next((key for key in _STATE_KEYS if key in states), None)
-    if key is not None:
-        others = [repr(_short(name)) for name in states if name != key]
-        note = (
-            f"checkpoint {path.name}: {key!r} is read, not {_some(others)}; to use another, save it"
-            " as a file of its own"
-        )
-        return states[key], [note] * bool(others)
-    names = _some([str(key) for key in content]) or "nothing"
-    raise CheckpointError(f"checkpoint {path} has no state dict of plain tensors; it holds {names}")
+    chosen = key or next((each for each in _STATE_KEYS if each in states), "")
+    if chosen in states:
+        others = _some([repr(name) for name in states if name != chosen])
+        note = f"checkpoint {path.name}: {chosen!r} is read, not {others}; {path.name}:KEY chooses"
+        return states[chosen], [note] * (len(states) > 1)
+    fact = f"no state dict {key!r}" if key else "no state dict of plain tensors"
+    held = _some([str(name) for name in content]) or "nothing"
+    way_out = f"; --checkpoint {path}:KEY reads that of {_some(list(states), ' or ')}"
+    raise CheckpointError(f"checkpoint {path} has {fact}; it holds {held}{way_out * bool(states)}")
 
 
 def _only_tensors(mapping: Mapping[Any, Any]) -> bool:

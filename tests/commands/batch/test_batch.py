@@ -12,6 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
 from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.commands.batch import running as batch_running
@@ -121,6 +123,10 @@ def test_other_settings_or_other_code_in_the_same_file_do_all_again(root: Path) 
     for number in "56":
         code.write_text(code.read_text().replace(f"2.{number} + 3", f"2.{int(number) + 1} + 3"))
         assert done(root, limit=2, refine=named) == ["a", "b"]
+    own = load_file(root / "net/my_net.safetensors")
+    torch.save({"model": own, "ema": own}, root / "w.pt")
+    for checkpoint in ("w.pt", "w.pt:ema"):
+        assert done(root, limit=2, refine={"checkpoint": root / checkpoint}) == ["a", "b"]
 
 
 def test_a_bad_frame_is_reported_counted_skipped_and_done_when_it_is_mended(root: Path) -> None:

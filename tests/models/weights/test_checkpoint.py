@@ -149,6 +149,18 @@ def test_of_several_state_dictionaries_the_one_that_is_read_is_named(
     state, (note,) = loaded(tmp_path / "w.pth")
     assert equal(state, weights())
     assert "'model' is read, not 'ema'" in note
+    state, (note,) = loaded(tmp_path / "w.pth:ema")
+    assert equal(state, averaged)
+    assert "'ema' is read, not 'model'" in note
+    with pytest.raises(CheckpointError, match="'teacher'"):
+        loaded(tmp_path / "w.pth:teacher")
+
+
+def test_a_state_dictionary_of_another_name_is_read_if_it_is_named(tmp_path: Path) -> None:
+    torch.save({"teacher": weights(), "epoch": 7}, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match="KEY reads that of teacher"):
+        loaded(tmp_path / "w.pth")
+    assert equal(loaded(tmp_path / "w.pth:teacher")[0], weights())
 
 
 def test_a_prefix_of_some_keys_or_of_the_network_itself_is_kept(tmp_path: Path) -> None:
