@@ -22,7 +22,15 @@ FOR_THE_PROGRAM = {
     "Settings": {"fixed_by", "with_preset", "given", "opened", "over", "complete"},
     "Split": {"static_graph", "in_half"},
     "Network": {
-        *("image_of", "arguments_of", "synthetic_arguments", "verified", "depth_of", "raw_of"),
+        *(
+            "image_of",
+            "arguments_of",
+            "synthetic_arguments",
+            "verified",
+            "depth_of",
+            "raw_of",
+            "intrinsics_of",
+        ),
     },
 }
 """Methods that take or give what is not public."""

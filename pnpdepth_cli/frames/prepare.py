@@ -28,10 +28,12 @@ class PreparedFrame:
     """The points that the network sees, in its frame and on its device, without outliers."""
     prior: Tensor | None = None
     """(1, 1, h, w) metres, 0 = unknown: the dense prior in the network's frame. None without."""
+    intrinsics: Tensor | None = None
+    """(1, 3, 3): the camera matrix in the network's frame, of a network that takes it."""
 
     def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
         """Returns the arguments of the network for some of the points; the image is the same."""
-        return self.network.arguments_of(self.image, points, self.prior)
+        return self.network.arguments_of(self.image, points, self.prior, self.intrinsics)
 
     def depth_reader(self, align: str) -> AlignedDepth:
         """Returns a new reader of the network's output in metres, (1, 1, h, w).
@@ -63,7 +65,7 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     """Returns the frame as the network takes it; `points` may be empty.
 
     Raises:
-        UsageError: The network needs an image and the frame has none.
+        UsageError: The network needs an image or intrinsics, and the frame has none.
         ModelError: The definition does not make arguments of it.
     """
     to_network = FrameMap.fit(network.definition.size, *frame.size)
@@ -75,12 +77,14 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     prior = None
     if frame.prior is not None and network.definition.takes_prior:
         prior = to_network.prior_to_network(frame.prior[None, None]).to(network.device)
+    intrinsics = network.intrinsics_of(to_network, frame.camera)
     return PreparedFrame(
         network=network,
         frame=frame,
         map=to_network,
         image=image,
-        arguments=network.arguments_of(image, given, prior),
+        arguments=network.arguments_of(image, given, prior, intrinsics),
         points=points.tensors(network.device),
         prior=prior,
+        intrinsics=intrinsics,
     )

@@ -27,12 +27,6 @@ def fingerprint(path: Path) -> Fingerprint:
     return Fingerprint(size=size, mtime_ns=mtime_ns, ctime_ns=ctime_ns, sha256=_digest(path, *now))
 
 
-def file_and_part(path: Path) -> tuple[Path, str]:
-    """Returns the file of FILE:PART, as networks are named, and the part; empty without one."""
-    name, _, part = path.name.rpartition(":")
-    return (path.with_name(name), part) if name and not path.exists() else (path, "")
-
-
 def is_unchanged(path: Path, known: Fingerprint) -> bool:
     """Returns whether the file is there with that content; it is read unless no time differs."""
     try:

@@ -29,7 +29,7 @@ sense raises ModelError as soon as the object is made.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Any
 from pnpdepth_cli import choices
 from pnpdepth_cli.choices import Fit, OutputKind, OutputScale
 from pnpdepth_cli.choices import InputKind as InputKind  # for definition files
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models import validity
 from pnpdepth_cli.settings import Settings as Settings  # for definition files
 
@@ -171,6 +172,9 @@ class ModelDefinition:
     takes_prior: bool = False
     """True if forward takes one more argument, which may be left out: a dense prior (1, 1, H, W) in
     metres with 0 = unknown, such as another network's depth aligned with the points."""
+    takes_intrinsics: bool = False
+    """True if forward takes one more argument, the camera matrix (1, 3, 3) in pixels of its image,
+    whole numbers at pixel centres."""
     weighs_points: bool = False
     """True if the network itself finds outliers among its points. It is then given those, too, that
     are left out elsewhere as outliers."""
@@ -179,10 +183,10 @@ class ModelDefinition:
     even where values of tensors reach Python code. Then the cut is learned only once."""
     read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
     """Renames or reshapes the tensors of a published checkpoint into the network's state dict."""
-    arguments: Callable[[Tensor | None, Tensor | None], tuple[Tensor, ...]] | None = None
+    arguments: Callable[..., tuple[Tensor, ...]] | None = None
     """Returns the positional arguments of forward, for rgb (1, 3, H, W), normalised, and sparse
-    depth (1, 1, H, W) in metres with 0 = unknown; each None if `input_kind` lacks it. By default
-    they are passed in the order of `input_kind`."""
+    depth (1, 1, H, W) in metres with 0 = unknown, each None if `input_kind` lacks it; and for the
+    intrinsics if it takes them. By default they are passed in this order."""
     output: Callable[[Any], Tensor] | None = None
     """Returns the prediction, (1, 1, h, w) or (1, h, w), from what forward returns. By default that
     is the tensor itself, or the only tensor in it."""
@@ -223,30 +227,82 @@ class ModelDefinition:
         metric = self.output_scale == "metric" and self.output_kind != "unknown"
         return self.defaults.align or ("none" if metric else "auto")
 
-    def call_arguments(self, rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...]:
+    def call_arguments(
+        self, rgb: Tensor | None, sparse: Tensor | None, intrinsics: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
         """Returns the positional arguments of the network's forward for one frame.
 
         Args:
             rgb: (1, 3, H, W), normalised, or None.
             sparse: (1, 1, H, W) in metres with 0 = unknown, or None.
+            intrinsics: (1, 3, 3), where the network takes them.
         """
         if self.arguments is not None:
-            return self.arguments(rgb, sparse)
+            return self.arguments(*(rgb, sparse, intrinsics)[: 2 + self.takes_intrinsics])
         by_name = {"rgb": rgb, "sparse": sparse}
-        inputs = (by_name[name] for name in self.input_kind.split("+"))
+        inputs = (*(by_name[name] for name in self.input_kind.split("+")), intrinsics)
         return tuple(tensor for tensor in inputs if tensor is not None)
 
 
-def undescribed(**known: Any) -> ModelDefinition:
-    """Returns a definition for a network of rgb that brings no description of its numbers.
+def file_and_part(path: Path) -> tuple[Path, str]:
+    """Returns the file of FILE:PART, as networks are named, and the part; empty without one."""
+    name, _, part = path.name.rpartition(":")
+    return (path.with_name(name), part) if name and not path.exists() else (path, "")
 
-    The points decide its normalisation and what its output means.
+
+def undescribed(**known: Any) -> ModelDefinition:
+    """Returns a definition for a network that brings no description of its numbers.
+
+    It is of rgb unless it is known to be of other inputs. The points decide its normalisation and
+    what its output means.
     """
-    return ModelDefinition(
-        input_kind="rgb",
-        normalisation=None,
-        output_kind="unknown",
-        output_scale="unknown",
-        defaults=UNTUNED_DEFAULTS,
-        **known,
-    )
+    unknown: dict[str, Any] = {
+        "input_kind": "rgb",
+        "normalisation": None,
+        "output_kind": "unknown",
+        "output_scale": "unknown",
+        "defaults": UNTUNED_DEFAULTS,
+    }
+    return ModelDefinition(**unknown | known)
+
+
+def graph_definition(
+    shapes: Sequence[Sequence[Any]], file: Path, stated: Mapping[str, Any], **known: Any
+) -> ModelDefinition:
+    """Returns the definition of a graph that was exported with its weights.
+
+    Args:
+        shapes: Of its inputs, in their order; no whole number where a side is of any length.
+        file: It is from.
+        stated: Fields that a definition file states of it.
+        **known: Fields that are read in the file; `size` if no side is fixed.
+
+    Raises:
+        ModelError: The inputs are others than those stated, without any one rgb image.
+    """
+    kind = stated.get("input_kind", "rgb")
+    wanted = [*kind.split("+"), *["intrinsics"] * bool(stated.get("takes_intrinsics"))]
+    # The image, or the sparse depth where there is none, has the sides; 1×3×H×W or 1×H×W×3.
+    channels = 3 if "rgb" in kind else 1
+    sides = [s[1:] for s in shapes if len(s) == 4 and (s[0] == 1 or not isinstance(s[0], int))]
+    image = next((side for side in sides if channels in (side[0], side[2])), None)
+    if image is None or len(shapes) != len(wanted):
+        listed = ", ".join("×".join(map(str, shape)) for shape in shapes)
+        raise ModelError(
+            f"{file} has {len(shapes)} input(s), {listed[:80]}, where {' and '.join(wanted)} is"
+            " expected, the image as 1×3×H×W or 1×H×W×3; `input_kind` of a definition says others"
+        )
+    last = [len(s) == 4 and s[3] in (1, 3) and s[1] not in (1, 3) for s in shapes]
+    height, width = image[1:] if image[0] == channels else image[:2]
+
+    def arguments(*given: Tensor | None) -> tuple[Tensor, ...]:
+        tensors = (tensor for tensor in given if tensor is not None)
+        return tuple(
+            tensor.permute(0, 2, 3, 1).contiguous() if is_last else tensor
+            for tensor, is_last in zip(tensors, last, strict=True)
+        )
+
+    if isinstance(height, int) and isinstance(width, int):
+        known["size"] = Fixed(height, width)
+    known |= {"name": file.stem, "complete": True, "checkpoint": file, "arguments": arguments}
+    return undescribed(**known | dict(stated))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.models.definition import Fixed, Multiple, Near
 from pnpdepth_cli.points import SparsePoints
 
@@ -79,6 +81,13 @@ class FrameMap:
         resized = points.cropped(*self.crop).resized(*self.resized)
         return SparsePoints(xy=resized.xy, depth=resized.depth, size=self.network)
 
+    def intrinsics_to_network(self, camera: Camera) -> Tensor:
+        """The camera of the image → its matrix (1, 3, 3) in the network's pixels."""
+        top, left, height, width = self.crop
+        moved = camera.intrinsics - np.array([[0, 0, left], [0, 0, top], [0, 0, 0]])
+        resized = Camera(intrinsics=moved, size=(height, width)).resized(*self.resized)
+        return torch.from_numpy(resized.intrinsics)[None].float()
+
     def depth_to_image(self, depth: Tensor) -> Tensor:
         """Depth (1, 1, h', w') over the network's frame → (H, W); 0 outside the crop."""
         if self.network != self.resized:
@@ -110,3 +119,11 @@ def synthetic_frame(size: tuple[int, int]) -> tuple[Tensor, SparsePoints]:
         size=size,
     )
     return rgb, points
+
+
+def synthetic_camera(size: tuple[int, int]) -> Camera:
+    """A camera whose focal length is the width of its images, (H, W)."""
+    height, width = size
+    center_x, center_y = (width - 1) / 2, (height - 1) / 2
+    matrix = np.array([[width, 0, center_x], [0, width, center_y], [0, 0, 1.0]])
+    return Camera(intrinsics=matrix, size=size)

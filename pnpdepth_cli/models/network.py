@@ -13,13 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.budget import budget, check_claim
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
-from pnpdepth_cli.io.fingerprint import file_and_part
-from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
-from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, file_and_part
+from pnpdepth_cli.models.frame_map import FrameMap, synthetic_camera, synthetic_frame
 from pnpdepth_cli.models.precision import dtype_of, lower
 from pnpdepth_cli.models.python_file import importing_beside
 from pnpdepth_cli.models.registry import find_definition
@@ -80,8 +80,30 @@ class Network:
         std = rgb.new_tensor(normalise.std).reshape(1, 3, 1, 1)
         return ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
 
+    def intrinsics_of(self, frame: FrameMap, camera: Camera | None) -> Tensor | None:
+        """Returns the camera matrix as the network takes it, (1, 3, 3); None if it takes none.
+
+        Args:
+            frame: Maps the image frame to the network's frame.
+            camera: In pixels of the image frame; None if it is unknown.
+
+        Raises:
+            UsageError: The network takes them and the camera is unknown.
+        """
+        if not self.definition.takes_intrinsics:
+            return None
+        if camera is None:
+            raise UsageError(
+                f"network {self.definition.name!r} takes the camera's intrinsics; give --calib"
+            )
+        return frame.intrinsics_to_network(camera).to(self.device)
+
     def arguments_of(
-        self, image: Tensor | None, points: SparsePoints, prior: Tensor | None = None
+        self,
+        image: Tensor | None,
+        points: SparsePoints,
+        prior: Tensor | None = None,
+        intrinsics: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """Returns the positional arguments of the network's forward.
 
@@ -89,6 +111,7 @@ class Network:
             image: From `image_of`.
             points: In the network's frame.
             prior: (1, 1, h, w) metres, 0 = unknown, for a network that takes one; None without.
+            intrinsics: (1, 3, 3) in the network's frame, for a network that takes them.
 
         Raises:
             ModelError: The definition's `arguments` raises or does not return a tuple.
@@ -96,7 +119,7 @@ class Network:
         takes_points = "sparse" in self.definition.input_kind
         sparse = points.scatter().to(self.device) if takes_points else None
         with wrap_user_errors(f"arguments of network {self.definition.name!r}"):
-            arguments = self.definition.call_arguments(image, sparse)
+            arguments = self.definition.call_arguments(image, sparse, intrinsics)
         if not isinstance(arguments, tuple):
             raise ModelError(
                 f"arguments of network {self.definition.name!r} gives a"
@@ -107,7 +130,11 @@ class Network:
     def synthetic_arguments(self, frame: FrameMap) -> tuple[Tensor, ...]:
         """Returns the arguments for a synthetic frame of this size."""
         rgb, points = synthetic_frame(frame.image)
-        return self.arguments_of(self.image_of(frame, rgb), frame.points_to_network(points))
+        return self.arguments_of(
+            self.image_of(frame, rgb),
+            frame.points_to_network(points),
+            intrinsics=self.intrinsics_of(frame, synthetic_camera(frame.image)),
+        )
 
     def verified(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
         """Returns the notes of the definition's `verify` on the network's arguments for a frame.

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, graph_definition
 from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
 from pnpdepth_cli.models.weights.torch_file import refuse_inflated
@@ -61,7 +61,7 @@ class ExportedOperation(nn.Module):
 
 
 class ExportedGraph(nn.Module):
-    """The graph of an exported program as a module of one image; every operation is a submodule.
+    """The graph of an exported program as a module; every operation is a submodule.
 
     Args:
         program: The content of models/model.json.
@@ -144,11 +144,12 @@ class ExportedGraph(nn.Module):
             yield Step(run=run, arguments=[Value(str(result))], outputs=str(name))
 
 
-def exported_definition(file: Path) -> ModelDefinition:
+def exported_definition(file: Path, **stated: Any) -> ModelDefinition:
     """Returns the definition of a network saved by torch.export.save.
 
     Args:
-        file: The .pt2 file; it takes one rgb image 1×3×H×W.
+        file: The .pt2 file; it takes one rgb image 1×3×H×W, unless another `input_kind` is stated.
+        **stated: Fields of `ModelDefinition` that a definition file states of it.
 
     Raises:
         ModelError: The file cannot be read, would do more than compute, or has other inputs.
@@ -160,27 +161,20 @@ def exported_definition(file: Path) -> ModelDefinition:
         program, tensors = _read(file)
         graph = ExportedGraph(program, tensors)
         values = program["graph_module"]["graph"]["tensor_values"]
-        shapes = [[dict(s).get("as_int") for s in values[name]["sizes"]] for name in graph.inputs]
+        sizes = [values[name]["sizes"] for name in graph.inputs]
+        shapes = [[dict(side).get("as_int", "?") for side in size] for size in sizes]
     except CONTENT_ERRORS as error:
         reason = str(error) if isinstance(error, BrokenFileError) else describe(error)
         raise ModelError(
             f"exported program {file} cannot be read: {reason[:160]}; it must be written by"
             f" torch.export.save of about this version of torch ({torch.__version__})"
         ) from None
-    if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
-        raise ModelError(
-            f"exported program {file} takes inputs {str(shapes)[:80]}; one rgb image 1×3×H×W is"
-            " expected"
-        )
-    height, width = shapes[0][2:]
-    return undescribed(
-        name=file.stem,
+    return graph_definition(
+        shapes, file, stated,
         summary="torch.export archive",
-        size=Fixed(height, width) if height and width else Multiple(_ASSUMED_MULTIPLE),
+        size=Multiple(_ASSUMED_MULTIPLE),
         build=lambda: ExportedGraph(program, tensors),
-        complete=True,
-        checkpoint=file,
-    )
+    )  # fmt: skip
 
 
 def _read(file: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:

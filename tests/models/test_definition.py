@@ -13,7 +13,14 @@ import torch
 from torch import nn
 
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near, Normalisation
+from pnpdepth_cli.models.definition import (
+    Fixed,
+    ModelDefinition,
+    Multiple,
+    Near,
+    Normalisation,
+    graph_definition,
+)
 from pnpdepth_cli.settings import Settings
 
 
@@ -37,6 +44,30 @@ def test_arguments_come_in_the_order_of_the_input_kind() -> None:
     assert definition(input_kind="rgb+sparse").call_arguments(rgb, sparse) == (rgb, sparse)
     swapped = definition(arguments=lambda rgb, sparse: (sparse, rgb))
     assert swapped.call_arguments(rgb, sparse) == (sparse, rgb)
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        ((1, 32, 48, 3), Fixed(32, 48)),
+        ((1, 3, 48, 3), Fixed(48, 3)),
+        (("n", 3, "h", "w"), Multiple(8)),
+        ((3, 3, 3, 3), None),
+        ((1, 2, 4, 2), None),
+    ],
+)
+def test_an_image_of_a_graph_has_three_channels_first_or_last(
+    shape: tuple[Any, ...], size: Fixed | Multiple | None
+) -> None:
+    known = {"size": Multiple(8), "build": nn.Identity}
+    if size is None:
+        with pytest.raises(ModelError, match=r"net\.onnx has 1 input"):
+            graph_definition([shape], Path("net.onnx"), {}, **known)
+        return
+    found = graph_definition([shape], Path("net.onnx"), {}, **known)
+    assert found.size == size
+    (argument,) = found.call_arguments(torch.zeros(1, 3, 32, 48), None)
+    assert argument.shape == ((1, 32, 48, 3) if shape[1] == 32 else (1, 3, 32, 48))
 
 
 # ------------------------------------------------------------------ fields that make no sense

@@ -7,19 +7,25 @@ import json
 import os
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.export import Dim
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.errors import CheckpointError, ModelError, UsageError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import Fixed, Multiple
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.registry import find_definition
+from pnpdepth_cli.points import SparsePoints
 from tests.models.weights.files import Hostile, little
 
 
@@ -52,6 +58,73 @@ def test_an_exported_program_is_cut_at_its_graphs_nodes_bit_for_bit(tmp_path: Pa
         for name in names:
             with Split(network.module, name) as split:
                 assert torch.equal(network.raw_of(split.rear(split.front(x))), whole), name
+
+
+class WithPointsAndCamera(nn.Module):
+    """Depth from an image, sparse depth and the camera's focal length and centre."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encode = nn.Conv2d(4, 8, 3, 1, 1)
+        self.decode = nn.Conv2d(8, 1, 3, 1, 1)
+
+    def forward(self, rgb: Tensor, sparse: Tensor, intrinsics: Tensor) -> Tensor:
+        z = self.encode(torch.cat([rgb, sparse], dim=1)).relu()
+        return 2 + self.decode(z).sigmoid() + intrinsics[:, :1, 2:, None] / intrinsics[0, 0, 0]
+
+
+DEFINITION = """
+from pathlib import Path
+from pnpdepth_cli.models.definition import Normalisation
+from pnpdepth_cli.models.{module} import {function}
+
+definition = {function}(
+    Path(__file__).with_name("net{suffix}"), input_kind="rgb+sparse", takes_intrinsics=True,
+    normalisation=Normalisation(), output_kind="depth", output_scale="metric",
+)
+"""
+
+
+@pytest.mark.parametrize(
+    ("suffix", "module", "function"),
+    [
+        (".onnx", "onnx.onnx_file", "onnx_definition"),
+        (".pt2", "torch_export", "exported_definition"),
+    ],
+)
+def test_a_definition_names_a_graph_of_image_sparse_depth_and_intrinsics(
+    tmp_path: Path, suffix: str, module: str, function: str
+) -> None:
+    torch.manual_seed(0)
+    net, rgb = WithPointsAndCamera().eval(), torch.rand(3, 20, 30)
+    given = (rgb[None], torch.zeros(1, 1, 20, 30), torch.eye(3)[None])
+    if suffix == ".onnx":
+        pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
+        torch.onnx.export(net, given, str(tmp_path / "net.onnx"), dynamo=False)
+    else:
+        torch.export.save(torch.export.export(net, given), tmp_path / "net.pt2")
+    mine = tmp_path / "mine.py"
+    mine.write_text(DEFINITION.format(suffix=suffix, module=module, function=function))
+    network = load_network(str(mine), None)
+    # an image of twice the size, whose camera has half the focal length in the network's pixels
+    points = SparsePoints(xy=torch.tensor([[4.5, 8.5]]), depth=torch.tensor([3.0]), size=(40, 60))
+    camera = Camera(intrinsics=np.array([[50.0, 0, 29.5], [0, 60, 19.5], [0, 0, 1]]))
+    frame = Frame(rgb=rgb.repeat_interleave(2, 1).repeat_interleave(2, 2), points=points)
+    arguments = prepare(network, replace(frame, camera=camera)).arguments
+    sparse = torch.zeros(1, 1, 20, 30)
+    sparse[0, 0, 4, 2] = 3.0
+    intrinsics = torch.tensor([[[25.0, 0, 14.5], [0, 30, 9.5], [0, 0, 1]]])
+    for argument, right in zip(arguments[1:], (sparse, intrinsics), strict=True):
+        torch.testing.assert_close(argument, right)
+    with torch.no_grad():
+        right = net(arguments[0], sparse, intrinsics)
+        torch.testing.assert_close(network.raw_of(network.module(*arguments)), right)
+    if suffix == ".onnx":
+        assert "agrees with onnxruntime" in network.verified(arguments)[0]
+    with pytest.raises(UsageError, match="intrinsics; give --calib"):
+        prepare(network, frame)
+    with pytest.raises(ModelError, match="has 3 input"):
+        load_network(str(tmp_path / f"net{suffix}"), None)
 
 
 class Dynamic(nn.Module):

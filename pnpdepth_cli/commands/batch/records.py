@@ -25,9 +25,10 @@ from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.file_bytes import cannot_read
-from pnpdepth_cli.io.fingerprint import Fingerprint, file_and_part, is_unchanged
+from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.record import parse_json, plain, sha256_of, write_json
+from pnpdepth_cli.models.definition import file_and_part
 from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
-from pnpdepth_cli.models.frame_map import synthetic_frame
+from pnpdepth_cli.models.frame_map import synthetic_camera, synthetic_frame
 from pnpdepth_cli.models.measure_layers import MeasuredLayer, measure_layers
 from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
 from pnpdepth_cli.models.registry import families
@@ -127,14 +127,14 @@ def _own_size(network: Network) -> tuple[int, int]:
 
 def _synthetic(size: tuple[int, int]) -> Frame:
     rgb, points = synthetic_frame(size)
-    return Frame(rgb=rgb[0], points=points)
+    return Frame(rgb=rgb[0], points=points, camera=synthetic_camera(size))
 
 
 def _read(image: Path) -> Frame:
     rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1).contiguous()
     height, width = rgb.shape[-2:]
     no_points = SparsePoints(xy=torch.zeros(0, 2), depth=torch.zeros(0), size=(height, width))
-    return Frame(rgb=rgb, points=no_points)
+    return Frame(rgb=rgb, points=no_points, camera=synthetic_camera((height, width)))
 
 
 def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], whole: Tensor) -> str:

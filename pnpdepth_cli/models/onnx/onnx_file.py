@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, undescribed
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, graph_definition
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
 from pnpdepth_cli.models.onnx.limits import inlined, load_external
 from pnpdepth_cli.models.onnx.quantised import Quantised, outputs_of, quantises, session_of
@@ -33,43 +33,39 @@ _MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside
 _ASSUMED_MULTIPLE = 32
 
 
-def onnx_definition(file: Path, output: str | None = None) -> ModelDefinition:
+def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> ModelDefinition:
     """Returns the definition of an ONNX depth network.
 
     Args:
-        file: The .onnx file; it takes one rgb image 1×3×H×W or 1×H×W×3.
+        file: The .onnx file; it takes one rgb image 1×3×H×W or 1×H×W×3, unless another
+            `input_kind` is stated.
         output: Name of the graph's output that is the depth; None if it has only one.
+        **stated: Fields of `ModelDefinition` that a definition file states of it.
 
     Raises:
         ModelError: The file cannot be read, or the network cannot be run.
     """
     model = inlined(_read(file), file)
-    input_name, input_shape = _image_input(model, file)
-    chosen = _chosen_output(model, output, file)
-    channels_last = _channels_last(input_shape)
-    height, width = input_shape[1:3] if channels_last else input_shape[2:4]
-    fixed = isinstance(height, int) and isinstance(width, int)
-    is_part = _pruned(model, chosen, file)
+    constants = {tensor.name for tensor in model.graph.initializer}
+    inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
+    is_part = _pruned(model, _chosen_output(model, output, file), file)
     # From the file, onnxruntime reads weights that lie beside it.
     source = model.SerializeToString() if is_part else str(file)
-    definition = undescribed(
-        name=file.stem,
-        size=Fixed(int(height), int(width))
-        if fixed
-        else Multiple(_patch_size(model) or _ASSUMED_MULTIPLE),
+    definition = graph_definition(
+        list(inputs.values()), file, stated,
+        size=Multiple(_patch_size(model) or _ASSUMED_MULTIPLE),
         build=lambda: OnnxGraph(model, file),
-        complete=True,
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
-        checkpoint=file,
-        arguments=lambda rgb, _: (_as_input(rgb, channels_last),),
         output=_as_map,
         verify=_FirstImageCheck(source, file),
-    )
+    )  # fmt: skip
     if not quantises(model):
         return definition
+    if len(inputs) > 1:
+        raise ModelError(f"ONNX file {file} is quantised and has several inputs: not covered")
     return replace(
         definition,
-        build=lambda: Quantised(source, file, model, input_name),
+        build=lambda: Quantised(source, file, model, next(iter(inputs))),
         verify=None,
         layers=("output",),
         defaults=replace(definition.defaults, iterations=0),
@@ -118,11 +114,6 @@ def _pruned(model: Any, output: str, path: Path) -> bool:
     return pruned
 
 
-def _as_input(rgb: Tensor | None, channels_last: bool) -> Tensor:
-    assert rgb is not None
-    return rgb.permute(0, 2, 3, 1).contiguous() if channels_last else rgb
-
-
 def _as_map(output: Any) -> Tensor:
     tensor: Tensor = output
     last = tensor.ndim == 4 and tensor.shape[-1] == 1 and tensor.shape[1] != 1
@@ -164,29 +155,6 @@ def _read(file: Path) -> Any:
 
 def _opset(model: Any) -> int:
     return max((o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), default=1)
-
-
-def _image_input(model: Any, file: Path) -> tuple[str, list[int | str]]:
-    """Name and shape of the only input. ModelError unless it is a batch of one rgb image."""
-    constants = {tensor.name for tensor in model.graph.initializer}
-    inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
-    listed = ", ".join(f"{name} {'×'.join(map(str, shape))}" for name, shape in inputs.items())
-    if len(inputs) != 1:
-        raise ModelError(
-            f"ONNX file {file} has {len(inputs)} inputs ({listed}); only networks with one, an rgb"
-            " image, can be run"
-        )
-    ((name, shape),) = inputs.items()
-    one_image = len(shape) == 4 and (shape[0] == 1 or isinstance(shape[0], str))
-    if not one_image or 3 not in (shape[1], shape[3]):
-        raise ModelError(
-            f"ONNX file {file} takes {listed}; one rgb image 1×3×H×W or 1×H×W×3 is expected"
-        )
-    return name, shape
-
-
-def _channels_last(shape: Sequence[int | str]) -> bool:
-    return shape[3] == 3 and shape[1] != 3
 
 
 def _shape(value: Any) -> list[int | str]:

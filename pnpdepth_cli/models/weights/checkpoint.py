@@ -20,9 +20,8 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
-from pnpdepth_cli.io.fingerprint import file_and_part
 from pnpdepth_cli.models import registry
-from pnpdepth_cli.models.definition import ModelDefinition
+from pnpdepth_cli.models.definition import ModelDefinition, file_and_part
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, StandIn
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle

@@ -24,7 +24,7 @@ from pnpdepth_cli.errors import LayerError, ModelError, UsageError
 from pnpdepth_cli.models.definition import Multiple
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.onnx import graph, limits
-from pnpdepth_cli.models.onnx.onnx_file import _as_map, _channels_last, _deviation
+from pnpdepth_cli.models.onnx.onnx_file import _as_map, _deviation
 from pnpdepth_cli.models.onnx.table import OPERATORS
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -80,11 +80,6 @@ def test_an_output_with_channels_last_is_a_map(
     shape: tuple[int, ...], as_map: tuple[int, ...]
 ) -> None:
     assert _as_map(torch.zeros(shape)).shape == as_map
-
-
-def test_an_image_with_channels_last_has_three_in_its_last_axis_alone() -> None:
-    shapes = ((1, 32, 48, 3), (1, 3, 48, 3), (1, 3, 32, 48), (3, 3, 3, 3), (1, 2, 3, 2))
-    assert [_channels_last(shape) for shape in shapes] == [True, False, False, False, False]
 
 
 @pytest.mark.parametrize(
