@@ -9,6 +9,7 @@ import ast
 import importlib
 import inspect
 import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,7 @@ END = "<!-- end of the signatures -->\n"
 FOR_THE_PROGRAM = {
     "Refiner": {"refine_frame", "decide", "share_registration"},
     "Settings": {"fixed_by", "with_preset", "given", "opened", "over", "complete"},
+    "SparsePoints": {"cropped", "joined", "select", "tensors"},
     "Split": {"static_graph", "in_half"},
     "Network": {
         *(
@@ -33,13 +35,17 @@ FOR_THE_PROGRAM = {
         ),
     },
 }
-"""Methods that take or give what is not public."""
-WIDTH = 88
+"""Methods that a user does not need."""
+WIDTH = 74
 
 
-def first_line(text: str | None) -> str:
-    """The first paragraph of a docstring, on one line, without the options' defaults."""
-    return " ".join((text or "").split("\n\n")[0].split()).split(" [default")[0]
+def description(text: str | None) -> Iterator[str]:
+    """The first paragraph of a docstring, without the options' defaults."""
+    first = " ".join((text or "").split("\n\n")[0].split()).split(" [default")[0]
+    if first:
+        yield from textwrap.wrap(
+            f'"""{first}"""', WIDTH, initial_indent=" " * 4, subsequent_indent=" " * 4
+        )
 
 
 def arguments_of(node: ast.arguments) -> list[str]:
@@ -67,7 +73,7 @@ def function_lines(node: ast.FunctionDef) -> Iterator[str]:
         yield f"{node.name}: {returns}"
     else:
         yield from call_lines(f"def {node.name}", node, f" -> {returns}")
-    yield f'    """{first_line(ast.get_docstring(node))}"""'
+    yield from description(ast.get_docstring(node))
 
 
 def field_lines(node: ast.AnnAssign, after: ast.stmt | None) -> Iterator[str]:
@@ -81,8 +87,7 @@ def field_lines(node: ast.AnnAssign, after: ast.stmt | None) -> Iterator[str]:
         default = default.args[0] if default.args else None
     value = "" if default is None else f" = {ast.unparse(default)}"
     yield f"{ast.unparse(node.target)}: {ast.unparse(node.annotation)}{value}"
-    if described:
-        yield f'    """{first_line(described)}"""'
+    yield from description(described)
 
 
 def class_lines(node: ast.ClassDef) -> Iterator[str]:
@@ -94,7 +99,7 @@ def class_lines(node: ast.ClassDef) -> Iterator[str]:
     yield from (
         call_lines(f"class {node.name}", made_by[0], "") if made_by else (f"class {node.name}",)
     )
-    yield f'    """{first_line(ast.get_docstring(node))}"""'
+    yield from description(ast.get_docstring(node))
     for each, after in zip(node.body, [*node.body[1:], None], strict=True):
         lines: Iterator[str] = iter(())
         if isinstance(each, ast.AnnAssign):
@@ -119,8 +124,8 @@ def signatures() -> str:
     values = {name: getattr(pnpdepth_cli, name) for name in pnpdepth_cli.__all__[1:]}
     error = pnpdepth_cli.PnpDepthError
     shown = [n for n, v in values.items() if not (isinstance(v, type) and issubclass(v, error))]
-    blocks = ("\n".join(lines_of(name)) for name in shown)
-    return "\n".join(f"```python\n{block}\n```\n" for block in blocks)
+    blocks = {name: "\n".join(lines_of(name)) for name in shown}
+    return "\n".join(f"### {n}\n\n```python\n{block}\n```\n" for n, block in blocks.items())
 
 
 def test_the_signatures_of_the_page_are_those_of_the_code() -> None:

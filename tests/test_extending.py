@@ -12,6 +12,7 @@ import pytest
 from safetensors.torch import save_file
 
 from pnpdepth_cli.models.registry import find_definition
+from tests.test_readme import YOUR_NETWORK, titled_blocks
 from tests.test_readme import run as run_python
 
 pytestmark = pytest.mark.slow
@@ -30,6 +31,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, text in SHOWN.items():
         if name.endswith(".py"):
             (folder / "my_package" / name).write_text(text)
+    (folder / "my_package" / "my_net.py").write_text(titled_blocks(YOUR_NETWORK)["my_net.py"])
     info = folder / "my_package-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_package\nVersion: 1.0\n")

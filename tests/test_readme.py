@@ -111,7 +111,7 @@ def test_the_python_example_of_a_page_runs(page: Path, folder: Path) -> None:
 
 
 def test_the_readme_is_short_and_its_example_has_ten_lines() -> None:
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= 160
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 140
     (code,) = [block for block in blocks(README, "python") if "import pnpdepth_cli as pnp" in block]
     assert len([line for line in code.splitlines() if line]) <= 10
 
