@@ -46,13 +46,16 @@ def write_bag(
     compression: Any = None,
     view: View | None = None,
     clock_s: float = 0.0,
+    depth: str = "",
+    depth_frame: str = "camera",
 ) -> Path:
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.
     With `poses`, base moves 0.3 m along x from one image to the next: "odometry" or "tf", or the
     camera does: "pose". `compression` is rosbags' of the chunks. `view` replaces image, scan and
-    camera_info. `clock_s` is added to the stamps of the scans.
+    camera_info. `clock_s` is added to the stamps of the scans. With `depth`, an encoding such as
+    "16UC1" or "32FC1; compressedDepth", `depth_m` is there instead of scans.
     """
     ros1 = path.suffix == ".bag"
     store = message_types(ros1=ros1)
@@ -81,6 +84,13 @@ def write_bag(
             pixels[:, : WIDTH // 2, 0] = 200
             pixels, topic = (pixels, IMAGES) if view is None else (view.pixels, view.topic)
             yield _image(make, header(time_ns, "camera"), pixels, time_ns, topic, compressed)
+            if depth:
+                stamp = header(time_ns + 4_000_000, depth_frame)
+                info_of_depth = _camera_info(make, stamp, ros1, view)
+                yield "/depth/camera_info", time_ns + 5_000_000, info_of_depth
+                topic, message = _depth(make, stamp, depth)
+                yield topic, time_ns + 5_000_000, message
+                continue
             cloud = _cloud(make, header(time_ns + 4_000_000 + round(clock_s * 1e9), "lidar"), view)
             yield POINTS, time_ns + 5_000_000, cloud
         if poses:
@@ -152,11 +162,15 @@ def _moved(make: Make, header: Any, x: float, kind: str) -> tuple[str, int, Any]
 
 
 def _transforms(make: Make, header: Make) -> Any:
-    """camera is in base, and so is lidar: x forward, y left, z up, 0.2 m above the camera."""
+    """camera is in base, and so is lidar: x forward, y left, z up, 0.2 m above the camera.
+
+    The camera of depth is 0.05 m left of the camera.
+    """
     base = header(10**9, "base")
     camera = _link(make, base, "camera", (1.0, 0.0, 0.0), (-0.5, 0.5, -0.5, 0.5))
     lidar = _link(make, base, "lidar", (1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))
-    return make("tf2_msgs/TFMessage", transforms=[camera, lidar])
+    depth = _link(make, base, "depth", (1.0, 0.05, 0.0), (-0.5, 0.5, -0.5, 0.5))
+    return make("tf2_msgs/TFMessage", transforms=[camera, lidar, depth])
 
 
 def _camera_info(make: Make, header: Any, ros1: bool, view: View | None) -> Any:
@@ -200,6 +214,36 @@ def _image(
         data=padded.ravel(),
     )
     return topic, time_ns, message
+
+
+def depth_m() -> np.ndarray:
+    """(HEIGHT, WIDTH) metres: a wall 4 m ahead, unknown in the first rows."""
+    depth = np.full((HEIGHT, WIDTH), 4.0, np.float32)
+    depth[:10] = 0
+    return depth
+
+
+def _depth(make: Make, header: Any, kind: str) -> tuple[str, Any]:
+    """The topic and the message of `depth_m`."""
+    depth, (encoding, _, compressed) = depth_m(), kind.partition("; ")
+    codes = (1000 * depth).astype("<u2") if encoding == "16UC1" else depth.astype("<f4")
+    if not compressed:
+        message = make(
+            "sensor_msgs/Image", header=header, height=HEIGHT, width=WIDTH, encoding=encoding,
+            is_bigendian=0, step=WIDTH * codes.itemsize,
+            data=np.frombuffer(codes.tobytes(), np.uint8),
+        )  # fmt: skip
+        return "/depth/image_raw", message
+    # compressed_depth_image_transport with depth_quantization = 100, depth_max = 10
+    a = 100.0 * (100 + 1)
+    b = 1 - a / 10
+    if encoding == "32FC1":
+        codes = np.where(depth > 0, a / np.maximum(depth, 1) + b, 0).astype(np.uint16)
+    png = cv2.imencode(".png", codes)[1].ravel()
+    start = np.frombuffer(np.array([a, b], "<f4").tobytes(), np.uint8)
+    data = np.concatenate([np.zeros(4, np.uint8), start, png])
+    message = make("sensor_msgs/CompressedImage", header=header, format=kind, data=data)
+    return "/depth/image_raw/compressedDepth", message
 
 
 def _cloud(make: Make, header: Any, view: View | None) -> Any:

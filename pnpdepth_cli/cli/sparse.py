@@ -178,8 +178,8 @@ def simulate(
     "topics",
     multiple=True,
     metavar="TOPIC",
-    help="Topic of the images, of the points (PointCloud2), or of the poses; may be given for each."
-    "  [default: the only one]",
+    help="Topic of the images, of the points (PointCloud2 or depth images), or of the poses; may be"
+    " given for each.  [default: the only one]",
 )
 @click.option(
     "--tolerance",
@@ -206,7 +206,8 @@ def frames(bag: Path, output: Path, **values: Any) -> None:
     pnpdepth batch drive/ -o refined/
 
     BAG is a file of ROS 1 (.bag) or ROS 2 (.mcap, .db3), or a folder that ROS 2 recorded. OUTPUT
-    gets rgb/, sparse/ (PLY), calib.txt from camera_info and tf_static, and poses.txt from odometry.
+    gets rgb/, sparse/ (PLY or EXR), calib.txt from camera_info and tf_static, and poses.txt from
+    odometry.
     """
     from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, write_frames
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.plausible import scan_returns
 from pnpdepth_cli.dataset.scan_points import chosen_camera
 from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, UsageError
@@ -31,7 +32,9 @@ from pnpdepth_cli.io.bags import (
 from pnpdepth_cli.io.bags.messages import (
     Stamped,
     cloud_points,
+    depth_image,
     image_file,
+    is_depth,
     nearest_pairs,
     seconds_of,
 )
@@ -45,11 +48,13 @@ from pnpdepth_cli.io.bags.transforms import (
 )
 from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.cloud_files import write_points
+from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.poses import POSES_FILE, Trajectory
 from pnpdepth_cli.io.record import plain, read_json, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors import describe_dropped
+from pnpdepth_cli.sensors.lens import unproject
 
 RECORD = "frames.json"
 _FOLDERS = ("rgb", "sparse")
@@ -119,7 +124,8 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         raise OutputError(f"{folder} exists, and holds no frames of a bag; name another with -o")
     with open_bag(request.bag) as bag:
         check_topics(bag, wanted, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES, *TRANSFORMS))
-        topics = topic_of(bag, wanted, IMAGES), topic_of(bag, wanted, CLOUDS)
+        sensors = _sensors(bag, wanted, say)
+        topics = sensors.images, sensors.points
         say(f"topics: images of {topics[0]}, points of {topics[1]}")
         _clear(request)
         lost, times, poses = 0, list[float](), None
@@ -132,22 +138,21 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
             if scan is None:
                 lost += 1
                 continue
-            cloud = cloud_points(scan.message, topics[1])
-            try:  # the unit is left to what reads the frames
-                xyz, counts, _ = scan_returns(topics[1], cloud, scale=1.0)
+            try:
+                values, counts = _measured(sensors, scan.message)
             except NoPointsError:
                 lost += 1
                 continue
             dropped.update(counts)
             frames = frames if times else (frame_of(image.message), frame_of(scan.message))
-            _write_frame(request.output, topics[0], image, xyz)
+            _write_frame(request.output, sensors, image, values)
             times.append(image.time_s)
             if len(times) == request.limit:
                 break
         if dropped:
             say(f"points: dropped {describe_dropped(dropped)}")
         if times:
-            camera = _write_calibration(request, bag, topics[0], frames, say)
+            camera = _write_calibration(request, bag, sensors, frames, say)
             poses = _write_poses(request, bag, camera, times, say)
     if lost:
         say(f"warning: {lost:,} images have no scan with points within {tolerance:g} s")
@@ -236,22 +241,96 @@ def _first_times(path: Path, topics: tuple[str, str]) -> str:
     return ", ".join(times) or "there is none"
 
 
-def _write_frame(folder: Path, topic: str, image: Stamped, xyz: NDArray[np.float32]) -> None:
-    """Writes rgb/NAME.png and sparse/NAME.ply; the name is the image's time."""
+@dataclass(frozen=True, kw_only=True)
+class _Sensors:
+    """Which topics hold images and depth."""
+
+    images: str
+    points: str
+    is_depth: bool
+    """Whether the points are depth images."""
+    depth_camera: Camera | None = None
+    """Camera of the depth images. None: that of the images, or the points are clouds."""
+
+    @property
+    def is_map(self) -> bool:
+        """Whether the points are depth images of the images' own camera."""
+        return self.is_depth and self.depth_camera is None
+
+
+def _sensors(bag: Bag, wanted: Sequence[str], say: Say) -> _Sensors:
+    """The topics that are named, or the only ones; clouds rather than depth images.
+
+    Of several depth images, that in the frame of the images.
+    """
+    counts = {name: count for name, count in bag.topics(IMAGES).items() if count}
+    first = {name: next(bag.messages([name]))[2] for name in counts}
+    depths = {name: count for name, count in counts.items() if is_depth(first[name])}
+    colours = {name: count for name, count in counts.items() if name not in depths}
+    images, clouds = topic_of(bag, wanted, colours, "images"), bag.topics(CLOUDS)
+    if not depths or (clouds and not set(wanted) & set(depths)):
+        points = topic_of(bag, wanted, clouds, f"points ({CLOUDS[0]} or depth images)")
+        return _Sensors(images=images, points=points, is_depth=False)
+    frame = frame_of(first[images])
+    registered = {name: count for name, count in depths.items() if frame_of(first[name]) == frame}
+    usable = depths if set(wanted) & set(depths) else registered or depths
+    points = topic_of(bag, wanted, usable, "depth images")
+    info = camera_info_topic(bag, points)
+    if points in registered or info == camera_info_topic(bag, images):
+        return _Sensors(images=images, points=points, is_depth=True)
+    camera = None if info is None else camera_of_bag(bag, info)
+    if camera is None:
+        say(f"warning: {points} has no camera_info; its pixels are taken for those of the images")
+        return _Sensors(images=images, points=points, is_depth=True)
+    return _Sensors(images=images, points=points, is_depth=True, depth_camera=camera[0].camera)
+
+
+def _measured(sensors: _Sensors, message: Any) -> tuple[NDArray[np.float32], dict[str, int]]:
+    """A depth image (H, W) of the images' camera, or points (N, 3); and counts of what is none.
+
+    Raises:
+        NoPointsError: Nothing was measured.
+    """
+    topic = sensors.points
+    if not sensors.is_depth:
+        cloud = cloud_points(message, topic)
+    else:
+        depth = depth_image(message, topic)
+        if not depth.any():
+            raise NoPointsError(f"{topic}: a depth image without depth")
+        if sensors.depth_camera is None:
+            return depth, {}
+        rows, columns = np.nonzero(depth)
+        xy = np.column_stack([columns, rows]).astype(np.float64)
+        cloud = unproject(sensors.depth_camera, xy, depth[rows, columns]).astype(np.float32)
+    # the unit is left to what reads the frames
+    points, counts, _ = scan_returns(topic, cloud, scale=1.0)
+    return points, counts
+
+
+def _write_frame(
+    folder: Path, sensors: _Sensors, image: Stamped, values: NDArray[np.float32]
+) -> None:
+    """Writes rgb/NAME and sparse/NAME; the name is the image's time."""
     name = f"{image.time_s:.6f}".replace(".", "_")
-    suffix, data = image_file(image.message, topic)
+    suffix, data = image_file(image.message, sensors.images)
     with atomic_path(folder / "rgb" / f"{name}{suffix}") as temporary:
         temporary.write_bytes(data)
-    write_points(folder / "sparse" / f"{name}.ply", xyz)
+    sparse = folder / "sparse" / name
+    if sensors.is_map:
+        write_depth(sparse.with_suffix(".exr"), values)
+    else:
+        write_points(sparse.with_suffix(".ply"), values)
 
 
 def _write_calibration(
-    request: FramesRequest, bag: Bag, image_topic: str, frames: tuple[str, str], say: Say
+    request: FramesRequest, bag: Bag, sensors: _Sensors, frames: tuple[str, str], say: Say
 ) -> str:
     """Writes calib.txt as far as there is a calibration; returns the name of the camera's frame.
 
     `frames` are the names in the headers of an image and a scan.
     """
+    image_topic = sensors.images
     topic = camera_info_topic(bag, image_topic)
     of_bag = None if topic is None else camera_of_bag(bag, topic)
     names = (of_bag[1] if of_bag else "") or frames[0], frames[1]
@@ -263,7 +342,7 @@ def _write_calibration(
     if scanner is not None:
         source += f", and /tf_static from {names[0]} to {names[1]}"
         calibration = replace(calibration, scanner=scanner)
-    if calibration.scanner is None:
+    if calibration.scanner is None and not sensors.is_map:
         say(
             f"warning: {bag.path} has no static transform from {names[0]} to {names[1]}; refine"
             " with --extrinsics FILE"
@@ -271,7 +350,7 @@ def _write_calibration(
     else:
         say(f"calibration: {source}")
     if calibration.rectified:
-        pairs = _some_frames(request.output)
+        pairs = () if sensors.is_map else _some_frames(request.output)
         calibration, note = chosen_camera(calibration, pairs, image_topic)
         say(note)
     with atomic_path(request.output / "calib.txt") as temporary:

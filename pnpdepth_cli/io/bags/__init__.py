@@ -32,6 +32,8 @@ CAMERAS = ("sensor_msgs/msg/CameraInfo",)
 ODOMETRY = ("nav_msgs/msg/Odometry",)
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = ("tf2_msgs/msg/TFMessage",)
+COMPRESSED = ("/compressed", "/compressedDepth")
+"""Ends of the names of topics of compressed images."""
 
 
 def is_bag(path: Path) -> bool:
@@ -108,21 +110,27 @@ def message_types(*, ros1: bool) -> Any:
     return store
 
 
-def topic_of(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> str:
-    """Returns the topic of these message types that is named, or else the only one.
+def topic_of(bag: Bag, wanted: Sequence[str], topics: Mapping[str, int], what: str) -> str:
+    """Returns the one of these topics that is named, or else the only one.
+
+    Args:
+        bag: They are of.
+        wanted: Names of topics of any kind.
+        topics: Their numbers of messages, as of `Bag.topics`.
+        what: They hold, for a message.
 
     Raises:
         UsageError: There are several or none.
     """
-    topics = bag.topics(kinds)
-    # an image and its compressed copy are one camera
-    names = [n for n in topics if not (n.endswith("/compressed") and n[:-11] in topics)]
-    names = [n for n in wanted if n in topics] or names
+    # an image and its compressed copies are one camera
+    copies = [n for n in topics if n.rpartition("/")[0] in topics and n.endswith(COMPRESSED)]
+    names = [n for n in wanted if n in topics] or [n for n in topics if n not in copies]
     if len(names) != 1:
         listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
-        what = f"several topics of {kinds[0]}" if names else f"no topic of {kinds[0]}"
+        number = "several topics" if names else "no topic"
         raise UsageError(
-            f"{bag.path} has {what}; choose with --topic of `pnpdepth frames`: {listing or 'none'}"
+            f"{bag.path} has {number} of {what}; choose with --topic of `pnpdepth frames`:"
+            f" {listing or 'none'}"
         )
     return names[0]
 

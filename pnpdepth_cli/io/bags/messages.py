@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
@@ -14,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.depth import known_metres
 from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.io.formats import format_of_content
+from pnpdepth_cli.io.formats.images import PNG
 
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Data types of sensor_msgs/PointField."""
@@ -24,6 +28,8 @@ _MOST_WAITING = 64
 
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PN": ".png"}
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1}
+_DEPTH = {"16UC1": "u2", "32FC1": "f4"}
+_COMPRESSED_DEPTH, _DEPTH_HEADER, _MM_PER_M = "compressedDepth", 12, 1000.0
 _TO_BGR = {
     "rgb8": cv2.COLOR_RGB2BGR,
     "rgba8": cv2.COLOR_RGBA2BGR,
@@ -44,7 +50,6 @@ def image_file(message: Any, topic: str) -> tuple[str, bytes]:
     """
     if not hasattr(message, "encoding"):
         data = bytes(message.data)
-        # compressed depth has a header before the PNG, and is no image
         suffix = next((s for start, s in _MAGIC.items() if data.startswith(start)), None)
         if suffix is None:
             raise FileFormatError(
@@ -67,19 +72,60 @@ def _pixels(message: Any, topic: str) -> NDArray[np.uint8]:
             f"{topic}: images of encoding {one_line(encoding)[:30]!r} are not read; known are"
             f" {', '.join((*_CHANNELS, *(n for n in _TO_BGR if n.startswith('bayer'))))}"
         )
+    rows = _rows(message, topic, channels)
+    pixels = rows if channels == 1 else rows.reshape(len(rows), -1, channels)
+    if encoding in _TO_BGR:
+        pixels = np.asarray(cv2.cvtColor(pixels, _TO_BGR[encoding]), np.uint8)
+    return pixels
+
+
+def _rows(message: Any, topic: str, pixel_bytes: int) -> NDArray[np.uint8]:
+    """The bytes of an Image's pixels, (H, W * pixel_bytes)."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
-    if not 0 < width * channels <= step or not 0 < height * step <= data.size:
+    if not 0 < width * pixel_bytes <= step or not 0 < height * step <= data.size:
         raise FileFormatError(
             f"{topic}: an image of {width}×{height} pixels and {step} bytes a row has"
             f" {data.size:,} bytes; the bag is damaged"
         )
-    rows = data[: height * step].reshape(height, step)[:, : width * channels]
-    shape = (height, width) if channels == 1 else (height, width, channels)
-    pixels = np.ascontiguousarray(rows).reshape(shape)
-    if encoding in _TO_BGR:
-        pixels = np.asarray(cv2.cvtColor(pixels, _TO_BGR[encoding]), np.uint8)
-    return pixels
+    rows = data[: height * step].reshape(height, step)[:, : width * pixel_bytes]
+    return np.ascontiguousarray(rows)
+
+
+def is_depth(message: Any) -> bool:
+    """Returns whether an Image, or CompressedImage, is a depth image."""
+    if hasattr(message, "encoding"):
+        return str(message.encoding) in _DEPTH
+    return _COMPRESSED_DEPTH in str(message.format)
+
+
+def depth_image(message: Any, topic: str) -> NDArray[np.float32]:
+    """Returns the depth image (H, W) of a message in metres, 0 where unknown.
+
+    16UC1 holds millimetres, 32FC1 metres (REP 118). A compressed one is a PNG behind 12 bytes: a
+    number, and a and b of the code a / depth + b of 32FC1 (compressed_depth_image_transport).
+
+    Raises:
+        FileFormatError: It is damaged, or compressed otherwise.
+    """
+    if hasattr(message, "encoding"):
+        number = np.dtype(_DEPTH[str(message.encoding)])
+        values = _rows(message, topic, number.itemsize).view(
+            number.newbyteorder(">" if message.is_bigendian else "<")
+        )
+        return known_metres(values if number.kind == "f" else values / _MM_PER_M)
+    data, kind = bytes(message.data), str(message.format).partition(";")[0].strip()
+    if kind not in _DEPTH or format_of_content(data[_DEPTH_HEADER:]) is not PNG:
+        raise FileFormatError(
+            f"{topic}: compressed depth ({one_line(message.format)[:40]}) is not a PNG of"
+            f" {' or '.join(_DEPTH)}; name another topic with --topic"
+        )
+    codes = PNG.read(Path(topic), data[_DEPTH_HEADER:]).values
+    if kind == "16UC1":
+        return known_metres(codes / _MM_PER_M)
+    a, b = np.frombuffer(data, "<f4", 2, offset=4)
+    with np.errstate(divide="ignore"):
+        return known_metres(np.where(codes > 0, a / (codes.astype(np.float64) - b), 0))
 
 
 def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_FRAME, Extrinsics
-from pnpdepth_cli.io.bags import CAMERAS, ODOMETRY, POSES, TRANSFORMS, Bag
+from pnpdepth_cli.io.bags import CAMERAS, COMPRESSED, ODOMETRY, POSES, TRANSFORMS, Bag
 from pnpdepth_cli.io.bags.messages import seconds_of
 from pnpdepth_cli.io.calibration import Calibration, camera_in_yaml
 from pnpdepth_cli.io.extrinsics import pose_of_quaternion
@@ -31,7 +31,9 @@ Floats = NDArray[np.float64]
 def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
     """Returns the topic of the camera's intrinsics: beside the image's, or the only one."""
     topics = bag.topics(CAMERAS)
-    beside = image_topic.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+    for end in COMPRESSED:
+        image_topic = image_topic.removesuffix(end)
+    beside = image_topic.rpartition("/")[0] + "/camera_info"
     if beside in topics:
         return beside
     return next(iter(topics)) if len(topics) == 1 else None

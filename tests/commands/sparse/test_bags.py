@@ -19,9 +19,10 @@ from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import FileFormatError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from tests.bags import HEIGHT, IMAGES, POINTS, WIDTH, write_bag
+from tests.bags import HEIGHT, IMAGES, POINTS, WIDTH, depth_m, write_bag
 from tests.commands.frames import frame_on_disk
 from tests.data_sets import read_frames
 
@@ -64,6 +65,29 @@ def test_a_bag_becomes_frames_with_a_calibration(
     # y = 0, z = -0.1667 in the LiDAR is 0.0333 m above the camera's axis, 5 m ahead
     np.testing.assert_allclose(points.depth, 5)
     assert np.abs(points.xy - [31.5, 23.5 - 60 * 0.03333 / 5]).sum(axis=1).min() < 0.01
+
+
+@pytest.mark.parametrize("compressed", ["", "; compressedDepth"])
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+@pytest.mark.parametrize("kind", ["ros1.bag", "drive.mcap"])
+def test_depth_images_of_a_bag_are_sparse_depth(
+    kind: str, encoding: str, compressed: str, tmp_path: Path
+) -> None:
+    depth, error = depth_m(), 0.004 if encoding + compressed == "32FC1; compressedDepth" else 1e-6
+    bag = write_bag(tmp_path / kind, depth=encoding + compressed)
+    written(bag, tmp_path / "same")
+    for frame in read_frames(tmp_path / "same"):
+        np.testing.assert_allclose(read_depth(frame.sparse).values, depth, rtol=error)  # type: ignore[arg-type]
+    # another camera, 0.05 m to the left: f · 0.05 m / 4 m = 0.75 pixels
+    other = write_bag(tmp_path / f"other_{kind}", depth=encoding + compressed, depth_frame="depth")
+    written(other, tmp_path / "other")
+    frame = read_frames(tmp_path / "other")[0]
+    options = ScanOptions(calib=frame.calib)
+    points = read_scan_points(frame.sparse, options, (HEIGHT, WIDTH)).points  # type: ignore[arg-type]
+    np.testing.assert_allclose(points.depth, 4, rtol=error)
+    x, y = points.xy.T
+    np.testing.assert_allclose(x + 0.75, np.rint(x + 0.75), atol=0.01)
+    assert (x.min(), y.min(), len(points)) == pytest.approx((0.25, 10, 38 * 63), abs=0.01)
 
 
 def test_a_batch_takes_a_bag_and_writes_its_frames_once(
