@@ -26,6 +26,7 @@ from pnpdepth_cli.io.formats.depth_format import SATURATED_CODE
 from pnpdepth_cli.sensors import Points
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.pixels import DropCounter, describe_dropped
+from pnpdepth_cli.sensors.projection import hidden_among
 
 _SIZES_IN_RANGE = 8.0
 """A 16-bit file in model units holds depths up to at least so many times the model's extent."""
@@ -41,6 +42,9 @@ def read_colmap_points(
     path: Path, image: Path, size: tuple[int, int], *, unit_scale: float | None = None
 ) -> SparseDepth:
     """Returns the points that COLMAP matched in an image, projected into it.
+
+    Into an image without matches, as of a model of known poses, all points are projected that no
+    nearer ones occlude.
 
     The camera's own lens distortion is applied to the points, so the photo stays as it was taken.
 
@@ -60,7 +64,7 @@ def read_colmap_points(
     camera = model.cameras[model.images[name].camera]
     assert camera.size is not None  # of every camera of a model
     check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
-    points = _observed(model, name, unit_scale or 1.0)
+    points, notes = _points_in(model, name, unit_scale or 1.0)
     dropped = points.dropped
     unit = MODEL_UNITS if unit_scale is None else METRES
     far, lines = far_values(points.depth, unit)
@@ -70,7 +74,7 @@ def read_colmap_points(
         f"COLMAP model, image {name}, {camera.source}",
         scale=_output_scale(model) if unit == MODEL_UNITS else None,
     )
-    notes = [f"sparse: {describe_range(points.depth, reading, unit=unit)}"]
+    notes = [f"sparse: {describe_range(points.depth, reading, unit=unit)}", *notes]
     if camera.size != size:
         notes.append(f"sparse: {moved_note(camera.size, size)}")
     if camera.has_lens:
@@ -100,20 +104,22 @@ def read_colmap_points(
     )
 
 
-def _observed(model: ColmapModel, name: str, unit_scale: float) -> Points:
-    """The points in the image's tracks that pass the filters, in the frame of its camera's size."""
+def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points, list[str]]:
+    """The points of an image that pass the filters, in its camera's size; and lines for a person.
+
+    They are those of its tracks, else all that are not occluded.
+    """
     image, points = model.images[name], model.points
     camera = model.cameras[image.camera]
     assert camera.size is not None
-    row = np.searchsorted(points.number, image.points)
-    known = row < len(points.number)
-    known[known] = points.number[row[known]] == image.points[known]
-    row = row[known]
-    if not len(row):
-        raise NoPointsError(f"{model.folder} has no points in {name!r}; register it with matches")
-    drops = DropCounter()
+    row = np.flatnonzero(np.isin(points.number, image.points))
+    untracked = not len(row)
+    if untracked:
+        row = np.arange(len(points.number))
+    total, drops = len(row), DropCounter()
     least = min(_LEAST_TRACK, len(model.images))
-    row = row[drops.keep(points.track[row] >= least, f"seen in fewer than {least} images")]
+    if points.track.any():
+        row = row[drops.keep(points.track[row] >= least, f"seen in fewer than {least} images")]
     why = f"with a reprojection error above {_MOST_REPROJECTION_PX:g} px"
     row = row[drops.keep(points.error[row] <= _MOST_REPROJECTION_PX, why)]
     seen = points.xyz[row] @ image.rotation.T + image.translation
@@ -125,18 +131,24 @@ def _observed(model: ColmapModel, name: str, unit_scale: float) -> Points:
         )
     seen = seen[front]
     seen, xy = drops.keep_seen(seen, pixels_of(camera, seen), camera.size)
+    notes = list[str]()
+    if untracked:
+        visible = drops.keep(~hidden_among(xy, seen[:, 2], camera.size), "hidden by foreground")
+        seen, xy = seen[visible], xy[visible]
+        notes = [f"sparse: {name} has no tracks; all {total:,} points of the model are projected"]
     depth = seen[:, 2] * unit_scale
     if not len(depth):
         raise NoPointsError(
-            f"none of the {len(known):,} points of {name!r} in {model.folder} is left ({drops});"
+            f"none of the {total:,} points of {name!r} in {model.folder} is left ({drops});"
             " register it with more matches"
         )
-    return Points(
+    found = Points(
         xy=xy.astype(np.float32),
         depth=depth.astype(np.float32),
         size=camera.size,
         dropped=drops.dropped,
     )
+    return found, notes
 
 
 def _output_scale(model: ColmapModel) -> float:

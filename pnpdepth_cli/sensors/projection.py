@@ -209,6 +209,27 @@ def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats
         return np.where(passed[:, None], at / near[:, None], xy)
 
 
+def hidden_among(xy: Floats, depth: Floats, size: tuple[int, int]) -> Mask:
+    """Returns (N,) true for points that are occluded from the camera by something nearer.
+
+    Foreground is looked for within twice the median distance from a point to the nearest other.
+    With points of other views of ICL-NUIM and 7-Scenes, and a quarter of them behind a wall, a
+    fifth or less of those behind others stay, and 1 (5,000 points) to 11 % (200) of the rest go.
+
+    Args:
+        xy: (N, 2) pixel coordinates inside the image, at most one point per pixel.
+        depth: (N,) z.
+        size: (H, W) of the image.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(xy) < 2:
+        return np.zeros(len(xy), bool)
+    margin = 2 * float(np.median(cKDTree(xy).query(xy, k=2)[0][:, 1]))
+    focal_px = margin / np.radians(_MARGIN_DEG)
+    return hidden_points(xy, depth, size, focal_px=focal_px, scanner=np.zeros(3))
+
+
 def occluded_in_map(points: Points) -> Mask | None:
     """Returns (N,) true for points of a projected scan that are occluded by something nearer.
 

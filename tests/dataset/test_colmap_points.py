@@ -160,6 +160,28 @@ def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) ->
     assert pair.dropped["seen in fewer than 2 images"] == 0
 
 
+@pytest.mark.parametrize("tracks", ["", "2 0 3 0 4 0"])
+def test_all_points_that_nothing_hides_are_those_of_an_image_without_tracks(
+    tracks: str, project: Path
+) -> None:
+    # a fence of 12 × 9 points, 4 units ahead, and a wall of 11 × 8 points behind it
+    x, y = np.meshgrid(np.arange(12) * 5 + 4.0, np.arange(9) * 5 + 4.0)
+    front = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 4.0)])
+    behind = front[(front[:, 0] < 58) & (front[:, 1] < 43)] + (2.5, 2.5, 8.0)
+    pixels = np.concatenate([front, behind])
+    xyz = np.column_stack([(pixels[:, :2] - (32, 22.5)) / (50, 52) * pixels[:, 2:], pixels[:, 2]])
+    lines = [f"{n + 1} {' '.join(map(str, p))} 9 9 9 0.5 {tracks}\n" for n, p in enumerate(xyz)]
+    (project / "sparse/0/points3D.txt").write_text("".join(lines))
+    images = project / "sparse/0/images.txt"
+    poses = [line for line in images.read_text().splitlines() if line.endswith(".png")]
+    images.write_text("".join(f"{pose}\n\n" for pose in poses))
+    sparse = read(project)
+    np.testing.assert_allclose(sparse.points.depth, 4)
+    assert {tuple(xy) for xy in sparse.points.xy.round(3).tolist()} == set(map(tuple, front[:, :2]))
+    assert sparse.points.dropped["hidden by foreground"] == len(behind)
+    assert any("no tracks" in note for note in sparse.notes)
+
+
 def test_points_behind_the_camera_are_counted_and_a_model_of_nothing_else_refused(
     project: Path,
 ) -> None:
