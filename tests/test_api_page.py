@@ -20,6 +20,7 @@ BEGIN = "<!-- signatures, written by `python -m tests.test_api_page` -->\n"
 END = "<!-- end of the signatures -->\n"
 FOR_THE_PROGRAM = {
     "Refiner": {"refine_frame", "decide", "share_registration"},
+    "Scores": {"to_json"},
     "Settings": {"fixed_by", "with_preset", "given", "opened", "over", "complete"},
     "SparsePoints": {"cropped", "joined", "select", "tensors"},
     "Split": {"static_graph", "in_half"},
