@@ -126,6 +126,8 @@ class FrameFiles:
     """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""
     gt_other_size: bool = False
     """Whether the ground truth may have another size than the image, of the same view."""
+    one_view: bool = False
+    """Whether the data set says that image and depth are of one view, pixel by pixel."""
     group: str | None = None  # the sequence it belongs to; None derives it from the name
 
     def __post_init__(self) -> None:

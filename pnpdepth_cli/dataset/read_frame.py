@@ -40,7 +40,7 @@ from pnpdepth_cli.dataset.plausible import (
 from pnpdepth_cli.dataset.read_options import METRES, ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.scan_points import SparseDepth, read_scan_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
-from pnpdepth_cli.frames.frame import Frame, Register, registration_to_make, tensor_of
+from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
 from pnpdepth_cli.io.depth import describe_range, read_depth
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.formats import DepthFile, Reading
@@ -146,12 +146,14 @@ def read_frame(
         )
     if neighbours:
         sources["neighbours"] = neighbours
+    one_view = _is_one_view(files, options)
     return Frame(
         rgb=None if rgb is None else tensor_of(rgb),
         points=points,
         given=given,
         held_out=held_out,
-        register=_register(files, options),
+        register=None if one_view else registration_to_make(options.registration, Settings()),
+        one_view=one_view,
         gt=gt,
         depth_scale=sparse.reading.scale,
         assumed=tuple(f"{side}: {r}" for side, r in readings.items() if r and r.assumed),
@@ -163,14 +165,11 @@ def read_frame(
     )
 
 
-def _register(files: FrameFiles, options: ReadOptions) -> Register:
-    """How the image is to be moved. A calibrated scan and SfM points are registered."""
-    calibrated = files.sparse is not None and (
-        files.sparse.is_dir() or _is_scan(files.sparse, files, options)
-    )
-    if calibrated and options.registration == "auto":
-        return None
-    return registration_to_make(options.registration, Settings())
+def _is_one_view(files: FrameFiles, options: ReadOptions) -> bool:
+    """Whether user or files say so; a calibrated scan and SfM points are of the image's view."""
+    sparse = files.sparse
+    calibrated = sparse is not None and (sparse.is_dir() or _is_scan(sparse, files, options))
+    return calibrated or files.one_view or options.registration == "off"
 
 
 def _is_scan(path: Path, files: FrameFiles, options: ReadOptions) -> bool:

@@ -41,6 +41,8 @@ class Frame:
     held_out: SparsePoints | None = None  # points that are kept out, to score at
     unit: str = METRES  # of all depths: "m", or "model units" of a COLMAP model without scale
     register: Register = None  # how `rgb` is to be moved into the frame of the points
+    one_view: bool = False
+    """Whether image and points are stated to be of one view, so that the image is not doubted."""
     outliers: SparsePoints | None = None
     """Points that were left out as outliers, for networks that weigh their points."""
     prior: Tensor | None = None
@@ -276,6 +278,7 @@ def frame_of_arrays(
         rgb=None if rgb is None else tensor_of(rgb),
         points=inside,
         register=register,
+        one_view=register is None,
         notes=tuple(f"sparse: {n:,} points {why} are not used" for why, n in lost.items() if n),
     )
 

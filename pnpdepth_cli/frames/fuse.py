@@ -149,7 +149,7 @@ def without_doubt(
     """
     fusing = _fusing(networks)
     rgb, count = split.whole.rgb, len(split.points)
-    if fusing is None or rgb is None or count < ENOUGH_FOR_DOUBT:
+    if fusing is None or rgb is None or split.whole.one_view or count < ENOUGH_FOR_DOUBT:
         return experts, ()
     at = {each.name: each.at for each in experts}
     of_linear = split.gain(at[fusing.name], at[LINEAR])

@@ -51,6 +51,13 @@ def test_a_registered_image_stays(seed: int, count: int) -> None:
     assert estimated([evidence_of(seed, count=count)]) is None
 
 
+@pytest.mark.parametrize("gap_px", [5, 8])
+def test_a_registered_image_stays_where_points_beside_jumps_are_missing(gap_px: int) -> None:
+    known = [evidence(*frame(seed, count=500, gap_px=gap_px)) for seed in range(8)]
+    assert None not in known
+    assert estimated(known) is None
+
+
 def test_frames_with_few_points_show_together_what_each_does_not() -> None:
     frames = [evidence_of(seed, UNREGISTERED, count=80) for seed in range(8)]
     assert [estimated([alone]) for alone in frames[:3]] == [None] * 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -28,15 +29,21 @@ def boxes(seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def frame(
-    seed: int, registration: ImageRegistration | None = None, count: int = 500
+    seed: int, registration: ImageRegistration | None = None, count: int = 500, gap_px: int = 0
 ) -> tuple[NDArray[np.float32], SparsePoints]:
-    """Image and random points of a frame with this registration; None: it is registered."""
+    """Image and random points of a frame with this registration; None: it is registered.
+
+    No point is within `gap_px` of a jump of depth, as on phones, which are unsure of those.
+    """
     rgb, depth = boxes(seed)
     inner = tuple(slice(side // 2, side // 2 + side) for side in SIZE)
     if registration is not None:  # as the other camera sees the scene: moved by the inverse
         rgb = registration.inverse().applied(rgb)
     rgb, depth = np.clip(rgb[inner], 0, 1), depth[inner]
-    chosen = np.random.default_rng(seed).choice(depth.size, count, replace=False)
+    jump = cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0.1
+    beside = cv2.dilate(jump.astype(np.uint8), np.ones(2 * (2 * gap_px + 1,))) > 0
+    far = np.flatnonzero(~beside) if gap_px else depth.size
+    chosen = np.random.default_rng(seed).choice(far, count, replace=False)
     rows, columns = np.unravel_index(chosen, depth.shape)
     points = SparsePoints(
         xy=torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32)),

@@ -254,6 +254,9 @@ def test_an_image_that_does_not_belong_to_its_points_gets_a_warning_with_two_err
     (note,) = [note for note in wrong.notes if note.startswith("warning: the image")]
     assert "80 validation points" in note
     assert "compact without the image" in wrong.weights
+    stated = refined(replace(frame, rgb=stripes, one_view=True), compact())
+    assert "compact without the image" not in stated.weights
+    assert not any(note.startswith("warning: the image") for note in stated.notes)
 
 
 def test_a_completion_network_of_the_scanner_has_most_of_the_result(

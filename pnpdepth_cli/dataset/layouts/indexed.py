@@ -76,6 +76,7 @@ def _of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
             image=image_path,
             gt=depth_path,
             gt_scale=5000.0,
+            one_view=True,
             pose=None if pose is None else as_pose(pose),
         )
 

@@ -35,6 +35,7 @@ _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 _AS_PUBLISHED: dict[str, Any] = {
     "sparse_scale": 256.0,
     "gt_scale": 256.0,
+    "one_view": True,
 }
 
 

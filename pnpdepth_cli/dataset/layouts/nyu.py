@@ -66,6 +66,7 @@ def _of_mat(root: Path) -> Iterator[FrameFiles]:
             name=f"{number:04}",
             image=Hdf5Array(path=path, name="images", axes=(2, 1, 0), index=number - 1),
             gt=Hdf5Array(path=path, name="depths", axes=(1, 0), index=number - 1),
+            one_view=True,
             part=NYU_PART,
         )
 

@@ -76,6 +76,7 @@ STRAY_SCANNER = row(
     calib="camera_matrix.csv",
     more=_of_stray_scanner,
     sparse_scale=1000.0,
+    one_view=True,
 )
 RECORD3D = row(
     {"image": r"rgb/(\d+).IMAGE", "sparse": r"depth/(\d+).exr"},
@@ -83,4 +84,5 @@ RECORD3D = row(
     name=lambda root, place, stem: stem,
     calib=_METADATA,
     more=_of_record3d,
+    one_view=True,
 )

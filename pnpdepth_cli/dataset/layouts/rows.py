@@ -72,6 +72,7 @@ ROWS: dict[str, Layout] = {
         sparse_scale=1000.0,
         gt_scale=1000.0,
         gt_other_size=True,
+        one_view=True,
     ),
     "diode": row(
         {"gt": "*_depth.npy", "image": "*.png", "mask": "*_depth_mask.npy"},
@@ -141,5 +142,6 @@ ROWS: dict[str, Layout] = {
         more=_of_void,
         sparse_scale=256.0,
         gt_scale=256.0,
+        one_view=True,
     ),
 }

@@ -56,6 +56,8 @@ def test_off_and_the_papers_preset_leave_the_image_and_numbers_are_recorded(
 ) -> None:
     assert refined(tmp_path / "a", frame, preset="paper")["registration"] is None
     assert refined(tmp_path / "a", frame, registration="off")["registration"] is None
+    request = RefineRequest.from_fields(**write_frame(tmp_path, 0, 500), registration="off")
+    assert read_requested(request).one_view
     record = refined(tmp_path / "a", frame, registration=(0.9, -5.0, 3.0))
     assert record["registration"] == {"zoom": 0.9, "right": -5.0, "down": 3.0}
 

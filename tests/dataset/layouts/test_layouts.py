@@ -234,6 +234,7 @@ def test_associations_pair_images_and_depth(line: str, tmp_path: Path) -> None:
             image=tmp_path / "rgb/0.png",
             gt=tmp_path / "depth/0.png",
             gt_scale=5000,
+            one_view=True,
             pose=at_x(7),
         )
     ]
