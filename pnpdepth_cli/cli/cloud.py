@@ -27,7 +27,7 @@ from pnpdepth_cli.cli import options
     "--poses",
     type=options.FILE,
     help="Camera poses of a folder's files: TUM rows are joined by time, KITTI rows by"
-    " order.  [default: the records']",
+    " order, transforms.json by name.  [default: the records']",
 )
 @options.depth_scale
 @click.option("--max-depth", type=float, default=math.inf, metavar="M", help="Drop farther pixels.")

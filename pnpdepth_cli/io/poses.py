@@ -1,4 +1,4 @@
-"""Camera poses: rows of KITTI odometry or TUM RGB-D, KITTI's packets, and at times between rows.
+"""Camera poses: of KITTI odometry, TUM RGB-D and Nerfstudio, KITTI's packets, between two times.
 
 A packet (oxts/data/*.txt of KITTI's raw drives) begins with latitude, longitude (degrees), altitude
 (metres), roll, pitch and yaw (radians) of the inertial system, which is x forward, y left, z up. As
@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,8 @@ from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration, read_rigid_motion
 from pnpdepth_cli.io.extrinsics import is_rotation, rotation_of
-from pnpdepth_cli.io.file_bytes import read_bytes
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.record import read_json
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 
@@ -52,16 +53,46 @@ def read_poses(path: Path) -> Floats:
 
 
 def poses_of_frames(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
-    """Returns the poses (N, 3, 4) of the frames of these names, and how they were joined.
+    """Returns the poses (N, 3, 4) of the frames of these names, and how they were read.
 
-    Names that are times in seconds take the row of the nearest time, at most LONGEST_GAP_S away, as
-    evo joins trajectories. Else there is a row for each frame, in their order; or, with more rows
-    than frames, the number in a name is the number of its row from 0.
+    Those of a `transforms.json` are joined by the names of its images. Else, names that are times
+    in seconds take the row of the nearest time, at most LONGEST_GAP_S away, as evo joins
+    trajectories. Else there is a row for each frame, in their order; or, with more rows than
+    frames, the number in a name is the number of its row from 0.
 
     Raises:
         FileFormatError: As of `read_poses`.
         InputError: The rows do not fit the frames.
     """
+    if path.suffix.lower() == ".json":
+        return _poses_of_nerfstudio(path, names), (
+            "joined by name; from camera to world, turned from axes y up and z back (OpenGL)"
+        )
+    poses, how = _poses_of_rows(path, names)
+    return poses, f"{how}; taken as from camera to world, of axes x right, y down, z forward"
+
+
+def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
+    """The poses (N, 3, 4) of the frames of these names in a transforms.json."""
+    content = read_json(path)
+    try:
+        listed = {
+            PurePosixPath(each["file_path"]).stem: np.array(each["transform_matrix"], np.float64)
+            for each in content["frames"]
+        }
+        missing = [name for name in names if PurePosixPath(name).name not in listed]
+        if missing:
+            raise InputError(f"{path} has no frame of the name {missing[0]!r}; add it")
+        poses = np.stack([listed[PurePosixPath(name).name] for name in names])[:, :3, :4]
+        if poses.shape[1:] != (3, 4) or not all(is_rotation(pose[:, :3]) for pose in poses):
+            raise ValueError("a transform_matrix is no rotation and position")
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(f"{path} is no transforms.json ({one_line(error)})") from error
+    return poses * (1, -1, -1, 1)
+
+
+def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
+    """The poses (N, 3, 4) of the frames of these names in a file of rows, and how they join."""
     rows = _rows(path)
     poses = np.stack([pose for _, _, pose in rows])
     numbers = [_last_number(name) for name in names]

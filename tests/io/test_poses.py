@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +52,28 @@ def test_poses_are_joined_by_time_else_by_order_or_number(
     tmp_path: Path, text: str, names: list[str], expected: list[float]
 ) -> None:
     (tmp_path / "poses.txt").write_text(text)
-    poses, _ = poses_of_frames(tmp_path / "poses.txt", names)
+    poses, how = poses_of_frames(tmp_path / "poses.txt", names)
+    assert "from camera to world" in how
     assert poses[:, 0, 3].tolist() == expected
+
+
+def test_poses_of_nerfstudio_have_axes_up_and_back(tmp_path: Path) -> None:
+    # a camera at (1, 2, 3) that looks along x of the world, whose z is up
+    matrix = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
+    still = np.eye(4).tolist()
+    frames = [("images/b.jpg", matrix), ("./images/a.png", still), ("c.png", still)]
+    listed = [{"file_path": name, "transform_matrix": pose} for name, pose in frames]
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"frames": listed}))
+    (_, pose), how = poses_of_frames(path, ["rgb/a", "rgb/b"])
+    assert pose @ [0, 0, 5, 1] == pytest.approx([6, 2, 3])  # 5 ahead
+    assert pose @ [0, 1, 0, 1] == pytest.approx([1, 2, 2])  # 1 down
+    assert "OpenGL" in how
+    with pytest.raises(InputError, match="'d'"):
+        poses_of_frames(path, ["d"])
+    path.write_text(json.dumps({"frames": [{"file_path": "a", "transform_matrix": [[1, 2]]}]}))
+    with pytest.raises(FileFormatError):
+        poses_of_frames(path, ["a"])
 
 
 def test_poses_that_fit_no_frames_are_refused(tmp_path: Path) -> None:

@@ -75,8 +75,8 @@ class SequenceOptions:
     )
     poses: Path | None = option(
         None,
-        "Camera poses of the frames: TUM rows are joined by time, KITTI rows by order."
-        "  [default: the layout's or poses.txt, else estimated]",
+        "Camera poses of the frames: TUM rows are joined by time, KITTI rows by order,"
+        " transforms.json by name.  [default: the layout's or poses.txt, else estimated]",
         metavar="FILE",
     )
 
