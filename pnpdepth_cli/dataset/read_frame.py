@@ -20,7 +20,7 @@ from pnpdepth_cli.dataset.arrays import (
     read_levels,
 )
 from pnpdepth_cli.dataset.colmap_points import read_colmap_points
-from pnpdepth_cli.dataset.frame_camera import camera_of_frame
+from pnpdepth_cli.dataset.frame_camera import camera_of_file, camera_of_frame
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
@@ -53,6 +53,7 @@ from pnpdepth_cli.sensors import (
     occluded_in_map,
     sample_points,
 )
+from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.settings import Settings
 
 ImageArray = NDArray[np.float32]
@@ -298,6 +299,10 @@ def _read_sparse(
         sparse = read_scan_points(path, options.scan.over(files), size, image, scale=scale)
     else:
         sparse = _read_points(files, options, path, size)
+        if options.sparse_range:
+            sparse = _of_distances(sparse, files, options)
+    if options.sparse_range and (path.is_dir() or _is_scan(path, files, options)):
+        raise UsageError(f"{path} is no depth map or list, so --sparse-range does not apply")
     if files.sparse_mask is not None:
         sparse = _confident(sparse, files.sparse_mask, files.min_confidence)
     points = sparse.points.tensors()
@@ -310,6 +315,27 @@ def _read_sparse(
         if not len(points):
             raise NoPointsError(f"{path}: none of its {len(whole)} points lies in the image")
     return replace(sparse, points=points)
+
+
+def _of_distances(sparse: SparseDepth, files: FrameFiles, options: ReadOptions) -> SparseDepth:
+    """The points with depth z, from distances to the camera; none where the lens shows nothing."""
+    scan = options.scan.over(files)
+    if scan.calib is None:
+        raise UsageError("--sparse-range needs the camera of the distances; give --calib")
+    points = sparse.points.tensors()
+    camera, _ = camera_of_file(scan.calib, scan.camera, points.size, files.image_file)
+    length = np.linalg.norm(
+        np.column_stack([rays_of(camera, points.xy.numpy()), np.ones(len(points))]), axis=1
+    )
+    seen = np.isfinite(length)
+    depth = (points.depth.double() / torch.from_numpy(length)).float()
+    points = replace(points, depth=depth).select(torch.from_numpy(seen))
+    note = (
+        f"sparse: distances became depth, ÷ {length[seen].min():.3f} to {length[seen].max():.3f}"
+        f" by the camera of {scan.calib}"
+    )
+    record = sparse.record | {"read_as": f"{sparse.record['read_as']}, distances"}
+    return replace(sparse, points=points, record=record, notes=(*sparse.notes, note))
 
 
 def _confident(sparse: SparseDepth, path: Path, least: float | None) -> SparseDepth:

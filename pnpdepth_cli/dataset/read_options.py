@@ -88,6 +88,10 @@ class ReadOptions:
         "Metres per unit of a COLMAP model.  [default: depth is in model units]",
         metavar="M",
     )
+    sparse_range: bool = option(
+        False,
+        "Sparse depth is the distance from the camera, not depth z; needs --calib.",
+    )
     registration: str = option(
         "auto",
         "Whether the image is moved to the points: auto, if their depth edges show"

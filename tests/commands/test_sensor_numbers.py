@@ -295,6 +295,28 @@ def test_a_mask_of_ground_truth_that_is_not_there_is_said_not_to_be_used(tmp_pat
     assert any("sparse_mask" in note for note in frame.notes)
 
 
+def test_distances_from_a_wide_camera_become_depth(tmp_path: Path) -> None:
+    truth = codes_of(INDOOR / "sparse.png") / 1000
+    x, y = (np.arange(640) - 319.5) / 320, (np.arange(480) - 239.5) / 320  # 90° across
+    length = np.sqrt(1 + x**2 + y[:, None] ** 2)
+    assert length.max() == pytest.approx(1.6, abs=0.01)  # 60 % in the corners
+    np.save(tmp_path / "distance.npy", (truth * length).astype(np.float32))
+    (tmp_path / "calib.txt").write_text("K: [320, 0, 319.5, 0, 320, 239.5, 0, 0, 1]")
+
+    def read_as(calib: Path | None, sparse: Path) -> Frame:
+        files = FrameFiles(image=INDOOR / "rgb.png", sparse=sparse, calib=calib)
+        return read_frame(files, ReadOptions(sparse_range=True))
+
+    frame = read_as(tmp_path / "calib.txt", tmp_path / "distance.npy")
+    column, row = frame.points.xy.numpy().astype(int).T
+    assert len(frame.points) == np.count_nonzero(truth)
+    np.testing.assert_allclose(frame.points.depth, truth[row, column], rtol=1e-6)
+    with pytest.raises(UsageError, match="--calib"):
+        read_as(None, tmp_path / "distance.npy")
+    with pytest.raises(UsageError, match="no depth map or list"):
+        read_as(STREET / "calib.txt", STREET / "000000.bin")
+
+
 def test_an_image_of_16_bits_that_holds_8_is_read_as_of_8(tmp_path: Path) -> None:
     pixels = np.asarray(Image.open(INDOOR / "rgb.png")).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "rgb.png"), pixels[:, :, ::-1])
