@@ -147,7 +147,9 @@ def read_frame(
         )
     if neighbours:
         sources["neighbours"] = neighbours
-    one_view = _is_one_view(files, options)
+    # points that wrong poses moved say nothing of the image
+    contradicted = any(each.get("contradicts_images") for each in neighbours)
+    one_view = contradicted or _is_one_view(files, options)
     return Frame(
         rgb=None if rgb is None else tensor_of(rgb),
         points=points,

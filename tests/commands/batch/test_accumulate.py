@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.commands.batch.frames import find_frames
 from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
@@ -149,6 +150,20 @@ def test_without_poses_the_motion_is_estimated_and_recorded(tmp_path: Path) -> N
     assert neighbour["basis"].endswith("matches of the images")
     assert abs(neighbour["motion"][2][3] - 0.6) < 0.03
     assert record["points"]["moved"] > 500
+
+
+@pytest.mark.parametrize(("metres", "turned"), [(0.6, 0.0), (0.3, 0.02)])
+def test_poses_that_the_images_contradict_get_a_warning(
+    metres: float, turned: float, tmp_path: Path
+) -> None:
+    root, listener = rendered_drive(tmp_path), RecordingListener()
+    turn = Rotation.from_rotvec([0, turned, 0]).as_matrix()
+    rows = [np.eye(3, 4), *2 * [np.column_stack([turn, [0, 0, metres]])]]
+    np.savetxt(root / "poses.txt", np.reshape(rows, (3, 12)))
+    accumulating(root, listener=listener, limit=1)
+    (neighbour,) = record_of(root, "drive_000")["inputs"]["neighbours"]
+    assert neighbour["contradicts_images"] == (turned > 0)
+    assert any("contradict the images" in text for text in listener.messages) == (turned > 0)
 
 
 @pytest.mark.slow
