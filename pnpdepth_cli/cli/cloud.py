@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.progress import progress_bar
 
 
 @click.command(short_help="Write depth as a coloured point cloud.")
@@ -66,7 +67,8 @@ def cloud(**values: Any) -> None:
     """
     from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
 
-    record = write_depth_cloud(CloudRequest(**values))
+    with progress_bar("cloud", "frame") as show:
+        record = write_depth_cloud(CloudRequest(**values), show)
     for note in record["notes"]:
         click.echo(note, err=True)
     colours = "coloured" if record["coloured"] else "without colours (no image is known)"

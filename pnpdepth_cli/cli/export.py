@@ -8,6 +8,7 @@ import click
 
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.cli import options
+from pnpdepth_cli.cli.progress import progress_bar
 
 
 @click.command(short_help="Write depth for COLMAP, Nerfstudio or 3DGS.")
@@ -25,15 +26,18 @@ def export(**values: Any) -> None:
 
     \b
     colmap              stereo/depth_maps, stereo/normal_maps, for `colmap stereo_fusion`
-    nerfstudio          transforms.json (also for Instant-NGP), depths/ (16-bit PNG), images/
-    gaussian-splatting  inverse_depths/ (its option -d), depth_masks/, sparse/0/depth_params.json
+    nerfstudio          transforms.json (also for Instant-NGP), depths/ (16-bit PNG), images/,
+                        start.ply
+    gaussian-splatting  inverse_depths/ (its option -d), depth_masks/, sparse/0/depth_params.json,
+                        and images/ and a model in sparse/0/ unless they are there
 
     Camera and pose come from the records, so RESULTS are best those of a COLMAP project
     (`pnpdepth batch --layout colmap`). OUTPUT may be the project itself.
     """
     from pnpdepth_cli.commands.exports import export_results
 
-    record = export_results(**values)
+    with progress_bar("export", "frame") as show:
+        record = export_results(**values, show=show)
     for note in record["notes"]:
         click.echo(note, err=True)
     frames = f"{record['frames']:,} frame{'' if record['frames'] == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""Progress bars: drawn on a terminal only; a batch prints a line per minute elsewhere."""
+"""Progress: bars on a terminal, a line per minute elsewhere."""
 
 from __future__ import annotations
 
@@ -29,14 +29,20 @@ def open_bar(title: str, unit: str, **settings: Any) -> tqdm[Any]:
 def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
     """Yields `show(done, total, text="")`, which draws a bar for work of more than a second.
 
-    The time counts from the first call of `show`.
+    Not on a terminal, it prints a line per minute. The time counts from the first call of `show`.
     """
     bar: tqdm[Any] | None = None
+    began = printed_at = 0.0
 
     def show(done: int, total: int, text: str = "") -> None:
-        nonlocal bar
+        nonlocal bar, began, printed_at
+        now = time.monotonic()
         if bar is None:
             bar = open_bar(title, unit, total=total, leave=False, delay=_SHOWN_AFTER_S)
+            began = printed_at = now
+        if bar.disable and done and now - printed_at >= _LINE_EVERY_S:
+            printed_at = now
+            say(_pace(done, total, unit, now - began))
         bar.set_postfix_str(text, refresh=False)
         bar.update(done - bar.n)
 
@@ -93,14 +99,14 @@ class BatchProgress:
                 self._bar.set_postfix_str(f"{self.failed:,} failed")
         elif time.monotonic() - self._printed_at >= _LINE_EVERY_S:
             self._printed_at = time.monotonic()
-            self.say(self._line(self._printed_at - self._began))
+            pace = _pace(self.done, self.to_do, "frame", self._printed_at - self._began)
+            self.say(pace + (f", {self.failed:,} failed" if self.failed else ""))
 
-    def _line(self, spent_s: float) -> str:
-        rate = self.done / spent_s
-        left = _duration((self.to_do - self.done) / rate)
-        failed = f", {self.failed:,} failed" if self.failed else ""
-        pace = f"{1 / rate:.1f} s a frame" if rate < 1 else f"{rate:.1f} frames a second"
-        return f"{self.done:,} of {self.to_do:,} frames, {pace}, {left} left{failed}"
+
+def _pace(done: int, total: int, unit: str, spent_s: float) -> str:
+    rate = done / spent_s
+    pace = f"{1 / rate:.1f} s a {unit}" if rate < 1 else f"{rate:.1f} {unit}s a second"
+    return f"{done:,} of {total:,} {unit}s, {pace}, {_duration((total - done) / rate)} left"
 
 
 def _duration(seconds: float) -> str:

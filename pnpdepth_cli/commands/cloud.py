@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
-from pnpdepth_cli.dataset.arrays import read_image
+from pnpdepth_cli.dataset.arrays import image_of_size
 from pnpdepth_cli.dataset.frame_camera import (
     Pose,
     camera_of_exif,
@@ -29,7 +29,6 @@ from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.poses import poses_of_frames
 from pnpdepth_cli.io.record import plain, write_json
-from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.point_cloud import (
     PointCloud,
     View,
@@ -72,8 +71,14 @@ class CloudRequest:
     overwrite: bool = False
 
 
-def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
+def write_depth_cloud(
+    request: CloudRequest, show: Callable[[int, int], None] = lambda done, of: None
+) -> dict[str, Any]:
     """Writes the cloud and its record beside it, and returns the record.
+
+    Args:
+        request: What is asked for.
+        show: Receives the numbers of frames that are in the cloud, and of all.
 
     Raises:
         PnpDepthError: An input or output is at fault; then nothing is written.
@@ -88,7 +93,7 @@ def write_depth_cloud(request: CloudRequest) -> dict[str, Any]:
             " results, and --poses"
         )
     coloured = all(request.image or frame.image for frame in frames)
-    parts = _parts(request, frames, poses, coloured, notes)
+    parts = _parts(request, frames, poses, coloured, notes, show)
     make_folder(request.output.parent)
     points = write_cloud(request.output, _merged(request, parts, coloured))
     inputs = ("depth", "output", "image", "overwrite", "calib", "poses")
@@ -154,6 +159,7 @@ def _parts(
     poses: list[Pose | None],
     coloured: bool,
     notes: list[str],
+    show: Callable[[int, int], None],
 ) -> Iterator[PointCloud]:
     """Yields the clouds of all depth maps, in the world's frame if there are poses."""
 
@@ -166,13 +172,15 @@ def _parts(
         return View(depth=depth, camera=camera, pose=np.eye(4)[:3] if pose is None else pose)
 
     for index, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
+        show(index, len(frames))
         here = view(index)
         depth = here.depth
         if request.min_views > 1:
             known = np.stack([each for each in poses if each is not None])
             others = (view(other) for other in neighbouring_views(known, index))
             depth = consistent_depth(here, others, request.min_views)
-        rgb = _colours(request, frame, here.depth) if coloured else None
+        image = request.image or frame.image
+        rgb = image_of_size(image, depth.shape) if coloured and image is not None else None
         for part in cloud_from_depth(depth, here.camera, rgb=rgb):
             yield part if pose is None else part.transformed(pose)
 
@@ -210,22 +218,6 @@ def _depth(request: CloudRequest, frame: ResultFrame, notes: list[str]) -> NDArr
             )
         keep &= frame.of_size(frame.sigma, depth) <= request.max_sigma * depth
     return np.where(keep, depth, np.float32(0))
-
-
-def _colours(
-    request: CloudRequest, frame: ResultFrame, depth: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    image = request.image or frame.image
-    assert image is not None
-    rgb = read_image(image)
-    if rgb.shape[:2] != depth.shape and isinstance(image, Path):  # COLMAP reads it as stored
-        rgb = read_rgb(image, upright=False).values
-    if rgb.shape[:2] != depth.shape:
-        raise SizeError(
-            f"{image} is {rgb.shape[1]}×{rgb.shape[0]} but {frame.depth} is"
-            f" {depth.shape[1]}×{depth.shape[0]}; give the image of this depth with --image"
-        )
-    return rgb
 
 
 def _camera(

@@ -37,6 +37,23 @@ def read_image(source: ImageSource) -> NDArray[np.float32]:
     return _rgb_of(source)
 
 
+def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.float32]:
+    """Returns (H, W, 3) in 0..1 of the image that has this size: upright, or as COLMAP reads it.
+
+    Raises:
+        SizeError: It has neither.
+    """
+    rgb = read_image(source)
+    if rgb.shape[:2] != size and isinstance(source, Path):
+        rgb = read_rgb(source, upright=False).values
+    if rgb.shape[:2] != size:
+        raise SizeError(
+            f"{source} is {rgb.shape[1]}×{rgb.shape[0]} but its depth {size[1]}×{size[0]}; give the"
+            " image of this depth with --image"
+        )
+    return rgb
+
+
 def read_mask(path: Path) -> NDArray[np.bool_]:
     """Returns (H, W), true where an image has any channel above 0, or an array a number above 0.
 

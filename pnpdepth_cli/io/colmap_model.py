@@ -91,7 +91,7 @@ MODELS = {
 _NAMES = {model.number: name for name, model in MODELS.items()} | {17: "EQUIRECTANGULAR"}
 _LARGEST = 1e9
 
-_PARTS = ("cameras", "images", "points3D")
+MODEL_PARTS = ("cameras", "images", "points3D")
 _LOCK = threading.Lock()
 """So that threads that read frames of one model wait for it instead of reading it again."""
 _COUNT, _CAMERA = struct.Struct("<Q"), struct.Struct("<IiQQ")
@@ -103,7 +103,7 @@ _TRACK_ENTRY = 8
 def model_files(folder: Path) -> list[Path]:
     """Returns the three files of a model; none if this is no folder with a model."""
     for suffix in (".bin", ".txt"):  # binary first, as COLMAP itself
-        files = [folder / f"{part}{suffix}" for part in _PARTS]
+        files = [folder / f"{part}{suffix}" for part in MODEL_PARTS]
         if all(file.is_file() for file in files):
             return files
     return []

@@ -17,6 +17,7 @@ from pnpdepth_cli.dataset.colmap_points import read_colmap_points
 from pnpdepth_cli.dataset.frame_camera import camera_to_json
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.scans import read_scan
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 
 DEPTH = (3.6 + 0.01 * np.mgrid[:HEIGHT, :WIDTH][1]).astype(np.float32)
@@ -138,10 +139,11 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     far[0] = 20
     folder = results(root, far, unit_scale)
     change(folder / "c.json", points={"farthest": 2.0})
-    notes = export(folder, "nerfstudio", scene)["notes"]
-    assert notes == ([] if unit_scale else [
+    record = export(folder, "nerfstudio", scene)
+    assert record["unit"] == ("m" if unit_scale else "model units × 8")
+    assert record["notes"] == ([] if unit_scale else [
         f"depth: {3 * WIDTH} pixels beyond 8.192 model units are unknown",
-        "unit: poses and depth are × 8, so that depth fits 16 bits",
+        "unit: poses, depth and start are × 8, so that depth fits 16 bits",
     ])  # fmt: skip
     content = json.loads((scene / "transforms.json").read_text())
     assert content["camera_model"] == "OPENCV"
@@ -162,6 +164,33 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     factor = world[2] / expected[2]
     assert np.log2(factor) == pytest.approx(0 if unit_scale else round(np.log2(factor)), abs=1e-3)
     assert world[:3] == pytest.approx(expected * factor, rel=1e-3)
+    start = read_scan(scene / content["ply_file_path"]).points
+    assert len(start) > 500
+    median = np.median(DEPTH) * world[2] / DEPTH[v, u]
+    assert np.median(start[:, 2]) == pytest.approx(median, rel=0.01)
+
+
+@pytest.mark.parametrize("unit_scale", [None, 0.25])
+def test_3dgs_finds_a_model_of_the_refined_images_and_points_of_their_depth(
+    root: Path, unit_scale: float | None
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    record = export(results(root, unit_scale=unit_scale), "gaussian-splatting", root / "scene")
+    assert record["unit"] == "model units"
+    own, new = (pycolmap.Reconstruction(root / path) for path in ("sparse", "scene/sparse/0"))
+    assert new.num_points3D() > 500
+    depths = [point.xyz[2] for point in new.points3D.values()]
+    assert np.median(depths) == pytest.approx(np.median(DEPTH), rel=0.01)
+    pose_of = {image.name: image.cam_from_world().matrix() for image in own.images.values()}
+    for image in new.images.values():
+        assert image.cam_from_world().matrix() == pytest.approx(pose_of[image.name], abs=1e-6)
+        assert image.camera.params == pytest.approx([50, 52, 32.5, 23])
+        assert (root / "scene/images" / image.name).is_file()
+    again = export(root / "out", "gaussian-splatting", root / "scene", overwrite=True)
+    assert again["files"] == [name for name in record["files"] if "/images/" not in name]
+    shutil.copytree(root / "sparse", root / "sparse/0")  # COLMAP's own stays
+    record = export(root / "out", "gaussian-splatting", root)
+    assert not any(name.endswith("cameras.txt") for name in record["files"])
 
 
 def test_depth_beyond_16_bits_is_unknown_for_nerfstudio_and_said_so(root: Path) -> None:

@@ -6,7 +6,10 @@ holds an `Export` called `EXPORT`.
 
 from __future__ import annotations
 
+import filecmp
+import itertools
 import operator
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,12 +23,18 @@ from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
+from pnpdepth_cli.dataset.arrays import image_of_size, read_image
 from pnpdepth_cli.dataset.frame_camera import Pose
+from pnpdepth_cli.dataset.frame_files import ImageSource, file_of
+from pnpdepth_cli.dataset.read_options import MODEL_UNITS
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.rgb import sizes_of
+from pnpdepth_cli.sensors.point_cloud import PointCloud, cloud_from_depth
 
+_START_POINTS = 200_000
+"""Of all frames together: a scene that a splatting program begins with."""
 _LONGEST_NAME = 200
 """Bytes of a name of a record that becomes a path."""
 
@@ -35,7 +44,7 @@ class ExportFrame:
     """A refined frame."""
 
     result: ResultFrame
-    image: Path
+    image: ImageSource
     image_name: str
     """Its path below the folder of the images, as COLMAP names it, with slashes."""
     size: tuple[int, int]
@@ -57,6 +66,46 @@ class ExportFrame:
         depth, valid = self.result.read()
         return np.where(valid, depth, np.float32(0))
 
+    def image_in(self, folder: Path) -> Path:
+        """Returns the image in this folder, or where it is copied to: programs read it there."""
+        inside = file_of(self.image).resolve().is_relative_to(folder.resolve())
+        if inside and isinstance(self.image, Path):
+            return self.image
+        return folder / "images" / self.image_name
+
+    def is_in(self, folder: Path) -> bool:
+        """Returns whether the image lies there already, itself or, in a copied project, a copy."""
+        path = self.image_in(folder)
+        if path == self.image or not path.is_file():
+            return path == self.image
+        return isinstance(self.image, Path) and filecmp.cmp(path, self.image, shallow=False)
+
+    def copy_image(self, folder: Path) -> None:
+        """Copies the image into the folder, unless it lies there."""
+        if self.is_in(folder):
+            return
+        if isinstance(self.image, Path):
+            with new_file(self.image_in(folder)) as temporary:
+                shutil.copyfile(self.image, temporary)
+        else:
+            pixels = np.rint(255 * read_image(self.image)).astype(np.uint8)
+            save_png(self.image_in(folder), pixels)
+
+    def start_points(self, frames: int) -> PointCloud:
+        """Returns its share, as one of so many, of points to begin with, in the world's frame."""
+        assert self.pose is not None
+        rgb = image_of_size(self.image, self.size)
+        parts = list(cloud_from_depth(self.valid_depth(), self.camera, rgb=rgb))
+        step = max(1, sum(len(part.xyz) for part in parts) * frames // _START_POINTS)
+        columns: Any = zip(*parts, strict=True)
+        cloud = PointCloud(*(np.concatenate(column)[::step] for column in columns))
+        return cloud.transformed(self.pose)
+
+
+def unit_of_model(frames: Sequence[ExportFrame]) -> str:
+    """Returns the unit of files that are in that of the COLMAP model, if there is one."""
+    return frames[0].result.unit if frames[0].unit_scale == 1 else MODEL_UNITS
+
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
@@ -64,8 +113,9 @@ class Export:
 
     needs_pose: bool
     files: Callable[[Path, Sequence[ExportFrame]], list[Path]]
-    write: Callable[[Path, Sequence[ExportFrame]], list[str]]
-    """Writes them and returns notes. Raises PnpDepthError."""
+    write: Callable[[Path, Sequence[ExportFrame], Callable[[], None]], list[str]]
+    """Writes them, calls the function after each frame, and returns notes. Raises PnpDepthError."""
+    unit: Callable[[Sequence[ExportFrame]], str] = unit_of_model
 
 
 @contextmanager
@@ -74,6 +124,14 @@ def new_file(path: Path) -> Iterator[Path]:
     make_folder(path.parent)
     with atomic_path(path) as temporary:
         yield temporary
+
+
+def save_png(path: Path, pixels: NDArray[np.uint16] | NDArray[np.uint8]) -> None:
+    """Writes pixels (H, W) or (H, W, 3)."""
+    from PIL import Image
+
+    with new_file(path) as temporary:
+        Image.fromarray(pixels).save(temporary, "PNG")
 
 
 def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
@@ -89,7 +147,12 @@ def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
 
 
 def export_results(
-    results: Path, output: Path, *, to: str, overwrite: bool = False
+    results: Path,
+    output: Path,
+    *,
+    to: str,
+    overwrite: bool = False,
+    show: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, Any]:
     """Writes the files and `export_NAME.json`, and returns what that holds.
 
@@ -98,6 +161,7 @@ def export_results(
         output: The folder to write to; it may hold the images and the model already.
         to: One of `choices.EXPORTS`.
         overwrite: Whether existing files are replaced.
+        show: Receives the numbers of frames that are written, and of all.
 
     Raises:
         PnpDepthError: An input or output is at fault; then nothing is written.
@@ -122,10 +186,12 @@ def export_results(
         "to": to,
         "results": str(results),
         "frames": len(frames),
-        "unit": frames[0].result.unit,
+        "unit": export.unit(frames),
     }
+    numbers = itertools.count(1)
+    show(0, len(frames))
     with all_or_none(written):
-        record["notes"] = export.write(output, frames)
+        record["notes"] = export.write(output, frames, lambda: show(next(numbers), len(frames)))
         record["files"] = [path.as_posix() for path in written[:-1]]
         write_json(written[-1], record)
     return record
@@ -133,7 +199,7 @@ def export_results(
 
 def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     record, image, (camera, pose) = result.record, result.image, result.camera_and_pose
-    if camera is None or not isinstance(image, Path):
+    if camera is None or image is None:
         lacks = "its image; run this in the folder where it was refined, or refine it again"
         if camera is None:
             lacks = "a record with its camera; refine it with a COLMAP model or --calib"
@@ -147,14 +213,15 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
         width, height = map(operator.index, record["size"])
         sparse = dict(record["inputs"]["sparse"])
         numbers = float(record["points"]["farthest"]), float(sparse.get("unit_scale") or 1)
-        name = sparse.get("image") or (PurePosixPath(result.name).parent / image.name).as_posix()
+        own = image.name if isinstance(image, Path) else f"{PurePosixPath(result.name).name}.png"
+        name = sparse.get("image") or (PurePosixPath(result.name).parent / own).as_posix()
         if not all(1e-9 < number < 1e9 for number in numbers) or not _is_fit(name):
             raise ValueError
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FileFormatError(
             f"{result.depth}: the record beside it is damaged; refine it again"
         ) from error
-    if (height, width) not in sizes_of(image):
+    if isinstance(image, Path) and (height, width) not in sizes_of(image):
         raise SizeError(
             f"{result.depth} is not of the size of {image}; refine the whole image"
             " (--protocol whole)"

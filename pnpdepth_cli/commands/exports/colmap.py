@@ -6,7 +6,7 @@ channel (COLMAP's documentation of dense maps, and its read_write_dense.py).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +26,12 @@ def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
     return maps if listed.exists() else [*maps, listed]
 
 
-def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
+def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
     for frame in frames:
         depth = frame.valid_depth()
         _write_map(_map(folder, frame, "normal"), depth_normals(depth, frame.camera))
         _write_map(_map(folder, frame, "depth"), depth[..., None] / frame.unit_scale)
+        done()
     for listed in _files(folder, frames)[2 * len(frames) :]:
         with new_file(listed) as temporary:
             text = "".join(f"{frame.image_name}\n" for frame in frames)

@@ -5,24 +5,34 @@ png / 2^16 · scale + offset: NAME.png of 16 bits in the folder of its option -d
 each image in sparse/0/depth_params.json. It ignores images whose scale is below 0.2 or above 5
 times the median, so all images have one scale here. It takes 0 for infinitely far and reads no
 masks, so every pixel has a depth: one that is not valid its own, one that is unknown that of the
-nearest known pixel. depth_masks/NAME.png is 0 at both, for other programs.
+nearest known pixel. depth_masks/NAME.png is 0 at both, for other programs. Unless a model is there,
+sparse/0/ gets one of the refined images with points of their depth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note, new_file
+from pnpdepth_cli.commands.exports import (
+    Export,
+    ExportFrame,
+    distortion_note,
+    new_file,
+    save_png,
+)
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.colmap_model import MODEL_PARTS, model_files
 from pnpdepth_cli.io.record import write_json
 
 _CODES = 2**16
+_OURS = b"# Of pnpdepth export: the refined images, points of their depth\n"
 _NEAREST_PERCENTILE = 99.9
 """Of the inverse depth of an image; nearer pixels are clipped, so that few do not set the scale."""
 
@@ -41,22 +51,35 @@ def _mask(folder: Path, frame: ExportFrame) -> Path:
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
     images = [path(folder, frame) for frame in frames for path in (_depth_image, _mask)]
-    return [*images, _parameters(folder)]
+    copies = [frame.image_in(folder) for frame in frames if not frame.is_in(folder)]
+    model = [_parameters(folder).with_name(f"{part}.txt") for part in MODEL_PARTS]
+    return [*copies, *images, _parameters(folder), *(model if _needs_model(folder, frames) else [])]
 
 
-def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
+def _needs_model(folder: Path, frames: Sequence[ExportFrame]) -> bool:
+    """Whether no other's model is in sparse/0/, and one without distortion can be made."""
+    usable = all(frame.pose is not None and not frame.camera.has_lens for frame in frames)
+    there = model_files(_parameters(folder).parent)
+    return usable and (not there or there[0].read_bytes().startswith(_OURS))
+
+
+def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
     scale = max(np.percentile(_inverse(frame)[0], _NEAREST_PERCENTILE) for frame in frames)
     if scale == 0:
         raise InputError("no frame has a pixel with known depth; refine them again")
     masked, clipped, pixels = 0, 0, 0
+    if _needs_model(folder, frames):
+        _write_model(_parameters(folder).parent, frames)
     for frame in frames:
         inverse, valid = _inverse(frame)
         codes = np.rint(inverse / scale * _CODES)
         masked += int((~valid).sum())
         clipped += int((codes > _CODES - 1).sum())
         pixels += codes.size
-        _save(_depth_image(folder, frame), np.minimum(codes, _CODES - 1).astype(np.uint16))
-        _save(_mask(folder, frame), valid.astype(np.uint8) * np.uint8(255))
+        save_png(_depth_image(folder, frame), np.minimum(codes, _CODES - 1).astype(np.uint16))
+        save_png(_mask(folder, frame), valid.astype(np.uint8) * np.uint8(255))
+        frame.copy_image(folder)
+        done()
     make_folder(_parameters(folder).parent)
     parameters = {"scale": float(scale), "offset": 0.0}
     write_json(_parameters(folder), {frame.stem: parameters for frame in frames})
@@ -81,11 +104,28 @@ def _inverse(frame: ExportFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]
     return frame.unit_scale / depth.astype(np.float64), valid
 
 
-def _save(path: Path, pixels: NDArray[np.uint16] | NDArray[np.uint8]) -> None:
-    from PIL import Image
-
-    with new_file(path) as temporary:
-        Image.fromarray(pixels).save(temporary, "PNG")
+def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
+    """Writes cameras, poses, and points of the depth as text of COLMAP, in units of the model."""
+    lines = {part: [_OURS.decode()] for part in MODEL_PARTS}
+    for number, frame in enumerate(frames, 1):
+        cloud, pose, unit = frame.start_points(len(frames)), frame.pose, frame.unit_scale
+        assert pose is not None
+        assert cloud.rgb is not None
+        (fx, _, cx), (_, fy, cy), _ = frame.camera.intrinsics
+        height, width = frame.size
+        # COLMAP counts pixels from the image's corner, and its poses lead to the camera
+        lens = f"{fx} {fy} {cx + 0.5} {cy + 0.5}"
+        x, y, z, w = Rotation.from_matrix(pose[:, :3].T).as_quat()
+        shift = " ".join(map(str, -pose[:, :3].T @ pose[:, 3] / unit))
+        lines["cameras"].append(f"{number} PINHOLE {width} {height} {lens}\n")
+        lines["images"].append(f"{number} {w} {x} {y} {z} {shift} {number} {frame.image_name}\n\n")
+        for point, (red, green, blue) in zip(cloud.xyz / unit, cloud.rgb, strict=True):
+            place = " ".join(f"{value:.7g}" for value in point)
+            index = len(lines["points3D"])
+            lines["points3D"].append(f"{index} {place} {red} {green} {blue} 0\n")
+    for part, text in lines.items():
+        with new_file(folder / f"{part}.txt") as temporary:
+            temporary.write_text("".join(text), encoding="utf-8", newline="\n")
 
 
 EXPORT = Export(needs_pose=False, files=_files, write=_write)

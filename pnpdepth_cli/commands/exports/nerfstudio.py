@@ -2,29 +2,30 @@
 
 Nerfstudio's data conventions: camera axes are x right, y up, z backwards; principal points count
 from the image's corner, so pixel centres are at .5; a depth is PNG code × 0.001 in the unit of the
-poses. Instant-NGP reads the same file; it takes that factor from `integer_depth_scale`.
+poses. Instant-NGP reads the same file; it takes that factor from `integer_depth_scale`. Splatting
+begins with the points of start.ply, in the frame and unit of the poses.
 """
 
 from __future__ import annotations
 
-import filecmp
 import math
-import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame, new_file
+from pnpdepth_cli.commands.exports import Export, ExportFrame
 from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.record import write_json
 
 _CODES_PER_UNIT = 1000.0
+_START = "start.ply"
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _COEFFICIENTS = {
     "radial-tangential": ("k1", "k2", "p1", "p2", "k3", "k4"),
@@ -37,24 +38,13 @@ def _depth_image(folder: Path, frame: ExportFrame) -> Path:
     return folder / "depths" / f"{frame.stem}.png"
 
 
-def _image(folder: Path, frame: ExportFrame) -> Path:
-    """The image, or where it is copied to: Nerfstudio reads images in its folder."""
-    inside = frame.image.resolve().is_relative_to(folder.resolve())
-    return frame.image if inside else folder / "images" / frame.image_name
-
-
-def _is_there(folder: Path, frame: ExportFrame) -> bool:
-    """Whether the image lies in the folder already, itself or, as in a copied project, a copy."""
-    path = _image(folder, frame)
-    return path == frame.image or (path.is_file() and filecmp.cmp(path, frame.image, shallow=False))
-
-
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
-    copies = [_image(folder, frame) for frame in frames if not _is_there(folder, frame)]
-    return [*copies, *(_depth_image(folder, f) for f in frames), folder / "transforms.json"]
+    copies = [frame.image_in(folder) for frame in frames if not frame.is_in(folder)]
+    depths = [_depth_image(folder, frame) for frame in frames]
+    return [*copies, *depths, folder / _START, folder / "transforms.json"]
 
 
-def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
+def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
     lenses = sorted({frame.camera.lens for frame in frames})
     if len(lenses) > 1:
         raise InputError(
@@ -62,22 +52,26 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
             " takes one; undistort the images first"
         )
     factor = _factor(frames)
-    clipped, entries = 0, []
+    clipped, entries, start = 0, [], []
     for frame in frames:
         entries.append(_entry(folder, frame, factor))
-        depth = frame.valid_depth() * np.float32(factor)
+        depth = frame.valid_depth()
+        points = frame.start_points(len(frames))
+        start.append(points._replace(xyz=points.xyz * np.float32(factor)))
+        depth *= np.float32(factor)
         fits = np.rint(depth * _CODES_PER_UNIT) <= LARGEST_CODE
         clipped += int((~fits).sum())
         path = _depth_image(folder, frame)
         make_folder(path.parent)
         write_depth(path, np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
-        if not _is_there(folder, frame):
-            with new_file(_image(folder, frame)) as temporary:
-                shutil.copyfile(frame.image, temporary)
+        frame.copy_image(folder)
+        done()
+    write_cloud(folder / _START, start)
     content = {
         "camera_model": _MODELS[lenses[0]],
         "enable_depth_loading": True,
         "integer_depth_scale": 1 / _CODES_PER_UNIT,
+        "ply_file_path": _START,
         "frames": entries,
     }
     write_json(folder / "transforms.json", content)
@@ -88,7 +82,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame]) -> list[str]:
             f"depth: {clipped:,} pixels beyond {limit:.4g} {frames[0].result.unit} are unknown"
         )
     if factor != 1:
-        notes.append(f"unit: poses and depth are × {factor:g}, so that depth fits 16 bits")
+        notes.append(f"unit: poses, depth and start are × {factor:g}, so that depth fits 16 bits")
     return notes
 
 
@@ -118,7 +112,7 @@ def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
     matrix[:3, 1:3] *= -1
     intrinsics = camera.intrinsics
     return {
-        "file_path": _relative(_image(folder, frame), folder),
+        "file_path": _relative(frame.image_in(folder), folder),
         "depth_file_path": depth,
         "depth_path": depth,
         "transform_matrix": matrix.tolist(),
@@ -138,4 +132,9 @@ def _relative(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix()
 
 
-EXPORT = Export(needs_pose=True, files=_files, write=_write)
+def _unit(frames: Sequence[ExportFrame]) -> str:
+    factor = _factor(frames)
+    return frames[0].result.unit if factor == 1 else f"{frames[0].result.unit} × {factor:g}"
+
+
+EXPORT = Export(needs_pose=True, files=_files, write=_write, unit=_unit)

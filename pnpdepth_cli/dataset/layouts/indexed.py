@@ -7,7 +7,8 @@ per line. Poses are those of groundtruth.txt beside them, at the times of the im
 `colmap`: a COLMAP project, images/ and sparse/0/, or sparse/, or a model beside images/, as that of
 ETH3D's undistorted images in dslr_calibration_undistorted/, or Nerfstudio's colmap/sparse/0/. The
 images of dense/, which COLMAP undistorts, are a project of their own: dense/images/ and
-dense/sparse/. Of several models, sparse/0 to sparse/N, the one with the most images is used.
+dense/sparse/. Of several models, sparse/0 to sparse/N, the one with the most images is used. The
+folder of a model in a project is read, too.
 """
 
 from __future__ import annotations
@@ -131,13 +132,20 @@ def _colmap_models(root: Path) -> list[Path]:
     numbered = sorted(inside, key=lambda p: int(p.name))
     folders = (*numbered, *parents, root, root / _OF_ETH3D)
     found = [folder for folder in folders if model_files(folder)]
-    return found if (root / "images").is_dir() else []
+    return found if _photos(root) else []
+
+
+def _photos(root: Path) -> Path | None:
+    """The folder images/ of a project, or of that whose sparse/0, say, this is."""
+    above = root.absolute().parents[:3] if model_files(root) else ()
+    return next((p / "images" for p in (root, *above) if (p / "images").is_dir()), None)
 
 
 def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
     """One frame for each registered image that exists."""
     models = [read_model(folder) for folder in _colmap_models(root)]
-    model, photos = max(models, key=lambda other: len(other.images)), root / "images"
+    model, photos = max(models, key=lambda other: len(other.images)), _photos(root)
+    assert photos is not None
     files, unreadable = find_files(photos, IMAGE_SUFFIXES)
     yield from unreadable
     for path in files.values():

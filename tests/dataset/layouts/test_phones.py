@@ -67,3 +67,4 @@ def test_nerfstudios_folder_has_its_model_in_colmap(tmp_path: Path) -> None:
     touch(tmp_path / "images/frame_00001.png", tmp_path / "images_2/frame_00001.png")
     (frame,) = read_frames(tmp_path, "colmap")
     assert frame.sparse == tmp_path / "colmap/sparse/0"
+    assert read_frames(tmp_path / "colmap/sparse/0", "colmap")[0].image == frame.image
