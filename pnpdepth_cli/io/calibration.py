@@ -18,7 +18,6 @@ matrix T_camera_lidar there is the pose of the scanner. A folder is KITTI's raw 
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -34,12 +33,13 @@ from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.extrinsics import checked_pose, numbers_in, pose_of_matrix
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_text_size, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
+from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.yaml_file import parse_yaml
 
 CAMERA = 2
 """KITTI's left colour camera, whose images the benchmarks have."""
 
-_PERSPECTIVE = "perspective.txt"  # of KITTI-360
+_PERSPECTIVE, _FROM_CAMERA_0 = "perspective.txt", "calib_cam_to_velo.txt"  # of KITTI-360
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
 _YAML_MARKS = ("camera_matrix:", "distortion_model:", "camera_model:", "distortion_coeffs:")
@@ -98,20 +98,14 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         InputError: The file cannot be read.
         UsageError: There is no such camera.
     """
-    if path.name == _PERSPECTIVE or (path / _PERSPECTIVE).is_file():
-        return _kitti_360(path if path.is_dir() else path.parent, camera)
-    if path.is_dir() or path.name in _RAW_FILES:
-        return _kitti_raw(path if path.is_dir() else path.parent, camera)
+    if path.is_dir() or path.name in (_PERSPECTIVE, *_RAW_FILES):
+        return _kitti_folder(path if path.is_dir() else path.parent, camera)
     text = _text(path)
     if text.lstrip().startswith("%YAML") or any(mark in text for mark in _YAML_MARKS):
         return camera_in_yaml(path, parse_yaml(path, text), camera)
     fields: dict[str, Any]
     if text.lstrip().startswith("{"):
-        try:
-            fields = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            reason = one_line(error)
-            raise FileFormatError(f"{path} is not valid JSON ({reason}); correct it") from error
+        fields = read_json(path)
         if {"K", "w", "h", "poses"} <= set(fields):  # Record3D's, with K by columns
             by_rows = _matrix(path, fields, "K", (3, 3)).T.ravel().tolist()
             fields = {"K": by_rows, "width": fields["w"], "height": fields["h"]}
@@ -207,42 +201,31 @@ def _kitti(path: Path, fields: Mapping[str, Any], camera: int | None) -> Calibra
     return _rectified(path, projection, rectify, pose, f"KITTI calibration, camera {number}")
 
 
-def _kitti_raw(folder: Path, camera: int | None) -> Calibration:
-    """KITTI's raw data; without the file of the scanner, the camera alone."""
-    cameras, scanner = (folder / name for name in _RAW_FILES)
+def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
+    """KITTI's raw data or KITTI-360; without the file of the scanner, the camera alone."""
+    is_360 = (folder / _PERSPECTIVE).is_file()
+    cameras = folder / (_PERSPECTIVE if is_360 else _RAW_FILES[0])
     if not cameras.is_file():
         raise InputError(
             f"{folder} has no {cameras.name}; give the folder with KITTI's {_RAW_FILES[0]} and"
             f" {_RAW_FILES[1]}, or one calibration file"
         )
+    scanner = folder / (_FROM_CAMERA_0 if is_360 else _RAW_FILES[1])
+    pose = None
+    if scanner.is_file() and is_360:  # it maps camera 0 to the scanner
+        pose = pose_of_matrix(scanner, "the matrix", numbers_in(_text(scanner)) or []).inverse()
+    elif scanner.is_file():
+        pose = read_rigid_motion(scanner)
     fields = _fields(cameras, _text(cameras))
     numbers = [int(name[-2:]) for name in fields if re.fullmatch(r"P_rect_\d\d", name)]
-    number = _camera(cameras, camera, numbers)
-    size = _numbers(cameras, fields, f"S_rect_{number:02}", 2)
-    # The raw data's development kit rotates every camera by camera 0's rectification.
+    number = _camera(cameras, 0 if is_360 and camera is None else camera, numbers)
+    # The development kit of the raw data rotates every camera by camera 0's rectification.
     return _rectified(
         cameras,
         _matrix(cameras, fields, f"P_rect_{number:02}", (3, 4)),
         _matrix(cameras, fields, "R_rect_00", (3, 3)),
-        read_rigid_motion(scanner) if scanner.is_file() else None,
-        f"KITTI raw calibration, camera {number}",
-        _height_width(cameras, size),
-    )
-
-
-def _kitti_360(folder: Path, camera: int | None) -> Calibration:
-    """KITTI-360's perspective cameras 0 and 1; its Velodyne file maps camera 0 to the scanner."""
-    cameras, scanner = folder / _PERSPECTIVE, folder / "calib_cam_to_velo.txt"
-    fields = _fields(cameras, _text(cameras))
-    numbers = [int(name[-2:]) for name in fields if re.fullmatch(r"P_rect_\d\d", name)]
-    number = _camera(cameras, camera or 0, numbers)
-    pose = numbers_in(_text(scanner)) if scanner.is_file() else None
-    return _rectified(
-        cameras,
-        _matrix(cameras, fields, f"P_rect_{number:02}", (3, 4)),
-        _matrix(cameras, fields, "R_rect_00", (3, 3)),
-        None if pose is None else pose_of_matrix(scanner, "the matrix", pose).inverse(),
-        f"KITTI-360 calibration, camera {number}",
+        pose,
+        f"{'KITTI-360' if is_360 else 'KITTI raw'} calibration, camera {number}",
         _height_width(cameras, _numbers(cameras, fields, f"S_rect_{number:02}", 2)),
     )
 

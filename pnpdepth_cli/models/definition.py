@@ -121,6 +121,9 @@ UNTUNED_DEFAULTS = Settings(
 Chosen with FastDepth on rendered rooms; Adam with steps of 3 % left a quarter more of the error.
 """
 
+ASSUMED_MULTIPLE = 32
+"""Of the sides of images, for a network that does not say what sizes it takes."""
+
 DENSE_SPACING = 10.0
 """Mean spacing of the points in pixels below which they are dense, as those of a LiDAR are."""
 
@@ -253,11 +256,12 @@ def file_and_part(path: Path) -> tuple[Path, str]:
 def undescribed(**known: Any) -> ModelDefinition:
     """Returns a definition for a network that brings no description of its numbers.
 
-    It is of rgb unless it is known to be of other inputs. The points decide its normalisation and
-    what its output means.
+    It is of rgb, and sides of images are padded to multiples of `ASSUMED_MULTIPLE`, unless other
+    things are known. The points decide its normalisation and what its output means.
     """
     unknown: dict[str, Any] = {
         "input_kind": "rgb",
+        "size": Multiple(ASSUMED_MULTIPLE),
         "normalisation": None,
         "output_kind": "unknown",
         "output_scale": "unknown",
@@ -275,7 +279,7 @@ def graph_definition(
         shapes: Of its inputs, in their order; no whole number where a side is of any length.
         file: It is from.
         stated: Fields that a definition file states of it.
-        **known: Fields that are read in the file; `size` if no side is fixed.
+        **known: Fields that are read in the file.
 
     Raises:
         ModelError: The inputs are others than those stated, without any one rgb image.

@@ -17,10 +17,7 @@ from typing import Any
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, undescribed
-
-_ASSUMED_MULTIPLE = 32
-"""Image sides are padded to multiples of this where no definition says otherwise."""
+from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, undescribed
 
 
 def python_definition(file: Path, attribute: str | None = None) -> ModelDefinition:
@@ -113,10 +110,9 @@ def _assumed_definition(build: Callable[..., Any], attribute: str, file: Path) -
     return undescribed(
         name=f"{file.stem}.{attribute}",
         summary=f"{attribute} of {file.name}",
-        size=Multiple(_ASSUMED_MULTIPLE),
         build=build,
         assumed=f"{attribute!r} of {file.name} is not a definition; assumed: one rgb image in,"
-        f" sides padded to multiples of {_ASSUMED_MULTIPLE}; what its numbers mean is decided from"
+        f" sides padded to multiples of {ASSUMED_MULTIPLE}; what its numbers mean is decided from"
         " the points",
     )
 

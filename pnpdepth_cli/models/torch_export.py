@@ -24,12 +24,11 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, graph_definition
+from pnpdepth_cli.models.definition import ModelDefinition, graph_definition
 from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
 from pnpdepth_cli.models.weights.torch_file import refuse_inflated
 
-_ASSUMED_MULTIPLE = 32
 _OPERATOR = re.compile(r"torch\.ops\.(aten|prims?|torchvision|quantized)\.(\w+)\.(\w+)")
 _TOUCHES_FILES = re.compile("file|save|load|read|write|video|decode")
 _ARITHMETIC = re.compile(
@@ -171,9 +170,7 @@ def exported_definition(file: Path, **stated: Any) -> ModelDefinition:
         ) from None
     return graph_definition(
         shapes, file, stated,
-        summary="torch.export archive",
-        size=Multiple(_ASSUMED_MULTIPLE),
-        build=lambda: ExportedGraph(program, tensors),
+        summary="torch.export archive", build=lambda: ExportedGraph(program, tensors),
     )  # fmt: skip
 
 

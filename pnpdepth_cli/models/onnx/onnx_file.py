@@ -19,7 +19,12 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, graph_definition
+from pnpdepth_cli.models.definition import (
+    ASSUMED_MULTIPLE,
+    ModelDefinition,
+    Multiple,
+    graph_definition,
+)
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
 from pnpdepth_cli.models.onnx.limits import inlined, load_external
 from pnpdepth_cli.models.onnx.quantised import Quantised, outputs_of, quantises, session_of
@@ -30,7 +35,6 @@ MISMATCH = 1e-3
 _HALF_MISMATCH = 1e-2  # half precision itself is no better
 _OPSETS = range(7, 25)  # onnxruntime runs none that is older
 _MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
-_ASSUMED_MULTIPLE = 32
 
 
 def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> ModelDefinition:
@@ -53,7 +57,7 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
     source = model.SerializeToString() if is_part else str(file)
     definition = graph_definition(
         list(inputs.values()), file, stated,
-        size=Multiple(_patch_size(model) or _ASSUMED_MULTIPLE),
+        size=Multiple(_patch_size(model) or ASSUMED_MULTIPLE),
         build=lambda: OnnxGraph(model, file),
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
         output=_as_map,
