@@ -22,11 +22,9 @@ from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.python_file import python_definition
+from pnpdepth_cli.models.weights.checkpoint import WEIGHT_SUFFIXES
 
-_WEIGHTS_ONLY = (
-    *(".pt", ".pth", ".ts", ".torchscript", ".ckpt", ".bin", ".safetensors", ".tar"),
-    *(".npy", ".npz", ".index"),
-)
+_TORCHSCRIPT = (".ts", ".torchscript")
 
 
 def names() -> list[str]:
@@ -115,37 +113,14 @@ def _from_file(spec: str) -> ModelDefinition | None:
         from pnpdepth_cli.models.torch_export import exported_definition
 
         return exported_definition(Path(spec))
-    if spec.endswith(_WEIGHTS_ONLY):
-        raise ModelError(_why_weights_are_no_network(Path(spec)))
+    if spec.endswith((*WEIGHT_SUFFIXES, *_TORCHSCRIPT)):
+        raise ModelError(
+            f"model {spec} is a file of weights, a pickled module or a TorchScript archive, which"
+            " is not run; name the network's Python file with --model and the weights with"
+            " --checkpoint, or export the network by torch.export (.pt2) or to ONNX"
+        )
     if Path(spec).is_dir():
         from pnpdepth_cli.models.hugging_face import hf_definition
 
         return hf_definition(Path(spec))
     return None
-
-
-def _why_weights_are_no_network(file: Path) -> str:
-    """What the file is, and the lines that make a network of it."""
-    from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS
-    from pnpdepth_cli.models.weights.torch_file import TORCHSCRIPT, is_module, read_torch_file
-
-    what, load = "is a file of weights", None
-    if file.is_file() and file.suffix not in (".safetensors", ".npy", ".npz", ".index"):
-        try:
-            if is_module(read_torch_file(file)[0]):
-                what, load = "is a whole pickled module", "torch.load({!r}, weights_only=False)"
-        except CONTENT_ERRORS as error:  # another file of weights, or none
-            if TORCHSCRIPT in str(error):
-                what, load = "is a TorchScript archive", "torch.jit.load({!r})"
-    if load is None:
-        return (
-            f"model {file} {what}, which cannot be cut; name the network's Python file with --model"
-            " and this file with --checkpoint, or export the network by torch.export (.pt2) or to"
-            " ONNX"
-        )
-    return (
-        f"model {file} {what}, which is not run; where you trust it, export it to ONNX (with the"
-        f" size of your images): net = {load.format(file.name)}.eval();"
-        f" torch.onnx.export(net, torch.zeros(1, 3, 480, 640), {file.stem + '.onnx'!r},"
-        " dynamo=False)"
-    )

@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
-from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition, file_and_part
 from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, StandIn
@@ -76,23 +75,13 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
         path: See `read_checkpoint`.
 
     Raises:
-        CheckpointError: A tensor is missing, unexpected, of another shape, or not finite. If the
-            file fits another network that can be named, the message names that.
+        CheckpointError: A tensor is missing, unexpected, of another shape, or not finite.
     """
     stored, notes = _read(path)
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
     stored, prefix_notes = _without_prefixes(stored, path, own)
     notes = [*notes, *prefix_notes]
-    try:
-        state = _fitted(definition, own, stored, path)
-    except CheckpointError:
-        fitting = _networks_it_fits(stored, path, definition.name)
-        if not fitting:
-            raise
-        raise CheckpointError(
-            f"checkpoint {path} does not fit network {definition.name!r}: this is"
-            f" {_some(fitting, ' or ')}; use --model {fitting[0]}"
-        ) from None
+    state = _fitted(definition, own, stored, path)
     # A sum shows a value that is not finite, without a copy of the tensor.
     broken = [
         name
@@ -147,25 +136,6 @@ def _fitted(
             f"checkpoint {path} does not fit network {definition.name!r}: {'; '.join(listed)}"
         )
     return state
-
-
-def _networks_it_fits(stored: Mapping[str, Tensor], path: Path, wanted: str) -> list[str]:
-    """The names of the networks whose weights these are; those that end as `wanted` come first.
-
-    Tensor names and shapes decide, so variants for other image sizes (`-kitti`) fit too.
-    """
-    fitting = []
-    for name in registry.names():
-        definition = registry.find_definition(name)
-        try:
-            with torch.device("meta"):
-                own = definition.build().state_dict()
-            _fitted(definition, own, stored, path)
-        except Exception:  # of another package; such a network is none that fits
-            continue
-        fitting.append(name)
-    ending = wanted.rpartition("-")[2]
-    return sorted(fitting, key=lambda name: name.rpartition("-")[2] != ending)
 
 
 def _prefix(state: Mapping[str, Any]) -> str | None:
@@ -229,16 +199,11 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
             raise CheckpointError(f"checkpoint {path} is a {kind}, which has no {key!r} to choose")
         return content, []
     content, names = content
-    notes = []
+    state, notes = _state_in(content, path, key)
     if names:
-        notes = [f"checkpoint {path.name}: its pickle names {_some(names)}; nothing of it was run"]
-    arguments = content.get("args") if isinstance(content, Mapping) else None
-    arguments = getattr(arguments, "state", arguments)
-    if isinstance(arguments, Mapping) and isinstance(data := arguments.get("data"), str):
-        # Weights for other data may fit all the same.
-        notes.append(f"checkpoint {path.name}: trained with data {_short(data)}")
-    state, several = _state_in(content, path, key)
-    return state, [*notes, *several]
+        fact = f"its pickle names {_some(names)}; nothing of it was run"
+        notes = [f"checkpoint {path.name}: {fact}", *notes]
+    return state, notes
 
 
 def _read_folder(folder: Path) -> tuple[dict[str, Tensor], list[str]]:

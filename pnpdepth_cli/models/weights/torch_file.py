@@ -29,7 +29,6 @@ from pnpdepth_cli.models.weights.pickle_reader import (
     read_pickle,
 )
 
-TORCHSCRIPT = "it is a TorchScript archive"
 _MAGIC = 0x1950A86A20F9469CFC6C
 _MAX_DEPTH = 100
 _MAX_MODULES = 100_000
@@ -91,7 +90,7 @@ def _read_archive(path: Path) -> tuple[Any, list[str]]:
     with zipfile.ZipFile(path) as archive:
         entries = {info.filename: info for info in archive.infolist()}
         if any("/code/" in name for name in entries):
-            raise BrokenFileError(f"{TORCHSCRIPT}; save the state_dict() of its module instead")
+            raise BrokenFileError("it is TorchScript; save the state_dict() of its module instead")
         refuse_inflated(archive, path)
         pickles = [name for name in entries if name == "data.pkl" or name.endswith("/data.pkl")]
         if len(pickles) != 1:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import struct
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,6 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from pnpdepth_cli.errors import CheckpointError, ModelError
-from pnpdepth_cli.models import registry
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.torch_export import exported_definition
@@ -28,13 +25,6 @@ from tests.models.weights.files import little, refused, write_npy
 from tests.models.weights.test_tensor_bundle import bundle, entry
 
 LARGE = 100 << 30  # bytes
-
-
-@pytest.fixture(autouse=True)
-def few_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Weights that do not fit are compared with three known networks only."""
-    known = ["nconv", "sparse2dense-tiny", "sparse2dense-tiny-kitti"]
-    monkeypatch.setattr(registry, "names", lambda: known)
 
 
 class Net(nn.Module):
@@ -214,16 +204,6 @@ def test_a_definition_may_rename_what_a_published_file_holds(tmp_path: Path) -> 
     assert equal(loaded(tmp_path / "w.pth", **rename)[0], weights())
 
 
-def test_the_data_of_the_training_and_what_was_not_run_are_reported(tmp_path: Path) -> None:
-    for data, shown in (("kitti", "kitti"), ("a" * 10**5, "a" * 60 + "…")):
-        args = argparse.Namespace(data=data, lr=0.1, secret="x")
-        torch.save({"args": args, "state_dict": weights()}, tmp_path / "w.pth")
-        assert loaded(tmp_path / "w.pth")[1] == [
-            "checkpoint w.pth: its pickle names argparse.Namespace; nothing of it was run",
-            f"checkpoint w.pth: trained with data {shown}",
-        ]
-
-
 @pytest.mark.parametrize("save", [torch.save, save_older])
 def test_the_tensors_of_a_whole_module_are_extracted_and_reported(
     save: Callable[[Any, Path], None], tmp_path: Path
@@ -284,19 +264,6 @@ def test_a_network_that_refuses_its_state_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"does not fit .*_extra_state") as error:
         load_checkpoint(Picky(), definition(), tmp_path / "w.pth")
     assert "\n" not in str(error.value)
-
-
-def test_weights_of_known_networks_name_them_the_one_with_the_requested_ending_first(
-    tmp_path: Path,
-) -> None:
-    path = tmp_path / "w.pth"
-    torch.save(registry.find_definition("nconv").build().state_dict(), path)
-    with pytest.raises(CheckpointError, match=r"network 'net': this is nconv; use --model nconv$"):
-        loaded(path)
-    torch.save(registry.find_definition("sparse2dense-tiny").build().state_dict(), path)
-    for wanted, first in (("net-kitti", "tiny-kitti"), ("net-tiny", "tiny")):
-        with pytest.raises(CheckpointError, match=rf"--model sparse2dense-{first}$"):
-            load_checkpoint(Net(), replace(definition(), name=wanted), path)
 
 
 @pytest.mark.parametrize(
