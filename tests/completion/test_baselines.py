@@ -40,7 +40,7 @@ def test_what_aligns_a_prediction_leaves_unknown_what_is_unknown_and_needs_one(n
     dense = BASELINES[name].depth(random_points(depth, 80), prediction)
     assert bool((dense[:10] == 0).all())
     assert bool((dense[10:] > 0).all())
-    with pytest.raises(UsageError, match="needs a network's prediction"):
+    with pytest.raises(UsageError):
         BASELINES[name].depth(random_points(depth, 80))
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.completion import gaussian_process as kriging
 from pnpdepth_cli.completion.gaussian_process import (
     CONSTANT,
     SLOPE,
@@ -62,19 +61,6 @@ def test_the_mean_is_that_of_the_textbook(count: int, colour: bool) -> None:
     assert np.allclose(predict(residuals).numpy(), dense_reference(residuals), atol=2e-4)
 
 
-def test_prediction_by_blocks_is_near_the_exact_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
-    residuals = field(120, size=(60, 80))
-    exact = predict(residuals)
-    monkeypatch.setattr(kriging, "_MAX_EXACT", 10)
-    monkeypatch.setattr(kriging, "_MAX_EXACT_SMALL", 10)
-    blocks = predict(residuals)
-    assert not torch.equal(blocks, exact)
-    assert kriging._block_side(residuals.points) == 15  # of 80, 57, 41, 29, 21
-    assert kriging._block_side(field(16, size=(60, 80)).points) == 80
-    assert float((blocks - exact).abs().max()) < 0.05
-    assert float((blocks - exact).abs().mean()) < 0.005
-
-
 @pytest.mark.parametrize(
     ("count", "size", "atol"), [(3, SIZE, 1e-5), (40, SIZE, 1e-5), (900, (60, 80), 0.02)]
 )
@@ -86,48 +72,6 @@ def test_prediction_at_positions_equals_the_dense_one_and_is_near_it_with_many_p
     queries = SparsePoints(xy=positions, depth=torch.ones(4), size=size)
     at = predict_at(residuals, positions, residuals.features_at(queries))
     assert torch.allclose(at, queries.sample(predict(residuals)), atol=atol)
-
-
-def pixels_in_order(rows: int, columns: int, every: tuple[int, int]) -> torch.Tensor:
-    """(N, 2) x and y of every so many rows and columns."""
-    y, x = torch.arange(0, rows, every[0]), torch.arange(0, columns, every[1])
-    return torch.cartesian_prod(y, x).flip(1).float()
-
-
-@pytest.mark.parametrize(
-    ("size", "every", "steps"),
-    [
-        ((128, 512), (32, 32), (4, 4)),  # a sixth of the spacing, and at most 4 pixels
-        ((128, 512), (16, 16), (2, 2)),
-        ((128, 512), (2, 2), (1, 1)),
-        ((127, 512), (32, 32), (1, 1)),  # too small an image to be worth it
-        ((128, 512), (7, 1), (3, 1)),  # half the spacing of scan lines
-        ((128, 512), (32, 1), (4, 1)),
-    ],
-)
-def test_the_nodes_of_the_grid_are_dense_between_the_points(
-    size: tuple[int, int], every: tuple[int, int], steps: tuple[int, int]
-) -> None:
-    xy = pixels_in_order(*size, every)
-    assert kriging._steps(SparsePoints(xy=xy, depth=torch.ones(len(xy)), size=size)) == steps
-
-
-@pytest.mark.parametrize(
-    ("count", "size", "exact"),
-    [
-        (128, (1000, 1000), True),
-        (129, (1000, 1000), False),
-        (200, (400, 500), True),  # 40 million points × pixels
-        (200, (400, 501), False),
-        (256, (100, 100), True),
-        (257, (100, 100), False),
-    ],
-)
-def test_all_points_predict_every_pixel_where_that_is_cheap(
-    count: int, size: tuple[int, int], exact: bool
-) -> None:
-    points = SparsePoints(xy=torch.zeros(count, 2), depth=torch.ones(count), size=size)
-    assert kriging._is_exact(replace(field(1), points=points)) == exact
 
 
 def left_out_by_hand(residuals: ResidualField, index: int) -> float:

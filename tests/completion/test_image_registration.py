@@ -1,12 +1,9 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.completion import image_registration
 from pnpdepth_cli.completion.image_registration import (
     Evidence,
     ImageRegistration,
@@ -64,30 +61,6 @@ def test_frames_with_few_points_show_together_what_each_does_not() -> None:
     found = estimated(frames)
     assert isinstance(found, ImageRegistration)
     assert found.zoom == pytest.approx(UNREGISTERED.zoom, abs=0.02)
-
-
-def test_a_pair_of_points_says_the_same_in_either_order() -> None:
-    known = evidence_of(0)
-    turned = replace(known, ends=known.ends[:, ::-1])
-    assert turned.unmoved == pytest.approx(known.unmoved, abs=0.02 * known.unmoved.std())
-
-
-def test_pairs_without_a_depth_edge_speak_against_an_edge_of_the_image() -> None:
-    rng = np.random.default_rng(0)
-    at = rng.random((300, 2)) * 100
-    log_depth = np.where(at[:, 0] < 30, 0.0, 1.0) + 0.01 * rng.standard_normal(300)
-    pairs = image_registration._pairs(at)
-    assert pairs is not None
-    edges = image_registration._depth_edges(at, log_depth, pairs)
-    assert edges is not None
-    assert edges.mean() == pytest.approx(0, abs=1e-12)
-    across = (at[pairs][:, :, 0] < 30).sum(axis=1) == 1
-    assert edges[across].min() > edges[~across].max()
-
-
-def test_frames_of_another_size_than_the_first_are_left_out() -> None:
-    first, other = evidence_of(0, UNREGISTERED), evidence_of(1)
-    assert estimated([first, replace(other, size=(200, 320))]) == estimated([first])
 
 
 @pytest.mark.parametrize("zoom", [0.72, 1.4])

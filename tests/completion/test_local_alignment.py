@@ -68,28 +68,6 @@ def test_a_scale_that_drifts_over_the_image_is_followed(space: str, count: int) 
     assert mean_log_error(local, gt) < 0.35 * mean_log_error(everywhere, gt)
 
 
-@pytest.mark.parametrize(("count", "fraction"), [(40, 0.5), (400, 0.05)])
-def test_inlier_weights_reduce_the_effect_of_20_percent_gross_outliers(
-    count: int, fraction: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gt = scene_depth()
-    drift = torch.linspace(0.8, 1.25, SIZE[0])[:, None]
-    noise = torch.randn(SIZE, generator=torch.Generator().manual_seed(1))
-    prediction = gt * drift * (1 + 0.02 * noise)
-
-    def rise() -> float:
-        errors = []
-        for seed in range(4):
-            points = random_points(gt, count, seed)
-            clean, moved = (locally_aligned(prediction, p) for p in (points, spoiled(points)))
-            errors.append(mean_log_error(moved, gt) - mean_log_error(clean, gt))
-        return sum(errors)
-
-    weighted = rise()
-    monkeypatch.setattr("pnpdepth_cli.completion.outliers.ALONE", 1e9)
-    assert weighted < fraction * rise()
-
-
 def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:
     gt = scene_depth()
     points = random_points(gt, 100)
@@ -98,13 +76,3 @@ def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:
     dense = locally_aligned(prediction, points, space="inverse")
     assert float(dense.max()) <= float(points.depth.max()) * BEYOND * (1 + 1e-5)
     assert float(dense.min()) >= float(points.depth.min()) / BEYOND * (1 - 1e-5)
-
-
-def test_a_coarser_grid_is_near_the_alignment_of_every_pixel(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    gt = scene_depth()
-    prediction = gt * torch.linspace(0.6, 1.5, SIZE[1])
-    whole = locally_aligned(prediction, random_points(gt, 60))
-    monkeypatch.setattr("pnpdepth_cli.completion.local_lines._NODES", gt.numel() // 4)
-    assert mean_log_error(locally_aligned(prediction, random_points(gt, 60)), whole) < 0.01

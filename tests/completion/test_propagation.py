@@ -38,15 +38,6 @@ def test_a_prediction_that_drifts_is_put_right_with_and_without_an_image(
         assert mean_log_error(points.sample(depth), points.depth) < 0.01
 
 
-@pytest.mark.parametrize("kind", PROPAGATIONS)
-def test_a_kernel_that_was_fitted_before_gives_the_same_depth(kind: str) -> None:
-    gt, rgb, prediction = scene()
-    points, xy = random_points(gt, 60), torch.tensor([[3.0, 4.0], [20.0, 11.0]])
-    kernel = propagate(prediction, points, rgb, kind=kind).kernel
-    again = propagate_at(prediction, points, rgb, xy, kind=kind, kernel=kernel)
-    assert torch.equal(again, propagate_at(prediction, points, rgb, xy, kind=kind))
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_point_moves_all_by_its_factor_and_nothing_left_leaves_the_prediction(
     kind: str,
@@ -82,17 +73,6 @@ def test_outliers_do_not_propagate(kind: str, count: int) -> None:
         for p in (points, spoiled(points))
     )
     assert disturbed < 1.5 * clean + 0.01
-
-
-@pytest.mark.parametrize("kind", PROPAGATIONS)
-@pytest.mark.parametrize("count", [7, 300])
-def test_the_order_of_the_points_does_not_matter(kind: str, count: int) -> None:
-    gt, rgb, prediction = scene()
-    points = random_points(gt, count)
-    other = torch.randperm(count, generator=torch.Generator().manual_seed(1))
-    turned = SparsePoints(xy=points.xy[other], depth=points.depth[other], size=SIZE)
-    depth, again = (propagate(prediction, p, rgb, kind=kind).depth for p in (points, turned))
-    assert torch.equal(depth, again)
 
 
 @pytest.mark.parametrize("kind", KINDS)

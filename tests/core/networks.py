@@ -6,7 +6,7 @@ import functools
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -19,43 +19,6 @@ def conv(channels: int, out: int, kernel: int = 3, stride: int = 1) -> nn.Conv2d
 
 
 # ------------------------------------------------------------------ ordinary architectures
-
-
-class BasicBlock(nn.Module):
-    """As in ResNet: one in-place ReLU called twice, and `out += identity`."""
-
-    def __init__(self, channels: int, out: int, stride: int):
-        super().__init__()
-        self.conv1, self.bn1 = conv(channels, out, stride=stride), nn.BatchNorm2d(out)
-        self.conv2, self.bn2 = conv(out, out), nn.BatchNorm2d(out)
-        self.relu = nn.ReLU(inplace=True)
-        self.downsample = None
-        if stride != 1 or channels != out:
-            self.downsample = nn.Sequential(conv(channels, out, 1, stride), nn.BatchNorm2d(out))
-
-    def forward(self, x: Tensor) -> Tensor:
-        identity = x if self.downsample is None else self.downsample(x)
-        out = self.relu(self.bn1(self.conv1(x)))
-        out = self.bn2(self.conv2(out))
-        out += identity
-        return self.relu(out)
-
-
-class ResNetDepth(nn.Module):
-    """ResNet encoder, upsampling decoder, no skips."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.stem = nn.Sequential(conv(3, 8, stride=2), nn.BatchNorm2d(8), nn.ReLU(inplace=True))
-        self.layer1 = nn.Sequential(BasicBlock(8, 8, 1), BasicBlock(8, 8, 1))
-        self.layer2 = nn.Sequential(BasicBlock(8, 16, 2), BasicBlock(16, 16, 1))
-        self.up1, self.up2, self.head = conv(16, 8), conv(8, 8), conv(8, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.layer2(self.layer1(self.stem(x)))
-        x = F.relu(self.up1(F.interpolate(x, scale_factor=2.0)), inplace=True)
-        x = F.relu(self.up2(F.interpolate(x, scale_factor=2.0)), inplace=True)
-        return F.softplus(self.head(x)) + 1
 
 
 class SkipEncoder(nn.Module):
@@ -265,11 +228,6 @@ class Repeated(nn.Module):
         return self.head(x).abs() + 1
 
 
-class Pair(NamedTuple):
-    deep: Tensor
-    shallow: Tensor
-
-
 @dataclass(frozen=True)
 class Frozen:
     deep: Tensor
@@ -282,9 +240,7 @@ class Structured(nn.Module):
 
     makes: dict[str, Callable[[Tensor, Tensor], Any]] = {  # noqa: RUF012
         "tuple": lambda a, b: (a, b),
-        "list": lambda a, b: [a, b],
         "dict": lambda a, b: {"deep": a, "shallow": b},
-        "namedtuple": Pair,
         "dataclass": Frozen,
         "nested": lambda a, b: {"out": [(a, 3), {"x": b}], 5: "text"},
     }
@@ -375,30 +331,20 @@ class Appends(nn.Module):
 
 
 class SideEffects(nn.Module):
-    """Parts that change their list argument; a generator; an object that hides tensors."""
+    """Parts that change their list argument; an object that hides tensors."""
 
     def __init__(self) -> None:
         super().__init__()
         self.enter, self.one, self.two, self.cut = conv(3, 4), Appends(), Appends(), conv(4, 4)
-        self.many, self.hide, self.head = Generates(), Hides(), conv(4, 1)
+        self.hide, self.head = Hides(), conv(4, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         tensors: list[Tensor] = []
         x = self.two(self.one(self.enter(x), tensors), into=tensors)
         hidden = self.hide(x)
         hidden.tensor += 1
-        lazy = self.many(x)
-        z = self.cut(x) + sum(lazy) + hidden.tensor
+        z = self.cut(x) + hidden.tensor
         return self.head(z * tensors[0] + tensors[1]).abs() + 1
-
-
-class Generates(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv = conv(4, 4)
-
-    def forward(self, x: Tensor) -> Any:
-        return (self.conv(x * i) for i in range(2))
 
 
 class Hides(nn.Module):
@@ -480,33 +426,18 @@ class Scripted(nn.Module):
 
 
 class Checkpointed(nn.Module):
-    def __init__(self, reentrant: bool):
+    def __init__(self) -> None:
         super().__init__()
         self.enter, self.cut, self.a, self.b = conv(3, 4), conv(4, 4), conv(4, 4), conv(4, 4)
         self.head = conv(4, 1)
-        self.reentrant = reentrant
 
     def block(self, y: Tensor, x: Tensor) -> Tensor:
         return self.b(torch.sigmoid(self.a(y)) * self.enter(x)).sin()
 
     def forward(self, x: Tensor) -> Tensor:
         y = self.cut(self.enter(x))
-        y = checkpoint(self.block, y, x, use_reentrant=self.reentrant)
+        y = checkpoint(self.block, y, x, use_reentrant=False)
         return self.head(y).abs() + 1
-
-
-class CheckpointedCut(nn.Module):
-    """The cut itself lies inside what is computed again in the backward pass."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter, self.cut, self.head = conv(3, 4), conv(4, 4), conv(4, 1)
-
-    def block(self, x: Tensor) -> Tensor:
-        return self.cut(x).sin() * x
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.head(checkpoint(self.block, self.enter(x), use_reentrant=False)).abs() + 1
 
 
 class HalfInference(nn.Module):
@@ -529,33 +460,6 @@ class InferenceConv(nn.Module):
     @torch.inference_mode()
     def forward(self, x: Tensor) -> Tensor:
         return self.inner(x)
-
-
-class Sparse(nn.Module):
-    """A sparse matrix on either side of the cut."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter, self.cut, self.to_sparse, self.head = (
-            conv(3, 4),
-            conv(4, 4),
-            ToSparse(),
-            conv(4, 1),
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.enter(x)
-        affinity = self.to_sparse(x)
-        z = self.cut(x)
-        propagated = torch.sparse.mm(affinity, z[0].flatten(1)).unflatten(1, z.shape[-2:])
-        gate = self.to_sparse(z.detach()).to_dense().mean()
-        return self.head(z + propagated[None] * gate).abs() + 1
-
-
-class ToSparse(nn.Module):
-    def forward(self, x: Tensor) -> Tensor:
-        flat = x[0].flatten(1)
-        return (flat @ flat.t()).relu().to_sparse()
 
 
 def native_scale(x: Tensor) -> Tensor:
@@ -593,10 +497,6 @@ class Native(nn.Module):
         return self.head(self.after(self.native(self.cut(self.enter(x))))).abs() + 1
 
 
-def traced() -> nn.Module:
-    return torch.fx.symbolic_trace(nn.Sequential(conv(3, 4), nn.ReLU(inplace=True), UNetTail()))
-
-
 class UNetTail(nn.Module):
     def __init__(self) -> None:
         super().__init__()
@@ -615,7 +515,6 @@ def wrapped_network() -> nn.Module:
 
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {
-    "resnet": ResNetDepth,
     "unet": UNet,
     "vit": ViTDepth,
     "in place": InPlace,
@@ -628,13 +527,9 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "updating": Updating,
     "direct": Direct,
     "scripted": Scripted,
-    "checkpointed": functools.partial(Checkpointed, False),
-    "checkpointed, reentrant": functools.partial(Checkpointed, True),
-    "checkpointed cut": CheckpointedCut,
+    "checkpointed": Checkpointed,
     "half inference": HalfInference,
-    "sparse": Sparse,
     "native": Native,
-    "fx": traced,
     "wrapped": wrapped_network,
 }
 

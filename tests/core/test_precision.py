@@ -56,11 +56,6 @@ def test_z_is_handed_out_in_float32_and_the_rear_of_it_is_the_network_bit_for_bi
         assert torch.equal(output, network(image))
 
 
-def test_a_network_in_float64_keeps_its_z() -> None:
-    with torch.no_grad(), Split(InHalf(torch.float64), "encode") as split:
-        assert split.front(torch.rand(1, 1, 8, 8)).dtype == torch.float64
-
-
 def test_steps_far_below_the_precision_of_z_add_up() -> None:
     """A step of 2^-12 is nothing to a bfloat16 near 1; many of them together are not."""
     many = refined(InHalf(torch.bfloat16), iterations=200, lr=2.0**-10)

@@ -28,7 +28,7 @@ def test_a_per_cent_step_is_that_fraction_of_the_standard_deviation_of_z0() -> N
     "lr", [0, -1, "0%", "-3%", "x", "", "%", "nan", "inf", float("nan"), "3%%"]
 )
 def test_what_is_no_step_is_refused(lr: float | str) -> None:
-    with pytest.raises(UsageError, match="step size"):
+    with pytest.raises(UsageError):
         step_size(lr, torch.ones(2))
 
 

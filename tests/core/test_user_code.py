@@ -42,11 +42,6 @@ def test_running_out_of_memory_stays_itself(error: Exception) -> None:
         raise error
 
 
-def test_other_errors_are_not_taken_for_it() -> None:
-    assert not is_out_of_memory(RuntimeError("shape mismatch"))
-    assert not is_out_of_memory(ValueError("out of memory"))
-
-
 def test_the_line_of_a_file_is_named_however_the_file_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
