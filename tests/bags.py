@@ -48,6 +48,7 @@ def write_bag(
     clock_s: float = 0.0,
     depth: str = "",
     depth_frame: str = "camera",
+    depth_focal: float = FOCAL_PX,
 ) -> Path:
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
@@ -86,7 +87,7 @@ def write_bag(
             yield _image(make, header(time_ns, "camera"), pixels, time_ns, topic, compressed)
             if depth:
                 stamp = header(time_ns + 4_000_000, depth_frame)
-                info_of_depth = _camera_info(make, stamp, ros1, view)
+                info_of_depth = _camera_info(make, stamp, ros1, view, depth_focal)
                 yield "/depth/camera_info", time_ns + 5_000_000, info_of_depth
                 topic, message = _depth(make, stamp, depth)
                 yield topic, time_ns + 5_000_000, message
@@ -173,8 +174,10 @@ def _transforms(make: Make, header: Make) -> Any:
     return make("tf2_msgs/TFMessage", transforms=[camera, lidar, depth])
 
 
-def _camera_info(make: Make, header: Any, ros1: bool, view: View | None) -> Any:
-    matrix = np.array([FOCAL_PX, 0, 31.5, 0, FOCAL_PX, 23.5, 0, 0, 1.0])
+def _camera_info(
+    make: Make, header: Any, ros1: bool, view: View | None, focal: float = FOCAL_PX
+) -> Any:
+    matrix = np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1.0])
     values = {"d": np.zeros(5), "k": matrix, "r": np.eye(3).ravel(), "p": np.zeros(12)}
     if view is not None:
         values = {name: getattr(view, name).ravel().astype(float) for name in "dkrp"}

@@ -69,6 +69,9 @@ _SLOWEST_S = 1.0
 _LONGEST_GAP_S = 0.5
 """Between two poses that one is interpolated from."""
 
+_SAME_K = 0.05
+"""Relative difference of intrinsics of one camera, which a driver may have calibrated twice."""
+
 Say = Callable[[str], None]
 
 
@@ -265,7 +268,7 @@ def _sensors(bag: Bag, wanted: Sequence[str], say: Say) -> _Sensors:
     """
     counts = {name: count for name, count in bag.topics(IMAGES).items() if count}
     first = {name: next(bag.messages([name]))[2] for name in counts}
-    depths = {name: count for name, count in counts.items() if is_depth(first[name])}
+    depths = {name: count for name, count in counts.items() if is_depth(first[name], name)}
     colours = {name: count for name, count in counts.items() if name not in depths}
     images, clouds = topic_of(bag, wanted, colours, "images"), bag.topics(CLOUDS)
     if not depths or (clouds and not set(wanted) & set(depths)):
@@ -275,14 +278,19 @@ def _sensors(bag: Bag, wanted: Sequence[str], say: Say) -> _Sensors:
     registered = {name: count for name, count in depths.items() if frame_of(first[name]) == frame}
     usable = depths if set(wanted) & set(depths) else registered or depths
     points = topic_of(bag, wanted, usable, "depth images")
-    info = camera_info_topic(bag, points)
-    if points in registered or info == camera_info_topic(bag, images):
-        return _Sensors(images=images, points=points, is_depth=True)
-    camera = None if info is None else camera_of_bag(bag, info)
-    if camera is None:
-        say(f"warning: {points} has no camera_info; its pixels are taken for those of the images")
-        return _Sensors(images=images, points=points, is_depth=True)
-    return _Sensors(images=images, points=points, is_depth=True, depth_camera=camera[0].camera)
+    same = _Sensors(images=images, points=points, is_depth=True)
+    infos = camera_info_topic(bag, images), camera_info_topic(bag, points)
+    of_images, of_depth = (None if info is None else camera_of_bag(bag, info) for info in infos)
+    if of_depth is None or infos[0] == infos[1]:
+        if points not in registered and of_depth is None:
+            say(f"warning: {points} has no camera_info; its pixels are taken for the images'")
+        return same
+    if points in registered and of_images is not None:
+        own, other = of_images[0].camera, of_depth[0].camera
+        if own.size == other.size and np.allclose(own.intrinsics, other.intrinsics, rtol=_SAME_K):
+            return same
+        say(f"{points} is of another camera than {images}, but in its frame: no offset is known")
+    return replace(same, depth_camera=of_depth[0].camera)
 
 
 def _measured(sensors: _Sensors, message: Any) -> tuple[NDArray[np.float32], dict[str, int]]:

@@ -28,7 +28,7 @@ _MOST_WAITING = 64
 
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PN": ".png"}
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1}
-_DEPTH = {"16UC1": "u2", "32FC1": "f4"}
+_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _COMPRESSED_DEPTH, _DEPTH_HEADER, _MM_PER_M = "compressedDepth", 12, 1000.0
 _TO_BGR = {
     "rgb8": cv2.COLOR_RGB2BGR,
@@ -92,10 +92,14 @@ def _rows(message: Any, topic: str, pixel_bytes: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(rows)
 
 
-def is_depth(message: Any) -> bool:
-    """Returns whether an Image, or CompressedImage, is a depth image."""
+def is_depth(message: Any, topic: str) -> bool:
+    """Returns whether an Image, or CompressedImage, is a depth image.
+
+    Grey images of 16 bits are if the topic says so, as those that librealsense records.
+    """
     if hasattr(message, "encoding"):
-        return str(message.encoding) in _DEPTH
+        encoding = str(message.encoding)
+        return encoding in _DEPTH and (encoding != "mono16" or "depth" in topic.lower())
     return _COMPRESSED_DEPTH in str(message.format)
 
 
@@ -121,7 +125,7 @@ def depth_image(message: Any, topic: str) -> NDArray[np.float32]:
             f" {' or '.join(_DEPTH)}; name another topic with --topic"
         )
     codes = PNG.read(Path(topic), data[_DEPTH_HEADER:]).values
-    if kind == "16UC1":
+    if _DEPTH[kind] == "u2":
         return known_metres(codes / _MM_PER_M)
     a, b = np.frombuffer(data, "<f4", 2, offset=4)
     with np.errstate(divide="ignore"):

@@ -33,9 +33,11 @@ def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
     topics = bag.topics(CAMERAS)
     for end in COMPRESSED:
         image_topic = image_topic.removesuffix(end)
-    beside = image_topic.rpartition("/")[0] + "/camera_info"
-    if beside in topics:
-        return beside
+    folder = image_topic.rpartition("/")[0]
+    # librealsense has /device_0/sensor_1/Color_0/image/data and …/Color_0/info/camera_info
+    for beside in (f"{folder}/camera_info", f"{folder.rpartition('/')[0]}/info/camera_info"):
+        if beside in topics:
+            return beside
     return next(iter(topics)) if len(topics) == 1 else None
 
 

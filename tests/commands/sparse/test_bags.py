@@ -78,6 +78,12 @@ def test_depth_images_of_a_bag_are_sparse_depth(
     written(bag, tmp_path / "same")
     for frame in read_frames(tmp_path / "same"):
         np.testing.assert_allclose(read_depth(frame.sparse).values, depth, rtol=error)  # type: ignore[arg-type]
+    wide = write_bag(tmp_path / f"wide_{kind}", depth=encoding + compressed, depth_focal=30.0)
+    written(wide, tmp_path / "wide")
+    frame = read_frames(tmp_path / "wide")[0]  # in the same frame, of half the focal length
+    options = ScanOptions(calib=frame.calib)
+    points = read_scan_points(frame.sparse, options, (HEIGHT, WIDTH)).points  # type: ignore[arg-type]
+    np.testing.assert_allclose(points.xy[:, 0] % 2, 0.5, atol=0.01)  # 31.5 + 2 · (u − 31.5)
     # another camera, 0.05 m to the left: f · 0.05 m / 4 m = 0.75 pixels
     other = write_bag(tmp_path / f"other_{kind}", depth=encoding + compressed, depth_frame="depth")
     written(other, tmp_path / "other")
