@@ -41,14 +41,15 @@ _END_OF_PNG = b"\xaeB`\x82"
 def check_tags(data: bytes) -> None:
     """Checks the tags of all pages of a TIFF, or of EXIF, before a library copies them.
 
-    Thousands of tags can share the same bytes.
+    Thousands of tags can share the same bytes, and so can pages.
 
     Raises:
-        ValueError: The tags together claim more bytes than there are.
+        ValueError: The tags, or the pages, together claim more bytes than there are.
         struct.error: A page or a tag lies outside the data.
     """
     order = "<" if data[:2] == b"II" else ">"
-    pages, seen, claimed = list(struct.unpack_from(f"{order}I", data, 4)), set[int](), 0
+    pages, seen = list(struct.unpack_from(f"{order}I", data, 4)), set[int]()
+    claimed = of_pages = 0
     while pages:
         start = pages.pop()
         if start == 0 or start in seen:
@@ -56,6 +57,9 @@ def check_tags(data: bytes) -> None:
         seen.add(start)
         end = start + 2 + 12 * struct.unpack_from(f"{order}H", data, start)[0]
         pages += struct.unpack_from(f"{order}I", data, end)  # the list of tags is complete
+        of_pages += end - start
+        if of_pages > len(data):
+            raise ValueError("its pages overlap")
         for tag, kind, number, value in struct.iter_unpack(f"{order}HHII", data[start + 2 : end]):
             claimed += number * _BYTES_OF_TYPE.get(kind, 1)
             if claimed > len(data):

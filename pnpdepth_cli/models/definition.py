@@ -36,6 +36,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import choices
+from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.choices import Fit, OutputKind, OutputScale
 from pnpdepth_cli.choices import InputKind as InputKind  # for definition files
 from pnpdepth_cli.errors import ModelError
@@ -307,6 +308,9 @@ def graph_definition(
         )
 
     if isinstance(height, int) and isinstance(width, int):
+        claim = f"{file} takes images of {width}×{height} pixels"
+        limit = "allow more with --max-pixels"
+        check_claim(claim, height * width, budget().max_pixels, error=ModelError, way_out=limit)
         known["size"] = Fixed(height, width)
     known |= {"name": file.stem, "complete": True, "checkpoint": file, "arguments": arguments}
     return undescribed(**known | dict(stated))

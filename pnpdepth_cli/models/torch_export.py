@@ -8,6 +8,7 @@ lies in the archive is left alone (layout and schema: torch/_export/serde/schema
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import operator
@@ -25,6 +26,8 @@ from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, graph_definition
+from pnpdepth_cli.models.onnx.limits import run_first
+from pnpdepth_cli.models.onnx.table import Unsupported
 from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
 from pnpdepth_cli.models.weights.torch_file import refuse_inflated
@@ -56,7 +59,10 @@ class ExportedOperation(nn.Module):
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Returns the operation's result."""
-        return self._operation(*args, **kwargs)
+        try:
+            return self._operation(*args, **kwargs)
+        except Unsupported as error:
+            raise ModelError(f"the exported program calls {self._operation} for {error}") from None
 
 
 class ExportedGraph(nn.Module):
@@ -85,13 +91,19 @@ class ExportedGraph(nn.Module):
             for spec in module["signature"]["output_specs"]
             if "user_output" in spec
         ]
+        self._allowed: set[tuple[torch.Size, ...]] = set()
         self._steps = with_ends(list(self._steps_of(module["graph"])), self._outputs)
 
     def forward(self, *inputs: Tensor) -> Any:
         """Returns the output, or a tuple of several."""
         values: dict[str, Any] = dict(zip(self.inputs, inputs, strict=True))
         values |= {name: getattr(self, attribute) for name, attribute in self.held.items()}
-        deque(run_steps(self._steps, values), maxlen=0)
+        sizes = tuple(each.shape for each in inputs)
+        if sizes in self._allowed:
+            deque(run_steps(self._steps, values), maxlen=0)
+        else:
+            run_first(self._steps, values, 0, "operation")
+            self._allowed.add(sizes)
         outputs = tuple(values[name] for name in self._outputs)
         return outputs if len(outputs) > 1 else outputs[0]
 
@@ -126,6 +138,7 @@ class ExportedGraph(nn.Module):
             arguments=[_argument(one["arg"]) for one in inputs if one.get("kind") != 2],
             keywords={one["name"]: _argument(one["arg"]) for one in inputs if one.get("kind") == 2},
             outputs=str(named[0]) if alone else named,
+            name=target,
         )
 
     def _inlined(
@@ -216,7 +229,17 @@ def _function(target: str) -> Callable[..., Any]:
     arithmetic: Callable[..., Any] | None = getattr(place, found[1] or found[2] or found[3], None)
     if arithmetic is None:
         raise BrokenFileError(f"it calls {target[:80]!r}, which this version of torch lacks")
-    return arithmetic
+    return arithmetic if found[1] == "getitem" else functools.partial(_computed, arithmetic)
+
+
+def _computed(arithmetic: Callable[..., Any], *numbers: Any) -> Any:
+    """The result of arithmetic on numbers of 64 bits and tensors; not on lists and texts."""
+    if not all(isinstance(each, int | float | Tensor) for each in numbers):
+        raise ModelError("the exported program computes with what is no number")
+    result = arithmetic(*numbers)
+    if isinstance(result, int) and abs(result) >= 1 << 63:
+        raise ModelError("the exported program computes an integer beyond 64 bits")
+    return result
 
 
 def _argument(stated: Mapping[str, Any]) -> Any:

@@ -203,6 +203,17 @@ def test_an_exr_has_four_bytes_a_pixel_of_every_channel() -> None:
         _claimed_bytes(Path("a.exr"), header | {"channels": [channel] * 9}, 1 << 30)
 
 
+def test_pages_of_a_tiff_that_overlap_are_refused() -> None:
+    tags = 60_000
+    start = [8 + 2 + 12 * 3000 + 4 + 10 + 12 * k for k in range(3000)]
+    pointers = b"".join(struct.pack("<HHII", 34665, 4, 0, each) for each in start)
+    # each value ends with the number of tags of a page that begins there
+    shared = struct.pack("<HHIHH", 1, 1, 0, 0, tags) * (tags + 3001)
+    data = b"II*\0" + struct.pack("<IH", 8, 3000) + pointers + bytes(4) + shared
+    with little(seconds=2), pytest.raises(ValueError, match="overlap"):
+        check_tags(data)
+
+
 def test_the_tags_of_a_tiff_claim_as_many_bytes_as_their_types_have() -> None:
     sizes = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
     for kind, size in sizes.items():

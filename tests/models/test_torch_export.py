@@ -249,6 +249,64 @@ def test_what_could_do_more_than_compute_is_refused_in_one_line(archive: Path, k
     assert len(str(error.value)) < 500
 
 
+def first_node(target: str, *arguments: Any, output: str | None = None) -> Change:
+    """The first node is another one, whose result the next takes."""
+
+    def change(program: Any) -> None:
+        nodes = program["graph_module"]["graph"]["nodes"]
+        inputs = [{"name": "x", "arg": argument, "kind": 1} for argument in arguments]
+        named = {"as_sym_int": {"as_name": output}} if output else nodes[0]["outputs"][0]
+        node = {"target": target, "inputs": inputs, "outputs": [named], "metadata": {}}
+        nodes[0:1] = [node] * (80 if output else 1)
+
+    return edited(change)
+
+
+ONE = {"as_sym_int": {"as_int": 10**9}}
+INFLATING: dict[str, Change] = {
+    "a constant": first_node(
+        "torch.ops.aten.full.default", {"as_ints": [1, 8, 10**5, 10**4]}, {"as_float": 1.0}
+    ),
+    "a repeated input": first_node(
+        "torch.ops.aten.repeat.default",
+        {"as_tensor": {"name": "rgb"}},
+        {"as_ints": [1, 9, 999, 999]},
+    ),
+    "an integer": first_node("_operator.mul", ONE, ONE, output="x"),
+    "a list": first_node("_operator.mul", {"as_ints": [0]}, {"as_int": 10**10}, output="x"),
+}
+
+
+@pytest.mark.parametrize("kind", INFLATING)
+def test_a_small_archive_makes_nothing_far_larger_than_its_image(archive: Path, kind: str) -> None:
+    if kind == "an integer":  # squared again and again
+        chained = edited(
+            lambda p: [
+                node["inputs"][k].update(arg={"as_sym_int": {"as_name": "x"}})
+                for node in p["graph_module"]["graph"]["nodes"][1:80]
+                for k in (0, 1)
+            ]
+        )
+        change = INFLATING[kind]
+        path = rewritten(archive, MODEL, lambda content: chained(change(content)))
+    else:
+        path = rewritten(archive, MODEL, INFLATING[kind])
+    with little():
+        definition = find_definition(str(path))
+        with pytest.raises(ModelError), torch.no_grad():
+            definition.build()(torch.rand(1, 3, 32, 48))
+
+
+def test_an_input_larger_than_the_largest_image_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exported = torch.export.export(Net().eval(), (torch.rand(1, 3, 32, 48),))
+    torch.export.save(exported, tmp_path / "net.pt2")
+    monkeypatch.setattr("pnpdepth_cli.budget._chosen", 32 * 48 - 1)
+    with pytest.raises(ModelError, match="48×32"):
+        find_definition(str(tmp_path / "net.pt2"))
+
+
 def test_what_is_no_exported_program_is_refused(archive: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.pt2").write_bytes(b"no archive")
     packed = rewritten(archive, "data/x", lambda _: b"\0" * 10**7, zipfile.ZIP_DEFLATED)

@@ -24,7 +24,7 @@ from pnpdepth_cli.models.onnx import (  # noqa: F401  (each registers its operat
     layers,
     resizing,
 )
-from pnpdepth_cli.models.onnx.limits import SizeLimit, largest_activation
+from pnpdepth_cli.models.onnx.limits import SizeLimit, run_first
 from pnpdepth_cli.models.onnx.table import HOST_INPUTS, OPERATORS, Node, Unsupported
 from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
 
@@ -162,15 +162,7 @@ class OnnxGraph(nn.Module):
         if sizes in self._allowed:
             deque(run_steps(self._steps, values), maxlen=0)
         else:
-            elements = self._stored + sum(one.numel() for one in inputs)
-            largest = largest_activation(elements)
-            with SizeLimit(largest):
-                for step in run_steps(self._steps, values):
-                    if sum(value.numel() for value in values.values()) > 2 * largest:
-                        raise ModelError(
-                            f"ONNX node {step.name!r}: more than {2 * largest:,}"
-                            " elements are needed at a time, far more than image and weights have"
-                        )
+            run_first(self._steps, values, self._stored, "ONNX node")
             self._allowed.add(sizes)
         outputs = {n: values[n] if n in values else self._constants[n] for n in self.output_names}
         return outputs if len(outputs) > 1 else outputs[self.output_names[0]]

@@ -1,6 +1,6 @@
-"""Keeps what a small ONNX file makes as small as a network is.
+"""Keeps what a small ONNX file or .pt2 archive makes as small as a network is.
 
-The functions that a model defines itself may call each other and, written out, become endless.
+The functions that an ONNX model defines may call each other and, written out, become endless.
 ConstantOfShape, Tile, Pad, Expand and many other operators can turn a few bytes into gigabytes;
 `SizeLimit` knows the size of every result before it is allocated. Tensors can share the bytes of
 the files beside the model.
@@ -11,18 +11,19 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._pytree import tree_flatten
+from torch.utils._pytree import tree_flatten, tree_map_only
 
 from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.onnx.table import Unsupported
+from pnpdepth_cli.models.steps import Step, run_steps
 
 _MAX_WRITTEN_OUT = 1 << 28  # bytes
 _NODE_BYTES = 1 << 12  # that a node takes in memory at least; depth networks have up to 10,000
@@ -37,6 +38,32 @@ def largest_activation(given: int) -> int:
         given: Elements of input and weights.
     """
     return max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * given)
+
+
+def run_first(steps: Sequence[Step], values: dict[str, Any], stored: int, kind: str) -> None:
+    """Adds the results of the steps to the values, none of them far larger than image and weights.
+
+    Args:
+        steps: Of a graph.
+        values: The inputs, by name; what other values they have is stored, too.
+        stored: Elements of the weights in the file.
+        kind: Of a step, in messages.
+
+    Raises:
+        ModelError: A result is too large, or all at a time are.
+    """
+    largest = largest_activation(stored + _elements(values))
+    with SizeLimit(largest):
+        for step in run_steps(steps, values):
+            if _elements(values) > 2 * largest:
+                raise ModelError(
+                    f"{kind} {step.name!r}: more than {2 * largest:,} elements at a time, far more"
+                    " than image and weights have"
+                )
+
+
+def _elements(values: dict[str, Any]) -> int:
+    return sum(value.numel() for value in values.values() if isinstance(value, Tensor))
 
 
 def load_external(model: Any, folder: Path) -> None:
@@ -142,10 +169,28 @@ def _elements_at_most(func: Any, args: Any, kwargs: dict[str, Any]) -> float:
     Most functions give no more than their tensors broadcast together; `_GROWING` has the others
     that operators call.
     """
+    if isinstance(func, torch._ops.OpOverload):
+        return _of_operator(func, args, kwargs)
     growing = _GROWING.get(getattr(func, "__name__", ""))
     if growing is not None:
         return growing(*args, **kwargs)
     return _broadcast([tensor.shape for tensor in _tensors_in((args, kwargs))])
+
+
+def _of_operator(operator: Any, args: Any, kwargs: dict[str, Any]) -> float:
+    """Elements of an operator's results, from the shapes alone: on a device without memory."""
+    without = {"device": "meta"} if "device" in kwargs or not _tensors_in((args, kwargs)) else {}
+    args, kwargs = tree_map_only(Tensor, lambda tensor: tensor.to("meta"), (args, kwargs))
+    try:
+        with torch.no_grad():
+            result = operator(*args, **kwargs | without)
+    except NotImplementedError:
+        if operator._opname not in _BY_VALUES:
+            raise Unsupported("a result of a size that only its values tell") from None
+        return sum(each.numel() * max(1, each.ndim) for each in _tensors_in((args, kwargs)))
+    except (RuntimeError, ValueError, TypeError, IndexError):  # running it says what is wrong
+        return 0
+    return max((each.numel() for each in _tensors_in(result)), default=0)
 
 
 def _broadcast(shapes: list[torch.Size]) -> int:
@@ -207,6 +252,10 @@ _GROWING: dict[str, Callable[..., float]] = {
 }
 """Functions whose result may be far larger than their tensors."""
 
+
+_BY_VALUES = ("nonzero", "masked_select", "index", "item", "_local_scalar_dense", "equal")
+"""Operators of torch whose result has as many elements as their tensors' values say, at most as
+many coordinates as the tensors have."""
 
 _PRODUCTS: dict[str, Callable[..., int]] = {
     **{f"conv{axes}d": lambda _, weight, *__: weight[0].numel() for axes in (1, 2, 3)},
