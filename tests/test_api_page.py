@@ -25,15 +25,7 @@ FOR_THE_PROGRAM = {
     "SparsePoints": {"cropped", "joined", "select", "tensors"},
     "Split": {"static_graph", "in_half"},
     "Network": {
-        *(
-            "image_of",
-            "arguments_of",
-            "synthetic_arguments",
-            "verified",
-            "depth_of",
-            "raw_of",
-            "intrinsics_of",
-        ),
+        *("image_of", "arguments_of", "synthetic_arguments", "verified", "depth_of", "raw_of"),
     },
 }
 """Methods that a user does not need."""

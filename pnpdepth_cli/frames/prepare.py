@@ -29,7 +29,7 @@ class PreparedFrame:
     prior: Tensor | None = None
     """(1, 1, h, w) metres, 0 = unknown: the dense prior in the network's frame. None without."""
     intrinsics: Tensor | None = None
-    """(1, 3, 3): the camera matrix in the network's frame, of a network that takes it."""
+    """(1, 3, 3): the camera matrix in the network's frame. None where it is unknown."""
 
     def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
         """Returns the arguments of the network for some of the points; the image is the same."""
@@ -77,7 +77,8 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     prior = None
     if frame.prior is not None and network.definition.takes_prior:
         prior = to_network.prior_to_network(frame.prior[None, None]).to(network.device)
-    intrinsics = network.intrinsics_of(to_network, frame.camera)
+    camera = frame.camera
+    intrinsics = None if camera is None else to_network.intrinsics_to_network(camera)
     return PreparedFrame(
         network=network,
         frame=frame,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 from pnpdepth_cli.budget import budget, check_claim
@@ -29,6 +30,14 @@ def read_bytes(path: Path) -> bytes:
     if not data:
         raise FileFormatError(f"{path} is empty (0 bytes); copy or create it again")
     return data
+
+
+def numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yields the lines of a text that hold more than a comment after #, with their numbers."""
+    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
+        text = line.partition("#")[0].strip()
+        if text:
+            yield number, text
 
 
 def check_text_size(path: Path) -> None:

@@ -21,7 +21,7 @@ from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration, read_rigid_motion
 from pnpdepth_cli.io.extrinsics import is_rotation, rotation_of
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import numbered_lines, one_line, read_bytes
 from pnpdepth_cli.io.record import read_json
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
@@ -125,12 +125,9 @@ def _last_number(name: str) -> float | None:
 def _rows(path: Path) -> list[tuple[int, Floats, Floats]]:
     """(line, its numbers, the pose (3, 4)) of each row; at least one."""
     rows = []
-    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
+    for number, line in numbered_lines(path):
         try:
-            values = np.array(words, np.float64)
+            values = np.array(line.split(), np.float64)
         except ValueError:
             raise FileFormatError(f"{path}: line {number} is not made of numbers") from None
         if len(values) == _KITTI_COLUMNS:

@@ -216,10 +216,7 @@ def _size(processing: Mapping[str, Any], of: int, folder: Path) -> Fixed | Near:
     else:
         height = width = size
     if not all(isinstance(side, int) and 1 <= side <= _MAX_SIDE for side in (height, width)):
-        raise ModelError(
-            f"{folder / 'preprocessor_config.json'}: size must be a height and a width,"
-            f" got {str(size)[:60]}"
-        )
+        raise _wrong(folder, f"size must be a height and a width, got {str(size)[:60]}")
     assert isinstance(height, int)
     assert isinstance(width, int)
     if not processing.get("keep_aspect_ratio", False):
@@ -235,10 +232,7 @@ def _side(processing: Mapping[str, Any], key: str, folder: Path) -> int:
     if isinstance(value, float) and 1 / _MAX_SIDE <= value < 1:  # as ZoeDepth's folders have 1/32
         value = round(1 / value)
     if not isinstance(value, int) or not 1 <= value <= _MAX_SIDE:
-        raise ModelError(
-            f"{folder / 'preprocessor_config.json'}: {key} must be a number of pixels,"
-            f" got {str(value)[:60]!r}"
-        )
+        raise _wrong(folder, f"{key} must be a number of pixels, got {str(value)[:60]!r}")
     return value
 
 
@@ -255,11 +249,15 @@ def _normalisation(processing: Mapping[str, Any], folder: Path) -> Normalisation
             mean=(m0 / unit, m1 / unit, m2 / unit), std=(s0 / unit, s1 / unit, s2 / unit)
         )
     except (TypeError, ValueError, ArithmeticError, ModelError):
-        raise ModelError(
-            f"{folder / 'preprocessor_config.json'}: rescale_factor {str(factor)[:60]}, image_mean"
-            f" {str(mean)[:60]} and image_std {str(std)[:60]} are not a number and three numbers"
-            " each, the factor and image_std above 0"
+        raise _wrong(
+            folder,
+            f"rescale_factor {str(factor)[:60]}, image_mean {str(mean)[:60]} and image_std"
+            f" {str(std)[:60]} are not a number and three numbers each, the first and last above 0",
         ) from None
+
+
+def _wrong(folder: Path, fact: str) -> ModelError:
+    return ModelError(f"{folder / 'preprocessor_config.json'}: {fact}")
 
 
 def _build(folder: Path) -> nn.Module:

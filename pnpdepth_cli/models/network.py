@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.budget import budget, check_claim
-from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
@@ -80,24 +79,6 @@ class Network:
         std = rgb.new_tensor(normalise.std).reshape(1, 3, 1, 1)
         return ((frame.rgb_to_network(rgb) - mean) / std).to(self.device)
 
-    def intrinsics_of(self, frame: FrameMap, camera: Camera | None) -> Tensor | None:
-        """Returns the camera matrix as the network takes it, (1, 3, 3); None if it takes none.
-
-        Args:
-            frame: Maps the image frame to the network's frame.
-            camera: In pixels of the image frame; None if it is unknown.
-
-        Raises:
-            UsageError: The network takes them and the camera is unknown.
-        """
-        if not self.definition.takes_intrinsics:
-            return None
-        if camera is None:
-            raise UsageError(
-                f"network {self.definition.name!r} takes the camera's intrinsics; give --calib"
-            )
-        return frame.intrinsics_to_network(camera).to(self.device)
-
     def arguments_of(
         self,
         image: Tensor | None,
@@ -111,15 +92,23 @@ class Network:
             image: From `image_of`.
             points: In the network's frame.
             prior: (1, 1, h, w) metres, 0 = unknown, for a network that takes one; None without.
-            intrinsics: (1, 3, 3) in the network's frame, for a network that takes them.
+            intrinsics: (1, 3, 3) in the network's frame. None: unknown.
 
         Raises:
             ModelError: The definition's `arguments` raises or does not return a tuple.
+            UsageError: The network takes intrinsics, and they are unknown.
         """
         takes_points = "sparse" in self.definition.input_kind
         sparse = points.scatter().to(self.device) if takes_points else None
+        camera = None
+        if self.definition.takes_intrinsics:
+            if intrinsics is None:
+                raise UsageError(
+                    f"network {self.definition.name!r} takes the camera's intrinsics; give --calib"
+                )
+            camera = intrinsics.to(self.device)
         with wrap_user_errors(f"arguments of network {self.definition.name!r}"):
-            arguments = self.definition.call_arguments(image, sparse, intrinsics)
+            arguments = self.definition.call_arguments(image, sparse, camera)
         if not isinstance(arguments, tuple):
             raise ModelError(
                 f"arguments of network {self.definition.name!r} gives a"
@@ -133,7 +122,7 @@ class Network:
         return self.arguments_of(
             self.image_of(frame, rgb),
             frame.points_to_network(points),
-            intrinsics=self.intrinsics_of(frame, synthetic_camera(frame.image)),
+            intrinsics=frame.intrinsics_to_network(synthetic_camera(frame.image)),
         )
 
     def verified(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:

@@ -7,7 +7,6 @@ another definition, class or function in it.
 from __future__ import annotations
 
 import importlib.util
-import inspect
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -90,23 +89,6 @@ def _names_in_constructor(network: type) -> set[str]:
 
 def _assumed_definition(build: Callable[..., Any], attribute: str, file: Path) -> ModelDefinition:
     """A definition around a class or function that returns a network; the rest is assumed."""
-    from torch import nn
-
-    if isinstance(build, nn.Module):
-        raise ModelError(
-            f"{attribute!r} in model file {file} is a {type(build).__name__} that is made already;"
-            " name its class, a function that returns it, or a definition"
-        )
-    required = [
-        name
-        for name, p in inspect.signature(build).parameters.items()
-        if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-    ]
-    if required:
-        raise ModelError(
-            f"{attribute!r} in model file {file} needs arguments ({', '.join(required)}); write a"
-            " function without any that returns the network, and name that"
-        )
     return undescribed(
         name=f"{file.stem}.{attribute}",
         summary=f"{attribute} of {file.name}",

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -16,31 +15,8 @@ from pnpdepth_cli.errors import ModelError
 _SIMILAR_ASPECT = 1.3
 """A feature map's aspect ratio is at most this factor away from the image's."""
 
-
-@dataclass(frozen=True)
-class _FeatureMap:
-    """What a submodule returned, if that is one map (1, c, h, w) that has a gradient."""
-
-    name: str
-    output: Tensor
-
-    @property
-    def area(self) -> int:
-        """Rows times columns."""
-        return self.output[0, 0].numel()
-
-
-@dataclass(frozen=True)
-class _Run:
-    """One pass of the network: its prediction, (1, 1, h, w), and the maps behind it.
-
-    maps: of the submodules that ran once, in the order in which they ran. copies: of submodules'
-    outputs, that gradients were made to reach.
-    """
-
-    maps: list[_FeatureMap]
-    copies: list[Tensor]
-    prediction: Tensor
+Maps = dict[str, Tensor]
+"""What submodules returned, by name in the order in which they ran: maps (1, c, h, w)."""
 
 
 def suggest_layers(
@@ -67,21 +43,32 @@ def suggest_layers(
     if image is None:
         return ()
     sides = image.shape[1:3] if image.shape[-1] <= 4 else image.shape[2:4]
-    run = _observe(module, arguments, prediction_of)
-    if not run.prediction.requires_grad:  # the front has no gradients, the layers behind it may
-        run = _observe(module, arguments, prediction_of, reach_all=True)
-        if not _reaches_features(run):
+    prediction, maps, _ = _observe(module, arguments, prediction_of)
+    if not prediction.requires_grad:  # the front has no gradients, the layers behind it may
+        prediction, maps, copies = _observe(module, arguments, prediction_of, reach_all=True)
+        if not _reaches_features(prediction, copies):
             raise ModelError(
                 "no gradient comes back from the network's prediction to any of its layers; does"
                 " its forward run under torch.no_grad or inference_mode, detach, or go through"
                 " numpy? take that out"
             )
-    useful = [m for m in run.maps if m.area > 1 and _has_aspect_of(m.output, sides)]
-    gradients = _gradients(run.prediction, [m.output for m in useful])
-    reached = [m for m, g in zip(useful, gradients, strict=True) if g is not None and bool(g.any())]
-    chosen = _last_of_each_resolution([m for m in reached if m.output.shape[1] > 1])
-    finest = run.prediction.shape[-2] * run.prediction.shape[-1]
-    return tuple(m.name for m in chosen if m.area < finest or len(chosen) == 1)
+    useful = {
+        n: map_ for n, map_ in maps.items() if _area(map_) > 1 and _has_aspect_of(map_, sides)
+    }
+    gradients = _gradients(prediction, list(useful.values()))
+    reached = {
+        name: useful[name]
+        for name, gradient in zip(useful, gradients, strict=True)
+        if gradient is not None and bool(gradient.any()) and useful[name].shape[1] > 1
+    }
+    chosen = _last_of_each_resolution({name: _area(m) for name, m in reached.items()})
+    finest = _area(prediction)
+    return tuple(n for n in chosen if _area(maps[n]) < finest or len(chosen) == 1)
+
+
+def _area(output: Tensor) -> int:
+    """Rows times columns of a map (1, c, h, w)."""
+    return output[0, 0].numel()
 
 
 def _gradients(prediction: Tensor, tensors: list[Tensor]) -> tuple[Tensor | None, ...]:
@@ -92,16 +79,16 @@ def _gradients(prediction: Tensor, tensors: list[Tensor]) -> tuple[Tensor | None
         return torch.autograd.grad(prediction.sum(), tensors, allow_unused=True, retain_graph=True)
 
 
-def _last_of_each_resolution(maps: list[_FeatureMap]) -> list[_FeatureMap]:
+def _last_of_each_resolution(areas: Mapping[str, int]) -> list[str]:
     """From the first of the coarsest maps on, the last map before each finer one."""
-    chosen: list[_FeatureMap] = []
-    areas = [m.area for m in maps]
-    first = areas.index(min(areas)) if areas else 0
-    for m in maps[first:]:
-        if chosen and chosen[-1].area == m.area:
-            chosen[-1] = m
-        elif not chosen or m.area > chosen[-1].area:
-            chosen.append(m)
+    chosen: list[str] = []
+    names = list(areas)
+    first = names.index(min(names, key=areas.__getitem__)) if names else 0
+    for name in names[first:]:
+        if chosen and areas[chosen[-1]] == areas[name]:
+            chosen[-1] = name
+        elif not chosen or areas[name] > areas[chosen[-1]]:
+            chosen.append(name)
     return chosen
 
 
@@ -111,13 +98,13 @@ def _observe(
     prediction_of: Callable[[Any], Tensor],
     *,
     reach_all: bool = False,
-) -> _Run:
-    """Runs the network once and keeps the feature maps of its submodules.
+) -> tuple[Tensor, Maps, list[Tensor]]:
+    """One pass: the prediction, the maps of submodules that ran once, and copies of outputs.
 
     reach_all: outputs that gradients do not reach are replaced by copies that they do reach, as a
     cut there would.
     """
-    maps: dict[str, _FeatureMap] = {}
+    maps: Maps = {}
     ran: set[str] = set()
     ran_twice: set[str] = set()
     copies: list[Tensor] = []
@@ -133,7 +120,7 @@ def _observe(
         output = map_tensors(output, with_gradient) if reach_all else output
         (ran_twice if name in ran else ran).add(name)
         if isinstance(output, Tensor) and output.ndim == 4 and output.requires_grad:
-            maps[name] = _FeatureMap(name, output)
+            maps[name] = output
         return output
 
     hooks = [
@@ -150,17 +137,14 @@ def _observe(
     finally:
         for hook in hooks:
             hook.remove()
-    once = [m for name, m in maps.items() if name not in ran_twice]
-    return _Run(once, copies, prediction)
+    return prediction, {name: maps[name] for name in maps if name not in ran_twice}, copies
 
 
-def _reaches_features(run: _Run) -> bool:
+def _reaches_features(prediction: Tensor, copies: list[Tensor]) -> bool:
     """True if a gradient comes back to a copy that is more than the depth map itself."""
-    depth = run.prediction.squeeze().shape
-    features = [
-        t for t in run.copies if t.ndim > 2 and t.shape[1] > 1 and t.squeeze().shape != depth
-    ]
-    return any(gradient is not None for gradient in _gradients(run.prediction, features))
+    depth = prediction.squeeze().shape
+    features = [t for t in copies if t.ndim > 2 and t.shape[1] > 1 and t.squeeze().shape != depth]
+    return any(gradient is not None for gradient in _gradients(prediction, features))
 
 
 def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:

@@ -374,5 +374,5 @@ def test_the_only_class_of_a_file_is_a_network_and_its_assumptions_are_printed(
     assert network.definition.layers[0] == "1"
     assert network.definition.default_alignment == "auto"
     assert "assumed: one rgb image in" in network.notes[0]
-    with pytest.raises(ModelError, match=r"needs arguments \(width\)"):
-        find_definition(f"{spec}:needs")
+    with pytest.raises(ModelError, match=r"TypeError.*width"):
+        load_network(f"{spec}:needs", tmp_path / "w.pt")

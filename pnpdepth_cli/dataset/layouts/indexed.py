@@ -14,6 +14,7 @@ folder of a model in a project is read, too.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,13 +30,11 @@ from pnpdepth_cli.dataset.frame_files import (
 from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.colmap_model import model_files, read_model
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.poses import read_trajectory
+from pnpdepth_cli.io.file_bytes import numbered_lines, one_line
+from pnpdepth_cli.io.poses import LONGEST_GAP_S, read_trajectory
 
 _OF_ETH3D = "dslr_calibration_undistorted"
 _ASSOCIATIONS = "associations.txt"
-_LONGEST_GAP_S = 0.02
-"""As TUM's own tool associates them."""
 _LONGEST_POSE_GAP_S = 0.1
 """Between poses, which motion capture takes at 100 Hz."""
 
@@ -66,7 +65,7 @@ def _of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
                 taken.add(depth)
         pairs = [[images[i], depths[partner_of[i]]] for i in sorted(partner_of)]
         for timed, used, other in ((images, partner_of, "depth"), (depths, taken, "image")):
-            why = f"has no {other} within {_LONGEST_GAP_S} s that is not another's"
+            why = f"has no {other} within {LONGEST_GAP_S} s that is not another's"
             for number, (_, path) in enumerate(timed):
                 if number not in used:
                     yield Unmatched(path=path, why=why, spare=True)
@@ -85,10 +84,8 @@ def _of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
 def _timed_files(path: Path, count: int) -> list[list[Timed]]:
     """The times and paths of each line: one pair, or those of an image and of its depth."""
     rows = []
-    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
+    for number, line in numbered_lines(path):
+        words = line.split()
         try:
             row = [(float(words[2 * i]), path.parent / words[2 * i + 1]) for i in range(count)]
         except (ValueError, IndexError):
@@ -107,19 +104,15 @@ def _is_depth(timed: Timed) -> bool:
     return "depth" in timed[1].parts[-2:][0].lower()
 
 
-def _close_pairs(images: list[Timed], depths: list[Timed]) -> list[list[int]]:
+def _close_pairs(images: list[Timed], depths: list[Timed]) -> list[tuple[int, int]]:
     """Indices of images and depths at most 0.02 s apart, the closest first; times are sorted."""
-    image_times, depth_times = (np.array([time for time, _ in files]) for files in (images, depths))
-    first = np.searchsorted(depth_times, image_times - 2 * _LONGEST_GAP_S)
-    last = np.searchsorted(depth_times, image_times + 2 * _LONGEST_GAP_S, side="right")
-    count = last - first
-    image = np.repeat(np.arange(len(images)), count)
-    depth = np.arange(len(image)) + np.repeat(last - np.cumsum(count), count)
-    gap = np.abs(image_times[image] - depth_times[depth])
-    close = gap <= _LONGEST_GAP_S
-    order = np.argsort(gap[close], kind="stable")
-    closest: list[list[int]] = np.column_stack([image, depth])[close][order].tolist()
-    return closest
+    times, reach = [time for time, _ in depths], 2 * LONGEST_GAP_S
+    pairs = [
+        (abs(times[depth] - time), image, depth)
+        for image, (time, _) in enumerate(images)
+        for depth in range(bisect_left(times, time - reach), bisect_right(times, time + reach))
+    ]
+    return [(image, depth) for gap, image, depth in sorted(pairs) if gap <= LONGEST_GAP_S]
 
 
 TUM = Layout(matches=_is_tum, frames=_of_tum, needs=("rgb.txt", "depth.txt"))
