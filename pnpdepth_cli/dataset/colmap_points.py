@@ -142,13 +142,12 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
             f"none of the {total:,} points of {name!r} in {model.folder} is left ({drops});"
             " register it with more matches"
         )
-    found = Points(
+    return Points(
         xy=xy.astype(np.float32),
         depth=depth.astype(np.float32),
         size=camera.size,
         dropped=drops.dropped,
-    )
-    return found, notes
+    ), notes
 
 
 def _output_scale(model: ColmapModel) -> float:

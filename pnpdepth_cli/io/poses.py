@@ -13,6 +13,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,16 +77,21 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
     """The poses (N, 3, 4) of the frames of these names in a transforms.json."""
     content = read_json(path)
     try:
-        listed = {
-            PurePosixPath(each["file_path"]).stem: np.array(each["transform_matrix"], np.float64)
-            for each in content["frames"]
-        }
-        missing = [name for name in names if PurePosixPath(name).name not in listed]
-        if missing:
-            raise InputError(f"{path} has no frame of the name {missing[0]!r}; add it")
-        poses = np.stack([listed[PurePosixPath(name).name] for name in names])[:, :3, :4]
-        if poses.shape[1:] != (3, 4) or not all(is_rotation(pose[:, :3]) for pose in poses):
-            raise ValueError("a transform_matrix is no rotation and position")
+        entries = [(each["file_path"], each["transform_matrix"]) for each in content["frames"]]
+        listed: dict[str, list[tuple[str, Any]]] = {}
+        for file, matrix in entries:
+            whole = PurePosixPath(file).with_suffix("").as_posix()
+            listed.setdefault(whole.rpartition("/")[2], []).append((f"/{whole}", matrix))
+        poses = np.empty((len(names), 3, 4))
+        for index, name in enumerate(names):
+            found = listed.get(name.rpartition("/")[2], [])
+            if len(found) > 1:  # of several cameras, by their folders
+                found = [each for each in found if each[0].endswith(f"/{name}")]
+            if len(found) != 1:
+                raise InputError(f"{path} has {len(found)} frames of the name {name!r}, not one")
+            poses[index] = np.array(found[0][1], np.float64)[:3, :4]
+            if not is_rotation(poses[index, :, :3]):
+                raise ValueError(f"the pose of {name} is no rotation")
     except (KeyError, TypeError, ValueError) as error:
         raise FileFormatError(f"{path} is no transforms.json ({one_line(error)})") from error
     return poses * (1, -1, -1, 1)

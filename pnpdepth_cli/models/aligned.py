@@ -72,12 +72,8 @@ class AlignedDepth:
             f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there; left"
             f" {lost:,} of {len(seen):,} sparse points there out of the loss"
         )
-        if lost <= _MOST_LOST * len(seen):
-            return (note,)
-        return (
-            f"warning: {note}; are the network's weights, input range (--normalise) and precision"
-            " right?",
-        )
+        doubt = "; are the network's weights, input range (--normalise) and precision right?"
+        return (f"warning: {note}{doubt}" if lost > _MOST_LOST * len(seen) else note,)
 
     def _notes(self, fit: Alignment, raw: Tensor) -> tuple[str, ...]:
         decided = " (decided from the points)" if self._kind == "auto" else ""

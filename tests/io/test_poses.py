@@ -71,6 +71,14 @@ def test_poses_of_nerfstudio_have_axes_up_and_back(tmp_path: Path) -> None:
     assert "OpenGL" in how
     with pytest.raises(InputError, match="'d'"):
         poses_of_frames(path, ["d"])
+    listed = [
+        {"file_path": f"images/{name}.png", "transform_matrix": pose}
+        for name, pose in (("cam1/a", matrix), ("cam0/a", still))
+    ]
+    path.write_text(json.dumps({"frames": listed}))
+    assert poses_of_frames(path, ["cam0/a", "cam1/a"])[0][:, 0, 3].tolist() == [0, 1]
+    with pytest.raises(InputError, match="'a'"):
+        poses_of_frames(path, ["a"])
     path.write_text(json.dumps({"frames": [{"file_path": "a", "transform_matrix": [[1, 2]]}]}))
     with pytest.raises(FileFormatError):
         poses_of_frames(path, ["a"])

@@ -559,7 +559,7 @@ def test_activations_that_are_needed_at_a_time_are_bounded_together(
     ]
     last = helper.make_node("Sum", [*(f"t{n}" for n in range(6))], ["out"])
     path = write_network(tmp_path / "x.onnx", nodes=(*tiles, last), outputs=("out",))
-    with pytest.raises(ModelError, match="Tile_t2.*more than 200,000 elements"):
+    with pytest.raises(ModelError, match=r"Tile_t2.*more than 200,000 elements"):
         graph.OnnxGraph(onnx.load(path), path)(image(1, 3, 32, 48))
 
 
