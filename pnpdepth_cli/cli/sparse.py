@@ -7,10 +7,10 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.choices import PATTERNS, SENSORS
+from pnpdepth_cli.choices import SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.streams import say
-from pnpdepth_cli.commands.refinement.request import sample_pattern
+from pnpdepth_cli.commands.refinement.request import parse_sample
 from pnpdepth_cli.dataset.read_options import ScanOptions
 
 
@@ -25,14 +25,12 @@ from pnpdepth_cli.dataset.read_options import ScanOptions
 )
 @options.depth_scale
 @options.sparse_output
-@click.option("--overlay", type=options.FILE, help="Also write a PNG of the points on the image.")
 @options.overwrite
 def project(
     scan: Path,
     image: Path,
     depth_scale: float | None,
     output: Path,
-    overlay: Path | None,
     overwrite: bool,
     **values: Any,
 ) -> None:
@@ -43,12 +41,13 @@ def project(
     pnpdepth project 0000000005.bin --calib 2011_09_26/ --camera 3 -o sparse.exr
 
     Points behind the camera, outside the image, behind another point in their pixel, or occluded by
-    the foreground are dropped and counted. A JSON file beside the output records the settings.
+    the foreground are dropped and counted. Beside the output, NAME_overlay.png is the image with
+    the points, and a JSON file records the settings.
     """
     from pnpdepth_cli.cli.tables import print_sparse
     from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 
-    target = SparseTarget(output=output, overlay=overlay, overwrite=overwrite)
+    target = SparseTarget(output=output, overwrite=overwrite)
     of_scan = ScanOptions(**options.taken(ScanOptions, values))
     print_sparse(project_scan(scan, of_scan, target, image, scale=depth_scale))
 
@@ -56,14 +55,10 @@ def project(
 @click.command(short_help="Sample sparse depth from dense depth.")
 @click.argument("depth", type=options.FILE)
 @click.option(
-    "--pattern",
-    type=click.Choice(PATTERNS),
-    default="uniform",
-    show_default=True,
-    help="Which pixels are sampled.",
-)
-@click.option(
-    "--count", metavar="N|P%", help="Number of points (of lines for `lines`), or % of known pixels."
+    "--count",
+    required=True,
+    metavar="[PATTERN:]N|P%",
+    help="Number of points (of lines for `lines`), or % of known pixels.",
 )
 @click.option("--image", type=options.FILE, help="Image for `features`.")
 @options.seed
@@ -80,8 +75,7 @@ def project(
 @options.overwrite
 def sample(
     depth: Path,
-    pattern: str,
-    count: str | None,
+    count: str,
     noise: str | None,
     outliers: str | None,
     output: Path,
@@ -91,12 +85,12 @@ def sample(
     """Sample sparse depth from the dense DEPTH.
 
     \b
-    pnpdepth sample gt.png --pattern uniform --count 500 --seed 1 -o sparse.png
+    pnpdepth sample gt.png --count 500 --seed 1 -o sparse.png
     pnpdepth sample gt.png --count 500 --noise 2% --outliers 5% -o noisy.png
-    pnpdepth sample gt.png --pattern features --count 300 --image rgb.png -o sparse.png
+    pnpdepth sample gt.png --count features:300 --image rgb.png -o sparse.png
 
     \b
-    uniform    N random known pixels
+    uniform    N random known pixels; the default pattern
     shuffle    the first N known pixels as numpy's legacy generator shuffles them
     grid       square grid with N nodes on a full map
     lines      all known pixels of N evenly spaced rows
@@ -109,8 +103,9 @@ def sample(
 
     values["scale"] = values.pop("depth_scale")
     target = make.SparseTarget(output=output, overwrite=overwrite)
-    added, chosen = make.read_noise(noise, outliers), sample_pattern(pattern, count)
-    print_sparse(make.sample_depth(depth, target, chosen, noise=added, **values))
+    added, pattern = make.read_noise(noise, outliers), parse_sample(count)
+    assert pattern is not None
+    print_sparse(make.sample_depth(depth, target, pattern, noise=added, **values))
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
@@ -195,7 +190,16 @@ def simulate(
     metavar="SECONDS",
     help="Added to the times of the points.  [default: 0; by the times of the log if above 1 s]",
 )
-@click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first N frames.")
+@click.option(
+    "--between",
+    type=click.IntRange(0),
+    nargs=2,
+    metavar="FIRST LAST",
+    help="Only the frames of these numbers, from 0.",
+)
+@click.option(
+    "--every", type=click.IntRange(1), default=1, metavar="N", help="Only every N-th of them."
+)
 @options.overwrite
 def frames(bag: Path, output: Path, **values: Any) -> None:
     """Write the images of a BAG and the scans nearest in time as files.

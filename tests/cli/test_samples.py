@@ -164,7 +164,7 @@ def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
     [
         (
             f"project {SAMPLES}/street/000000.bin --calib {SAMPLES}/street/calib.txt"
-            f" --image {SAMPLES}/street/rgb.png --overlay overlay.png",
+            f" --image {SAMPLES}/street/rgb.png",
             16007,
         ),
         (f"sample {SAMPLES}/indoor/gt.png --count 100", 100),

@@ -86,7 +86,8 @@ def unpacked(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, write_frames, written_before
 
     folder = request.output.with_name(f"{request.output.name}_frames")
-    frames = FramesRequest(bag=request.source, output=folder, limit=request.limit, overwrite=True)
+    between = None if request.limit is None else (0, request.limit - 1)
+    frames = FramesRequest(bag=request.source, output=folder, between=between, overwrite=True)
     if not written_before(frames):
         record = write_frames(frames, say)
         say(f"bag: wrote {record['frames']:,} frames to {folder}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -88,10 +90,14 @@ class FramesRequest:
     """Largest time between an image and its scan, seconds."""
     clock_offset: float | None = None
     """Seconds that are added to the times of scans. None: by the log, where it is large."""
-    limit: int | None = None
+    between: tuple[int, int] | None = None
+    """Numbers of the first and the last frame, from 0. None: all."""
+    every: int = 1
     overwrite: bool = False
 
     def __post_init__(self) -> None:
+        if self.between is not None and self.between[0] > self.between[1]:
+            raise UsageError("--between {} {} has no frame; give FIRST LAST".format(*self.between))
         if not self.tolerance >= 0:
             raise UsageError(f"--tolerance must be >= 0, got {self.tolerance:g}")
 
@@ -105,7 +111,8 @@ class FramesRequest:
             "topics": list(self.topics),
             "tolerance": self.tolerance,
             "clock_offset": self.clock_offset,
-            "limit": self.limit,
+            "between": self.between,
+            "every": self.every,
         }
 
 
@@ -132,6 +139,8 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         say(f"topics: images of {topics[0]}, points of {topics[1]}")
         _clear(request)
         lost, times, poses = 0, list[float](), None
+        first, last = request.between or (0, math.inf)
+        numbers = itertools.count()
         dropped = Counter[str]()
         frames = "", ""
         offset = request.clock_offset
@@ -140,6 +149,10 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         for image, scan in nearest_pairs(_stream(bag, *topics, offset), tolerance):
             if scan is None:
                 lost += 1
+                continue
+            if (number := next(numbers)) > last:
+                break
+            if number < first or (number - first) % request.every:
                 continue
             try:
                 values, counts = _measured(sensors, scan.message)
@@ -150,8 +163,6 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
             frames = frames if times else (frame_of(image.message), frame_of(scan.message))
             _write_frame(request.output, sensors, image, values)
             times.append(image.time_s)
-            if len(times) == request.limit:
-                break
         if dropped:
             say(f"points: dropped {describe_dropped(dropped)}")
         if times:

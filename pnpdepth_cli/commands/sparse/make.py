@@ -44,7 +44,6 @@ class SparseTarget:
 
     output: Path
     """Its suffix is one of `SPARSE_SUFFIXES`."""
-    overlay: Path | None = None
     overwrite: bool = False
 
     @property
@@ -52,16 +51,19 @@ class SparseTarget:
         """The JSON."""
         return self.output.with_suffix(".json")
 
-    def check(self, inputs: Iterable[Path | None]) -> None:
+    @property
+    def overlay(self) -> Path:
+        """The image with the points, of a scan that is projected."""
+        return self.output.with_name(f"{self.output.stem}_overlay.png")
+
+    def check(self, inputs: Iterable[Path | None], *, drawn: bool = False) -> None:
         """Raises OutputError for files that cannot be written, or that replace an input."""
         if self.output.suffix.lower() not in SPARSE_SUFFIXES:
             raise OutputError(
                 f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
             )
-        if self.overlay is not None and self.overlay.suffix.lower() != ".png":
-            raise OutputError(f"{self.overlay}: the overlay is a PNG; name it so")
         taken = {p.resolve() for p in inputs if p is not None}
-        for path in filter(None, (self.output, self.record, self.overlay)):
+        for path in (self.output, self.record, *[self.overlay] * drawn):
             if path.resolve() in taken:
                 raise OutputError(f"{path} is an input or named twice; give another output")
             if path.exists() and not self.overwrite:
@@ -86,14 +88,13 @@ class SparseTarget:
             settings: How it was made; kept in a PNG or CSV too.
             inputs: Files by their part, or what a record keeps of them.
             notes: Lines for a person.
-            rgb: (H, W, 3) in 0..1, the image of the overlay.
+            rgb: (H, W, 3) in 0..1, the image of the overlay. None: there is none.
         """
         provenance = {"command": command, "version": __version__, **settings}
-        for path in filter(None, (self.output, self.overlay)):
-            make_folder(path.parent)
+        make_folder(self.output.parent)
         image = as_depth_image(points)
         write_sparse(self.output, points.xy, points.depth, image, provenance=provenance)
-        if self.overlay is not None and rgb is not None:
+        if rgb is not None:
             overlay(rgb, points.xy, points.depth, self.overlay)
         record = {
             **provenance,
@@ -115,7 +116,7 @@ class SparseTarget:
             "notes": list(notes),
             "outputs": {
                 "sparse": str(self.output),
-                "overlay": str(self.overlay) if self.overlay else None,
+                "overlay": None if rgb is None else str(self.overlay),
                 "record": str(self.record),
             },
         }
@@ -137,10 +138,10 @@ def project_scan(
         scan: Its file.
         options: The calibration.
         target: Files to write.
-        image: The camera's image, which gives the size and the ground of an overlay.
+        image: The camera's image, which gives the size and the ground of the overlay.
         scale: Numbers of the scan per metre, for `read_scan_points`.
     """
-    target.check((scan, image, options.calib, options.extrinsics))
+    target.check((scan, image, options.calib, options.extrinsics), drawn=True)
     rgb = read_rgb(image).values
     size = (rgb.shape[0], rgb.shape[1])
     projected = read_scan_points(scan, options, size, image, scale=scale)

@@ -106,8 +106,7 @@ def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     below = SparseTarget(output=frame.gt / "s.png")
     refused(frame, OutputError, "cannot be written (file exists)", target=below)
     refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))
-    drawn = SparseTarget(output=frame.folder / "s.png", overlay=frame.folder / "o.jpg")
-    refused(frame, OutputError, "the overlay is a PNG", target=drawn)
+    assert (frame.folder / "sparse_overlay.png").is_file()
 
 
 def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> None:

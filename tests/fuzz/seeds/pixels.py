@@ -32,7 +32,7 @@ def _images(folder: Path, rng: np.random.Generator) -> list[Seed]:
     names = [f"image.{suffix}" for suffix in ("png", "jpg", "webp", "tif")]
     for name in names:
         cv2.imwrite(str(folder / name), image)
-    features = ("--pattern", "features", "--count", "5")
+    features = ("--count", "features:5")
     return [
         Seed(file=name, command=("sample", "gt.npy", *features, "--image", name, *OUT))
         for name in names
