@@ -59,7 +59,8 @@ def by_method(network: Network, name: str, inputs: Frame, seed: int) -> tuple[De
     method = METHODS[name]
     if method is PAPER:
         own = network.definition.default_alignment
-        layer, settings = resolve_layer(network.definition, None), replace(method, align=own)
+        layer = resolve_layer(network.definition, None)
+        settings = replace(method, align=own).closed()
     else:
         layer = resolve_layer(network.definition, method.layer)
         settings = resolve_settings(network.definition, replace(method, seed=seed))

@@ -24,6 +24,7 @@ import numpy as np
 from pnpdepth_cli.commands.batch.batch import run_batch
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import write_depth
 
 LINKS = 50_000
@@ -41,7 +42,7 @@ class Quiet:
     def begin(self, to_do: int) -> None:
         """Nothing."""
 
-    def frame(self, row: dict[str, Any]) -> None:
+    def frame(self, record: FrameRecord) -> None:
         """Nothing."""
 
 
@@ -118,7 +119,7 @@ RESUME = """
 import sys; from pathlib import Path
 from benchmarks.cluster import Quiet, request_of
 from pnpdepth_cli.commands.batch.batch import run_batch
-counts = run_batch(request_of(Path(sys.argv[1])), Quiet()).summary["counts"]
+counts = run_batch(request_of(Path(sys.argv[1])), Quiet()).summary.counts
 assert counts["done"] == counts["frames"], counts
 """
 

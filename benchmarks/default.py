@@ -46,10 +46,11 @@ from benchmarks.frames import (
     without_occluded,
 )
 from pnpdepth_cli.completion.interpolation import linear
-from pnpdepth_cli.frames.default import LEAST_PART
-from pnpdepth_cli.frames.frame import Refined
+from pnpdepth_cli.frames.fuse import LEAST_PART
+from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
 COUNTS = (20, 100, 500)
 NETWORKS = {
@@ -65,13 +66,13 @@ NETWORKS = {
     "realsense": ("fastdepth", "compact"),  # its colour is not registered
 }
 """By set; nothing was chosen on the last four."""
-STAGES = ("linear", "aligned", "updated", "propagated", "alone", "result")
+STAGES = (LINEAR, BEFORE, UPDATED, PROPAGATED, ALONE, AFTER)
 MULTIPLES = (1, 2, 3, 4)
 WRONG = 0.2  # fraction of the points, with `--outliers`
 LARGE_ERROR = 0.25  # of the depth
 MASKED = 0.05  # of the ground truth
 HEAD = (
-    *("network", "set, runs", "points", *STAGES, "result / linear", "worse", "weight", "no part"),
+    *("network", "set, runs", "points", *STAGES, "after / linear", "worse", "weight", "no part"),
     *("warned", "CPU s"),
 )
 UNCERTAINTY_HEAD = (
@@ -103,7 +104,7 @@ def measure(
     start = time.process_time()
     refined = by_default(network, inputs, seed)
     seconds = time.process_time() - start
-    depths = {"linear": linear(inputs.points), "result": torch.from_numpy(refined.after)}
+    depths = {LINEAR: linear(inputs.points), AFTER: torch.from_numpy(refined.after)}
     depths |= {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
     return {
         "errors": errors_of(depths, torch.from_numpy(frame.gt)),
@@ -159,7 +160,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "frames": len(rows),
         "mean": {n: tuple(np.mean([each[n] for each in errors], axis=0).tolist()) for n in names},
-        "worse": float(np.mean([each["result"][0] > each["linear"][0] for each in errors])),
+        "worse": float(np.mean([each[AFTER][0] > each[LINEAR][0] for each in errors])),
         "weight": float(np.mean([row["weight"] for row in rows])),
         "no_part": float(np.mean([row["weight"] < LEAST_PART for row in rows])),
         "warned": float(np.mean([row["warned"] for row in rows])),
@@ -207,7 +208,7 @@ def main() -> None:
         second.append((*case, *uncertainty_cells(rows)))
         print_row(
             *(*case, *errors, f"**{result}**"),
-            f"{of['mean']['result'][0] / of['mean']['linear'][0]:.3f}",
+            f"{of['mean'][AFTER][0] / of['mean'][LINEAR][0]:.3f}",
             *(f"{of['worse']:.0%}", f"{of['weight']:.0%}", f"{of['no_part']:.0%}"),
             *(f"{of['warned']:.0%}", f"{of['cpu_s']:.1f}"),
         )

@@ -24,7 +24,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -36,10 +35,10 @@ from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.precision import lower
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import PAPER
+from pnpdepth_cli.settings import ClosedSettings
 
 ITERATIONS, STEP, POINTS = 5, 0.01, 500
-SETTINGS = replace(PAPER, iterations=ITERATIONS, lr=STEP)
+SETTINGS = ClosedSettings(iterations=ITERATIONS, lr=STEP)
 CPU = torch.device("cpu")
 COMPARED = ("by hand", "ours", "ours, one frame", "by hook", "paper's code")
 """What gives the same, bit for bit."""

@@ -14,16 +14,18 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.batch.running import registering
 from pnpdepth_cli.completion.image_registration import estimated, evidence
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.frames.frame import Frame, Refined, Register, tensor_of
-from pnpdepth_cli.frames.refine import refine_frame
-from pnpdepth_cli.frames.refiner import Refiner
+from pnpdepth_cli.frames.fixed import refine_fixed
+from pnpdepth_cli.frames.frame import Frame, Register, tensor_of
+from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors import Points, occluded_in_map
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings, Settings
 
 Depth = NDArray[np.float32]
 
@@ -183,10 +185,10 @@ def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Frame:
     return replace(frame_inputs(frame.rgb, points, frame.gt), register=frame.register)
 
 
-def refined(network: Network, layer: str, settings: Settings, inputs: Frame) -> Refined:
+def refined(network: Network, layer: str, settings: ClosedSettings, inputs: Frame) -> Refined:
     """The refinement of a frame with all of its points."""
-    with network.cut_at(layer) as split:
-        return refine_frame(network, split, settings, inputs.registered())
+    with OpenNetworks([Member(network=network, layer=layer, settings=settings)]) as networks:
+        return refine_fixed(networks, inputs.registered())
 
 
 WEIGHTS = {
@@ -206,8 +208,8 @@ def opened(name: str, data: Path) -> Network:
 
 def by_default(network: Network, inputs: Frame, seed: int = 0) -> Refined:
     """The frame as `pnpdepth refine` gives it by default."""
-    with Refiner(network, Settings(seed=seed)) as refiner:
-        return refiner.refine_frame(inputs)
+    with Method([network], Settings(seed=seed), inputs) as method:
+        return method.refine(inputs)
 
 
 def with_outliers(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:

@@ -107,14 +107,14 @@ def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any
         results["paper"] if same else refined(entry.network, *entry.settings["tuned"], inputs)
     )
     # A step of 100 % is what the engine takes for the standard deviation of z_0.
-    unmoved = refined(entry.network, layer, replace(paper, iterations=0, lr="100%"), inputs)
+    moved = refined(entry.network, layer, replace(paper, iterations=1, lr="100%"), inputs)
     depths = {"linear": linear(points).numpy(), "before": results["paper"].before}
     depths |= {state: result.after for state, result in results.items()}
     scores, coverage = scores_of(depths, frame.gt)
     return {
         "points": len(points),
         "coverage": coverage,
-        "std_z": unmoved.refinement.step,
+        "std_z": moved.refinement.step,
         "diverged": sum(result.diverged is not None for result in results.values()),
         "aligned": None if (fit := results["paper"].alignment) is None else fit.kind,
         "scores": scores,

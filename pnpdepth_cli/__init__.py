@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pnpdepth_cli.errors import PnpDepthError as PnpDepthError
     from pnpdepth_cli.errors import SizeError as SizeError
     from pnpdepth_cli.errors import UsageError as UsageError
-    from pnpdepth_cli.frames.frame import Refined as Refined
+    from pnpdepth_cli.frames.refined import Refined as Refined
     from pnpdepth_cli.frames.refiner import Refiner as Refiner
     from pnpdepth_cli.models.network import Network as Network
     from pnpdepth_cli.points import SparsePoints as SparsePoints
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 _HOMES = {
     **dict.fromkeys(("load_network", "refine", "score"), "api"),
     "Refiner": "frames.refiner",
-    "Refined": "frames.frame",
+    "Refined": "frames.refined",
     "Settings": "settings",
     "Scores": "core.metrics",
     "Split": "core.split",

@@ -1,6 +1,6 @@
 """Every list of names that a user can choose from. Imports nothing heavy.
 
-Open lists are `Table`s: one function, or one file in a folder, adds one entry, and an entry point
+An `OpenList` is open: one function, or one file in a folder, adds one entry, and an entry point
 of an installed package adds another. Closed lists are tuples.
 """
 
@@ -19,7 +19,7 @@ from pnpdepth_cli import measures, protocols
 from pnpdepth_cli.errors import UsageError
 
 
-class Table(Mapping[str, Any]):
+class OpenList(Mapping[str, Any]):
     """The entries of an open list by name; listing the names imports none of them.
 
     An entry of this package is the object `attribute` of the module `path/<name>.py`, or the module
@@ -114,7 +114,7 @@ def _from_file(path: str, attribute: str, noun: str) -> Any:
     return values[attribute]
 
 
-LOSSES = Table(
+LOSSES = OpenList(
     "core/losses",
     in_file="loss",
     group="losses",
@@ -123,7 +123,7 @@ LOSSES = Table(
 )
 """L: (N,) predicted and (N,) measured depth to a scalar."""
 
-UPDATES = Table(
+UPDATES = OpenList(
     "core/update_rules",
     in_file="update_rule",
     group="updates",
@@ -132,7 +132,7 @@ UPDATES = Table(
 )
 """U: each entry creates a rule that turns gradients into directions of z."""
 
-PROPAGATIONS = Table(
+PROPAGATIONS = OpenList(
     "completion/propagation",
     group="propagations",
     noun="propagation",
@@ -140,7 +140,7 @@ PROPAGATIONS = Table(
 )
 """How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
 
-BASELINES = Table(
+BASELINES = OpenList(
     "completion/baselines",
     group="baselines",
     noun="baseline",
@@ -151,7 +151,7 @@ BASELINES = Table(
 )
 """Dense depth without refinement: `pnpdepth_cli.completion.baselines`."""
 
-NETWORKS = Table(
+NETWORKS = OpenList(
     "",
     group="models",
     noun="network",
@@ -163,7 +163,7 @@ NETWORKS = Table(
 )
 """The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
 
-FORMATS = Table(
+FORMATS = OpenList(
     "io/formats",
     group="formats",
     noun="depth format",
@@ -171,7 +171,7 @@ FORMATS = Table(
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
-LAYOUTS = Table(
+LAYOUTS = OpenList(
     "dataset/layouts",
     group="layouts",
     noun="layout",
@@ -183,7 +183,7 @@ LAYOUTS = Table(
 )
 """Data set layouts, in the order in which they are guessed (`dataset.layouts.Layout`)."""
 
-EXPORTS = Table(
+EXPORTS = OpenList(
     "commands/exports",
     "EXPORT",
     group="exports",
@@ -192,7 +192,7 @@ EXPORTS = Table(
 )
 """Files for reconstruction programs: `pnpdepth_cli.commands.exports.Export`."""
 
-MEASURES = Table("measures", group="measures", noun="measure", names=tuple(measures.TABLE))
+MEASURES = OpenList("measures", group="measures", noun="measure", names=tuple(measures.TABLE))
 """Measures that `eval` computes only on request: `pnpdepth_cli.measures.Measure`."""
 
 # The method

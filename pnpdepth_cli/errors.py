@@ -10,7 +10,6 @@
     │   └── NoPointsError        3  there is no sparse depth to work with
     ├── ModelError               4  the network or its definition is invalid
     │   ├── LayerError           4  the network cannot be cut at the layer
-    │   ├── BatchError           4  the network does not take several frames at once
     │   └── CheckpointError      4  the weights cannot be used
     ├── DivergedError            5  refinement produced non-finite numbers
     ├── DeviceError              6  the device is absent or out of memory
@@ -71,10 +70,6 @@ class ModelError(PnpDepthError):
 
 class LayerError(ModelError):
     """The network cannot be cut at the layer."""
-
-
-class BatchError(ModelError):
-    """The network does not take several frames at once, only one at a time."""
 
 
 class CheckpointError(ModelError):

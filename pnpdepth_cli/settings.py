@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any
 
@@ -81,7 +81,7 @@ class Settings:
     """Where a network is cut, what is updated and how, and what follows.
 
     A field at its default is open: the user's settings come first, then those of the network's
-    definition, then the paper's (`PAPER`). The types are those of settings with nothing open.
+    definition, then the paper's.
 
     Raises:
         UsageError: A value is out of range.
@@ -100,31 +100,31 @@ class Settings:
         " depth.",
         metavar="NAME|0..1",
     )
-    iterations: int = option(None, "Number of updates; 0 is no refinement.", metavar="K")
-    lr: float | str = option(
+    iterations: int | None = option(None, "Number of updates; 0 is no refinement.", metavar="K")
+    lr: float | str | None = option(
         None,
         "Step size: absolute, or % of the std of z.",
         metavar="NUMBER|P%",
         parse=str,
     )
-    loss: str = option(None, "Loss at the sparse points.", choices=choices.LOSSES)
-    update: str = option(
+    loss: str | None = option(None, "Loss at the sparse points.", choices=choices.LOSSES)
+    update: str | None = option(
         None,
         "Update rule; another than the network's resets --lr.",
         choices=choices.UPDATES,
     )
-    schedule: str = None  # type: ignore[assignment]
+    schedule: str | None = None
     """Step size over the updates, "constant" or "linear" to 0. It has no option."""
-    blur: float = None  # type: ignore[assignment]
+    blur: float | None = None
     """Standard deviation of the blur of the gradient in spacings of the points; 0 is off. It has no
     option."""
-    align: str = option(
+    align: str | None = option(
         None,
         "Fit the network's output to the points by scale, or scale and shift."
         "  [default: the network's own]",
         choices=choices.ALIGNMENTS,
     )
-    propagate: str = option(
+    propagate: str | None = option(
         None,
         "Propagate the residuals at the points to all pixels: by a Gaussian process, lines through"
         " the nearest points, or edge-aware diffusion.  [default: none, with other options of the"
@@ -173,9 +173,28 @@ class Settings:
         """Returns these settings, and the others' where these are open."""
         return replace(others, **self.given())
 
-    def complete(self) -> Settings:
+    def closed(self) -> ClosedSettings:
         """Returns these settings, and the paper's where these are open."""
-        return self.over(PAPER)
+        names = {each.name for each in fields(ClosedSettings)}
+        return ClosedSettings(**{k: v for k, v in self.given().items() if k in names})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedSettings:
+    """How z is updated and what follows, with nothing open.
+
+    The defaults are those of Wang et al., ICRA 2019, equations 2 and 3, with α, K, U and L of
+    section IV.
+    """
+
+    iterations: int = 5
+    lr: float | str = 0.01
+    loss: str = "l1"
+    update: str = "sign"
+    schedule: str = "constant"
+    blur: float = 0.0
+    align: str = "none"
+    propagate: str = "none"
 
 
 def _is_number(value: object) -> bool:
@@ -209,14 +228,5 @@ _CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
 
 _OPEN = {each.name: each.default for each in fields(Settings)}
 
-PAPER = Settings(
-    iterations=5,
-    lr=0.01,
-    loss="l1",
-    update="sign",
-    schedule="constant",
-    blur=0.0,
-    align="none",
-    propagate="none",
-)
-"""Wang et al., ICRA 2019, equations 2 and 3, with α, K, U and L of section IV; nothing is open."""
+PAPER = Settings(**asdict(ClosedSettings()))
+"""The settings of the paper, none open but the layer."""

@@ -15,10 +15,12 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
 GROUND_FLOOR = {
     "errors", "choices", "points", "camera", "budget", "scan_pattern", "settings",
-    "measures", "protocols",
+    "measures", "protocols", "file_record", "stages",
 }  # fmt: skip
 MAY_IMPORT = {
     "errors": set(),
+    "file_record": set(),
+    "stages": set(),
     "measures": {"errors"},
     "protocols": {"errors", "measures", "camera"},
     "choices": {"errors", "measures", "protocols"},

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pnpdepth_cli import choices
-from pnpdepth_cli.choices import Table
+from pnpdepth_cli.choices import OpenList
 from pnpdepth_cli.completion import baselines, propagation
 from pnpdepth_cli.core import losses, update_rules
 from pnpdepth_cli.core.update_rules import SCHEDULES
@@ -21,7 +21,7 @@ from pnpdepth_cli.sensors import LIDARS, PATTERNS
 
 
 @pytest.fixture
-def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Table:
+def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OpenList:
     """A table over the modules of `io`, and two entry points of another package."""
     info = tmp_path / "other-1.0.dist-info"
     info.mkdir()
@@ -31,11 +31,11 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Table:
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    return Table("io", "__name__", group="test_table", noun="entry", first=("record",))
+    return OpenList("io", "__name__", group="test_table", noun="entry", first=("record",))
 
 
 def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_there(
-    table: Table,
+    table: OpenList,
 ) -> None:
     names = list(table)
     assert names == ["record", *sorted(set(names) - {"record"})]
@@ -58,7 +58,7 @@ def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_th
     ],
 )
 def test_a_table_lists_the_names_of_its_module_in_their_order(
-    table: Table, implemented: Mapping[str, object]
+    table: OpenList, implemented: Mapping[str, object]
 ) -> None:
     assert list(table) == list(implemented)
     assert list(table.values()) == list(implemented.values())
@@ -74,7 +74,7 @@ def test_every_name_of_a_closed_list_is_implemented() -> None:
 
 
 def test_a_table_of_modules_leaves_out_subpackages() -> None:
-    table = Table("", None, group="test_none", noun="package")
+    table = OpenList("", None, group="test_none", noun="package")
     assert table["points"].__name__ == "pnpdepth_cli.points"
     assert "core" not in table
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,8 +14,10 @@ from pnpdepth_cli.commands.batch.frames import find_frames, task_of
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.commands.evaluation.scoring import scores_of
 from pnpdepth_cli.commands.refinement.refine import read_requested
 from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS, FramePart
@@ -110,10 +111,11 @@ def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_p
         path = tmp_path / "out" / f"{frame.name}_depth.npy"
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, np.full(each.gt.shape, 2.0, np.float32))
-        record = {"inputs": {"sparse": each.sources["sparse"]}, "size": each.gt.shape[::-1]}
-        path.with_name(path.name.replace("_depth.npy", ".json")).write_text(json.dumps(record))
+        height, width = each.gt.shape
+        record = FrameRecord(inputs={"sparse": each.sources["sparse"]}, size=(width, height))
+        record.write(path.with_name(path.name.replace("_depth.npy", ".json")))
     found = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=root, protocol=name))
-    assert [frame.pixels for frame in found.frames] == [pixels] * frames
+    assert [scores_of(frame)["pixels"] for frame in found.frames] == [pixels] * frames
 
 
 def test_every_protocol_of_a_completion_paper_is_worked_out() -> None:

@@ -11,13 +11,13 @@ import torch
 
 from pnpdepth_cli.core.update_rules import step_size
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.settings import PAPER, Settings
+from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
 
 NAN, INF = math.nan, math.inf
 
 
 def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
-    assert Settings().complete() == PAPER
+    assert Settings().closed() == PAPER.closed() == ClosedSettings()
     paper = (PAPER.iterations, PAPER.lr, PAPER.loss, PAPER.update, PAPER.align)
     assert paper == (5, 0.01, "l1", "sign", "none")
     assert Settings(iterations=3, blur=0.0).given() == {"iterations": 3, "blur": 0.0}
@@ -25,7 +25,7 @@ def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
     assert user.over(network) == Settings(lr="3%", blur=0.0, loss="log")
     assert user.over(network).opened("blur") == Settings(lr="3%", loss="log")
     preset = Settings(preset="paper", iterations=2).with_preset()
-    assert preset.complete() == Settings(preset="paper", iterations=2).over(PAPER)
+    assert preset == Settings(preset="paper", iterations=2).over(PAPER)
     assert Settings(iterations=2).with_preset() == Settings(iterations=2)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -32,6 +32,9 @@ from pnpdepth_cli.commands.refinement.request import (
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import FramesFailedError, StorageError
 from pnpdepth_cli.settings import Settings
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.commands.batch.summary import BatchSummary
 
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
@@ -103,7 +106,7 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
                 break
     if stopped or len(summaries) < len(requests):
         raise click.exceptions.Exit(INTERRUPTED)
-    counts = sum((Counter(summary["counts"]) for summary in summaries), Counter[str]())
+    counts = sum((Counter(summary.counts) for summary in summaries), Counter[str]())
     bad = [f"{counts[kind]:,} {kind}" for kind in ("failed", "diverged") if counts[kind]]
     if bad:
         raise FramesFailedError(
@@ -138,7 +141,7 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
     )
 
 
-def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[dict[str, Any], bool]:
+def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSummary, bool]:
     """Returns the batch's summary, which it prints, and whether the batch was stopped."""
     from pnpdepth_cli.cli.progress import BatchProgress
     from pnpdepth_cli.cli.tables import print_batch

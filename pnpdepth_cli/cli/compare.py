@@ -67,11 +67,11 @@ def compare(
     comparison = compare_runs(runs, columns=columns)
     if plot is not None:
         plot_comparison(comparison, plot, overwrite=files.overwrite)
-    print_notes(comparison["notes"])
+    print_notes(comparison.notes)
     table = comparison_table(comparison)
     to_stdout = files.write(csv=table, latex=methods_table(comparison))
     if files.as_json:
-        print_json(comparison)
+        print_json(comparison.to_json())
     elif not to_stdout:
         # a long label would make the table wider than a terminal
         rows = [[title, _short(label), *cells] for title, label, *cells in table.rows]

@@ -90,7 +90,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     described = replace(means, title=f"{means.title}; {evaluation.describe()}")
     to_stdout = files.write(csv=frames, latex=described)
     if files.as_json:
-        print_json(evaluation.as_record())
+        print_json(evaluation.to_json())
     elif not to_stdout:
         for table in tables.text_tables(evaluation, keys):
             print_table(table)

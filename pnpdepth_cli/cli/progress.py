@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,8 @@ from pnpdepth_cli.cli.streams import printable, say
 
 if TYPE_CHECKING:
     from tqdm import tqdm
+
+    from pnpdepth_cli.dataset.frame_record import FrameRecord
 
 _LINE_EVERY_S = 60.0
 _SHOWN_AFTER_S = 1.0
@@ -85,14 +87,14 @@ class BatchProgress:
         if sys.stderr.isatty():
             self._bar = open_bar("batch", "frame", total=to_do)
 
-    def frame(self, row: Mapping[str, Any]) -> None:
+    def frame(self, record: FrameRecord) -> None:
         """Counts a frame, and prints why it failed if it did; what was said of it is not again."""
-        line = f"{row['status']}: {row['name']}: {row['message']}"
-        if row["status"] != "done" and line not in self._said:
+        line = f"{record.status}: {record.name}: {record.message}"
+        if record.status != "done" and line not in self._said:
             self._said.add(line)
             self.say(line)
         self.done += 1
-        self.failed += row["status"] == "failed"
+        self.failed += record.status == "failed"
         if self._bar is not None:
             self._bar.update()
             if self.failed:

@@ -87,7 +87,7 @@ def refine(as_json: bool, **values: Any) -> None:
 
         outcome = refine_image(request, on_iteration=show_update)
     if as_json:
-        print_json(outcome.record)
+        print_json(outcome.record.to_json())
     else:
         print_refinement(outcome.record)
     if outcome.diverged is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,19 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from pnpdepth_cli.cli.streams import printable
+from pnpdepth_cli.commands.batch.summary import BatchSummary
 from pnpdepth_cli.commands.error_tables import (
     baselines_table,
+    has_baselines,
     held_out_table,
     mean_weights_text,
     means_table,
     refinement_table,
 )
 from pnpdepth_cli.commands.tables import Cell, Table, write_text
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.stages import GT, HELD_OUT
 
 _COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
 
@@ -115,69 +119,70 @@ def print_notes(notes: Sequence[str]) -> None:
         console.print(escape(printable(note)), style=style, soft_wrap=True)
 
 
-def print_refinement(record: Mapping[str, Any]) -> None:
+def print_refinement(record: FrameRecord) -> None:
     """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
-    print_notes(record["notes"])
+    assert record.method is not None
+    is_default, errors = record.method.kind == "default", record.errors
+    print_notes(record.notes)
     print_table(refinement_table(record), err=True)
-    if record["method"]["kind"] == "default" and record["held_out_error"]:
+    if is_default and HELD_OUT in errors:
         print_table(held_out_table(record), err=True)
-    if record["linear"]["worse"]:
+    if record.worse_than_linear:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
-    if record["baselines"] is not None:
-        print_table(baselines_table(record["baselines"], record["unit"]), err=True)
+    if has_baselines(errors):
+        print_table(baselines_table(errors, record.unit), err=True)
     console = _Console(stderr=True, highlight=False)
-    if record["improved_fraction"] is not None:
-        where = "held-out points" if record["held_out_error"] else "points used"
-        where = "pixels with ground truth" if record["scores"] else where
-        console.print(f"improved: {record['improved_fraction']:.1%} of the {where}")
-    settings = record["settings"]
+    if record.improved_fraction is not None:
+        where = "held-out points" if HELD_OUT in errors else "points used"
+        where = "pixels with ground truth" if GT in errors else where
+        console.print(f"improved: {record.improved_fraction:.1%} of the {where}")
+    settings = record.settings
     updates = (
         f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
         f" {settings['step']:.3g}) · "
     )
     console.print(
-        ("" if record["method"]["kind"] == "default" else updates)
-        + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in record["seconds"].items())
-        + f" · peak {record['peak_memory_mb']['process']:,.0f} MB",
+        ("" if is_default else updates)
+        + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in record.seconds.items())
+        + f" · peak {record.peak_memory_mb['process']:,.0f} MB",
         soft_wrap=True,
     )
-    _print_written(console, "wrote", record)
+    _print_written(console, "wrote", record.outputs.values())
 
 
-def _print_written(console: Console, start: str, record: Mapping[str, Any]) -> None:
-    written = [path for path in record["outputs"].values() if path]
-    console.print(f"{start} {escape('  '.join(written))}", soft_wrap=True)
+def _print_written(console: Console, start: str, paths: Iterable[str]) -> None:
+    console.print(f"{start} {escape('  '.join(paths))}", soft_wrap=True)
 
 
-def print_batch(summary: Mapping[str, Any]) -> None:
+def print_batch(summary: BatchSummary) -> None:
     """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files."""
-    mean, counts, beside = summary["mean"], summary["counts"], summary["linear"]
-    if any(mean.values()):
-        print_table(means_table(summary), err=True)
-    print_notes(summary["notes"])
-    if summary["baselines"]:
-        print_table(baselines_table(summary["baselines"], summary["unit"]), err=True)
+    counts, errors = summary.counts, summary.errors
+    if errors:
+        print_table(means_table(errors, summary.unit, summary.columns), err=True)
+    print_notes(summary.notes)
+    if has_baselines(errors):
+        print_table(baselines_table(errors, summary.unit), err=True)
     parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
     parts += [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
     ]
     if counts["with_warnings"]:
         parts.append(f"{counts['with_warnings']:,} with warnings")
-    if beside["frames"]:
-        worse = f"{beside['worse']:,} of {beside['frames']:,}"
+    if counts["compared"]:
+        worse = f"{counts['worse']:,} of {counts['compared']:,}"
         parts.append(f"{worse} worse than linear interpolation")
     console = _Console(stderr=True, highlight=False)
     console.print(", ".join(parts))
-    for each in summary.get("warnings", ()):
-        more = "" if each["frames"] <= len(each["first"]) else ", …"
-        names = f"{', '.join(each['first'])}{more}"
-        count = "1 frame" if each["frames"] == 1 else f"{each['frames']:,} frames"
-        note = each["note"].removeprefix("warning: ")
+    for each in summary.warnings:
+        more = "" if each.frames <= len(each.first) else ", …"
+        names = f"{', '.join(each.first)}{more}"
+        count = "1 frame" if each.frames == 1 else f"{each.frames:,} frames"
+        note = each.note.removeprefix("warning: ")
         console.print(escape(f"warning in {count} ({names}): {note}"), soft_wrap=True)
-    if summary["weights"]:
-        mean_weights = mean_weights_text(summary["weights"])
+    if summary.weights:
+        mean_weights = mean_weights_text(summary.weights)
         console.print(escape(f"mean weights in the result: {mean_weights}"), soft_wrap=True)
-    output = summary["output"]
+    output = summary.output
     console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
 
 
@@ -189,4 +194,5 @@ def print_sparse(record: Mapping[str, Any]) -> None:
         f"wrote {points['count']:,} points, {points['fraction_of_pixels']:.2%} of {width}×{height}"
         " pixels:"
     )
-    _print_written(_Console(stderr=True, highlight=False), start, record)
+    written = [path for path in record["outputs"].values() if path]
+    _print_written(_Console(stderr=True, highlight=False), start, written)

@@ -17,12 +17,12 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import image_of_size
 from pnpdepth_cli.dataset.frame_camera import (
-    Pose,
     camera_of_exif,
     camera_of_file,
     camera_of_fov,
     describe_pinhole,
 )
+from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.dataset.plausible import far_values
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
@@ -234,7 +234,7 @@ def _camera(
         return camera, [describe_pinhole(camera)]
     of_record, _ = frame.camera_and_pose
     if of_record is not None:
-        if frame.record.get("size") != [size[1], size[0]]:
+        if frame.record is None or frame.record.size != (size[1], size[0]):
             raise SizeError(
                 f"{frame.depth} is {size[1]}×{size[0]}, unlike its record; refine it again, or give"
                 " --calib"

@@ -4,71 +4,75 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.tables import Cell, Style, Table
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.measures import MEASURES
+from pnpdepth_cli.stages import (
+    AFTER,
+    ALONE,
+    BASES,
+    BEFORE,
+    GT,
+    HELD_OUT,
+    LINEAR,
+    PROPAGATED,
+    UPDATED,
+    USED,
+    VALIDATION,
+)
 
-GT, HELD_OUT, VALIDATION, USED = "scores", "held_out_error", "validation", "sparse_error"
-BASES = {
-    GT: "against ground truth",
-    HELD_OUT: "at held-out points",
-    VALIDATION: "at validation points",
-    USED: "at points used",
-}
-"""What errors are measured on, the best first. A change at the points used means nothing."""
+Errors = Mapping[str, Mapping[str, Scores]]
+"""By basis, then by stage, as of `FrameRecord.errors`."""
+
 _STAGES = {
-    "aligned": "{name}, aligned with the points",
-    "updated": "{name}, z updated",
-    "propagated": "{name}, residual propagated",
-    "alone": "{fusing} alone",
-    "result": "fused ({weights})",
-    "linear": "linear interpolation of all points",
+    BEFORE: "{name}, aligned with the points",
+    UPDATED: "{name}, z updated",
+    PROPAGATED: "{name}, residual propagated",
+    ALONE: "{fusing} alone",
+    AFTER: "fused ({weights})",
+    LINEAR: "linear interpolation of all points",
 }
-"""Rows of the default method, by the name of the stage."""
+"""Rows of the default method, by stage."""
 _MEASURES = {measure.key: measure for measure in MEASURES}
 
 
-def errors_by_basis(errors: Mapping[str, Any]) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """Returns the errors "before", "after" and of "linear" by their basis, the best first.
+def bases_of(errors: Errors) -> list[str]:
+    """Returns what errors are shown on, the best first.
 
-    Those at validation points are there only where no others say how good the result is.
-
-    Args:
-        errors: A record, a row of a summary, or a summary's means with its `linear`.
+    Validation points are there only where nothing else says how good the result is.
     """
-    linear = errors["linear"] or {}
-    found = {
-        basis: {**errors[basis], "linear": linear.get(basis) or {}}
-        for basis in (GT, HELD_OUT)
-        if errors[basis]
-    }
-    if not found and (at := linear.get("validation")):
-        stages = {"before": "aligned", "after": "result", "linear": "linear"}
-        found[VALIDATION] = {side: at | {"mae": at[name]} for side, name in stages.items()}
-    if errors[USED]:
-        found[USED] = {**errors[USED], "linear": {}}
-    return found
+    found = [basis for basis in BASES if errors.get(basis)]
+    return [b for b in found if b != VALIDATION or not {GT, HELD_OUT} & set(found)]
 
 
 def error_table(
-    title: str, errors: Mapping[str, Any], unit: str, keys: Sequence[str] | None = None
+    title: str,
+    errors: Errors,
+    unit: str,
+    keys: Sequence[str] | None = None,
+    bases: Sequence[str] | None = None,
 ) -> Table:
     """Returns a row for each measure: before, after and change, and linear interpolation beside.
 
     Args:
-        title: Of the table.
-        errors: Argument of `errors_by_basis`.
-        unit: Of the depths.
-        keys: Of the measures, in this order; None for all.
+        title: Title of the table.
+        errors: Errors of a frame, or their means.
+        unit: Unit of the depths.
+        keys: Keys of the measures, in this order; None for all.
+        bases: What the errors are on; None for `bases_of`.
     """
     rows = []
-    for basis, sides in errors_by_basis(errors).items():
-        before, after = sides["before"], sides["after"]
-        count = f"{after['points']:,} " if "points" in after else ""
-        for key in (key for key in keys or _MEASURES if key in before):
+    for basis in bases_of(errors) if bases is None else bases:
+        stages = errors[basis]
+        sides = [stages.get(stage, {}) for stage in (BEFORE, AFTER, LINEAR)]
+        count = "" if "frames" in sides[1] else f"{sides[1].get('points', 0):,} "
+        for key in (key for key in keys or _MEASURES if key in sides[0]):
             name = _title(key)
-            values = [side.get(key) for side in (before, after, sides["linear"])]
+            values = [side.get(key) for side in sides]
+            if basis == USED:
+                values[2] = None
             shown = [format_error(key, value, unit) for value in values]
             changes = ["", ""]
             if basis != USED:
@@ -80,72 +84,72 @@ def error_table(
     return Table(title=title, columns=columns, rows=rows)
 
 
-def means_table(summary: Mapping[str, Any]) -> Table:
-    """Returns the mean errors of a batch."""
-    means = summary["mean"] | {"linear": summary["linear"]}
-    counts = (f"{frames_of(e):,} {BASES[basis]}" for basis, e in errors_by_basis(means).items())
-    title = f"means over frames: {', '.join(counts)}"
-    return error_table(title, means, summary["unit"], summary.get("columns"))
+def means_table(errors: Errors, unit: str, keys: Sequence[str] | None = None) -> Table:
+    """Returns the mean errors of a batch; its measures have these keys, or are all."""
+    counts = (f"{errors[b][AFTER]['frames']:,} {BASES[b]}" for b in bases_of(errors))
+    return error_table(f"means over frames: {', '.join(counts)}", errors, unit, keys)
 
 
-def frames_of(errors: Mapping[str, Any]) -> int:
-    """Returns the number of frames behind the means of a basis."""
-    return int(errors["frames"] if "frames" in errors else errors["after"]["frames"])
-
-
-def refinement_table(record: Mapping[str, Any]) -> Table:
+def refinement_table(record: FrameRecord) -> Table:
     """Returns the errors of a record: by stage for the default method, else before and after."""
-    scores = record["scores"]
-    if record["method"]["kind"] == "default":
+    assert record.method is not None
+    if record.method.kind == "default":
         return _stages_table(record)
-    title = f"{record['model']['name']} cut at {record['settings']['layer']}"
-    if scores is not None:
-        title += f"; {_scored_on(scores['after'])}"
-    return error_table(title, record, record["unit"])
+    assert record.model is not None
+    title = f"{record.model.name} cut at {record.settings['layer']}"
+    if GT in record.errors:
+        title += f"; {_scored_on(record.errors[GT][AFTER])}"
+    return error_table(title, record.errors, record.unit)
 
 
-def held_out_table(record: Mapping[str, Any]) -> Table:
+def held_out_table(record: FrameRecord) -> Table:
     """Returns the errors of a record at its held-out points."""
-    only = {**dict.fromkeys((GT, USED)), HELD_OUT: record[HELD_OUT], "linear": record["linear"]}
-    return error_table("held-out points, which nothing used", only, record["unit"])
+    title = "held-out points, which nothing used"
+    return error_table(title, record.errors, record.unit, bases=[HELD_OUT])
 
 
-def made_by(record: Mapping[str, Any]) -> tuple[str, str]:
+def made_by(record: FrameRecord) -> tuple[str, str]:
     """Returns what the depth before and the depth after of a record are of, in a few words."""
-    settings = record["settings"]
-    if record["method"]["kind"] == "default":
-        name, weights = record["method"]["networks"][0], record["weights"]
-        alone = all(weight == 0 for expert, weight in weights.items() if expert != name)
-        after = _STAGES["propagated" if alone else "result"]
-        before = _STAGES["aligned"].format(name=name)
-        return before, after.format(name=name, weights=weights_text(weights))
-    name, align = record["model"]["name"], settings["align"] != "none"
+    assert record.method is not None
+    assert record.model is not None
+    settings = record.settings
+    if record.method.kind == "default":
+        name = record.method.networks[0]
+        alone = all(weight == 0 for expert, weight in record.weights.items() if expert != name)
+        after = _STAGES[PROPAGATED if alone else AFTER]
+        before = _STAGES[BEFORE].format(name=name)
+        return before, after.format(name=name, weights=weights_text(record.weights))
+    name, align = record.model.name, settings["align"] != "none"
     before = f"{name}, aligned with the points" if align else name
     steps = [f"{settings['iterations']} updates of z"] if settings["iterations"] else []
     steps += ["residual propagated"] if settings["propagate"] != "none" else []
     return before, ", ".join([name, *steps])
 
 
-def _stages_table(record: Mapping[str, Any]) -> Table:
+def _stages_table(record: FrameRecord) -> Table:
     """The stages of the default method: scores on the ground truth, or at validation points."""
-    beside, names = record["linear"], record["method"]["networks"]
-    keys, rows, scored = ["mae"], dict[str, Any](), "too few points to validate the result at some"
-    if record["stages"] is not None:
-        rows = {stage["stage"]: stage["scores"] for stage in record["stages"]}
-        rows |= {"result": record["scores"]["after"], "linear": beside["scores"]}
-        keys, scored = ["rmse", "mae", "mre", "delta1"], _scored_on(rows["linear"])
-    elif (at := beside["validation"]) is not None:
-        rows = {name: {"mae": at[name]} for name in _STAGES if name in at}
-        scored = f"at {at['points']:,} validation points, which the rows did not get"
-    if sum(weight > 0 for weight in record["weights"].values()) == 1 and "alone" not in rows:
-        rows.pop("result", None)  # the network's own
-    last = [name for name in rows if name != "linear"][-1:]
-    of_names = {"name": names[0], "fusing": names[-1], "weights": weights_text(record["weights"])}
+    assert record.method is not None
+    names, errors = record.method.networks, record.errors
+    keys, rows, scored = (
+        ["mae"],
+        dict[str, Scores](),
+        "too few points to validate the result at some",
+    )
+    if stages := errors.get(GT):
+        rows = {name: stages[name] for name in _STAGES if name in stages}
+        keys, scored = ["rmse", "mae", "mre", "delta1"], _scored_on(stages[LINEAR])
+    elif stages := errors.get(VALIDATION):
+        rows = {name: stages[name] for name in _STAGES if name in stages}
+        scored = f"at {stages[LINEAR]['points']:,} validation points, which the rows did not get"
+    if sum(weight > 0 for weight in record.weights.values()) == 1 and ALONE not in rows:
+        rows.pop(AFTER, None)  # the network's own
+    last = [name for name in rows if name != LINEAR][-1:]
+    of_names = {"name": names[0], "fusing": names[-1], "weights": weights_text(record.weights)}
     lines = []
     for name, scores in rows.items():
         style: Style = "bold" if [name] == last else ""
-        against = "" if name == "linear" else change("mae", rows["linear"]["mae"], scores["mae"])
-        cells = [format_error(key, scores[key], record["unit"]) for key in keys]
+        against = "" if name == LINEAR else change("mae", rows[LINEAR]["mae"], scores["mae"])
+        cells = [format_error(key, scores[key], record.unit) for key in keys]
         title = _STAGES[name].format(**of_names)
         lines.append([*(Cell(text, style) for text in (title, *cells)), against])
     columns = ["", *(_title(key) for key in keys), "MAE vs linear"]
@@ -165,28 +169,29 @@ def mean_weights_text(weights: Mapping[str, Mapping[str, float]]) -> str:
     )
 
 
-def baselines_table(baselines: Mapping[str, Mapping[str, Any]], unit: str) -> Table:
-    """Returns the baselines, the network and the result, best first at the validation points.
+def has_baselines(errors: Errors) -> bool:
+    """Returns whether every baseline was compared with, not only linear interpolation."""
+    return any(name in stages for stages in errors.values() for name in BASELINES if name != LINEAR)
 
-    Args:
-        baselines: Of a record or a summary, by name.
-        unit: Of the depths.
-    """
-    rows = {
-        name: {"at_validation": row["validation_mae"], **(row.get("scores", row) or {})}
-        for name, row in baselines.items()
-    }
-    titles = {"at_validation": "MAE, validation points"}
-    if any(row.get("mae") is not None for row in rows.values()):
-        titles |= {"mae": "MAE, ground truth", "rmse": "RMSE, ground truth"}
-    known = {name: row for name, row in rows.items() if row["at_validation"] is not None}
+
+def baselines_table(errors: Errors, unit: str) -> Table:
+    """Returns the baselines, the network and the result, best first at the validation points."""
+    titles = {BEFORE: "network", AFTER: "result"}
+    checked, scored = errors.get(VALIDATION, {}), errors.get(GT, {})
+    names = [name for name in (*BASELINES, *titles) if name in checked or name in scored]
+    columns = {"MAE, validation points": (checked, "mae")}
+    if scored:
+        columns |= {f"{key.upper()}, ground truth": (scored, key) for key in ("mae", "rmse")}
+    known = [name for name in names if checked.get(name, {}).get("mae") is not None]
     lines = []
-    for name in sorted(known, key=lambda name: known[name]["at_validation"]) or list(rows):
-        style: Style = "bold" if name == "result" else ""
-        cells = [format_error("mae", rows[name].get(key), unit) for key in titles]
-        lines.append([Cell(text, style) for text in (name, *cells)])
-    columns = ["", *titles.values()]
-    return Table(title="against every simple baseline", columns=columns, rows=lines)
+    for name in sorted(known, key=lambda name: checked[name]["mae"] or 0) or names:
+        style: Style = "bold" if name == AFTER else ""
+        cells = [
+            format_error(key, stages.get(name, {}).get(key), unit)
+            for stages, key in columns.values()
+        ]
+        lines.append([Cell(text, style) for text in (titles.get(name, name), *cells)])
+    return Table(title="against every simple baseline", columns=["", *columns], rows=lines)
 
 
 def format_error(key: str, value: float | None, unit: str) -> str:
@@ -216,7 +221,7 @@ def change(key: str, before: float | None, after: float | None) -> Cell:
     return Cell(text, "good" if gain > 0 else "bad" if gain < 0 else "dim")
 
 
-def _scored_on(scores: Mapping[str, Any]) -> str:
+def _scored_on(scores: Scores) -> str:
     return (
         f"scored on {scores['pixels']:,} pixels of ground truth"
         f" ({scores['coverage']:.1%} of those known)"

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.dataset.frame_camera import Pose, camera_from_json
 from pnpdepth_cli.dataset.frame_files import ImageSource, file_of, find_files, source_of
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Pose
 from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
-from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.rgb import read_rgb
 
 DEPTH_ENDING = "_depth"
@@ -34,28 +31,28 @@ class ResultFrame:
     depth: Path
     sigma: Path | None = None
     valid: Path | None = None
-    record: Mapping[str, Any] = field(default_factory=dict)
-    """The record beside the depth; empty if there is none."""
+    record: FrameRecord | None = None
+    """The record beside the depth. None: there is none."""
 
     @property
     def image(self) -> ImageSource | None:
         """The image that the record names, if it exists."""
-        text = _entry(_entry(self.record, "inputs"), "image").get("path")
-        image = source_of(text) if isinstance(text, str) else None
+        entry = None if self.record is None else self.record.inputs.get("image")
+        image = None if entry is None else source_of(entry.path)
         return image if image is not None and file_of(image).is_file() else None
 
     @property
     def unit(self) -> str:
         """The unit of the depth."""
-        return str(self.record.get("unit", METRES))
+        return METRES if self.record is None else self.record.unit
 
     @functools.cached_property
     def camera_and_pose(self) -> tuple[Camera | None, Pose | None]:
         """The camera that the record holds, and its pose. Raises FileFormatError if damaged."""
-        entry = _entry(self.record, "camera")
+        camera = None if self.record is None else self.record.camera
         try:
-            return camera_from_json(entry) if entry else (None, None)
-        except (KeyError, ValueError, TypeError, OverflowError) as error:
+            return (None, None) if camera is None else camera.read()
+        except ValueError as error:
             raise FileFormatError(
                 f"{self.depth}: the camera in the record beside it is damaged; refine it again"
             ) from error
@@ -99,10 +96,10 @@ def result_frames(root: Path) -> list[ResultFrame]:
 
 def _frame(name: str, depth: Path) -> ResultFrame:
     path = _beside(depth, ".json")
-    record = {} if path is None else read_json(path)
+    record = None if path is None else FrameRecord.read(path)
     files = {"sigma": f"_sigma{depth.suffix}", "valid": "_valid.png"}
-    if isinstance(written := record.get("outputs"), dict):  # others are of other runs
-        files = {kind: ending for kind, ending in files.items() if written.get(kind)}
+    if record is not None:  # others are of other runs
+        files = {kind: ending for kind, ending in files.items() if kind in record.outputs}
     companions = {kind: _beside(depth, ending) for kind, ending in files.items()}
     return ResultFrame(name=name, depth=depth, record=record, **companions)
 
@@ -110,8 +107,3 @@ def _frame(name: str, depth: Path) -> ResultFrame:
 def _beside(depth: Path, ending: str) -> Path | None:
     path = depth.with_name(depth.stem.removesuffix(DEPTH_ENDING) + ending)
     return path if path != depth and path.is_file() else None
-
-
-def _entry(record: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    value = record.get(name)
-    return value if isinstance(value, dict) else {}

@@ -12,6 +12,7 @@ from pnpdepth_cli.dataset.plausible import far_values
 from pnpdepth_cli.dataset.read_options import METRES, MODEL_UNITS
 from pnpdepth_cli.dataset.scan_points import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.colmap_model import (
     ColmapModel,
     find_model,
@@ -90,16 +91,14 @@ def read_colmap_points(
         pose=np.column_stack([turn, -turn @ shift * (unit_scale or 1.0)]),
         unit=unit,
         reading=reading,
-        record={
-            "path": str(model.folder),
-            "sha256": {p.name: fingerprint(p).sha256 for p in model_files(find_model(path))},
-            "read_as": reading.source,
-            "image": name,
-            "lens": camera.lens,
-            "distortion": list(camera.distortion),
-            "unit_scale": unit_scale,
-            "dropped": dict(dropped),
-        },
+        record=FileRecord(
+            path=str(model.folder),
+            sha256={p.name: fingerprint(p).sha256 for p in model_files(find_model(path))},
+            read_as=reading.source,
+            image=name,
+            unit_scale=unit_scale,
+            dropped=dict(dropped),
+        ),
         notes=tuple(notes),
     )
 

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.dataset.scan_points import SparseDepth, check_size
@@ -20,46 +16,7 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.rgb import read_focal_length
 
-Pose = NDArray[np.float64]
-"""(3, 4) x_world = pose · (x, 1), in the unit of the depth."""
-
 _MAX_FOV_DEG = 170.0
-
-
-def camera_to_json(camera: Camera, pose: Pose | None) -> dict[str, Any]:
-    """Returns what a record keeps of a camera and its pose; `camera_from_json` reads it."""
-    return {
-        "intrinsics": camera.intrinsics.tolist(),
-        "lens": camera.lens,
-        "distortion": list(camera.distortion),
-        "pose": None if pose is None else pose.tolist(),
-        "source": camera.source,
-    }
-
-
-def camera_from_json(entry: Mapping[str, Any]) -> tuple[Camera, Pose | None]:
-    """Returns the camera and its pose of an entry of `camera_to_json`.
-
-    Raises:
-        KeyError: A part is missing.
-        TypeError: A part is not of numbers.
-        ValueError: No camera has these numbers.
-    """
-    intrinsics = np.array(entry["intrinsics"], np.float64).reshape(3, 3)
-    distortion = tuple(float(each) for each in entry["distortion"])
-    pose = None if entry["pose"] is None else np.array(entry["pose"], float).reshape(3, 4)
-    numbers = np.concatenate([intrinsics.ravel(), distortion, [] if pose is None else pose.ravel()])
-    if not np.isfinite(numbers).all() or entry["lens"] not in LENSES:
-        raise ValueError("no camera has these numbers")
-    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or intrinsics[2].tolist() != [0, 0, 1]:
-        raise ValueError("no camera has these intrinsics")
-    camera = Camera(
-        intrinsics=intrinsics,
-        lens=entry["lens"],
-        distortion=distortion,
-        source=str(entry["source"]),
-    )
-    return camera, pose
 
 
 def camera_of_frame(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.arrays import read_image
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ImageSource, Neighbour, file_of
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart
@@ -31,7 +31,7 @@ def read_neighbours(
     used: SparsePoints,
     camera: Camera | None,
     points_of: Callable[[FrameFiles], SparsePoints],
-) -> tuple[SparsePoints, list[dict[str, Any]], list[str]]:
+) -> tuple[SparsePoints, list[FileRecord], list[str]]:
     """Returns the points with those of the neighbours that agree with them.
 
     A neighbour whose motion is neither known nor can be estimated is left out. Known motion to the
@@ -58,7 +58,7 @@ def read_neighbours(
             " column calib in a list"
         )
     own, scans, notes = _in_numpy(used), list[NeighbourScan](), list[str]()
-    record: list[dict[str, Any]] = []
+    records = list[FileRecord]()
     for neighbour in files.neighbours:
         points, source = (
             _in_numpy(points_of(neighbour.files)),
@@ -70,16 +70,10 @@ def read_neighbours(
             estimate = _estimated(files, neighbour.files, points, camera)
         else:
             estimate = MotionEstimate(motion=np.array(known), basis=neighbour.poses)
-        entry: dict[str, Any] = {
-            "path": str(source),
-            "sha256": fingerprint(file_of(source)).sha256,
-            "poses": neighbour.poses,
-            "basis": estimate.basis if known is None else None,
-        }
+        off: str | None = None
         if known is not None and not any(each.apart == 1 for each in scans):
             off = _off_images(files, neighbour, points, camera)
             notes += [off] if off else []
-            entry["contradicts_images"] = off is not None
         if estimate.motion is None:
             notes.append(
                 f"warning: {_name_of(neighbour.files)} is left out of the accumulated points, as"
@@ -88,14 +82,21 @@ def read_neighbours(
         else:
             apart = neighbour.apart
             scans.append(NeighbourScan(points=points, motion=estimate.motion, apart=apart))
-            entry["motion"] = estimate.motion.tolist()
-        record.append(entry)
+        records.append(
+            FileRecord(
+                path=str(source),
+                sha256=fingerprint(file_of(source)).sha256,
+                poses=neighbour.poses + (f": {estimate.basis}" if known is None else ""),
+                motion=None if estimate.motion is None else estimate.motion.tolist(),
+                contradicts_images=off is not None,
+            )
+        )
     if not scans:
         raise InputError(
             f"{_name_of(files)}: no motion to a neighbour can be estimated ({estimate.basis}); give"
             " --poses, or leave out --accumulate"
         )
-    return accumulated(own, scans, camera).tensors(), record, notes
+    return accumulated(own, scans, camera).tensors(), records, notes
 
 
 def _estimated(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -40,6 +39,7 @@ from pnpdepth_cli.dataset.plausible import (
 from pnpdepth_cli.dataset.read_options import METRES, ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.scan_points import SparseDepth, read_scan_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.file_record import FileRecord, Sampling
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
 from pnpdepth_cli.io.depth import describe_range, read_depth
 from pnpdepth_cli.io.fingerprint import fingerprint
@@ -85,7 +85,7 @@ def read_frame(
     if files.min_confidence is not None and files.sparse_mask is None:
         raise UsageError("--min-confidence needs --sparse-mask, the confidence of the sparse depth")
     crop = files.part.apply
-    notes, sources = list[str](), dict[str, Any]()
+    notes, sources = list[str](), dict[str, FileRecord]()
     rgb: ImageArray | None = None
     gt: ImageArray | None = None
     whole: tuple[int, int] | None = None
@@ -145,10 +145,8 @@ def read_frame(
             f"mask {files.masks[0]} is of ground truth, of which there is none, so it is not used;"
             " a mask of the sparse depth is --sparse-mask, or sparse_mask in a list"
         )
-    if neighbours:
-        sources["neighbours"] = neighbours
     # points that wrong poses moved say nothing of the image
-    contradicted = any(each.get("contradicts_images") for each in neighbours)
+    contradicted = any(each.contradicts_images for each in neighbours)
     one_view = contradicted or _is_one_view(files, options)
     return Frame(
         rgb=None if rgb is None else tensor_of(rgb),
@@ -159,8 +157,8 @@ def read_frame(
         one_view=one_view,
         gt=gt,
         depth_scale=sparse.reading.scale,
-        assumed=tuple(f"{side}: {r}" for side, r in readings.items() if r and r.assumed),
         sources=sources,
+        neighbours=tuple(neighbours),
         notes=tuple(notes),
         unit=sparse.unit,
         camera=camera,
@@ -224,7 +222,7 @@ def _read_ground_truth(
     options: ReadOptions,
     source: Source | RawDepth,
     size: tuple[int, int] | None,
-) -> tuple[DepthFile, dict[str, Any], list[str]]:
+) -> tuple[DepthFile, FileRecord, list[str]]:
     """The ground truth of an image (H, W), what a record keeps of it, and lines for a person."""
     scale = options.depth_scale or files.gt_scale
     if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
@@ -245,12 +243,15 @@ def _read_ground_truth(
         values = moved_to(file_of(source), values, size)
     values, notes = plausible_map(values, truth.reading, "gt", "gt_scale of a list", scale)
     described = describe_range(values, truth.reading, noun="pixels", option="gt_scale of a list")
-    record = _file_record(source) | {"read_as": str(truth.reading)}
+    record = _file_record(source, truth.reading)
     return replace(truth, values=values), record, [f"gt: {described}", *notes]
 
 
-def _file_record(source: ImageSource | RawDepth) -> dict[str, Any]:
-    return {"path": str(source), "sha256": fingerprint(file_of(source)).sha256}
+def _file_record(source: ImageSource | RawDepth, reading: Reading | None = None) -> FileRecord:
+    record = FileRecord(path=str(source), sha256=fingerprint(file_of(source)).sha256)
+    if reading is None:
+        return record
+    return replace(record, read_as=reading.source, scale=reading.scale, assumed=reading.assumed)
 
 
 def _sampled(
@@ -275,7 +276,9 @@ def _sampled(
     return SparseDepth(
         points=points.tensors(),
         reading=reading,
-        record={"sampled_from": str(files.gt), **asdict(options.sample), "seed": seed},
+        record=FileRecord(
+            path=str(files.gt), sampled=Sampling(**asdict(options.sample), seed=seed)
+        ),
         notes=(f"sparse: {describe_range(points.depth, reading)}",),
     )
 
@@ -336,7 +339,7 @@ def _of_distances(sparse: SparseDepth, files: FrameFiles, options: ReadOptions) 
         f"sparse: distances became depth, ÷ {length[seen].min():.3f} to {length[seen].max():.3f}"
         f" by the camera of {scan.calib}"
     )
-    record = sparse.record | {"read_as": f"{sparse.record['read_as']}, distances"}
+    record = replace(sparse.record, read_as=f"{sparse.record.read_as}, distances")
     return replace(sparse, points=points, record=record, notes=(*sparse.notes, note))
 
 
@@ -358,8 +361,8 @@ def _confident(sparse: SparseDepth, path: Path, least: float | None) -> SparseDe
     )
     if not kept.any():
         raise NoPointsError(f"{note.removeprefix('sparse: ')}; lower --min-confidence")
-    record = sparse.record | {"mask": _file_record(path) | {"least": least}}
-    record["dropped"] = {**record.get("dropped", {}), "of low confidence": int((~kept).sum())}
+    dropped = sparse.record.dropped | {"of low confidence": int((~kept).sum())}
+    record = replace(sparse.record, mask=str(path), least=least, dropped=dropped)
     return replace(
         sparse,
         points=points.select(torch.from_numpy(kept)),
@@ -380,20 +383,20 @@ def _read_points(
     size = image_size or visible.size
     check_same_view(str(path), visible.size, size)
     notes = [f"sparse: {describe_range(depth, reading)}", *(f"sparse: {line}" for line in lines)]
-    record = _file_record(path) | {"read_as": str(reading)}
+    record = _file_record(path, reading)
     if visible.size != size:
         notes.append(f"sparse: {moved_note(visible.size, size)}")
     keep_occluded = options.scan.keep_occluded
     if options.foreground is not None:
         behind = behind_foreground(visible, *options.foreground)
         visible, count = visible.select(~behind), int(behind.sum())
-        record["dropped"] = {"behind the foreground": count}
+        record = replace(record, dropped={"behind the foreground": count})
         notes.append(f"sparse: dropped {count:,} points behind others, as the protocol does")
         keep_occluded = True
     hidden = None if keep_occluded else occluded_in_map(visible)
     if hidden is not None and hidden.any():
         visible, count = visible.select(~hidden), int(hidden.sum())
-        record["dropped"] = {"hidden by foreground": count}
+        record = replace(record, dropped={"hidden by foreground": count})
         notes.append(
             f"sparse: a projected LiDAR scan; dropped {count:,} points occluded from the camera by"
             " nearer ones; --preset paper keeps them"

@@ -17,6 +17,7 @@ from pnpdepth_cli.camera import SAME_FRAME, Camera, Extrinsics
 from pnpdepth_cli.dataset.plausible import scan_returns
 from pnpdepth_cli.dataset.read_options import METRES, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.extrinsics import read_extrinsics
@@ -52,7 +53,7 @@ class SparseDepth:
 
     points: SparsePoints[Any]
     """In the image, as arrays of either library."""
-    record: dict[str, Any]
+    record: FileRecord
     notes: tuple[str, ...]
     reading: Reading
     """Its scale is that of an integer file of the depth, per unit. None: it holds no integers."""
@@ -129,16 +130,16 @@ def read_scan_points(
     return SparseDepth(
         points=points,
         camera=replace(camera, source=f"calibration of {path.name}"),
-        record={
-            "path": str(path),
-            "sha256": sha256_of(path),
-            "read_as": reading.source,
-            "calibration": str(named),
-            "camera": options.camera,
-            "extrinsics": None if options.extrinsics is None else str(options.extrinsics),
-            "keep_occluded": options.keep_occluded,
-            "dropped": {**no_returns, **points.dropped},
-        },
+        record=FileRecord(
+            path=str(path),
+            sha256=sha256_of(path),
+            read_as=reading.source,
+            calibration=str(named),
+            camera=options.camera,
+            extrinsics=None if options.extrinsics is None else str(options.extrinsics),
+            keep_occluded=options.keep_occluded,
+            dropped={**no_returns, **points.dropped},
+        ),
         notes=(*notes, *warnings),
         reading=reading,
     )

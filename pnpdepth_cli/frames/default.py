@@ -15,30 +15,24 @@ from torch import Tensor
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.outliers import far_points, outliers
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined, Validation, is_dense, no_points
+from pnpdepth_cli.frames.frame import Frame, is_dense
 from pnpdepth_cli.frames.fuse import (
     FEW_POINTS,
-    LINEAR,
+    LEAST_PART,
     Expert,
     fitted_weights,
     judge_of,
+    predicted_by,
     predictions,
-    refined_by,
     scanner_shares,
     weighs_points,
     weighted_mean,
     without_doubt,
 )
-from pnpdepth_cli.frames.opened import OpenNetworks
-from pnpdepth_cli.frames.validation import FOLDS, ValidationSplit, consistency, split_frame
-from pnpdepth_cli.points import SparsePoints
-
-ALIGNED, UPDATED, PROPAGATED = "aligned", "updated", "propagated"
-"""The user's network: aligned with the points, z updated, the residual propagated."""
-ALONE, RESULT = "alone", "result"
-"""The network that takes a prior, without one; the result."""
-LEAST_PART = 0.01
-"""A network with less weight has no part in the result, which is said."""
+from pnpdepth_cli.frames.open_networks import OpenNetworks
+from pnpdepth_cli.frames.refined import Prediction, Refined, Validation, refined_of
+from pnpdepth_cli.frames.validation import FOLDS, ValidationSplit, split_frame
+from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
 
 def refine_default(networks: OpenNetworks, frame: Frame, *, seed: int = 0) -> Refined:
@@ -56,7 +50,7 @@ def refine_default(networks: OpenNetworks, frame: Frame, *, seed: int = 0) -> Re
     # Points that contradict their neighbours are outliers.
     inliers, judged = without_outliers(networks, frame)
     # A fifth of the inliers are validation points, which every expert predicts from the others.
-    split = split_frame(inliers, judged, seed)
+    split = split_frame(inliers, judged.before, seed)
     experts = predictions(networks, split, judged)
     # Where the image does not help, an expert that does not see it joins.
     experts, warnings = without_doubt(networks, split, experts)
@@ -70,22 +64,19 @@ def refine_default(networks: OpenNetworks, frame: Frame, *, seed: int = 0) -> Re
     shares = scanner_shares(experts, split, weights)
     depth = _with_shares(depth, {e.name: e.dense() for e in experts if e.name in shares}, shares)
     weights = {name: (1 - sum(shares.values())) * w for name, w in weights.items()} | shares
-    return Refined(
-        before=_user(experts).before,
-        after=depth.numpy(),
+    return refined_of(
+        frame,
+        _user(experts),
+        depth,
         used=inliers.points,
-        held_out=no_points(frame.points),
-        refinement=_user(experts).refinement,
-        diverged=_user(experts).diverged,
-        alignment=_user(experts).alignment,
-        notes=(*_user(experts).notes, *_notes(frame, inliers, split, experts, weights), *warnings),
+        notes=(*_notes(frame, inliers, split, experts, weights), *warnings),
         stages={} if frame.gt is None else _stages(experts, inliers, split.propagation),
         validation=_validation(experts, split, shares) if len(split.points) else None,
         weights=weights,
     )
 
 
-def without_outliers(networks: OpenNetworks, frame: Frame) -> tuple[Frame, Refined]:
+def without_outliers(networks: OpenNetworks, frame: Frame) -> tuple[Frame, Prediction]:
     """Returns the frame without its outliers, and what the network that judged them gives for it.
 
     That is the network that weighs its points, else the user's: a useless network does not decide
@@ -100,47 +91,22 @@ def without_outliers(networks: OpenNetworks, frame: Frame) -> tuple[Frame, Refin
     any_suspected = bool(suspected.any())
     consistent = frame.with_points(points.select(~suspected)) if any_suspected else frame
     weighs = any_suspected and weighs_points(judge)
-    judged = refined_by(networks, judge, consistent, updates=not weighs)
-    outlying = outliers(torch.from_numpy(judged.before), points, frame.rgb)
+    judged = predicted_by(networks, judge, consistent, updates=not weighs)
+    outlying = outliers(judged.before, points, frame.rgb)
     if len(points) >= FEW_POINTS:
         outlying = outlying | suspected
     inliers = frame.without(outlying)
     # A network that weighs its points is given the outliers too, now that they are known.
     if weighs or not torch.equal(outlying, suspected):
-        judged = refined_by(networks, judge, inliers)
+        judged = predicted_by(networks, judge, inliers)
     return inliers, judged
 
 
-def without_far_points(networks: OpenNetworks, frame: Frame, judged: Refined) -> Frame:
+def without_far_points(networks: OpenNetworks, frame: Frame, judged: Prediction) -> Frame:
     """Returns the frame without points far from the depth of a network that weighs them."""
     if not weighs_points(judge_of(networks)) or is_dense(frame.points):
         return frame
-    return frame.without(far_points(torch.from_numpy(judged.before), frame.points))
-
-
-def check_fixed(
-    refined: Refined, again: Refined, kept: SparsePoints, points: SparsePoints
-) -> Validation:
-    """Returns the validation of a fixed method that was run with all points, and with some.
-
-    Args:
-        refined: The frame refined with all points.
-        again: The same without the validation points.
-        kept: The points of `again`.
-        points: The validation points.
-    """
-    before, after = (torch.from_numpy(depth) for depth in (again.before, again.after))
-    return Validation(
-        points=points,
-        kept=kept,
-        network=before,
-        weights=consistency(points, torch.from_numpy(refined.after)),
-        predicted={
-            ALIGNED: points.sample(before),
-            LINEAR: linear(kept, points.xy),
-            RESULT: points.sample(after),
-        },
-    )
+    return frame.without(far_points(judged.before, frame.points))
 
 
 def _propagated(depth: Tensor, frame: Frame, kind: str) -> Tensor:
@@ -154,10 +120,10 @@ def _with_shares(depth: Tensor, own: Mapping[str, Tensor], shares: Mapping[str, 
     return weighted_mean([rest, *((own[name], share) for name, share in shares.items())])
 
 
-def _user(experts: Sequence[Expert]) -> Refined:
+def _user(experts: Sequence[Expert]) -> Prediction:
     """What the user's network gives from all points."""
-    assert experts[0].refined is not None
-    return experts[0].refined
+    assert experts[0].prediction is not None
+    return experts[0].prediction
 
 
 def _alone(experts: Sequence[Expert]) -> Expert | None:
@@ -165,16 +131,13 @@ def _alone(experts: Sequence[Expert]) -> Expert | None:
     return next((e for e in experts[1:] if e.user is None and e.network is not None), None)
 
 
-def _stages(experts: Sequence[Expert], frame: Frame, kind: str) -> dict[str, DepthMap]:
+def _stages(experts: Sequence[Expert], frame: Frame, kind: str) -> dict[str, Tensor]:
     """The user's network after each step of its own, and the network that takes a prior alone."""
     user, alone, own = _user(experts), _alone(experts), experts[0].dense()
     propagated = own if experts[0].of_scanner else _propagated(own, frame, kind)
-    stages = {ALIGNED: user.before, UPDATED: user.after, PROPAGATED: propagated.numpy()}
-    return (
-        stages
-        if alone is None
-        else stages | {ALONE: _propagated(alone.dense(), frame, kind).numpy()}
-    )
+    stages = {BEFORE: user.before, UPDATED: user.after, PROPAGATED: propagated}
+    of_alone = {} if alone is None else {ALONE: _propagated(alone.dense(), frame, kind)}
+    return stages | of_alone
 
 
 def _validation(
@@ -186,7 +149,7 @@ def _validation(
     """
     user, alone, part = experts[0], _alone(experts), torch.arange(len(split.points)) % FOLDS
     own = user.updated if user.of_scanner else user.at
-    predicted = {ALIGNED: split.points.sample(user.aligned), PROPAGATED: own}
+    predicted = {BEFORE: split.points.sample(user.aligned), PROPAGATED: own}
     if user.network is not None and not user.network.takes_points:  # else z was not updated here
         predicted[UPDATED] = user.updated
     if alone is not None:
@@ -206,7 +169,7 @@ def _validation(
         weights=split.weights,
         predicted=predicted
         | {
-            RESULT: _with_shares(result, {each.name: each.updated for each in experts}, shares),
+            AFTER: _with_shares(result, {each.name: each.updated for each in experts}, shares),
             LINEAR: linear(given, split.points.xy),
         },
     )

@@ -20,13 +20,14 @@ from torch import Tensor
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate_at
 from pnpdepth_cli.errors import PnpDepthError
-from pnpdepth_cli.frames.frame import Frame, Refined, is_dense
-from pnpdepth_cli.frames.opened import Member, OpenNetworks
+from pnpdepth_cli.frames.frame import Frame, is_dense
+from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.refined import Prediction
 from pnpdepth_cli.frames.validation import MIN_POINTS, ValidationSplit, log_depth
+from pnpdepth_cli.stages import LINEAR
 
 Floats = NDArray[np.float64]
-LINEAR = "linear"
-"""Name of linear interpolation, as an expert and as a baseline."""
+
 # Prior weights and the strength were chosen on 7-Scenes, ICL-NUIM, NYU, RealSense, rendered rooms
 # and streets with each set left out in turn (docs/notes/fusion.md).
 OWN, WITH_PRIOR, WITHOUT_IMAGE = 0.15, 0.45, 0.05
@@ -52,6 +53,8 @@ and −2.8 % (nconv)."""
 FEW_POINTS = 50
 """With fewer points, updates of a network that takes them gain nothing, and one that contradicts
 its neighbours may be all that is seen of a small object."""
+LEAST_PART = 0.01
+"""A network with less weight has no part in the result, which is said."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,13 +68,13 @@ class Expert:
     at: Tensor  # (M,) metres, 0 = unknown: at the validation points, from the others
     aligned: Tensor  # (H, W) metres: a network's, from the others, before updates
     updated: Tensor  # (M,) metres: `at` before the residual is propagated
-    refined: Refined | None = None  # from all points. None without a network
+    prediction: Prediction | None = None  # from all points. None without a network
     network: Member | None = None  # that predicts. None: linear interpolation
     user: Member | None = None  # the user's network whose depth it is, or has as a prior
     of_scanner: bool = False  # whether it is a completion network of the user's, given scan lines
 
 
-def predictions(networks: OpenNetworks, split: ValidationSplit, judged: Refined) -> list[Expert]:
+def predictions(networks: OpenNetworks, split: ValidationSplit, judged: Prediction) -> list[Expert]:
     """Returns the experts, the user's network first.
 
     Without a network that takes a prior, the networks are the experts, with equal prior weights.
@@ -121,14 +124,14 @@ def trust(expert: Expert, split: ValidationSplit, alone: Expert) -> float:
         split: The frame and its validation points.
         alone: The network that takes a prior, without one.
     """
-    assert expert.refined is not None
+    assert expert.prediction is not None
     if expert.network is not None and expert.network.takes_points:
         if not len(split.points):
             return 0.0
         ratio = split.error(expert.updated) / max(split.error(alone.at), 1e-9)
         return min(1.0, max(0.0, 2.0 - ratio))
     points = split.whole.points
-    at = points.sample(torch.from_numpy(expert.refined.before)).double()
+    at = points.sample(expert.prediction.before).double()
     x, y = log_depth(at[at > 0]), log_depth(points.depth[at > 0].double())
     if len(x) < MIN_POINTS:
         return 0.0
@@ -282,10 +285,10 @@ def weighs_points(member: Member) -> bool:
     return member.network.definition.weighs_points
 
 
-def refined_by(
+def predicted_by(
     networks: OpenNetworks, member: Member, frame: Frame, *, updates: bool = True
-) -> Refined:
-    """Returns the frame refined by one network, its residual not propagated.
+) -> Prediction:
+    """Returns what one network gives for the frame, its residual not propagated.
 
     Updates of a network that takes the points gain 2 to 3 % with 500 points, 1 % with 100, nothing
     with 20, and 1 % with a LiDAR's, where they take as long as everything else (even frames).
@@ -300,7 +303,7 @@ def _expert(
     split: ValidationSplit,
     name: str,
     *,
-    known: Refined | None = None,
+    known: Prediction | None = None,
     prior: Expert | None = None,
     user: Member | None = None,
     updates: bool = True,
@@ -312,32 +315,33 @@ def _expert(
         member: The network that predicts.
         split: The frame and its validation points.
         name: What the expert is called.
-        known: The frame refined from all points, where that was done already.
+        known: What it gives from all points, where that was computed already.
         prior: The expert whose depth is the network's prior.
         user: The user's network whose depth it is, or has as a prior.
         updates: Whether z is updated with all points, which takes as long as all else.
     """
     whole, kept = split.whole, split.kept
     if prior is not None:
-        assert prior.refined is not None
-        whole = replace(whole, prior=torch.from_numpy(prior.refined.before))
+        assert prior.prediction is not None
+        whole = replace(whole, prior=prior.prediction.before)
         kept = replace(kept, prior=prior.aligned)
-    refined = known or refined_by(networks, member, whole, updates=updates)
-    aligned = torch.from_numpy(refined.before)
+    own = known or predicted_by(networks, member, whole, updates=updates)
+    aligned = own.before
     updated = at = torch.empty(0)
     if len(split.points):
-        again = refined_by(networks, member, kept, updates=not member.takes_points)
-        aligned, after = (torch.from_numpy(depth) for depth in (again.before, again.after))
-        updated = split.points.sample(after)
-        at = propagate_at(after, kept.points, kept.rgb, split.points.xy, kind=split.propagation)
+        again = predicted_by(networks, member, kept, updates=not member.takes_points)
+        aligned, updated = again.before, split.points.sample(again.after)
+        at = propagate_at(
+            again.after, kept.points, kept.rgb, split.points.xy, kind=split.propagation
+        )
     return Expert(
         name=name,
         weight=0.0,
-        dense=partial(torch.from_numpy, refined.after),
+        dense=lambda: own.after,
         at=at,
         aligned=aligned,
         updated=updated,
-        refined=refined,
+        prediction=own,
         network=member,
         user=user,
         of_scanner=user is member and member.takes_points and split.has_scan_lines,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
+import torch
 from torch import Tensor
 
 from pnpdepth_cli.errors import NoPointsError
-from pnpdepth_cli.frames.frame import DepthMap, Frame
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network
@@ -43,14 +43,13 @@ class PreparedFrame:
         """
         return AlignedDepth(self.network, self.points, align)
 
-    def to_image(self, depth: Tensor) -> DepthMap:
+    def to_image(self, depth: Tensor) -> Tensor:
         """Returns depth (1, 1, h, w) of the network's frame as (H, W) of the image frame.
 
         0 where it is unknown.
         """
-        image = self.map.depth_to_image(depth).cpu().numpy()
-        known = np.isfinite(image) & (image > 0)
-        return np.where(known, image, 0).astype(np.float32)
+        image = self.map.depth_to_image(depth).cpu()
+        return torch.where(image.isfinite() & (image > 0), image, 0.0).float()
 
     def no_points_error(self) -> NoPointsError:
         """Returns the error of a frame none of whose points the network sees."""

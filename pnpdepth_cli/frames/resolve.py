@@ -10,7 +10,8 @@ import torch
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.frame import METRES, Frame
+from pnpdepth_cli.frames.open_networks import Member
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
@@ -18,8 +19,9 @@ from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Normalisation,
 )
+from pnpdepth_cli.models.measure_layers import default_layer
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings, Settings
 
 NORMALISATIONS = {
     "unit": Normalisation(),
@@ -29,6 +31,8 @@ NORMALISATIONS = {
 }
 """rgb as the network may want it: 0…1, ImageNet's mean and deviation, −1…1, 0…255."""
 
+UPDATES = 5
+"""Most updates of z in the default method. More fit what propagation fits anyway."""
 _CLEARLY_BETTER = 0.6
 """Error of an input range over that of 0…1 below which it is taken.
 
@@ -107,7 +111,7 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
 
 def resolve_settings(
     definition: ModelDefinition, settings: Settings, *, metric: bool = True
-) -> Settings:
+) -> ClosedSettings:
     """Returns settings with nothing open: the user's, else the network's defaults.
 
     Another update rule than the network's starts from the paper's step size, schedule and blur,
@@ -115,6 +119,8 @@ def resolve_settings(
     an image alone is scaled to points in another unit.
 
     Args:
+        definition: The network's definition.
+        settings: What the user asks for.
         metric: Whether the points are in metres.
 
     Raises:
@@ -122,14 +128,39 @@ def resolve_settings(
     """
     defaults = definition.defaults
     settings = settings.with_preset()
-    if settings.update not in (None, defaults.complete().update):
+    if settings.update not in (None, defaults.closed().update):
         defaults = defaults.opened("lr", "schedule", "blur")
     alignment = definition.default_alignment
     if not metric and alignment == "none" and definition.input_kind == "rgb":
         alignment = "scale"
-    closed = settings.over(replace(defaults, align=alignment)).complete()
-    layer = settings.layer or definition.default_layer
-    return replace(closed, layer=None if layer is None else resolve_layer(definition, layer))
+    return settings.over(replace(defaults, align=alignment)).closed()
+
+
+def resolve_member(network: Network, frame: Frame, asked: Settings, *, is_default: bool) -> Member:
+    """Returns a network, where it is cut, and its settings, with nothing left open.
+
+    In the default method, a network whose output is metric is aligned too, where the points say
+    that it should be. Of networks that take the points, only those with a prior are updated.
+
+    Args:
+        network: A network whose definition is resolved.
+        frame: The first frame, registered.
+        asked: What the user asks for.
+        is_default: Whether the default method refines it.
+    """
+    definition, layer = network.definition, asked.layer
+    if layer is None and asked.preset is None:
+        layer = default_layer(network, frame.size, len(frame.points))
+    layer = resolve_layer(definition, layer)
+    settings = resolve_settings(definition, asked, metric=frame.unit == METRES)
+    if is_default:
+        settings = replace(settings, iterations=min(settings.iterations, UPDATES))
+    member = Member(network=network, layer=layer, settings=settings, coarse=is_default)
+    if is_default and member.takes_points and not member.takes_prior:
+        return replace(member, settings=replace(settings, iterations=0))
+    if is_default and not member.takes_points and settings.align == "none":
+        return replace(member, settings=replace(settings, align="auto"))
+    return member
 
 
 def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[Network, str]:

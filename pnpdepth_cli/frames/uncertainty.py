@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points
-from pnpdepth_cli.frames.default import RESULT
-from pnpdepth_cli.frames.frame import DepthMap, Refined, Validation
+from pnpdepth_cli.frames.frame import DepthMap
+from pnpdepth_cli.frames.refined import Refined, Validation
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.stages import AFTER
 
 MIN_INLIER_WEIGHT = 0.05
 """Held-out points with less weight do not calibrate."""
@@ -73,7 +74,7 @@ def with_uncertainty(frame: Refined) -> Refined:
 
 def _calibrating(validation: Validation) -> tuple[Tensor, Tensor]:
     """Residual of log depth and uncalibrated standard deviation, (M,), at validation points."""
-    predicted, points = validation.predicted[RESULT], validation.points
+    predicted, points = validation.predicted[AFTER], validation.points
     sigma = relative_shape(validation.kept, validation.network, predicted, points.xy)
     good = (validation.weights > MIN_INLIER_WEIGHT) & (predicted > 0)
     return points.depth[good].log() - predicted[good].log(), sigma[good]

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.folds import spatial_folds
 from pnpdepth_cli.completion.outliers import inlier_weights
-from pnpdepth_cli.frames.frame import Frame, Refined, ValidationPoints, no_points
+from pnpdepth_cli.frames.frame import Frame, no_points
+from pnpdepth_cli.frames.refined import ValidationPoints
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_pattern
 
@@ -56,12 +57,12 @@ class ValidationSplit(ValidationPoints):
         return float(mean / error.clamp_min(1e-12))
 
 
-def split_frame(frame: Frame, judged: Refined, seed: int) -> ValidationSplit:
+def split_frame(frame: Frame, judged: Tensor, seed: int) -> ValidationSplit:
     """Returns the frame with and without its validation points.
 
     Args:
         frame: The frame without its outliers.
-        judged: What the network that judged the outliers gives for it.
+        judged: (H, W) metres, what the network that judged the outliers gives for it.
         seed: Random seed of the validation points.
     """
     parts = split_points(frame.points, seed)
@@ -69,7 +70,7 @@ def split_frame(frame: Frame, judged: Refined, seed: int) -> ValidationSplit:
         none = no_points(frame.points)
         return ValidationSplit(whole=frame, kept=frame, points=none, weights=torch.empty(0))
     kept, points = parts
-    weights = consistency(points, torch.from_numpy(judged.before))
+    weights = consistency(points, judged)
     return ValidationSplit(
         whole=frame, kept=frame.with_points(kept), points=points, weights=weights
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colours import DepthScale, Pixels, dimmed, signed_bar
 
@@ -34,11 +35,6 @@ _FAINT_INK = (95, 99, 104)
 _LINE = (200, 202, 206)
 _UNKNOWN_GAIN = (52, 52, 52)
 _FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
-
-Content = dict[str, Any]
-"""What a figure shows, as a report needs it: `size` is (width, height), `panels` has the box (left,
-top, width, height) of each by title. A figure of depth has `scale_m`, the depths at the ends of its
-colours; one of gains has `ends`, `unknown` and `footer`, the texts of its legend."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +95,7 @@ def draw_discs(
 
 def save_depth_figure(
     path: Path, panels: list[Panel], scale: DepthScale, unit: str = "m", *, columns: int = 1
-) -> Content:
+) -> FigureRecord:
     """Writes a PNG of panels, `columns` to a row, beside a bar of depth colours."""
     figure, draw, content = _lay_out(panels, columns, legend_width=_LEGEND_WIDTH)
     left = figure.width - MARGIN - _LEGEND_WIDTH + GAP
@@ -119,7 +115,7 @@ def save_depth_figure(
         draw.line((right, y, right + 6, y), fill=_INK, width=1)
         draw.text((right + 11, y), label, font=_font(_SMALL_FONT_SIZE), fill=_INK, anchor="lm")
     _save(figure, path)
-    return content | {"scale_m": (scale.low_m, scale.high_m)}
+    return replace(content, scale_m=(scale.low_m, scale.high_m))
 
 
 def save_gain_figure(
@@ -130,7 +126,7 @@ def save_gain_figure(
     amount: str,
     noun: str,
     unknown: str = "",
-) -> tuple[float, Content]:
+) -> tuple[float, FigureRecord]:
     """Writes a PNG of one map of N gains with a colour bar; returns the fraction above 0 first.
 
     `amount` is the gain of full colour, with its unit; `noun` what is counted; `unknown` what the
@@ -157,7 +153,7 @@ def save_gain_figure(
         draw.text((x + 28, y), unknown, font=small, fill=_INK, anchor="lm")
     draw.text((MARGIN, y + 40), footer, font=font, fill=_INK, anchor="lm")
     _save(figure, path)
-    return improved, content | {"ends": ends, "unknown": unknown or None, "footer": footer}
+    return improved, replace(content, ends=ends, unknown=unknown or None, footer=footer)
 
 
 def _save(figure: PIL.Image.Image, path: Path) -> None:
@@ -172,7 +168,7 @@ def _lay_out(
     legend_width: int = 0,
     legend_height: int = 0,
     least_width: int = 0,
-) -> tuple[PIL.Image.Image, PIL.ImageDraw.ImageDraw, Content]:
+) -> tuple[PIL.Image.Image, PIL.ImageDraw.ImageDraw, FigureRecord]:
     """A figure with its panels, for a legend beside or below them to be drawn on."""
     from PIL import Image, ImageDraw
 
@@ -195,7 +191,7 @@ def _lay_out(
         draw.text((x + indent, y + 5), panel.remark, font=_font(_SMALL_FONT_SIZE), fill=_FAINT_INK)
         _paste(figure, panel.pixels, x, y + _TITLE_HEIGHT)
         boxes[panel.title] = (x, y + _TITLE_HEIGHT, width, height)
-    return figure, draw, {"size": figure.size, "panels": boxes}
+    return figure, draw, FigureRecord(size=figure.size, panels=boxes)
 
 
 def _labels(ticks: list[float]) -> list[tuple[float, str]]:

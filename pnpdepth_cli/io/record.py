@@ -90,7 +90,12 @@ def parse_json(data: bytes) -> Any:
     NaN, infinity and numbers that are too large to be finite are no JSON numbers.
     """
     text = data.decode("utf-8-sig")
-    return json.loads(text, parse_constant=_finite, parse_float=_finite)
+    return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_whole)
+
+
+def _whole(text: str) -> int:
+    _finite(text)
+    return int(text)
 
 
 def _finite(text: str) -> float:

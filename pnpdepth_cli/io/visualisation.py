@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
+from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colours import (
     DepthScale,
@@ -20,7 +21,6 @@ from pnpdepth_cli.io.colours import (
     paint_signed,
 )
 from pnpdepth_cli.io.figure import (
-    Content,
     Panel,
     draw_discs,
     magnification,
@@ -46,7 +46,7 @@ def preview(
     path: Path,
     unit: str = "m",
     made_by: tuple[str, str] = ("", ""),
-) -> Content:
+) -> FigureRecord:
     """Writes a PNG of image, sparse depth, depth before and after, and the signed change.
 
     All depth panels have one colour scale.
@@ -181,7 +181,7 @@ def improvement(
     path: Path,
     *,
     rgb: NDArray[np.float32] | None = None,
-) -> tuple[float, Content]:
+) -> tuple[float, FigureRecord]:
     """Writes a PNG of where |depth - gt| fell and rose, as figure 4(d) of the paper.
 
     Only pixels with known ground truth count; equal errors are neither better nor worse. All are
@@ -217,7 +217,7 @@ def improvement_at_points(
     held_out: bool,
     path: Path,
     unit: str = "m",
-) -> tuple[float, Content]:
+) -> tuple[float, FigureRecord]:
     """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
 
     The image is (H, W, 3) or (H, W) in 0..1, points are (N, 2) pixel coordinates. Depths in `unit`

@@ -13,6 +13,7 @@ from pnpdepth_cli.cli import batch as command
 from pnpdepth_cli.cli import progress
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.progress import BatchProgress
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.batches import add_frame
 
 PROGRAM = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
@@ -109,6 +110,9 @@ def test_the_second_ctrl_c_interrupts_and_the_old_handling_comes_back() -> None:
     assert signal.getsignal(signal.SIGINT) == before
 
 
+FAILED = FrameRecord(name="x", status="failed", message="bad")
+
+
 def test_without_a_terminal_there_is_a_line_a_minute(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,8 +123,7 @@ def test_without_a_terminal_there_is_a_line_a_minute(
         display.begin(600)
         for number in range(300):
             now += 1.0
-            status = "failed" if number == 10 else "done"
-            display.frame({"name": "x", "status": status, "message": "bad"})
+            display.frame(FAILED if number == 10 else FrameRecord(name="y"))
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "failed: x: bad"
     assert lines[1] == "60 of 600 frames, 1.0 frames a second, 9 min left, 1 failed"
@@ -133,8 +136,8 @@ def test_on_a_terminal_there_is_a_bar(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     with BatchProgress() as display:
         display.begin(2)
-        display.frame({"name": "x", "status": "failed", "message": "bad"})
-        display.frame({"name": "y", "status": "done", "message": None})
+        display.frame(FAILED)
+        display.frame(FrameRecord(name="y"))
     err = capsys.readouterr().err
     assert "failed: x: bad\n" in err
     assert " 2/2" in err

@@ -29,7 +29,7 @@ def test_without_a_word_the_settings_are_the_networks() -> None:
     for name in ("iterations", "lr", "loss", "update", "schedule", "blur"):
         assert getattr(settings, name) == getattr(UNTUNED_DEFAULTS, name)
     plain = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=UNet)
-    assert resolve_settings(plain, METHOD) == PAPER
+    assert resolve_settings(plain, METHOD) == PAPER.closed()
 
 
 def test_the_users_options_override_the_definition_and_another_update_its_step() -> None:

@@ -14,7 +14,7 @@ import cv2
 import pytest
 
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.frames.refiner import COMPANION
+from pnpdepth_cli.frames.method import COMPANION
 from pnpdepth_cli.io.depth import read_depth, write_depth
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -77,7 +77,7 @@ def test_refine_writes_its_files_and_lowers_the_error(
 ) -> None:
     record = result(capsys, f"{INDOOR} --gt {SAMPLES}/indoor/gt.png -o out {options}")
     assert {path.name for path in Path("out").iterdir()} == FILES | more
-    mae = [record["scores"][stage]["mae"] for stage in ("before", "after")]
+    mae = [record["errors"]["ground_truth"][stage]["mae"] for stage in ("before", "after")]
     assert mae == pytest.approx([before, after], rel=0.02)
 
 
@@ -134,7 +134,7 @@ def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
     line = f"batch {SAMPLES}/frames.csv -o out --model fcrn-tiny --preset paper"
     output(capsys, line)
     frames = json.loads(Path("out/summary.json").read_text())["frames"]
-    mae = {frame["name"]: frame["scores"]["after"]["mae"] for frame in frames}
+    mae = {frame["name"]: frame["errors"]["ground_truth"]["after"]["mae"] for frame in frames}
     assert mae == pytest.approx({"indoor": 1.317, "street": 11.92}, rel=0.02)
     names = {path.name for path in Path("out").iterdir() if not path.name.startswith(".")}
     ends = (".json", "_depth.png", "_improvement.png", "_preview.png")
@@ -145,7 +145,9 @@ def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
     assert Path("out/indoor_depth.png").stat().st_mtime_ns == before
 
     scored = result(capsys, f"eval out/indoor_depth.png {SAMPLES}/indoor/gt.png")
-    assert scored["frames"][0]["scores"]["after"]["mae"] == pytest.approx(mae["indoor"], rel=1e-3)
+    assert scored["frames"][0]["errors"]["ground_truth"]["after"]["mae"] == pytest.approx(
+        mae["indoor"], rel=1e-3
+    )
 
     table = output(capsys, "compare out/summary.json out/summary.json --csv table.csv")
     assert "MAE" in table

@@ -8,6 +8,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +22,12 @@ from tests.commands.frames import frame_on_disk
 
 def code_of(*arguments: str | Path) -> int:
     return run([str(argument) for argument in arguments])
+
+
+def scores_of(record: dict[str, Any]) -> dict[str, Any]:
+    """The scores of a frame's record in JSON."""
+    scores: dict[str, Any] = record["errors"]["ground_truth"]["after"]
+    return scores
 
 
 @pytest.fixture
@@ -44,7 +51,7 @@ def test_json_is_the_whole_result_with_every_option(
     record = json.loads(capsys.readouterr().out)
     assert record["scoring"]["max_depth"] == 10
     assert record["mean"]["mre"] == pytest.approx(0, abs=1e-6)  # predictions are 1.1 × too far
-    assert record["frames"][0]["factor"] == pytest.approx(1 / 1.1)
+    assert scores_of(record["frames"][0])["factor"] == pytest.approx(1 / 1.1)
 
 
 def test_csv_has_a_line_for_each_frame_also_those_without_score(frames: Path) -> None:
@@ -130,9 +137,10 @@ def test_a_refinement_scores_the_same_when_its_files_are_evaluated(
     text, err = capsys.readouterr()
     record, refined = json.loads(text), json.loads((out / "img.json").read_text())
     code = 1 / 1000  # the depth was written as whole millimetres
-    assert record["mean"]["mae"] == pytest.approx(refined["scores"]["after"]["mae"], abs=code)
-    assert record["frames"][0]["image"] == str(frame.image)
-    assert record["frames"][0]["pixels_given_as_sparse"] == 60
+    assert record["mean"]["mae"] == pytest.approx(scores_of(refined)["mae"], abs=code)
+    (scored,) = record["frames"]
+    assert scored["inputs"]["image"]["path"] == str(frame.image)
+    assert scores_of(scored)["given"] == 60
     assert "60 of the scored pixels (2.10%) have a point of the sparse input" in err
 
 

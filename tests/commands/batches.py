@@ -14,17 +14,18 @@ from pnpdepth_cli.commands.batch.batch import BatchOutcome, run_batch
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine import refine_image
 from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.frames import frame_on_disk
 
 NAMES = ("a", "b", "c", "d")
 
 
 class RecordingListener:
-    """Records the messages and rows of a batch."""
+    """Keeps the messages and records of a batch."""
 
     def __init__(self) -> None:
         self.messages: list[str] = []
-        self.rows: list[dict[str, Any]] = []
+        self.records: list[FrameRecord] = []
         self.to_do = 0
 
     def say(self, text: str) -> None:
@@ -33,12 +34,12 @@ class RecordingListener:
     def begin(self, to_do: int) -> None:
         self.to_do = to_do
 
-    def frame(self, row: dict[str, Any]) -> None:
-        self.rows.append(row)
+    def frame(self, record: FrameRecord) -> None:
+        self.records.append(record)
 
     @property
     def names(self) -> list[str]:
-        return [row["name"] for row in self.rows]
+        return [record.name for record in self.records]
 
 
 def pairs_on_disk(root: Path, names: tuple[str, ...] = NAMES, gt: bool = True) -> Path:
@@ -107,7 +108,10 @@ def refine_one_by_one(root: Path, names: tuple[str, ...], **changes: Any) -> Non
 
 
 def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
-    """Every result below a folder: bytes, and records without times and what a batch adds."""
+    """Every result below a folder: bytes, and records without times and what a batch adds.
+
+    The files that a record names are without their folders, which a batch leaves out.
+    """
     contents: dict[str, bytes | dict[str, Any]] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -117,6 +121,7 @@ def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
             record = json.loads(path.read_text())
             for key in ("seconds", "peak_memory_mb", "batch"):
                 record.pop(key, None)
+            record["outputs"] = {k: Path(file).name for k, file in record["outputs"].items()}
             contents[name] = record
         else:
             contents[name] = path.read_bytes()

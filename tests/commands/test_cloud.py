@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +12,26 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
+from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
 
 HEIGHT, WIDTH = 24, 32
 
 
-def frame(folder: Path, name: str, depth: float = 2.0) -> Path:
+def frame(
+    folder: Path, name: str, depth: float = 2.0, outputs: dict[str, str] | None = None
+) -> Path:
     """A depth file as `refine` writes it, with its image and record."""
     folder.mkdir(exist_ok=True)
     path = folder / f"{name}_depth.png"
     write_depth(path, np.full((HEIGHT, WIDTH), depth, np.float32))
     image = folder / f"{name}.png"
     cv2.imwrite(str(image), np.full((HEIGHT, WIDTH, 3), (10, 20, 30), np.uint8))
-    (folder / f"{name}.json").write_text(json.dumps({"inputs": {"image": {"path": str(image)}}}))
+    inputs = {"image": FileRecord(path=str(image))}
+    FrameRecord(inputs=inputs, outputs=outputs or {}).write(folder / f"{name}.json")
     return path
 
 
@@ -60,13 +66,13 @@ def test_the_field_of_view_or_a_calibration_file_gives_the_camera(tmp_path: Path
 
 def with_camera(path: Path, pose: list[list[float]] | None) -> Path:
     """The depth file, with a camera in its record."""
-    record = path.with_name(path.name.replace("_depth.png", ".json"))
-    camera = {
-        "intrinsics": [[20, 0, 0], [0, 20, 0], [0, 0, 1]], "lens": "radial-tangential",
-        "distortion": [], "source": "made up", "pose": pose,
-    }  # fmt: skip
-    entries = {"camera": camera, "size": [WIDTH, HEIGHT], "unit": "model units"}
-    record.write_text(json.dumps(json.loads(record.read_text()) | entries))
+    beside = path.with_name(path.name.replace("_depth.png", ".json"))
+    camera = CameraRecord(
+        intrinsics=[[20, 0, 0], [0, 20, 0], [0, 0, 1]], lens="radial-tangential",
+        distortion=[], source="made up", pose=pose,
+    )  # fmt: skip
+    record = FrameRecord.read(beside)
+    replace(record, camera=camera, size=(WIDTH, HEIGHT), unit="model units").write(beside)
     return path
 
 
@@ -118,7 +124,8 @@ def test_a_far_plane_is_no_part_of_a_cloud(tmp_path: Path) -> None:
 
 
 def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:
-    path = frame(tmp_path, "a")
+    companions = {"sigma": "a_sigma.png", "valid": "a_valid.png"}
+    path = frame(tmp_path, "a", outputs=companions)
     valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
     valid[:4] = 0
     cv2.imwrite(str(tmp_path / "a_valid.png"), valid)

@@ -22,7 +22,8 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, UsageError
-from pnpdepth_cli.frames.frame import Frame, frame_of_arrays
+from pnpdepth_cli.frames.arrays import frame_of_arrays
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors import SamplePattern
 
@@ -156,7 +157,7 @@ def test_beams_without_return_are_no_points_and_are_counted(
         path.write_bytes(header.encode() + rows.tobytes())
     same_points(path, scan[:, :3])
     frame = read(path)
-    assert 9000 in frame.sources["sparse"]["dropped"].values()
+    assert 9000 in frame.sources["sparse"].dropped.values()
     assert any("9,000 of" in note for note in frame.notes)
 
 
@@ -191,7 +192,7 @@ def test_a_far_plane_of_ground_truth_is_neither_scored_nor_sampled(
     request = EvalRequest(prediction=tmp_path / "prediction.npy", ground_truth=tmp_path / "gt.npy")
     result = evaluate(request)
     assert result.mean["mae"] == pytest.approx(0.25, abs=1e-5)
-    assert result.frames[0].pixels == np.count_nonzero(truth)
+    assert result.pixels == np.count_nonzero(truth)
     assert any(f"{np.count_nonzero(truth == 0):,} of" in note for note in result.notes)
     target = SparseTarget(output=tmp_path / "sparse.npy")
     record = sample_depth(tmp_path / "gt.npy", target, SamplePattern(count=3000))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import nan
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.error_tables import (
@@ -15,8 +17,11 @@ from pnpdepth_cli.commands.error_tables import (
     made_by,
     refinement_table,
 )
+from pnpdepth_cli.commands.evaluation.compare import ComparedRun, Comparison, Gain
 from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
+from pnpdepth_cli.commands.statistics import find_clusters
 from pnpdepth_cli.commands.tables import Table
+from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
 from pnpdepth_cli.measures import MEASURES
 
 
@@ -47,45 +52,49 @@ def test_an_error_has_its_unit_and_nothing_is_a_dash() -> None:
     assert shown == ["1.2500 m", "–", "–"]
 
 
+def record_of(
+    *networks: str, weights: dict[str, float] | None = None, **fields: Any
+) -> FrameRecord:
+    """A record of "net", refined by the default method if networks are named."""
+    kind: Literal["default", "fixed"] = "default" if networks else "fixed"
+    return FrameRecord(
+        model=ModelRecord(name="net", spec="net", checkpoint=None, checkpoint_sha256=None),
+        method=MethodRecord(kind=kind, reason="", networks=[*networks] or ["net"]),
+        weights=weights or {},
+        **fields,
+    )
+
+
+def at_points(count: int, **maes: float | None) -> dict[str, Scores]:
+    """The MAE of each stage at as many points."""
+    return {stage: {"mae": mae, "points": count} for stage, mae in maes.items()}
+
+
 def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> None:
-    at = {"points": 12, "aligned": 4.0, "propagated": 1.0, "result": 1.0, "linear": 2.0}
-    record: dict[str, Any] = {
-        "method": {"kind": "default", "networks": ["net"]},
-        "model": {"name": "net"},
-        "unit": "m",
-        "stages": None,
-        "scores": None,
-        "weights": {"net": 1.0},
-        "linear": {"validation": at},
-    }
+    at = at_points(12, before=4.0, propagated=1.0, after=1.0, linear=2.0)
+    record = record_of("net", weights={"net": 1.0}, errors={"validation": at})
     assert styled(refinement_table(record)) == [
         [("net, aligned with the points", ""), ("4.0000 m", ""), ("+100.0%", "bad")],
         [("net, residual propagated", "bold"), ("1.0000 m", "bold"), ("-50.0%", "good")],
         [("linear interpolation of all points", ""), ("2.0000 m", ""), ("", "")],
     ]
-    record["method"]["networks"].append("other")
-    record["weights"] = {"net": 0.15, "other with net": 0.0, "other": 0.85}
-    at |= {"alone": 0.7, "result": 0.5}
+    at |= at_points(12, alone=0.7, after=0.5)
+    weights = {"net": 0.15, "other with net": 0.0, "other": 0.85}
+    record = record_of("net", "other", weights=weights, errors={"validation": at})
     *_, alone, result, _ = (row[0] for row in refinement_table(record).rows)
     assert (alone, result) == ("other alone", "fused (net 15%, other 85%)")
 
 
 def test_errors_stand_by_what_they_are_measured_on_and_validation_points_count_only_alone() -> None:
-    after = {"rmse": 1.0, "delta1": 0.75, "pixels": 1200, "coverage": 0.5}
-    record: dict[str, Any] = {
-        "method": {"kind": "fixed"},
-        "model": {"name": "net"},
-        "settings": {"layer": "middle"},
-        "unit": "m",
-        "scores": {"before": {"rmse": 2.0, "delta1": 0.5}, "after": after},
-        "held_out_error": {"before": {"mae": 0.5}, "after": {"mae": 1.0, "points": 1000}},
-        "sparse_error": {"before": {"mae": 0.5}, "after": {"mae": 0.25, "points": 2000}},
-        "linear": {
-            "scores": {"rmse": 4.0, "delta1": 0.75},
-            "held_out_error": None,
-            "validation": {"points": 12, "aligned": 4.0, "result": 1.0, "linear": 2.0},
-        },
+    after: Scores = {"rmse": 1.0, "delta1": 0.75, "pixels": 1200, "coverage": 0.5}
+    linear: Scores = {"rmse": 4.0, "delta1": 0.75}
+    errors = {
+        "ground_truth": {"before": {"rmse": 2.0, "delta1": 0.5}, "after": after, "linear": linear},
+        "held_out": at_points(1000, before=0.5, after=1.0),
+        "validation": at_points(12, before=4.0, after=1.0, linear=2.0),
+        "used": at_points(2000, before=0.5, after=0.25),
     }
+    record = record_of(settings={"layer": "middle"}, errors=errors)
     table = refinement_table(record)
     scored = "scored on 1,200 pixels of ground truth (50.0% of those known)"
     assert table.title == f"net cut at middle; {scored}"
@@ -96,27 +105,26 @@ def test_errors_stand_by_what_they_are_measured_on_and_validation_points_count_o
         ["error at 1,000 held-out points, MAE", "0.5000 m", "1.0000 m", "+100.0%", "–", "–"],
         at_used,
     ]
-    table = refinement_table(record | dict.fromkeys(("scores", "held_out_error")))
+    without = {basis: errors[basis] for basis in ("validation", "used")}
+    table = refinement_table(replace(record, errors=without))
     assert table.title == "net cut at middle"
     validated = ["error at 12 validation points, MAE", "4.0000 m", "1.0000 m", "-75.0%"]
     assert table.rows == [[*validated, "2.0000 m", "-50.0%"], at_used]
 
 
 def test_held_out_points_have_a_table_of_their_own() -> None:
-    at = {"before": {"mae": 0.5}, "after": {"mae": 1.0, "points": 1000}}
-    record = {"held_out_error": at, "linear": {"held_out_error": {"mae": 2.0}}, "unit": "m"}
-    (row,) = held_out_table(record).rows
+    at = at_points(1000, before=0.5, after=1.0, linear=2.0)
+    (row,) = held_out_table(record_of(errors={"held_out": at})).rows
     assert row[0] == "error at 1,000 held-out points, MAE"
     assert row[1:] == ["0.5000 m", "1.0000 m", "+100.0%", "2.0000 m", "-50.0%"]
 
 
 def test_baselines_are_sorted_and_have_ground_truth_where_one_of_them_has() -> None:
-    baselines: dict[str, Any] = {
-        "nearest": {"validation_mae": 2.0, "scores": {"mae": 3.0, "rmse": 4.0}},
-        "result": {"validation_mae": 1.0, "scores": None},
-        "linear": {"validation_mae": None},
+    errors: dict[str, dict[str, Scores]] = {
+        "ground_truth": {"nearest": {"mae": 3.0, "rmse": 4.0}},
+        "validation": at_points(12, nearest=2.0, after=1.0, linear=None),
     }
-    table = baselines_table(baselines, "m")
+    table = baselines_table(errors, "m")
     assert table.columns == [
         "",
         "MAE, validation points",
@@ -127,8 +135,8 @@ def test_baselines_are_sorted_and_have_ground_truth_where_one_of_them_has() -> N
         [("result", "bold"), ("1.0000 m", "bold"), ("–", "bold"), ("–", "bold")],
         [("nearest", ""), ("2.0000 m", ""), ("3.0000 m", ""), ("4.0000 m", "")],
     ]
-    unknown = {name: {"validation_mae": None} for name in ("nearest", "linear")}
-    assert baselines_table(unknown, "m").rows == [["nearest", "–"], ["linear", "–"]]
+    unknown = {"validation": at_points(12, nearest=None, linear=None)}
+    assert sorted(baselines_table(unknown, "m").rows) == [["linear", "–"], ["nearest", "–"]]
 
 
 def styled(table: Table) -> list[list[tuple[str, str]]]:
@@ -136,38 +144,42 @@ def styled(table: Table) -> list[list[tuple[str, str]]]:
 
 
 def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -> None:
-    measures = [measure.to_json() for measure in MEASURES if measure.key in ("rmse", "delta1")]
+    def gain(percent: float | None, p: float | None) -> Gain:
+        return Gain(percent, None, 1.0, difference=None, p_value=None, p_adjusted=p)
 
-    def gain(percent: float | None, p: float | None) -> dict[str, Any]:
-        return {"percent": percent, "p_adjusted": p, "low_percent": None, "high_percent": 1.0}
-
+    gains: list[dict[str, Gain]] = [
+        {},
+        {"rmse": gain(50.0, 0.0009), "delta1": gain(-50.0, 0.01)},
+        {"rmse": gain(-50.0, 0.049), "delta1": gain(None, None)},
+    ]
     means = [(2.0, 0.5), (1.0, 0.25), (3.0, None)]
-    comparison = {
-        "runs": [
-            {"name": name, "mean": {"rmse": rmse, "delta1": delta}}
-            for name, (rmse, delta) in zip("abc", means, strict=True)
-        ],
-        "measures": measures,
-        "gains": [
-            {"rmse": gain(50.0, 0.0009), "delta1": gain(-50.0, 0.01)},
-            {"rmse": gain(-50.0, 0.049), "delta1": gain(None, None)},
-        ],
-        "frames": ["1", "2"],
-        "clusters": {"count": 2, "unit": "frames"},
-        "permutations": 1000,
-        "scoring": {"exclude_sparse": True},
-        "exact_p_values": False,
-    }
+    runs = [
+        ComparedRun(
+            name=name, path=name, mean={"rmse": rmse, "delta1": delta},
+            before={}, varied={}, coverage=1.0, gains=of_first,
+        )
+        for name, (rmse, delta), of_first in zip("abc", means, gains, strict=True)
+    ]  # fmt: skip
+    comparison = Comparison(
+        frames=("1", "2"),
+        measures=tuple(measure for measure in MEASURES if measure.key in ("rmse", "delta1")),
+        scoring={"exclude_sparse": True},
+        runs=tuple(runs),
+        clusters=find_clusters(["1", "2"], np.zeros((2, 1))),
+        exact_p_values=False,
+        tests=4,
+        notes=[],
+    )
     assert styled(methods_table(comparison)) == [
         [("a", ""), ("2.0000", ""), ("50.00%", "bold")],
         [("b", ""), ("1.0000***", "bold"), ("25.00%*", "")],
         [("c", ""), ("3.0000*", ""), ("–", "")],
     ]
-    gains = [row[3] for row in styled(comparison_table(comparison))]
+    shown = [row[3] for row in styled(comparison_table(comparison))]
     plain, better, worse = ("–", ""), ("+50.00", "good"), ("-50.00", "bad")
-    assert gains == [plain, better, worse, plain, worse, ("–", "dim")]
+    assert shown == [plain, better, worse, plain, worse, ("–", "dim")]
     assert comparison_table(comparison).rows[1][4:] == ["–", "+1.00", "0.0009"]
-    assert "from 1,000 random swaps, over 2 frames" in comparison_table(comparison).title
+    assert "from 10,000 random swaps, over 2 frames" in comparison_table(comparison).title
     for table in (comparison_table(comparison), methods_table(comparison)):
         assert table.title.endswith("; without the pixels of sparse points")
 
@@ -183,6 +195,5 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -
 def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part(
     weights: dict[str, float], after: str
 ) -> None:
-    method = {"kind": "default", "networks": ["net", "compact"]}
-    record = {"method": method, "weights": weights, "settings": {}}
+    record = record_of("net", "compact", weights=weights)
     assert made_by(record) == ("net, aligned with the points", after)

@@ -13,7 +13,7 @@ from pnpdepth_cli.choices import LOSSES, UPDATES
 from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 
 
 @contextmanager
@@ -48,11 +48,11 @@ def naive_refine(
     layer: str,
     x: Tensor,
     points: SparsePoints,
-    settings: Settings,
+    settings: ClosedSettings,
     depth_of: Callable[[Any], Tensor],
 ) -> tuple[Tensor, list[float]]:
     """(depth of z_K, L(z_0) … L(z_K))."""
-    name, settings = LayerName.parse(layer), settings.complete()
+    name, settings = LayerName.parse(layer), settings
     loss_of, update = LOSSES[settings.loss], UPDATES[settings.update]()
     z: Tensor | None = None
 

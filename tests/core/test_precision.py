@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 
 
 class InHalf(nn.Module):
@@ -38,7 +38,7 @@ def refined(network: nn.Module, *, per_unit: float = 1.0, **settings: object) ->
             split,
             (image,),
             points(),
-            Settings(**settings),  # type: ignore[arg-type]
+            ClosedSettings(**settings),  # type: ignore[arg-type]
             depth_of=lambda output: per_unit * output.float(),
         )
 

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.core.refine import Refinement, refine, refine_from
+from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
-    BatchError,
     DivergedError,
     LayerError,
     ModelError,
@@ -21,7 +20,7 @@ from pnpdepth_cli.errors import (
     PnpDepthError,
 )
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 from tests.completion.naive import naive_refine, plain
 from tests.core.networks import build, conv, depth_of, image
 
@@ -53,7 +52,7 @@ CUTS = {
 
 
 def refined(
-    network: nn.Module, layer: str, settings: Settings, points: SparsePoints = POINTS
+    network: nn.Module, layer: str, settings: ClosedSettings, points: SparsePoints = POINTS
 ) -> Refinement:
     with Split(network, layer) as split:
         return refine(split, (image(),), points, settings, depth_of=depth_of)
@@ -70,8 +69,8 @@ def test_five_updates_are_those_of_running_the_whole_network_every_time(
     name: str, layer: str, update: str
 ) -> None:
     network = build(name)
-    settings = Settings(iterations=5, lr=0.02, update=update)
-    depth, losses = naive_refine(network, layer, image(), POINTS, settings.complete(), depth_of)
+    settings = ClosedSettings(iterations=5, lr=0.02, update=update)
+    depth, losses = naive_refine(network, layer, image(), POINTS, settings, depth_of)
     result = refined(network, layer, settings)
     assert torch.equal(result.after, depth)
     assert list(result.losses) == losses
@@ -93,7 +92,7 @@ def test_points_that_agree_with_the_prediction_change_nothing(loss: str, update:
     network = build("unet")
     predicted = plain(network, image())
     points = SparsePoints(xy=POINTS.xy, depth=POINTS.sample(predicted), size=(16, 16))
-    settings = Settings(loss=loss, update=update)
+    settings = ClosedSettings(loss=loss, update=update)
     result = refined(network, "bottleneck", settings, points=points)
     assert torch.equal(result.after, predicted)
     assert result.losses == (0.0,) * 6
@@ -104,7 +103,7 @@ def test_pixels_that_no_point_reaches_keep_their_bits(update: str) -> None:
     torch.manual_seed(0)
     network = nn.Sequential(conv(3, 4), conv(4, 4), nn.ReLU(inplace=True), conv(4, 1))
     one = POINTS.select(torch.tensor([True, False, False, False, False]))  # at (3, 4)
-    result = refined(network, "0", Settings(update=update, lr=0.1), points=one)
+    result = refined(network, "0", ClosedSettings(update=update, lr=0.1), points=one)
     changed = (result.after != result.before)[0, 0]
     assert bool(changed[4, 3])
     rows, columns = changed.any(1).nonzero().flatten(), changed.any(0).nonzero().flatten()
@@ -114,7 +113,7 @@ def test_pixels_that_no_point_reaches_keep_their_bits(update: str) -> None:
     assert not changed[:, 8:].any()
 
 
-def doubled(pixels: int, depth: list[float], settings: Settings) -> Refinement:
+def doubled(pixels: int, depth: list[float], settings: ClosedSettings) -> Refinement:
     """`Doubling` refined in a row of pixels with a point on each, from depth 6 everywhere."""
     xy = torch.stack([torch.arange(float(pixels)), torch.zeros(pixels)], dim=1)
     points = SparsePoints(xy=xy, depth=torch.tensor(depth), size=(1, pixels))
@@ -124,7 +123,7 @@ def doubled(pixels: int, depth: list[float], settings: Settings) -> Refinement:
 
 
 def test_one_update_by_hand() -> None:
-    result = doubled(2, [5.0, 9.0], Settings(iterations=1, lr=0.25))
+    result = doubled(2, [5.0, 9.0], ClosedSettings(iterations=1, lr=0.25))
     assert result.before.flatten().tolist() == [6.0, 6.0]
     assert result.after.flatten().tolist() == [5.5, 6.5]
     assert result.losses == (2.0, 1.5)
@@ -136,7 +135,7 @@ def test_grad_mode_and_random_state_of_the_caller_stay_and_change_nothing() -> N
     before, results = torch.get_rng_state(), []
     for mode in (True, False):
         with torch.set_grad_enabled(mode):
-            results.append(refined(network, "bottleneck", Settings()))
+            results.append(refined(network, "bottleneck", ClosedSettings()))
             assert torch.is_grad_enabled() is mode
             assert not results[-1].after.requires_grad
             assert not results[-1].before.requires_grad
@@ -148,7 +147,7 @@ def test_grad_mode_and_random_state_of_the_caller_stay_and_change_nothing() -> N
 
 
 def test_a_linear_schedule_is_k_single_updates_with_falling_steps() -> None:
-    settings = Settings(iterations=4, lr=0.25, schedule="linear")
+    settings = ClosedSettings(iterations=4, lr=0.25, schedule="linear")
     moved = 2 * 0.25 * (1 + 0.75 + 0.5 + 0.25)
     assert doubled(2, [50.0, 90.0], settings).after.flatten().tolist() == [6 + moved, 6 + moved]
 
@@ -157,7 +156,7 @@ def test_a_blurred_gradient_moves_what_no_point_reaches() -> None:
     torch.manual_seed(0)
     network = nn.Sequential(conv(3, 4), conv(4, 4), nn.ReLU(inplace=True), conv(4, 1))
     one = POINTS.select(torch.tensor([True, False, False, False, False]))
-    settings = Settings(update="normalised", lr=0.1, blur=0.5)
+    settings = ClosedSettings(update="normalised", lr=0.1, blur=0.5)
     result = refined(network, "0", settings, points=one)
     assert bool((result.after != result.before).all())
     assert result.losses[-1] < result.losses[0]
@@ -202,10 +201,10 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_depth(
     torch.manual_seed(0)
     network = Breaking(iteration + 1, bad)
     with pytest.raises(DivergedError) as error:
-        refined(network, "cut", Settings())
+        refined(network, "cut", ClosedSettings())
     assert error.value.exit_code == 5
     network.n = 0
-    good = refined(network, "cut", Settings(iterations=iteration - 1))
+    good = refined(network, "cut", ClosedSettings(iterations=iteration - 1))
     assert torch.equal(error.value.last_good.after, good.after)
     assert torch.equal(error.value.last_good.before, good.before)
     assert error.value.last_good.losses == good.losses
@@ -214,7 +213,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_depth(
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_prediction_that_is_not_finite_to_begin_with_is_the_networks_fault(bad: float) -> None:
     with pytest.raises(ModelError) as error:
-        refined(Breaking(1, bad), "cut", Settings())
+        refined(Breaking(1, bad), "cut", ClosedSettings())
     assert f"at any of {len(POINTS)} sparse points" in str(error.value)
     assert error.value.exit_code == 4
     assert "\n" not in str(error.value)
@@ -230,13 +229,13 @@ def test_a_gradient_that_is_not_finite_stops_with_the_depth_it_came_from() -> No
             return self.cut(x[:, :1] * 0).sqrt() + 1
 
     with pytest.raises(DivergedError) as error:
-        refined(Root(), "cut", Settings(loss="l1"))
+        refined(Root(), "cut", ClosedSettings(loss="l1"))
     assert torch.equal(error.value.last_good.after, torch.ones(1, 1, 16, 16))
     assert len(error.value.last_good.losses) == 1
 
 
 def test_a_bad_prediction_without_updates_is_handed_over_as_it_is() -> None:
-    result = refined(Breaking(1, float("nan")), "cut", Settings(iterations=0))
+    result = refined(Breaking(1, float("nan")), "cut", ClosedSettings(iterations=0))
     assert bool(result.after.isnan().all())
 
 
@@ -285,126 +284,6 @@ def with_another_gradient() -> nn.Module:
 )
 def test_a_layer_without_a_gradient_back_to_it_is_refused_on_one_line(network: nn.Module) -> None:
     with pytest.raises(LayerError) as error:
-        refined(network, "cut", Settings())
+        refined(network, "cut", ClosedSettings())
     assert error.value.exit_code == 4
     assert "\n" not in str(error.value)
-
-
-# ------------------------------------------------------------------ several frames at once
-
-
-OTHERS = (
-    POINTS,
-    SparsePoints(xy=torch.tensor([[2.5, 7.0]]), depth=torch.tensor([9.0]), size=(16, 16)),
-    SparsePoints(xy=POINTS.xy.flip(1), depth=POINTS.depth * 3, size=(16, 16)),
-)
-IMAGES = torch.cat([image(), image().flip(-1) * 2, image() - 1])
-
-
-def refined_at_once(
-    network: nn.Module, layer: str, settings: Settings, *, read: Any = depth_of, **more: Any
-) -> list[Refinement | PnpDepthError]:
-    reads = read if isinstance(read, list) else [read] * 3
-    with Split(network, layer) as split:
-        with torch.no_grad():
-            z0 = split.front(IMAGES)
-        return refine_from(split, z0, OTHERS, settings, depth_of=reads, **more)
-
-
-def refined_alone(network: nn.Module, layer: str, settings: Settings, index: int) -> Refinement:
-    with Split(network, layer) as split:
-        x = (IMAGES[index : index + 1],)
-        return refine(split, x, OTHERS[index], settings, depth_of=depth_of)
-
-
-class PerPixel(nn.Module):
-    """Nothing is summed up, so a batch cannot change a bit."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.cut, self.after = nn.Tanh(), nn.Softplus()
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.after(self.cut(x)[:, :1] * 3)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        *(Settings(lr="5%", update=update, schedule="linear", blur=0.7) for update in UPDATES),
-        Settings(iterations=0),
-        Settings(lr="20%", loss="cauchy", update="normalised"),
-    ],
-)
-def test_at_once_is_alone_bit_for_bit_where_the_network_is(settings: Settings) -> None:
-    network = PerPixel()
-    for index, together in enumerate(refined_at_once(network, "cut", settings)):
-        assert isinstance(together, Refinement)
-        alone = refined_alone(network, "cut", settings, index)
-        assert torch.equal(together.before, alone.before)
-        assert torch.equal(together.after, alone.after)
-        assert (together.losses, together.step) == (alone.losses, alone.step)
-
-
-def test_a_frame_that_diverges_does_not_touch_the_others() -> None:
-    def bad(output: Tensor) -> Tensor:
-        calls.append(1)
-        return output * float("nan") if len(calls) == 3 else output
-
-    calls: list[int] = []
-    seen: list[tuple[int, float]] = []
-    settings, network = Settings(lr="5%"), PerPixel()
-    good = refined_at_once(network, "cut", settings)
-    mixed = refined_at_once(
-        network, "cut", settings, read=[depth_of, bad, depth_of],
-        on_iteration=lambda done, loss: seen.append((done, loss)),
-    )  # fmt: skip
-    assert isinstance(mixed[1], DivergedError)
-    assert "after 2 updates" in str(mixed[1])
-    assert len(mixed[1].last_good.losses) == 2
-    assert len(calls) == 3
-    for index in (0, 2):
-        together, alone = mixed[index], good[index]
-        assert isinstance(together, Refinement)
-        assert isinstance(alone, Refinement)
-        assert torch.equal(together.after, alone.after)
-        assert together.losses == alone.losses
-    assert [done for done, _ in seen] == [1, 2, 3, 4, 5]
-    assert seen[2][1] == pytest.approx((mixed[0].losses[2] + mixed[2].losses[2]) / 2)
-
-
-def test_an_error_of_one_frames_reading_stays_its_own() -> None:
-    def none(output: Tensor) -> Tensor:
-        raise NoPointsError("too few to align")
-
-    results = refined_at_once(PerPixel(), "cut", Settings(), read=[none, depth_of, depth_of])
-    assert isinstance(results[0], NoPointsError)
-    assert all(isinstance(result, Refinement) for result in results[1:])
-    nobody = refined_at_once(PerPixel(), "cut", Settings(), read=none)
-    assert [type(result) for result in nobody] == [NoPointsError] * 3
-
-
-class Sequence(nn.Module):
-    """Its z has the batch second, as in nn.Transformer; its output drops it on request."""
-
-    def __init__(self, *, dropping: bool) -> None:
-        super().__init__()
-        self.tokens, self.later, self.dropping = nn.Identity(), nn.Identity(), dropping
-
-    def forward(self, x: Tensor) -> Tensor:
-        tokens = self.tokens(x[:, :1].flatten(2).permute(2, 0, 1))
-        depth = self.later(tokens.permute(1, 2, 0).reshape(len(x), 1, *x.shape[-2:]))
-        return depth.flatten(0, 1).mean(0) if self.dropping else depth
-
-
-@pytest.mark.parametrize(("layer", "dropping"), [("tokens", False), ("later", True)])
-def test_a_network_without_one_part_per_frame_is_refused_and_works_one_at_a_time(
-    layer: str, dropping: bool
-) -> None:
-    network = Sequence(dropping=dropping)
-    with pytest.raises(BatchError) as error:
-        refined_at_once(network, layer, Settings(), read=lambda y: y)
-    assert error.value.exit_code == 4
-    with Split(network, layer) as split:
-        alone = refine(split, (image(),), POINTS, Settings(), depth_of=lambda y: y)
-    assert alone.losses[-1] < alone.losses[0]

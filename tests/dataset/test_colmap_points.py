@@ -14,6 +14,7 @@ from PIL import Image
 from pnpdepth_cli.cli.main import run as run_command
 from pnpdepth_cli.dataset import colmap_points
 from pnpdepth_cli.dataset.colmap_points import read_colmap_points
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError, UsageError
@@ -46,7 +47,7 @@ def change(project: Path, file: str, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
 
 
-def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> dict[str, Any]:
+def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> FrameRecord:
     files = {"image": project / "images" / "a.png", "sparse": project / "sparse" / "0"}
     return run(frame, **(files | changes)).record
 
@@ -68,9 +69,9 @@ def test_a_photo_with_exif_rotation_is_read_as_colmap_reads_it(
         exif[0x0112] = orientation
         image.save(photo, exif=exif)
     turned = refine(frame_on_disk(tmp_path), project, output=tmp_path / "turned")
-    assert turned["size"] == plain["size"] == [WIDTH, HEIGHT]
-    assert turned["points"] == plain["points"]
-    assert "image: EXIF rotation not applied, as COLMAP reads the photo" in turned["notes"]
+    assert turned.size == plain.size == (WIDTH, HEIGHT)
+    assert turned.points == plain.points
+    assert "image: EXIF rotation not applied, as COLMAP reads the photo" in turned.notes
 
 
 def test_a_photo_of_another_view_is_refused_whatever_its_size(project: Path) -> None:
@@ -117,11 +118,12 @@ def test_depth_is_in_model_units_or_with_a_scale_in_metres(
     unit_scale: float | None, unit: str, factor: float, align: str, tmp_path: Path, project: Path
 ) -> None:
     record = refine(frame_on_disk(tmp_path), project, unit_scale=unit_scale)
-    assert (record["unit"], record["settings"]["align"]) == (unit, align)
-    nearest, farthest = (record["points"][name] / factor for name in ("nearest", "farthest"))
+    assert (record.unit, record.settings["align"]) == (unit, align)
+    assert record.points is not None
+    nearest, farthest = record.points.nearest / factor, record.points.farthest / factor
     assert 3.4 < nearest < farthest < 4.6
     described = "model units (COLMAP model, image a.png"
-    assert any(described in note for note in record["notes"]) == (unit_scale is None)
+    assert any(described in note for note in record.notes) == (unit_scale is None)
     scale = read_depth(tmp_path / "out" / "a_depth.png").reading.scale
     assert (scale == 256) == (unit_scale is not None)
     assert np.log2(scale) % 1 == 0

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.opened import Member
+from pnpdepth_cli.frames.open_networks import Member
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 
 SIZE = (96, 128)
 
@@ -69,7 +69,7 @@ class Nearest(nn.Module):
 
 
 def member(
-    build: type[nn.Module], *, settings: Settings | None = None, **of_definition: Any
+    build: type[nn.Module], *, settings: ClosedSettings | None = None, **of_definition: Any
 ) -> Member:
     """The network as a member of the default method, by default without updates and alignment."""
     kind = "rgb" if issubclass(build, Brightness) else "rgb+sparse"
@@ -83,5 +83,5 @@ def member(
     network = Network(
         definition=definition, module=build().eval(), device=torch.device("cpu"), checkpoint=None
     )
-    settings = settings or Settings(iterations=0, align="none")
+    settings = settings or ClosedSettings(iterations=0, align="none")
     return Member(network=network, layer="layer", settings=settings)

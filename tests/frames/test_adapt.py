@@ -54,7 +54,7 @@ def test_learnt_weights_are_used_while_the_refiner_is_open(
     assert any("% loss at hidden points of 4 frames" in note for note in learnt.notes)
     assert np.array_equal(learnt.depth, again.depth)
     frame = frame_in_memory(seed=0)
-    expected = adapt.learn(refiner.network, named(range(8)))
+    expected = adapt.learn(network, named(range(8)))
     with adapt.weights_in_place(network, expected.weights):
         by_hand = pnp.refine(network, *FRAMES[0], SETTINGS)
     assert np.array_equal(learnt.depth, by_hand.depth)

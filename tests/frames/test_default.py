@@ -15,7 +15,7 @@ from pnpdepth_cli.core.split import Split as Cut
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames import default, fuse, validation
 from pnpdepth_cli.frames.default import refine_default, without_outliers
-from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.fuse import (
     FEW_POINTS,
     OWN_SCANNER,
@@ -24,12 +24,13 @@ from pnpdepth_cli.frames.fuse import (
     trust,
     weighted_mean,
 )
-from pnpdepth_cli.frames.opened import Member, OpenNetwork, OpenNetworks
+from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.refined import Prediction, Refined
 from pnpdepth_cli.frames.uncertainty import calibration, relative_shape, with_uncertainty
 from pnpdepth_cli.frames.validation import FOLDS, MIN_POINTS, ValidationSplit, split_points
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 from tests.core.split.test_split import same, state_of
 from tests.frames.scenes import (
     SIZE,
@@ -40,8 +41,8 @@ from tests.frames.scenes import (
     member,
 )
 
-UPDATES = Settings(iterations=3, lr="5%", update="sign", align="scale")
-ALIGNED = Settings(iterations=0, align="affine")
+UPDATES = ClosedSettings(iterations=3, lr="5%", update="sign", align="scale")
+ALIGNED = ClosedSettings(iterations=0, align="affine")
 
 
 class Noise(Brightness):
@@ -58,6 +59,12 @@ def refined(frame: Frame, *members: Member, seed: int = 0) -> Refined:
         return refine_default(networks, frame, seed=seed)
 
 
+def predicted_by(own: Member, frame: Frame) -> Prediction:
+    """What the network alone gives for the frame."""
+    with OpenNetworks([own]) as networks:
+        return networks.refine(own, frame)
+
+
 def with_gt(frame: Frame) -> Frame:
     """The frame with its ground truth, so that the stages are kept."""
     return replace(frame, gt=depth_of_scene().numpy())
@@ -66,7 +73,7 @@ def with_gt(frame: Frame) -> Frame:
 def compact() -> Member:
     """`compact` without updates of z."""
     network = load_network("compact", None)
-    return Member(network=network, layer="decoder.s8", settings=Settings(iterations=0))
+    return Member(network=network, layer="decoder.s8", settings=ClosedSettings(iterations=0))
 
 
 def scan_frame() -> Frame:
@@ -95,12 +102,12 @@ def split_of(depth: Tensor) -> ValidationSplit:
 def test_a_network_alone_is_aligned_updated_and_propagated() -> None:
     frame = with_gt(frame_in_memory(60))
     result = refined(frame, member(Brightness, settings=UPDATES))
-    assert list(result.stages) == ["aligned", "updated", "propagated"]
+    assert list(result.stages) == ["before", "updated", "propagated"]
     updated = torch.from_numpy(result.stages["updated"])
     expected = propagate(updated, frame.points, frame.rgb, kind="gp").depth
     assert np.allclose(result.after, expected.numpy(), rtol=1e-5)
     assert np.array_equal(result.after, result.stages["propagated"])
-    assert np.array_equal(result.before, result.stages["aligned"])
+    assert np.array_equal(result.before, result.stages["before"])
     assert result.weights == {"brightness": 1.0}
     errors = [float(np.abs(d - depth_of_scene().numpy()).mean()) for d in result.stages.values()]
     assert errors[-1] < errors[0]
@@ -121,11 +128,11 @@ def test_the_dense_depth_is_fused_by_the_weights_that_the_result_names() -> None
     assert list(result.weights) == ["brightness", "compact with brightness", "compact", "linear"]
     with OpenNetworks([own, compact()]) as networks:
         of_own = networks.refine(networks.members[0], frame)
-        prior = replace(frame, prior=torch.from_numpy(of_own.before))
+        prior = replace(frame, prior=of_own.before)
         depths = [
-            torch.from_numpy(of_own.after),
-            torch.from_numpy(networks.refine(networks.members[1], prior).after),
-            torch.from_numpy(networks.refine(networks.members[1], frame).after),
+            of_own.after,
+            networks.refine(networks.members[1], prior).after,
+            networks.refine(networks.members[1], frame).after,
             linear(frame.points),
         ]
     fused = weighted_mean(list(zip(depths, result.weights.values(), strict=True)))
@@ -158,9 +165,8 @@ def test_trust_grows_with_what_a_network_explains() -> None:
     found = []
     for share in (0.0, 0.6, 1.0):  # of noise in the depth
         predicted = torch.exp(depth.log() * (1 - share) + 0.6 * share * noise)
-        blank = refined(frame, member(Brightness))
-        shown = replace(blank, before=predicted.numpy())
-        one = replace(expert("net", torch.ones(200)), refined=shown)
+        shown = replace(predicted_by(member(Brightness), frame), before=predicted)
+        one = replace(expert("net", torch.ones(200)), prediction=shown)
         found.append(trust(one, split, expert("compact", torch.ones(200))))
     assert found[0] == pytest.approx(1)
     assert found[0] > found[1] > found[2] == 0
@@ -172,7 +178,7 @@ def test_trust_in_a_network_that_takes_points_falls_with_its_error_at_validation
     alone, own = expert("compact", depth + 0.1), member(Nearest)
     found = [
         trust(
-            replace(expert("own", depth + off), refined=refined(frame, own), network=own),
+            replace(expert("own", depth + off), prediction=predicted_by(own, frame), network=own),
             split,
             alone,
         )
@@ -239,7 +245,7 @@ def test_the_result_at_a_validation_point_does_not_depend_on_its_depth() -> None
     assert again is not None
     assert torch.equal(again.points.xy, first.points.xy)
     one = (again.points.xy == frame.points.xy[numbers[0]]).all(dim=1)
-    for name in ("aligned", "propagated", "alone", "linear", "result"):
+    for name in ("before", "propagated", "alone", "linear", "after"):
         assert torch.allclose(again.predicted[name][one], first.predicted[name][one], rtol=1e-3)
 
 
@@ -399,16 +405,17 @@ def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stay
     before = state_of(network.module)
     first = next(network.module.encoder.children())
     handle = first.register_forward_hook(lambda *_: runs.append(1))
-    frame, settings = frame_in_memory(60), Settings(iterations=1, lr="5%")
+    frame, settings = frame_in_memory(60), ClosedSettings(iterations=1, lr="5%")
     fewer = frame.with_points(frame.points.select(torch.arange(60) < 55))
-    with OpenNetwork(network, "decoder.s8") as opened:
-        opened.refine(frame, settings)
+    own = Member(network=network, layer="decoder.s8", settings=settings, coarse=True)
+    with OpenNetworks([own]) as opened:
+        opened.refine(own, frame)
         count = len(runs)
-        shared = opened.refine(fewer, settings)
-        plain = opened.refine(fewer, replace(settings, iterations=0))
+        shared = opened.refine(own, fewer)
+        plain = opened.refine(own, fewer, updates=False)
         assert len(runs) == count > 0
         opened.next_image()
-        alone = opened.refine(fewer, settings)
+        alone = opened.refine(own, fewer)
     handle.remove()
     assert (shared.after == alone.after).all()
     assert (plain.after == alone.before).all()
@@ -425,12 +432,11 @@ def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:
 def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
     frame, bad = spoiled(frame_in_memory(60))
     with OpenNetworks([member(Brightness)]) as networks:
-        inliers, user = without_outliers(networks, frame)
+        inliers, _ = without_outliers(networks, frame)
         clean, _ = without_outliers(networks, frame_in_memory(60))
     assert inliers.outliers is not None
     assert torch.equal(inliers.outliers.xy, frame.points.xy[bad])
     assert torch.equal(inliers.points.xy, frame.points.xy[~bad])
-    assert torch.equal(user.used.xy, inliers.points.xy)
     assert clean.outliers is None
     assert len(clean.points) == 60
 
@@ -444,7 +450,6 @@ def test_outliers_among_few_points_are_those_beside_the_network_and_else_those_o
     found = iter([bad & alone, bad & beside])
     monkeypatch.setattr(default, "outliers", lambda *_: next(found))
     with OpenNetworks([member(Brightness)]) as networks:
-        inliers, user = without_outliers(networks, frame)
+        inliers, _ = without_outliers(networks, frame)
     expected = frame.points.select(~(bad & (beside or count >= FEW_POINTS)))
     assert torch.equal(inliers.points.xy, expected.xy)
-    assert torch.equal(user.used.xy, expected.xy)

@@ -11,17 +11,18 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, ModelError, NoPointsError
-from pnpdepth_cli.frames.frame import Frame, Refined
-from pnpdepth_cli.frames.refine import refine_frame
+from pnpdepth_cli.frames.fixed import refine_fixed
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 from tests.commands.frames import frame_on_disk
 
-SETTINGS = Settings(iterations=4, lr="5%", update="adam")
+SETTINGS = ClosedSettings(iterations=4, lr="5%", update="adam")
 
 
 @pytest.fixture
@@ -42,9 +43,11 @@ def frame_of(seed: int, height: int = 46, width: int = 62, depth: float = 2.0) -
     return Frame(rgb=torch.from_numpy(rgb).permute(2, 0, 1).contiguous(), points=points)
 
 
-def refined(network: Network, settings: Settings, frame: Frame, layer: str = "middle") -> Refined:
-    with Split(network.module, layer) as split:
-        return refine_frame(network, split, settings, frame)
+def refined(
+    network: Network, settings: ClosedSettings, frame: Frame, layer: str = "middle"
+) -> Refined:
+    with OpenNetworks([Member(network=network, layer=layer, settings=settings)]) as networks:
+        return refine_fixed(networks, frame)
 
 
 def test_a_frame_without_a_point_in_the_networks_view_is_an_error(network: Network) -> None:

@@ -44,7 +44,11 @@ def test_the_text_is_readable_and_what_json_cannot_hold_leaves_the_old_file(tmp_
 
 
 @pytest.mark.parametrize(
-    "content", [b"{", b"[1]", b'{"a": NaN}', b"\xff\xfe", b"null", b"[" * 100_000, b"{} {}"]
+    "content",
+    [
+        *(b"{", b"[1]", b'{"a": NaN}', b"\xff\xfe", b"null", b"[" * 100_000, b"{} {}"),
+        b'{"a": 1%s}' % (b"0" * 400),
+    ],
 )
 def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "r.json"

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, SizeError
+from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.colours import UNKNOWN, DepthScale, depth_scale, paint_signed, round_steps
-from pnpdepth_cli.io.figure import MARGIN, Content, _labels, draw_discs, magnification, resized
+from pnpdepth_cli.io.figure import MARGIN, _labels, draw_discs, magnification, resized
 from pnpdepth_cli.io.visualisation import (
     error_map,
     improvement,
@@ -32,9 +33,9 @@ def pixels_of(path: Path) -> np.ndarray:
         return np.asarray(image)
 
 
-def panels_of(path: Path, content: Content) -> dict[str, np.ndarray]:
+def panels_of(path: Path, content: FigureRecord) -> dict[str, np.ndarray]:
     """The panels of a figure by title."""
-    pixels, boxes = pixels_of(path), content["panels"]
+    pixels, boxes = pixels_of(path), content.panels
     return {title: pixels[y : y + h, x : x + w] for title, (x, y, w, h) in boxes.items()}
 
 
@@ -70,10 +71,10 @@ def test_a_preview_has_its_panels_in_columns_and_the_image_as_it_is(
     panels, page = panels_of(path, content), pixels_of(path)
     scale = depth_scale(at(depth, xy), depth * 1.2, depth)
     assert page.shape[1] <= 1600
-    assert content["size"] == page.shape[1::-1]
-    assert content["scale_m"] == (scale.low_m, scale.high_m)
+    assert content.size == page.shape[1::-1]
+    assert content.scale_m == (scale.low_m, scale.high_m)
     assert list(panels) == TITLES
-    assert len({left for left, *_ in content["panels"].values()}) == columns
+    assert len({left for left, *_ in content.panels.values()}) == columns
     shown, factor = panels["Depth before"], panels["Depth before"].shape[1] // width
     if factor:
         centres = shown[factor // 2 :: factor, factor // 2 :: factor]
@@ -127,7 +128,7 @@ def test_parts_of_different_size_or_number_and_a_place_that_is_none_are_refused(
 
 def improved(
     folder: Path, gt: list, before: list, after: list, **options: Any
-) -> tuple[float, Any, Content]:
+) -> tuple[float, Any, FigureRecord]:
     """What `improvement` returns for one row, with a colour per pixel in between."""
     rows = (np.array([row], np.float32) for row in (before, after, gt))
     share, content = improvement(*rows, folder / "i.png", **options)
@@ -143,10 +144,10 @@ def test_better_worse_equal_and_unknown_have_their_own_colours(tmp_path: Path) -
     assert colours[:2] == [BLUE, ORANGE]
     assert len(set(colours[2])) == len(set(colours[3])) == 1
     assert colours[3][0] < 80 < 150 < colours[2][0]
-    assert content["ends"] == ("worse by 1 m or more", "better by 1 m or more")
-    assert content["footer"] == "33.3 % of 3 pixels improved, 33.3 % worse"
-    assert content["unknown"] == "no ground truth"
-    assert improved(tmp_path, [5, 5], [6, 5], [5, 6])[2]["unknown"] is None
+    assert content.ends == ("worse by 1 m or more", "better by 1 m or more")
+    assert content.footer == "33.3 % of 3 pixels improved, 33.3 % worse"
+    assert content.unknown == "no ground truth"
+    assert improved(tmp_path, [5, 5], [6, 5], [5, 6])[2].unknown is None
 
 
 def test_only_known_ground_truth_counts_and_a_depth_that_becomes_finite_is_better(
@@ -197,7 +198,7 @@ def test_points_are_coloured_discs_where_they_lie(
     assert colours[5, 5].tolist() == BLUE
     assert colours[20, 30].tolist() == ORANGE
     assert len(set(colours[12, 17].tolist())) == 1
-    assert ("held-out" in content["footer"]) == held_out
+    assert ("held-out" in content.footer) == held_out
 
 
 def test_points_outside_the_image_do_no_harm() -> None:

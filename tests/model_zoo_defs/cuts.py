@@ -11,7 +11,7 @@ from pnpdepth_cli.models.definition import Fixed, ModelDefinition
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 
 
 def built(definition: ModelDefinition) -> Network:
@@ -58,7 +58,7 @@ def assert_the_cut_changes_nothing_and_a_step_does(
     with torch.no_grad(), Split(network.module, layer) as split:
         z = split.front(*arguments)
         assert torch.equal(split.rear(z), network.module(*arguments))
-        once = Settings(iterations=1)
+        once = ClosedSettings(iterations=1)
         refinement = refine(split, arguments, POINTS, once, depth_of=network.depth_of)
     assert not torch.equal(refinement.before, refinement.after)
     return z

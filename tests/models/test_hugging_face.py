@@ -20,7 +20,7 @@ from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 from tests.models.test_hugging_face_settings import PROCESSING, changed
 from tests.models.weights.files import little
 
@@ -149,7 +149,7 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
     with Split(network.module, definition.layers[0]) as split:
         with torch.no_grad():
             assert torch.equal(network.raw_of(split.rear(split.front(*arguments))), whole)
-        settings = Settings(iterations=4, lr="30%", update="adam")
+        settings = ClosedSettings(iterations=4, lr="30%", update="adam")
         result = refine(split, arguments, at, settings, depth_of=depth_of)
     assert not torch.equal(result.before, result.after)
     assert min(result.losses[1:]) < result.losses[0]

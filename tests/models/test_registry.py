@@ -46,7 +46,7 @@ def open_list(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(model_zoo_defs, "__path__", [*model_zoo_defs.__path__, str(tmp_path)])
     monkeypatch.syspath_prepend(str(tmp_path))
     old = choices.NETWORKS
-    table = choices.Table(
+    table = choices.OpenList(
         "", None, group="models", noun="network", first=tuple(old), package="model_zoo_defs"
     )
     monkeypatch.setattr(choices, "NETWORKS", table)

@@ -9,32 +9,24 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, replace
-from typing import Any, NamedTuple, Protocol, TypeVar
+from dataclasses import replace
+from typing import NamedTuple, Protocol, TypeVar
 
 from pnpdepth_cli.commands.batch.frames import Task, find_frames, source_files, task_of
 from pnpdepth_cli.commands.batch.records import (
-    DAMAGED,
     Records,
-    damaged,
     model_identity,
     remove_all_leftovers,
     settings_of,
 )
-from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions, ray_workers_of
+from pnpdepth_cli.commands.batch.request import BatchRequest, ray_workers_of
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, sequences_of
-from pnpdepth_cli.commands.batch.summary import (
-    TEXT,
-    Row,
-    Tally,
-    failed_row,
-    write_summaries,
-)
+from pnpdepth_cli.commands.batch.summary import TEXT, BatchSummary, Tally, write_summaries
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.lock import in_turn, locked_folder
-from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 Result = TypeVar("Result")
@@ -55,25 +47,25 @@ class Listener(Protocol):
     def begin(self, to_do: int) -> None:
         """Called once the network is loaded, with the number of frames to do."""
 
-    def frame(self, row: Row) -> None:
-        """Called with the summary's row of each frame that is done or has failed."""
+    def frame(self, record: FrameRecord) -> None:
+        """Called with the record of each frame that is done or has failed."""
 
 
 class BatchOutcome(NamedTuple):
-    """The contents of summary.json without its frames, and whether the batch was stopped early."""
+    """What summary.json says of all frames, and whether the batch was stopped early."""
 
-    summary: dict[str, Any]
+    summary: BatchSummary
     stopped: bool
 
 
 def run_batch(
     request: BatchRequest, listener: Listener, stopped: Callable[[], bool] = lambda: False
 ) -> BatchOutcome:
-    """Refines every frame that is to be done; one that fails has a row that says why.
+    """Refines every frame that is to be done; one that fails has a record that says why.
 
     Args:
         request: What to refine, and how.
-        listener: Receives notes and the rows of frames.
+        listener: Receives notes and the records of frames.
         stopped: Asked before each frame; True ends the batch.
 
     Raises:
@@ -90,13 +82,13 @@ def run_batch(
         to_do = [frame for frame, _ in batch.to_do()]
         began = 0
         if to_do:
-            with closing(batch.rows(to_do, listener, stopped)) as rows:
-                for row in rows:
-                    listener.frame(row)
+            with closing(batch.refined(to_do, listener, stopped)) as records:
+                for record in records:
+                    listener.frame(record)
                     began += 1
         with in_turn(request.output):  # so the summary of the shard that ends last stays
             summary = batch.summarise()
-    for note in summary.get("unsure", ()):
+    for note in summary.unsure:
         listener.say(f"warning: {note}")
     return BatchOutcome(summary=summary, stopped=began < len(to_do))
 
@@ -218,10 +210,10 @@ class _Batch:
             self._say(f"{frames}, all of them done already")
         return to_do
 
-    def rows(
+    def refined(
         self, to_do: list[FrameFiles], listener: Listener, stopped: Callable[[], bool]
-    ) -> Generator[Row, None, None]:
-        """Refines frames in this process or on Ray workers; yields a row as each is done."""
+    ) -> Generator[FrameRecord, None, None]:
+        """Refines frames in this process or on Ray workers; yields the record of each."""
         # these import torch, which a run with nothing to do does not need
         from pnpdepth_cli.commands.batch import running
 
@@ -233,20 +225,20 @@ class _Batch:
             references = running.references_of(request, frames)
             if references is None:
                 begin()
-                yield from running.rows_of_unreadable(map(self._task, wanted), records)
+                yield from running.fail_unreadable(map(self._task, wanted), records)
             elif self.workers is not None:
-                from pnpdepth_cli.commands.batch.ray_workers import rows_of_workers
+                from pnpdepth_cli.commands.batch.ray_workers import refine_on_workers
 
                 begin()
-                yield from rows_of_workers(
+                yield from refine_on_workers(
                     request, self.workers, references, wanted, records,
                     settings_worked=worked, say=listener.say, stopped=stopped,
                 )  # fmt: skip
             else:
-                with running.opened_network(request, references, listener.say) as refiner:
+                with running.opened_method(request, references, listener.say) as method:
                     begin()
                     yield from running.refine_tasks(
-                        map(self._task, wanted), refiner, records,
+                        map(self._task, wanted), method, records,
                         settings_worked=worked, stopped=stopped,
                     )  # fmt: skip
 
@@ -258,69 +250,59 @@ class _Batch:
             parts.setdefault(id(part.records), (part, []))[1].append(frame)
         return list(parts.values())
 
-    def summarise(self) -> dict[str, Any]:
-        """Writes the summaries and the report; returns the summary without its frames."""
+    def summarise(self) -> BatchSummary:
+        """Writes the summaries and the report, and returns the summary."""
         request, tally = self.request, Tally()
-        refused = (failed_row(frame.name, {}, why) for frame, why in self.found.refused)
+        refused = (
+            FrameRecord(name=frame.name, group=frame.group, status="failed", message=why)
+            for frame, why in self.found.refused
+        )
         known = _read_in_parts(
-            lambda frame: self._part(frame).records.row(self._task(frame)), self.found.frames
+            lambda frame: self._part(frame).records.record_of(self._task(frame)), self.found.frames
         )
         with tempfile.TemporaryFile("w+", dir=request.output, **TEXT) as file:
-            for row in itertools.chain(refused, known):
-                if row is not None:
-                    try:
-                        tally.add(row)
-                    except DAMAGED as error:
-                        raise damaged(request.output / f"{row['name']}.json") from error
-                    file.write(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n")
-            summary = self._head(tally)
+            for record in filter(None, itertools.chain(refused, known)):
+                tally.add(record)
+                file.write(json.dumps(record.to_json(), ensure_ascii=False, allow_nan=False) + "\n")
+            summary = self._summary(tally)
 
-            def rows() -> Iterator[Row]:
+            def records() -> Iterator[FrameRecord]:
                 file.seek(0)
-                return map(json.loads, file)
+                return (FrameRecord.from_json(json.loads(line), request.output) for line in file)
 
-            write_summaries(request.output, summary, file, tally.baselines)
+            write_summaries(request.output, summary, file, records)
             if request.html is not None:
                 from pnpdepth_cli.commands.report.batch import write_batch_report
 
-                write_batch_report(request, request.html, summary, rows)
+                write_batch_report(request, request.html, summary, records)
         return summary
 
-    def _head(self, tally: Tally) -> dict[str, Any]:
-        """The summary without its frames."""
+    def _summary(self, tally: Tally) -> BatchSummary:
+        """What is said of all frames together."""
         request, found = self.request, self.found
-        frames, fixed_by = len(found.frames) + len(found.refused), request.refine.method.fixed_by
-        head = {
-            "command": "batch",
-            "source": str(request.source),
-            "output": str(request.output),
-            "layout": found.layout,
-            "method": {
-                "kind": "fixed" if fixed_by else "default",
-                "reason": fixed_by or "default",
+        frames = len(found.frames) + len(found.refused)
+        ended = sum(tally.counts[kind] for kind in ("done", "diverged", "failed"))
+        return BatchSummary(
+            source=str(request.source),
+            output=str(request.output),
+            layout=found.layout,
+            fixed_by=request.refine.method.fixed_by,
+            settings=settings_of(request.refine, self.model),
+            counts={"frames": frames, **tally.counts, "pending": frames - ended},
+            unit=tally.unit,
+            columns=request.columns,
+            notes=tally.notes(),
+            errors=tally.errors(),
+            weights=tally.weights,
+            warnings=tally.warnings,
+            unsure=list(tally.unsure),
+            unmatched=[str(each) for each in found.unmatched],
+            varied=dict(request.varied),
+            sequence={
+                "accumulate": request.sequence.accumulate,
+                "poses": str(request.sequence.poses) if request.sequence.poses else None,
             },
-            "settings": settings_of(request.refine, self.model),
-            "counts": {
-                "frames": frames,
-                **tally.counts,
-                "pending": frames - tally.counts.total(),
-                "with_warnings": tally.warned,
-            },
-            "unit": tally.unit,
-            "columns": request.columns,
-            "notes": tally.notes(),
-            **tally.means(),
-            "unmatched": [str(each) for each in found.unmatched],
-        }
-        if request.varied:
-            head["varied"] = dict(request.varied)
-        if tally.warnings:
-            head["warnings"] = tally.warnings
-        if tally.unsure:
-            head["unsure"] = list(tally.unsure)
-        if request.sequence != SequenceOptions():
-            head["sequence"] = plain(asdict(request.sequence))
-        return head
+        )
 
 
 def _read_in_parts(

@@ -18,15 +18,15 @@ from pnpdepth_cli.budget import chosen_max_pixels, set_max_pixels
 from pnpdepth_cli.commands.batch.frames import task_of
 from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
 from pnpdepth_cli.commands.batch.request import LOCAL, BatchRequest, RayWorkers
-from pnpdepth_cli.commands.batch.summary import Row
 from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.lock import LOCKS
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.running import References
-    from pnpdepth_cli.frames.refiner import Refiner
+    from pnpdepth_cli.frames.method import Method
 
 _CONNECT_S = 5.0
 _FRAMES_OF_A_CALL = 8
@@ -69,7 +69,7 @@ class Worker:
         self._versions, self._shared = versions, shared
         self._records = Records(request.output, model)
         self._open = ExitStack()  # until the process ends
-        self._network: Refiner | None = None
+        self._method: Method | None = None
         self._notes: list[str] = []
 
     def ready(self) -> None:
@@ -78,20 +78,20 @@ class Worker:
 
     def refine(
         self, frames: Sequence[FrameFiles], settings_worked: bool
-    ) -> tuple[list[Row], list[str]]:
-        """Returns the rows of the frames, and notes, after their results are written."""
-        from pnpdepth_cli.commands.batch.running import opened_network, refine_tasks
+    ) -> tuple[list[FrameRecord], list[str]]:
+        """Returns the records of the frames, and notes, after their results are written."""
+        from pnpdepth_cli.commands.batch.running import opened_method, refine_tasks
 
         request = self._request
-        if self._network is None:
-            opened = opened_network(request, self._references, self._notes.append)
-            self._network = self._open.enter_context(opened)
+        if self._method is None:
+            opened = opened_method(request, self._references, self._notes.append)
+            self._method = self._open.enter_context(opened)
         tasks = (task_of(request, frame) for frame in frames)
-        rows = list(
-            refine_tasks(tasks, self._network, self._records, settings_worked=settings_worked)
+        records = list(
+            refine_tasks(tasks, self._method, self._records, settings_worked=settings_worked)
         )
         notes, self._notes = self._notes, []
-        return rows, notes
+        return records, notes
 
 
 def software() -> dict[str, str]:
@@ -117,7 +117,7 @@ def check_node(versions: Mapping[str, str], shared: Sequence[Path]) -> None:
             )
 
 
-def rows_of_workers(
+def refine_on_workers(
     request: BatchRequest,
     workers: RayWorkers,
     references: References,
@@ -127,8 +127,8 @@ def rows_of_workers(
     settings_worked: bool,
     say: Callable[[str], None],
     stopped: Callable[[], bool],
-) -> Iterator[Row]:
-    """Refines and writes the frames on Ray workers; yields the rows as they are done.
+) -> Iterator[FrameRecord]:
+    """Refines and writes the frames on Ray workers; yields the records as they are done.
 
     Arguments and errors are as of `refine_tasks`, with ClusterError if the cluster cannot be used.
     """
@@ -141,7 +141,7 @@ def rows_of_workers(
         job = request, references, model, software(), shared, Path.cwd(), chosen_max_pixels()
         actors = [actor.remote(*job) for _ in range(count)]
         try:
-            yield from rows_of_actors(
+            yield from refine_on_actors(
                 ray, actors, to_do, worked=settings_worked,
                 lost=lambda frame, why: records.fail(task_of(request, frame), why), say=say,
                 stopped=stopped,
@@ -153,20 +153,20 @@ def rows_of_workers(
         remove_all_leftovers(request.output)  # of workers that died
 
 
-def rows_of_actors(
+def refine_on_actors(
     ray: Any,
     actors: Sequence[Any],
     to_do: Sequence[FrameFiles],
     *,
     worked: bool,
-    lost: Callable[[FrameFiles, str], Row],
+    lost: Callable[[FrameFiles, str], FrameRecord],
     say: Callable[[str], None],
     stopped: Callable[[], bool],
-) -> Iterator[Row]:
-    """Hands out frames, a call at a time for each worker; yields the rows as they are done.
+) -> Iterator[FrameRecord]:
+    """Hands out frames, a call at a time for each worker; yields the records as they are done.
 
     The frames of a worker that dies go to any worker again, one by one, and each `_RETRIES`
-    times; then `lost` gives its row from the frame and the reason. `worked` says whether
+    times; then `lost` gives its record from the frame and the reason. `worked` says whether
     a frame was refined with these settings before.
     """
     size = max(1, min(_FRAMES_OF_A_CALL, len(to_do) // (4 * len(actors))))
@@ -197,13 +197,13 @@ def rows_of_actors(
             )
         actor, frames, deaths, worked_before = running.pop(ended[0])
         try:
-            rows, notes = ray.get(ended[0]) or ([], [])
+            records, notes = ray.get(ended[0]) or ([], [])
         except ray.exceptions.RayTaskError as error:
             of_settings = isinstance(error.cause, ModelError) or type(error.cause) is UsageError
             if worked_before or not (frames and of_settings and worked):
                 raise error.cause if isinstance(error.cause, Exception) else error from None
             waiting.append((frames, deaths))  # of one frame: others worked meanwhile
-            rows, notes = [], []
+            records, notes = [], []
         except ray.exceptions.RayError as error:
             reason, deaths = reason_of(error), deaths + (len(frames) == 1)
             if not frames:
@@ -219,8 +219,8 @@ def rows_of_actors(
         for note in sorted({*notes} - said, key=notes.index):
             said.add(note)
             say(note)
-        worked |= any(row["status"] != "failed" for row in rows)
-        yield from rows
+        worked |= any(record.status != "failed" for record in records)
+        yield from records
 
 
 def reason_of(error: Exception) -> str:
@@ -261,7 +261,7 @@ def _connect(ray: ModuleType, workers: RayWorkers) -> None:
             names = [] if visible is None else visible.split(",")
             chosen = [names[i] if i < len(names) else str(i) for i in workers.indices]
             os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(chosen)
-        local = {"include_dashboard": False, "object_store_memory": 100 * 2**20}  # rows only
+        local = {"include_dashboard": False, "object_store_memory": 100 * 2**20}  # records only
     try:
         if address not in (LOCAL, "auto"):  # Ray takes minutes to find out that nothing answers
             host, _, port = address.removeprefix("ray://").rpartition(":")

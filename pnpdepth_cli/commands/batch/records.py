@@ -1,8 +1,7 @@
 """The record beside a result is the state of a batch: how the result was made, and of which files.
 
 `NAME.json` is written last, by rename, and removed before the files of `NAME` are written again.
-Its entry `batch` holds the digest of the settings, what identifies the inputs, and the files
-written; or why the frame failed.
+Its entry `batch` holds the digest of the settings and what identifies the inputs.
 """
 
 from __future__ import annotations
@@ -12,32 +11,31 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import fields, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.batch.frames import Task
-from pnpdepth_cli.commands.batch.summary import CSV, JSON, Row, failed_row, row_of
+from pnpdepth_cli.commands.batch.summary import CSV, JSON
 from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs, stale_outputs
 from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
 from pnpdepth_cli.errors import FileFormatError, OutputError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.file_bytes import cannot_read
 from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
 from pnpdepth_cli.io.lock import LOCKS
-from pnpdepth_cli.io.record import parse_json, plain, sha256_of, write_json
+from pnpdepth_cli.io.record import parse_json, plain, sha256_of
 from pnpdepth_cli.models.definition import file_and_part
 from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.refinement.refine import RefineOutcome
 
-_ENTRY = "batch"
 _OWN_SUMMARY = b'{\n  "command": "batch"'
-DAMAGED = (AttributeError, IndexError, KeyError, TypeError)
-"""What a record that holds less than it should leads to."""
 
 
 class Records:
@@ -77,46 +75,40 @@ class Records:
         names, files = self._names_in(task.record.parent), task.outputs
         if task.record.name not in names:
             return "interrupted" if any(path.name in names for path in files.values()) else "new"
-        entry, digest = _entry(_record(task.record)), self._digest(task)
-        if "failed" in entry:
-            return "failed before"
-        try:
-            if entry["settings"] != digest:
-                return "other settings"
-            if entry["inputs"].keys() != task.inputs.keys():
-                return "other input files"
-            for part, path in task.inputs.items():
-                if not is_unchanged(path, Fingerprint(**entry["inputs"][part])):
-                    return f"input changed: {part}"
-            for kind, path in files.items():
-                if kind not in IMAGES and path.name not in names:
-                    return f"result missing: {path.name}"
-        except DAMAGED:
+        record = _read(task.record)
+        if record is None:
             return "record damaged"
+        if record.batch is None:
+            return "other settings"
+        if record.status == "failed":
+            return "failed before"
+        if record.batch.settings != self._digest(task):
+            return "other settings"
+        known = record.batch.inputs
+        if known.keys() != task.inputs.keys():
+            return "other input files"
+        for part, path in task.inputs.items():
+            if not is_unchanged(path, known[part]):
+                return f"input changed: {part}"
+        for kind, path in files.items():
+            if kind not in IMAGES and path.name not in names:
+                return f"result missing: {path.name}"
         return None
 
-    def row(self, task: Task) -> Row | None:
-        """Returns the summary's row of a frame with its present settings; None if there is none.
-
-        Raises:
-            FileFormatError: The record is damaged.
-        """
-        record = _record(task.record)
-        entry = _entry(record)
-        if entry.get("settings") != self._digest(task):
+    def record_of(self, task: Task) -> FrameRecord | None:
+        """Returns the record of a frame with its present settings; None if there is none."""
+        record = _read(task.record)
+        if record is None or record.batch is None or record.batch.settings != self._digest(task):
             return None
-        try:
-            return _row(task, record, entry)
-        except DAMAGED as error:
-            raise damaged(task.record) from error
+        return record
 
     def write(
         self,
         task: Task,
         inputs: Mapping[str, Fingerprint],
         write: Callable[[Outputs], RefineOutcome],
-    ) -> Row:
-        """Writes the results of a frame, the record last; returns the summary's row.
+    ) -> FrameRecord:
+        """Writes the results of a frame, the record last, and returns the record.
 
         Args:
             task: The frame.
@@ -130,21 +122,27 @@ class Records:
             _remove(path)
         outcome = write({kind: path for kind, path in planned.items() if kind != "record"})
         written = [*outcome.outputs, "record"]
-        entry = {
-            "settings": self._digest(task),
-            "inputs": {part: asdict(known) for part, known in inputs.items()},
-            "outputs": {k: planned[k].relative_to(self.output).as_posix() for k in written},
-        }
-        record = {_ENTRY: entry} | outcome.record
-        write_json(planned["record"], record)
-        return _row(task, record, entry)
+        record = replace(
+            outcome.record,
+            batch=BatchState(settings=self._digest(task), inputs=dict(inputs)),
+            outputs={k: planned[k].relative_to(self.output).as_posix() for k in written},
+        )
+        record.write(planned["record"])
+        return record
 
-    def fail(self, task: Task, message: str) -> Row:
-        """Writes a record that says why a frame failed; returns the summary's row."""
-        entry = {"settings": self._digest(task), "failed": message}
+    def fail(self, task: Task, message: str) -> FrameRecord:
+        """Writes a record that says why a frame failed, and returns it."""
+        record = FrameRecord(
+            name=task.name,
+            group=task.group,
+            status="failed",
+            message=message,
+            batch=BatchState(settings=self._digest(task)),
+            inputs={part: FileRecord(path=str(path)) for part, path in task.inputs.items()},
+        )
         make_folder(task.record.parent, below=self.output)
-        write_json(task.record, {_ENTRY: entry})
-        return _row(task, {}, entry)
+        record.write(task.record)
+        return record
 
     def _digest(self, task: Task) -> str:
         """The SHA-256 of the settings that decide the frame's result."""
@@ -156,11 +154,6 @@ class Records:
         digest = hashlib.sha256(text.encode()).hexdigest()
         self._last = None if arrays else (files, digest)
         return digest
-
-
-def damaged(record: Path) -> FileFormatError:
-    """Returns the error of a record that holds less than it should."""
-    return FileFormatError(f"{record} is damaged; remove it, and run again")
 
 
 def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> dict[str, Any]:
@@ -227,27 +220,12 @@ def remove_all_leftovers(output: Path) -> int:
         raise cannot_write(output, error) from error
 
 
-def _row(task: Task, record: Mapping[str, Any], entry: Mapping[str, Any]) -> Row:
-    inputs = {part: str(path) for part, path in task.inputs.items()}
-    if "failed" in entry:
-        return failed_row(task.name, inputs, entry["failed"])
-    row = row_of(task.name, inputs, record, entry["outputs"])
-    return row if task.group is None else row | {"group": task.group}
-
-
-def _record(path: Path) -> dict[str, Any]:
-    """The content of a record; empty if there is none, or it is no JSON object."""
+def _read(path: Path) -> FrameRecord | None:
+    """The record in a file; None if there is none, or it is damaged."""
     try:
-        record = parse_json(_content(path) or b"")
-    except (ValueError, RecursionError):
-        return {}
-    return record if isinstance(record, dict) else {}
-
-
-def _entry(record: Mapping[str, Any]) -> dict[str, Any]:
-    """What a batch says in a record; empty if none wrote it."""
-    entry = record.get(_ENTRY)
-    return entry if isinstance(entry, dict) else {}
+        return FrameRecord.from_json(parse_json(_content(path) or b""), path)
+    except (ValueError, RecursionError, FileFormatError):
+        return None
 
 
 def _content(path: Path) -> bytes | None:

@@ -17,11 +17,11 @@ from typing import NamedTuple, TypeVar
 from pnpdepth_cli.commands.batch.frames import Task, task_of
 from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.batch.summary import Row
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
-from pnpdepth_cli.commands.refinement.refine import load_refiner, read_requested, write_refined
+from pnpdepth_cli.commands.refinement.refine import load_method, read_requested, write_refined
 from pnpdepth_cli.commands.stopwatch import Stopwatch
 from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import (
     InputError,
     ModelError,
@@ -29,8 +29,9 @@ from pnpdepth_cli.errors import (
     StorageError,
     UsageError,
 )
-from pnpdepth_cli.frames.frame import Frame, Refined
-from pnpdepth_cli.frames.refiner import Refiner
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
 
 Item = TypeVar("Item")
@@ -91,9 +92,9 @@ def registering(frames: Sequence[Item], first: int) -> list[Item]:
 
 
 @contextmanager
-def opened_network(
+def opened_method(
     request: BatchRequest, references: References, say: Callable[[str], None]
-) -> Iterator[Refiner]:
+) -> Iterator[Method]:
     """Yields the network, resolved on the frames that decide, open for any number of frames.
 
     Args:
@@ -111,28 +112,28 @@ def opened_network(
         return (frame for frame in read if frame is not None)
 
     others = functools.cache(lambda: [*readable(references.others)])
-    refiner = load_refiner(task.request, first, others)
-    for note in refiner.network.notes:
+    method = load_method(task.request, first, others)
+    for note in method.network.notes:
         say(note)
     if first.register == "auto":
-        refiner.share_registration(readable(references.registering))
-        for (height, width), registration in refiner.registrations.items():
+        method.share_registration(readable(references.registering))
+        for (height, width), registration in method.registrations.items():
             if registration is not None:
                 say(
                     f"images of {width}×{height} are moved to the points by"
                     f" {registration}; --registration off leaves them"
                 )
-    if refiner.is_default:
-        names = " and ".join(member.network.definition.name for member in refiner.members)
+    if method.is_default:
+        names = " and ".join(member.network.definition.name for member in method.members)
         say(f"method: the default, with {names}")
     else:
-        s = refiner.settings
+        s = method.settings
         say(
-            f"network: {refiner.network.definition.name} cut at {refiner.layer}, {s.iterations}"
+            f"network: {method.network.definition.name} cut at {method.own.layer}, {s.iterations}"
             f" updates of z ({s.update}, {s.loss}, step {s.lr})"
         )
-    with refiner:
-        yield refiner
+    with method:
+        yield method
 
 
 def _readable(task: Task) -> Frame | None:
@@ -162,17 +163,17 @@ class FrameInMemory:
 
 def refine_tasks(
     tasks: Iterable[Task],
-    refiner: Refiner,
+    method: Method,
     records: Records,
     *,
     settings_worked: bool,
     stopped: Callable[[], bool] = lambda: False,
-) -> Generator[Row, None, None]:
-    """Refines and writes each task; yields the summary's row of each, in their order.
+) -> Generator[FrameRecord, None, None]:
+    """Refines and writes each task; yields the record of each, in their order.
 
     Args:
         tasks: The frames to refine.
-        refiner: The network, open.
+        method: The method, open.
         records: Writes the results.
         settings_worked: True if a frame was refined with these settings before.
         stopped: True if no further frame is to be begun.
@@ -188,38 +189,38 @@ def refine_tasks(
         for frame in reading:
             if stopped():
                 return
-            _refine(frame, refiner)
+            _refine(frame, method)
             worked |= isinstance(frame.result, Refined)
             fatal = StorageError if worked else (StorageError, ModelError, UsageError)
             if isinstance(frame.result, fatal):
                 raise frame.result
             yield frame
 
-    def written(frame: FrameInMemory) -> Row:
-        return _write(frame, refiner, records)
+    def written(frame: FrameInMemory) -> FrameRecord:
+        return _write(frame, method, records)
 
     with (
         closing(in_order(_read, tasks, THREADS)) as reading,
-        closing(in_order(written, refined(reading), THREADS)) as rows,
+        closing(in_order(written, refined(reading), THREADS)) as done,
     ):
-        yield from rows
+        yield from done
 
 
-def rows_of_unreadable(tasks: Iterable[Task], records: Records) -> Iterator[Row]:
-    """Writes for each task why it cannot be read; yields the summary's rows."""
+def fail_unreadable(tasks: Iterable[Task], records: Records) -> Iterator[FrameRecord]:
+    """Writes for each task why it cannot be read; yields the records."""
     for task in tasks:
         result = _read(task).result
         later = InputError("no frame could be read when the batch began; run it again")
         yield records.fail(task, _message(result if isinstance(result, Exception) else later))
 
 
-def _refine(frame: FrameInMemory, refiner: Refiner) -> None:
+def _refine(frame: FrameInMemory, method: Method) -> None:
     """Sets the result of a frame that was read."""
     if frame.inputs is None:
         return
     with frame.watch("refine"):
         try:
-            frame.result = refiner.refine_frame(frame.inputs)
+            frame.result = method.refine(frame.inputs)
         except Exception as error:  # concerns this frame only
             frame.result = error
 
@@ -234,8 +235,8 @@ def _read(task: Task) -> FrameInMemory:
     return frame
 
 
-def _write(frame: FrameInMemory, refiner: Refiner, records: Records) -> Row:
-    """Writes a frame's results, or why there are none; returns the summary's row."""
+def _write(frame: FrameInMemory, method: Method, records: Records) -> FrameRecord:
+    """Writes a frame's results, or why there are none; returns the record."""
     inputs, result = frame.inputs, frame.result
     if isinstance(result, Refined) and inputs is not None:
         refined = result
@@ -244,7 +245,7 @@ def _write(frame: FrameInMemory, refiner: Refiner, records: Records) -> Row:
                 frame.task,
                 frame.fingerprints,
                 lambda outputs: write_refined(
-                    frame.task.request, outputs, refiner, inputs, refined, frame.watch
+                    frame.task.request, outputs, method, inputs, refined, frame.watch
                 ),
             )
         except StorageError:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,32 +24,18 @@ from pnpdepth_cli.commands.statistics import (
     swap_p_values,
 )
 from pnpdepth_cli.dataset.frame_files import groups_by_name
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.record import plain, read_json
 from pnpdepth_cli.measures import MEASURES, FrameMeans, Measure, chosen_measures
 from pnpdepth_cli.protocols import find_protocol
+from pnpdepth_cli.stages import AFTER, BEFORE, GT
 
 ALPHA = 0.05
 PERMUTATIONS, SEED = 10_000, 0
 """Most swaps of the permutation test, and their seed where not all are tried."""
 _SUMMARY = "summary.json"
-_STAGES = ("before", "after")
-_GAIN = ("percent", "low_percent", "high_percent", "difference", "p_value", "p_adjusted")
-
-
-class RunFrame(NamedTuple):
-    """A scored frame of a run."""
-
-    values: Mapping[str, float]
-    """By measure; NaN for null."""
-    before: Mapping[str, float]
-    """The same before refinement; empty for an evaluation."""
-    pixels: int
-    """Scored ones."""
-    known: int
-    """Pixels with ground truth."""
-    group: str
 
 
 class Run(NamedTuple):
@@ -57,27 +44,91 @@ class Run(NamedTuple):
     name: str
     """That of the folder, or of the file without its ending."""
     path: str
+    stage: str
+    """The depth that is compared: before or after refinement."""
     measures: Sequence[Measure]
     scoring: dict[str, Any]
-    frames: dict[str, RunFrame]
+    frames: dict[str, FrameRecord]
     varied: dict[str, str]
     """Options that `batch --vary` varied, with their values; empty for other runs."""
 
+    def scores(self, name: str, stage: str | None = None) -> Scores:
+        """Returns the scores of a frame; empty for a stage that the run does not have."""
+        return self.frames[name].errors[GT].get(stage or self.stage, {})
+
+    def counts(self, name: str) -> tuple[int, int]:
+        """Returns the numbers of scored pixels and of pixels with ground truth of a frame."""
+        scores = self.scores(name)
+        pixels, coverage = scores.get("pixels") or 0, scores.get("coverage")
+        known = scores.get("known", pixels / coverage if coverage else 0)
+        return round(pixels), round(known or 0)
+
     def coverage(self, names: Sequence[str]) -> float:
         """Returns the fraction of the ground truth of these frames that is scored."""
-        frames = [self.frames[name] for name in names]
-        known = sum(frame.known for frame in frames)
-        return sum(frame.pixels for frame in frames) / known if known else math.nan
+        pixels, known = (sum(counts) for counts in zip(*map(self.counts, names), strict=True))
+        return pixels / known if known else math.nan
 
 
-def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Gain:
+    """How much better a run is than the first by one measure; positive per cents are better."""
+
+    percent: float | None
+    """Of the first run's mean. None, as below, for a value that there is not."""
+    low_percent: float | None
+    """Lower end of the 95 % interval of `percent`."""
+    high_percent: float | None
+    difference: float | None
+    """Mean of the run minus mean of the first."""
+    p_value: float | None
+    """Probability of such a difference between equal runs."""
+    p_adjusted: float | None
+    """The same by the number of tests, of all measures and runs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedRun:
+    """A run on the frames that all runs scored."""
+
+    name: str
+    path: str
+    mean: dict[str, float | None]
+    before: dict[str, float | None]
+    """The mean before refinement, where the run has it."""
+    varied: dict[str, str]
+    coverage: float
+    gains: dict[str, Gain]
+    """By measure; empty for the first run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Runs on the frames that all of them scored, compared with the first."""
+
+    frames: tuple[str, ...]
+    measures: tuple[Measure, ...]
+    scoring: dict[str, Any]
+    runs: tuple[ComparedRun, ...]
+    clusters: Clusters
+    exact_p_values: bool
+    """Whether all swaps were tried, not `PERMUTATIONS` random ones."""
+    tests: int
+    notes: list[str]
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns what `--json` prints."""
+        clusters = {"count": self.clusters.count, "unit": self.clusters.unit}
+        measures = [measure.to_json() for measure in self.measures]
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        own = {"clusters": clusters, "measures": measures, "permutations": PERMUTATIONS}
+        result: dict[str, Any] = plain({"command": "compare"} | values | own)
+        return result
+
+
+def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Comparison:
     """Returns the runs on the frames that all of them scored, compared with the first.
 
     A measure that a frame lacks in one of the runs is averaged and tested over the other frames.
-    `runs` has the means of each run, `gains` those of each but the first: in per cent of the first
-    run's mean with the ends of the 95 % interval, and as a difference; positive per cents are
-    better. `p_value` is that of no difference, `p_adjusted` by the number of tests, of all
-    measures and runs. None is a value that there is not, as for a single frame.
 
     Args:
         paths: Files as `read_run` takes them; the first is the reference.
@@ -100,48 +151,48 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> di
     measures = _shared_measures(runs, columns)
     keys = [measure.key for measure in measures]
     values = np.array(
-        [[[run.frames[n].values.get(k, math.nan) for k in keys] for n in names] for run in runs]
+        [[[run.scores(name).get(key) for key in keys] for name in names] for run in runs],
+        np.float64,
     )
-    known = np.isfinite(values).all(axis=0)
+    known = np.asarray(np.isfinite(values).all(axis=0))
     values = np.where(known, values, math.nan)  # (runs, frames, measures)
     # the tests, over frames that count as independent
-    groups = [runs[0].frames[name].group for name in names]
-    differences = np.concatenate(list(values[1:] - values[0]), axis=1)
-    clusters = find_clusters(groups, differences)
+    by_name = groups_by_name(names)
+    own = (runs[0].frames[name].group for name in names)
+    groups = [group or name for group, name in zip(own, by_name, strict=True)]
+    clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     gains, exact = _gains(values, measures, clusters)
     tests = len(gains) * len(measures)
-    record = {
-        "command": "compare",
-        "frames": names,
-        "measures": [measure.to_json() for measure in measures],
-        "scoring": runs[0].scoring,
-        "runs": [
-            {
-                "name": name,
-                "path": run.path,
-                "mean": _means(keys, of_run),
-                "before": FrameMeans(
-                    {key: run.frames[frame].before.get(key) for key in keys} for frame in names
+    return Comparison(
+        frames=names,
+        measures=measures,
+        scoring=runs[0].scoring,
+        runs=tuple(
+            ComparedRun(
+                name=name,
+                path=run.path,
+                mean=_means(keys, of_run),
+                before=FrameMeans(
+                    {key: run.scores(frame, BEFORE).get(key) for key in keys} for frame in names
                 ).means(),
-                "varied": run.varied,
-                "coverage": run.coverage(names),
-            }
-            for name, run, of_run in zip(_names(runs), runs, values, strict=True)
-        ],
-        "gains": gains,
-        "clusters": {"count": clusters.count, "unit": clusters.unit},
-        "exact_p_values": exact,
-        "permutations": PERMUTATIONS,
-        "tests": tests,
-        "notes": [
+                varied=run.varied,
+                coverage=run.coverage(names),
+                gains=of_first,
+            )
+            for name, run, of_run, of_first in zip(
+                _names(runs), runs, values, [{}, *gains], strict=True
+            )
+        ),
+        clusters=clusters,
+        exact_p_values=exact,
+        tests=tests,
+        notes=[
             *_notes(runs, names),
             *_lacking(measures, known),
             *clusters.notes(),
             *_cluster_notes(clusters, len(names), tests),
         ],
-    }
-    result: dict[str, Any] = plain(record)
-    return result
+    )
 
 
 def _shared_measures(runs: Sequence[Run], columns: Sequence[str] | None) -> tuple[Measure, ...]:
@@ -158,7 +209,7 @@ def _means(keys: Sequence[str], values: NDArray[np.float64]) -> dict[str, float 
 
 def _gains(
     values: NDArray[np.float64], measures: Sequence[Measure], clusters: Clusters
-) -> tuple[list[dict[str, dict[str, float]]], bool]:
+) -> tuple[list[dict[str, Gain]], bool]:
     """The gain of each run but the first by measure, and whether the p-values are exact.
 
     Args:
@@ -178,8 +229,11 @@ def _gains(
     of_runs = np.array(rows)  # (runs − 1, 5, measures)
     of_runs = np.concatenate([of_runs, holm(of_runs[:, 4:])], axis=1)
     return [
-        {key: dict(zip(_GAIN, row, strict=True)) for key, row in zip(keys, rows, strict=True)}
-        for rows in of_runs.transpose(0, 2, 1).tolist()
+        {
+            key: Gain(*(None if math.isnan(v) else v for v in row))
+            for key, row in zip(keys, of_run, strict=True)
+        }
+        for of_run in of_runs.transpose(0, 2, 1).tolist()
     ], exact
 
 
@@ -214,13 +268,14 @@ def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
                 f"warning: {len(unshared):,} frames of {run.path} are not scored in all runs and"
                 f" left out: {some_names(unshared)}"
             )
-    frames = {name: [run.frames[name] for run in runs] for name in names}
-    if other_truth := [name for name, of in frames.items() if len({f.known for f in of}) > 1]:
+    counts = {name: [run.counts(name) for run in runs] for name in names}
+    other_truth = [name for name, of in counts.items() if len({known for _, known in of}) > 1]
+    if other_truth:
         lines.append(
             f"warning: {len(other_truth):,} frames have another number of pixels with ground truth"
             f" in another run, so the runs were not scored on the same: {some_names(other_truth)}"
         )
-    elif any(len({frame.pixels for frame in of}) > 1 for of in frames.values()):
+    elif any(len({*of}) > 1 for of in counts.values()):
         shares = ", ".join(f"{run.coverage(names):.2%} in {run.path}" for run in runs)
         lines.append(
             f"warning: coverage differs ({shares}), and a run that leaves hard pixels empty looks"
@@ -264,59 +319,39 @@ def read_run(text: str) -> Run:
         FileFormatError: For a file without scores.
         UsageError: For `:before` of an evaluation.
     """
-    path, stage = Path(text), "after"
+    path, stage = Path(text), AFTER
     start, colon, end = text.rpartition(":")
-    if colon and end in _STAGES and not path.exists():
+    if colon and end in (BEFORE, AFTER) and not path.exists():
         path, stage = Path(start), end
     path = path / _SUMMARY if path.is_dir() else path
     record, name = read_json(path), path.stem
     if path.name == _SUMMARY:
         name = path.resolve().parent.name
-    if record.get("command") == "eval" and stage == "before":
+    if record.get("command") == "eval" and stage == BEFORE:
         raise UsageError(f"{path} is of eval, which has no before; leave out :before")
+    entries, measures = record.get("frames"), record.get("measures", [])
+    scoring, varied = record.get("scoring"), record.get("varied", {})
     try:
-        frames = _scored_frames(record["frames"], stage)
-        measures = [Measure.from_json(entry) for entry in record.get("measures", ())]
+        records = [FrameRecord.from_json(entry, path) for entry in entries or ()]
+        frames = {
+            each.name: each for each in records if each.status != "failed" and GT in each.errors
+        }
+        if not frames:
+            raise ValueError("no frame has scores")
+        known = [Measure.from_json(entry) for entry in measures] or MEASURES
+        own = [each.errors[GT][stage] for each in frames.values()]
         return Run(
-            name=f"{name}:before" if stage == "before" else name,
+            name=f"{name}:before" if stage == BEFORE else name,
             path=text,
-            measures=[
-                measure
-                for measure in measures or MEASURES
-                if all(measure.key in frame.values for frame in frames.values())
-            ],
-            scoring=dict(record.get("scoring") or scoring_of(find_protocol("paper"))),
+            stage=stage,
+            measures=[each for each in known if all(each.key in scores for scores in own)],
+            scoring=dict(scoring or scoring_of(find_protocol("paper"))),
             frames=frames,
-            varied={str(key): str(value) for key, value in record.get("varied", {}).items()},
+            varied={str(key): str(value) for key, value in varied.items()},
         )
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         fact = one_line(repr(error))
         raise FileFormatError(
             f"{path} does not hold scores as pnpdepth writes them ({fact}); give what eval --json"
             " printed, or the summary of a batch with ground truth"
         ) from error
-
-
-def _scored_frames(entries: Sequence[Mapping[str, Any]], stage: str) -> dict[str, RunFrame]:
-    """The frames with scores by name; their counts stand among the scores or beside them."""
-    scored = [entry for entry in entries if entry.get("scores") is not None]
-    if not scored:
-        raise ValueError("no frame has scores")
-    frames = {}
-    groups = groups_by_name([entry["name"] for entry in scored])
-    for entry, group in zip(scored, groups, strict=True):
-        scores = entry["scores"]
-        counts = {**entry, **scores[stage]}
-        pixels, coverage = counts["pixels"], counts["coverage"]
-        frames[entry["name"]] = RunFrame(
-            values=_numbers(scores[stage]),
-            before=_numbers(scores.get("before", {})),
-            pixels=round(pixels),
-            known=round(counts.get("known", pixels / coverage if coverage else 0)),
-            group=str(entry.get("group", group)),
-        )
-    return frames
-
-
-def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    return {key: math.nan if value is None else float(value) for key, value in values.items()}

@@ -15,8 +15,11 @@ from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.scoring import (
-    FrameScores,
+    PREDICTION,
+    TRUTH,
+    is_missing,
     score_pair,
+    scores_of,
 )
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.commands.statistics import (
@@ -27,8 +30,9 @@ from pnpdepth_cli.commands.statistics import (
     interval,
 )
 from pnpdepth_cli.commands.stopwatch import versions
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.read_options import METRES
-from pnpdepth_cli.errors import InputError, PnpDepthError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
@@ -36,7 +40,7 @@ from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.measures import OF_SIGMA, FrameMeans, Measure
 
 _LISTED = 3
-_OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
+_OPTIONS = {PREDICTION: "--pred-scale", TRUTH: "--gt-scale"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +48,10 @@ class Evaluation:
     """Scored frames and their means."""
 
     request: EvalRequest
-    frames: tuple[FrameScores, ...]
-    """A row for each frame of the ground truth, in its order."""
+    pairs: tuple[FramePair, ...]
+    """The files of each frame of the ground truth, in its order."""
+    frames: tuple[FrameRecord, ...]
+    """The scores of each."""
     measures: tuple[Measure, ...]
     """Those of the request, and those of the standard deviation where a frame has one."""
     mean: dict[str, float | None]
@@ -56,15 +62,23 @@ class Evaluation:
     notes: tuple[str, ...]
 
     @property
-    def scored(self) -> tuple[FrameScores, ...]:
+    def scored(self) -> tuple[FrameRecord, ...]:
         """The frames that are in the means."""
-        return tuple(frame for frame in self.frames if frame.scored)
+        return tuple(frame for frame in self.frames if frame.status == "done")
+
+    @property
+    def pixels(self) -> int:
+        """Number of scored pixels of all frames."""
+        return self._sum("pixels")
 
     @property
     def coverage(self) -> float:
         """Fraction of all ground truth, of frames without prediction too, that has a prediction."""
-        known = sum(frame.known for frame in self.frames)
-        return sum(frame.predicted for frame in self.frames) / known if known else math.nan
+        known = self._sum("known")
+        return self._sum("predicted") / known if known else math.nan
+
+    def _sum(self, count: str) -> int:
+        return sum(int(scores_of(frame).get(count) or 0) for frame in self.frames)
 
     def describe(self) -> str:
         """Returns the protocol and every scale of files that was assumed, on one line."""
@@ -78,12 +92,12 @@ class Evaluation:
 
     def unscored(self) -> str:
         """Returns why frames are in no mean; empty if all are."""
-        missing = sum(frame.missing for frame in self.frames)
+        missing = sum(map(is_missing, self.frames))
         faulty = len(self.frames) - len(self.scored) - missing
         reasons = [f"{missing:,} without prediction"] * bool(missing)
         return ", ".join([*reasons, *[f"{faulty:,} with a faulty file"] * bool(faulty)])
 
-    def as_record(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
         request = self.request
         record = {
@@ -99,38 +113,19 @@ class Evaluation:
             "counts": {
                 "frames": len(self.frames),
                 "scored": len(self.scored),
-                "missing": sum(frame.missing for frame in self.frames),
-                "pixels": sum(frame.pixels for frame in self.frames),
+                "missing": sum(map(is_missing, self.frames)),
+                "pixels": self.pixels,
                 "coverage": self.coverage,
             },
             "mean": self.mean,
             "interval": self.interval,
             "level": LEVEL,
             "clusters": {"count": self.clusters.count, "unit": self.clusters.unit},
-            "frames": [frame_record(frame) for frame in self.frames],
+            "frames": [frame.to_json() for frame in self.frames],
             "notes": self.notes,
         }
         result: dict[str, Any] = plain(record)
         return result
-
-
-def frame_record(frame: FrameScores) -> dict[str, Any]:
-    """Returns a frame's row as files have it."""
-    pair, fit = frame.pair, frame.fit
-    return {
-        "name": frame.name,
-        "group": pair.group,
-        **{name: None if path is None else str(path) for name, path in pair.paths.items()},
-        "pixels": frame.pixels,
-        "known": frame.known,
-        "coverage": frame.coverage,
-        "pixels_given_as_sparse": frame.given,
-        "median_ratio": frame.ratio,
-        "factor": fit and fit.factor,
-        "shift": fit and fit.shift,
-        "scores": {"after": frame.values} if frame.scored else None,
-        "error": frame.error,
-    }
 
 
 def evaluate(
@@ -149,25 +144,21 @@ def evaluate(
     """
     pairs, notes = pair_frames(request.prediction, request.ground_truth, part=request.rules.part)
 
-    def score(pair: FramePair) -> FrameScores:
-        try:
-            return score_pair(pair, request)
-        except PnpDepthError as error:
-            return FrameScores(pair=pair, error=str(error))
-
-    rows: list[FrameScores] = []
-    for row in in_order(score, pairs, THREADS):
+    rows: list[FrameRecord] = []
+    for row in in_order(lambda pair: score_pair(pair, request), pairs, THREADS):
         rows.append(row)
         on_frame(len(rows), len(pairs))
-    scored = [row for row in rows if row.scored]
+    scored = [row for row in rows if row.status == "done"]
     if not scored:
-        raise InputError(f"no frame could be scored; the first: {rows[0].error}")
+        raise InputError(f"no frame could be scored; the first: {rows[0].message}")
     # means, and how sure they are over frames that count as independent
-    of_sigma = [m for m in OF_SIGMA if any(m.key in row.values for row in scored)]
+    scores = [scores_of(row) for row in scored]
+    of_sigma = [m for m in OF_SIGMA if any(m.key in each for each in scores)]
     measures = (*request.measures, *of_sigma)
-    values = np.array([[row.values.get(m.key, math.nan) for m in measures] for row in scored])
-    mean = FrameMeans(row.values for row in scored).means()
-    clusters = find_clusters([row.pair.group for row in scored], values)
+    keys = [measure.key for measure in measures]
+    values = np.array([[each.get(key, math.nan) for key in keys] for each in scores], np.float64)
+    mean = FrameMeans({key: each.get(key) for key in keys} for each in scores).means()
+    clusters = find_clusters([row.group or "" for row in scored], values)
     if request.is_devkit:
         exact = devkit_mean(values[:, : len(request.measures)]).tolist()
         mean |= dict(zip((m.key for m in request.measures), exact, strict=True))
@@ -179,6 +170,7 @@ def evaluate(
         )
     return Evaluation(
         request=request,
+        pairs=tuple(pairs),
         frames=tuple(rows),
         measures=measures,
         mean=mean,
@@ -208,12 +200,14 @@ def _intervals(
     return dict(zip((measure.key for measure in measures), ends, strict=True))
 
 
-def readings_of(rows: Sequence[FrameScores], side: str) -> list[tuple[Reading, int]]:
+def readings_of(rows: Sequence[FrameRecord], side: str) -> list[tuple[Reading, int]]:
     """Returns how the files "prediction" or "gt" were read with their number, frequent first."""
-    return Counter(row.readings[side] for row in rows if side in row.readings).most_common()
+    files = (row.inputs[side] for row in rows if side in row.inputs)
+    readings = (Reading(f.read_as, f.scale, f.assumed) for f in files if f.read_as is not None)
+    return Counter(readings).most_common()
 
 
-def _reading_notes(rows: Sequence[FrameScores]) -> list[str]:
+def _reading_notes(rows: Sequence[FrameRecord]) -> list[str]:
     """A line for the predictions, and one for the ground truth."""
     lines = []
     for side, option in _OPTIONS.items():
@@ -228,18 +222,18 @@ def _reading_notes(rows: Sequence[FrameScores]) -> list[str]:
     return lines
 
 
-def _unscored(rows: Sequence[FrameScores]) -> Iterator[str]:
+def _unscored(rows: Sequence[FrameRecord]) -> Iterator[str]:
     """Frames that are in no mean."""
-    if missing := [row.name for row in rows if row.missing]:
+    if missing := [row.name for row in rows if is_missing(row)]:
         yield f"warning: {len(missing):,} frames have no prediction: {some_names(missing)}"
-    if faulty := [row for row in rows if not row.scored and not row.missing]:
+    if faulty := [row for row in rows if row.status == "failed" and not is_missing(row)]:
         for row in faulty[:_LISTED]:
-            yield f"warning: frame {one_line(row.name)} was not scored: {row.error}"
+            yield f"warning: frame {one_line(row.name)} was not scored: {row.message}"
         if (more := len(faulty) - _LISTED) > 0:
             yield f"warning: {more:,} more frames were not scored"
 
 
-def _ground_truth(rows: Sequence[FrameScores]) -> Iterator[str]:
+def _ground_truth(rows: Sequence[FrameRecord]) -> Iterator[str]:
     """What was made of ground truth that is none."""
     noted = [row for row in rows if row.notes]
     for row in noted[:_LISTED]:
@@ -248,20 +242,26 @@ def _ground_truth(rows: Sequence[FrameScores]) -> Iterator[str]:
         yield f"{more:,} more frames have such ground truth"
 
 
-def _empty_pixels(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:
+def _numbers(rows: Sequence[FrameRecord], key: str) -> list[float]:
+    """The values of this key of the frames that have one."""
+    return [value for row in rows if (value := scores_of(row).get(key)) is not None]
+
+
+def _empty_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
     """Pixels of the ground truth without prediction."""
-    known = sum(row.known for row in scored)
+    known = sum(_numbers(scored, "known"))
     treatment = "lowers the coverage and is in no error"
     if request.rules.missing == "min":
         treatment = f"is scored as {request.rules.min_depth:g} m"
     elif request.is_devkit:
         treatment = "was filled in from its neighbours before scoring"
-    if empty := known - sum(row.predicted for row in scored):
+    if empty := known - sum(_numbers(scored, "predicted")):
         yield (
             f"warning: {empty:,} pixels ({empty / known:.2%}) of the ground truth have no"
             f" prediction; what is missing {treatment}"
         )
-    if holes := [row.name for row in scored if math.isnan(row.values.get("log_mae", 0.0))]:
+    holes = [row.name for row in scored if math.isnan(scores_of(row).get("log_mae") or 0.0)]
+    if holes:
         yield (
             f"warning: {len(holes):,} predictions have empty rows between filled ones, which the"
             f" development kit sets to −1 m and scores (its logarithmic errors are then NaN):"
@@ -269,25 +269,25 @@ def _empty_pixels(scored: Sequence[FrameScores], request: EvalRequest) -> Iterat
         )
 
 
-def _scales(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:
+def _scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
     """How predictions were scaled, and what looks like a wrong scale.
 
     Raises:
         InputError: If a scale that was assumed is wrong by a factor between those in use.
     """
-    if factors := [row.fit.factor for row in scored if row.fit is not None]:
+    if factors := _numbers(scored, "factor"):
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan
         yield (
             f"scale-by {request.scale_by}: factor {median:.4g} (median of {len(factors):,}"
             f" images), standard deviation / median {spread:.3f}"
         )
-    elif unscaled := [row for row in scored if row.pair.unit != METRES]:
+    elif unscaled := [row.unit for row in scored if row.unit != METRES]:
         yield (
-            f"warning: {len(unscaled):,} predictions are in {unscaled[0].pair.unit}, not in metres,"
-            " so errors against the ground truth show nothing; --scale-by median scales each image"
+            f"warning: {len(unscaled):,} predictions are in {unscaled[0]}, not in metres, so errors"
+            " against the ground truth show nothing; --scale-by median scales each image"
         )
-    ratios = [row.ratio for row in scored if math.isfinite(row.ratio)] or [math.nan]
+    ratios = _numbers(scored, "median_ratio") or [math.nan]
     by_option = {
         option: next((reading for reading, _ in readings_of(scored, side)), None)
         for side, option in _OPTIONS.items()
@@ -296,12 +296,12 @@ def _scales(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str
         yield warning
 
 
-def _given_points(scored: Sequence[FrameScores], request: EvalRequest) -> Iterator[str]:
+def _given_points(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
     """Scored pixels at which the network was given a depth."""
-    given = sum(row.given or 0 for row in scored)
+    given = round(sum(_numbers(scored, "given")))
     if given and not request.rules.exclude_sparse:
-        fraction = given / sum(row.pixels for row in scored if row.given is not None)
+        known = [row for row in scored if scores_of(row)["given"] is not None]
         yield (
-            f"{given:,} of the scored pixels ({fraction:.2%}) have a point of the sparse input;"
-            " --exclude-sparse leaves them out"
+            f"{given:,} of the scored pixels ({given / sum(_numbers(known, 'pixels')):.2%}) have a"
+            " point of the sparse input; --exclude-sparse leaves them out"
         )

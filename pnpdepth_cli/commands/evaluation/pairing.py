@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.frame_files import (
@@ -17,6 +17,7 @@ from pnpdepth_cli.dataset.frame_files import (
     find_files,
     groups_by_name,
 )
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import find_layout, list_frames
 from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
@@ -174,31 +175,24 @@ def _not_a_scan(path: Path | None) -> Path | None:
     return path if path is not None and path.suffix.lower() in DEPTH_SUFFIXES else None
 
 
-def _sparse_file(record: Mapping[str, Any]) -> Path | None:
-    """The sparse depth that a record names, if it exists and is no projected scan."""
-    entry = _sparse_entry(record)
-    path = entry.get("path")
-    if not isinstance(path, str) or "calibration" in entry or not Path(path).is_file():
+def _sparse_file(record: FrameRecord | None) -> Path | None:
+    """The sparse depth of a record, if it exists and is no projected scan."""
+    sparse = None if record is None else record.inputs.get("sparse")
+    if sparse is None or sparse.sampled or sparse.calibration or not Path(sparse.path).is_file():
         return None
-    return Path(path)
+    return Path(sparse.path)
 
 
-def _drawn_points(record: Mapping[str, Any]) -> DrawnPoints | None:
+def _drawn_points(record: FrameRecord | None) -> DrawnPoints | None:
     """The points that a record says were drawn from the ground truth; None if it does not."""
-    entry = _sparse_entry(record)
-    if "sampled_from" not in entry:
+    sparse = None if record is None else record.inputs.get("sparse")
+    if record is None or sparse is None or sparse.sampled is None:
         return None
-    with contextlib.suppress(KeyError, TypeError, ValueError, UsageError):
-        pattern = SamplePattern(**{name: entry[name] for name in ("kind", "count", "fraction")})
-        width, height = record["size"]
-        return DrawnPoints(pattern, int(entry["seed"]), (height, width))
+    drawn, (width, height) = sparse.sampled, record.size or (0, 0)
+    with contextlib.suppress(UsageError):
+        pattern = SamplePattern(kind=drawn.kind, count=drawn.count, fraction=drawn.fraction)
+        return DrawnPoints(pattern, drawn.seed, (height, width))
     return None
-
-
-def _sparse_entry(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    inputs = record.get("inputs")
-    entry = inputs.get("sparse") if isinstance(inputs, dict) else None
-    return entry if isinstance(entry, dict) else {}
 
 
 def frame_name(stem: str) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pnpdepth_cli.commands.evaluation.compare import ComparedRun, Comparison
 from pnpdepth_cli.commands.statistics import gain
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
@@ -18,7 +19,7 @@ _CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
 _SIDE_INCHES = 3.2
 
 
-def plot_comparison(comparison: Mapping[str, Any], path: Path, *, overwrite: bool = False) -> None:
+def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = False) -> None:
     """Writes a plot of each measure over a varied option, and of its improvement by refinement.
 
     Numbers, and of several options the one of most values, lie along the axis; each combination of
@@ -40,20 +41,20 @@ def plot_comparison(comparison: Mapping[str, Any], path: Path, *, overwrite: boo
     except ImportError:
         raise UsageError("--plot needs matplotlib: pip install 'pnpdepth[plot]'") from None
     # where each value lies, and the runs of each line in this order
-    across, positions = _axis(comparison["runs"])
-    lines: dict[str, list[Mapping[str, Any]]] = {}
-    for run in sorted(comparison["runs"], key=lambda run: positions[run["varied"][across]]):
-        others = [f"{name}={value}" for name, value in run["varied"].items() if name != across]
+    across, positions = _axis(comparison.runs)
+    lines: dict[str, list[ComparedRun]] = {}
+    for run in sorted(comparison.runs, key=lambda run: positions[run.varied[across]]):
+        others = [f"{name}={value}" for name, value in run.varied.items() if name != across]
         lines.setdefault(", ".join(others), []).append(run)
     # a column of two panels for each measure
-    measures = [Measure.from_json(each) for each in comparison["measures"]]
+    measures = comparison.measures
     size = _SIDE_INCHES * len(measures) + 1, 2 * _SIDE_INCHES
     with mpl.rc_context({"svg.hashsalt": "pnpdepth", "font.size": 8, "axes.grid": True}):
         figure = Figure(size, layout="constrained", dpi=150)
         panels = figure.subplots(2, len(measures), squeeze=False, sharex=True)
         for measure, above, below in zip(measures, *panels, strict=True):
             for number, (label, runs) in enumerate(lines.items()):
-                x = [positions[run["varied"][across]] for run in runs]
+                x = [positions[run.varied[across]] for run in runs]
                 before, after, improved = _values(measure, runs)
                 above.plot(x, before, f"C{number}--", linewidth=0.8)
                 above.plot(x, after, f"C{number}o-", label=label)
@@ -70,19 +71,19 @@ def plot_comparison(comparison: Mapping[str, Any], path: Path, *, overwrite: boo
             figure.savefig(temporary, format=path.suffix[1:], metadata=metadata)
 
 
-def _values(measure: Measure, runs: Sequence[Mapping[str, Any]]) -> tuple[Any, Any, Any]:
+def _values(measure: Measure, runs: Sequence[ComparedRun]) -> tuple[Any, Any, Any]:
     """The means before and after, in the shown unit, and the improvement in per cent."""
-    means = [[run[stage][measure.key] for run in runs] for stage in ("before", "mean")]
+    means = [[run.before[measure.key] for run in runs], [run.mean[measure.key] for run in runs]]
     before, after = np.array(means, np.float64) * measure.shown_factor  # None becomes NaN
     return before, after, gain(before, after, np.array(measure.sign, np.float64))
 
 
-def _axis(runs: Sequence[Mapping[str, Any]]) -> tuple[str, dict[str, float]]:
+def _axis(runs: Sequence[ComparedRun]) -> tuple[str, dict[str, float]]:
     """The option that lies along the axis, and where its values do: names from 0 on."""
-    options = {tuple(run["varied"]) for run in runs}
+    options = {tuple(run.varied) for run in runs}
     if len(options) > 1 or () in options:
         raise UsageError("--plot needs results of `batch --vary`, all of the same options")
-    values = {name: [*dict.fromkeys(run["varied"][name] for run in runs)] for name in options.pop()}
+    values = {name: [*dict.fromkeys(run.varied[name] for run in runs)] for name in options.pop()}
     across = max(values, key=lambda name: (_numbers(values[name]) is not None, len(values[name])))
     places = {value: float(place) for place, value in enumerate(values[across])}
     return across, _numbers(values[across]) or places

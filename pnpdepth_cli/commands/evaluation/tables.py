@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from pnpdepth_cli.commands.evaluation.compare import ALPHA
-from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, frame_record
-from pnpdepth_cli.commands.evaluation.scoring import FrameScores
+from pnpdepth_cli.commands.evaluation.compare import ALPHA, PERMUTATIONS, Comparison
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
+from pnpdepth_cli.commands.evaluation.scoring import PREDICTION, TRUTH, scores_of
 from pnpdepth_cli.commands.tables import Cell, Style, Table
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.record import plain
-from pnpdepth_cli.measures import COVERAGE, Measure, chosen_measures
+from pnpdepth_cli.measures import COVERAGE, chosen_measures
 
 _FRAMES_SHOWN = 12
 _FRAME_COLUMNS = 6
+_FILES = (PREDICTION, TRUTH, "sparse", "image")
 _STARS = (0.05, 0.01, 0.001)
 
 
@@ -28,8 +30,7 @@ def text_tables(evaluation: Evaluation, keys: Sequence[str] | None) -> list[Tabl
 def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
     count = len(evaluation.scored)
-    pixels = sum(frame.pixels for frame in evaluation.frames)
-    title = f"Means over {count:,} frame{'' if count == 1 else 's'}, {pixels:,} pixels"
+    title = f"Means over {count:,} frame{'' if count == 1 else 's'}, {evaluation.pixels:,} pixels"
     columns, intervals = ["", "mean"], evaluation.interval
     if intervals is not None:
         columns.append("95 %")
@@ -48,14 +49,18 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
 def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
     measures = chosen_measures(evaluation.measures, keys)
-    records = [plain(frame_record(frame)) for frame in evaluation.frames]
-    facts = [name for name in records[0] if name not in ("scores", "error")]
+    counts = ("pixels", "known", COVERAGE.key, "given", "median_ratio", "factor", "shift")
     rows = []
-    for record in records:
-        values = (record["scores"] or {}).get("after", {})
-        row = [*(record[name] for name in facts), *(values.get(m.key) for m in measures)]
-        rows.append([*row, record["error"]])
-    columns = [COVERAGE if name == COVERAGE.key else name for name in facts]
+    for frame in evaluation.frames:
+        scores = plain(scores_of(frame))
+        files = (frame.inputs.get(name) for name in _FILES)
+        row = [frame.name, frame.group, *(file and file.path for file in files)]
+        row += [scores.get(name) for name in counts]
+        row += [scores.get(measure.key) for measure in measures]
+        rows.append([*row, frame.message])
+    columns = [
+        COVERAGE if name == COVERAGE.key else name for name in ("name", "group", *_FILES, *counts)
+    ]
     return Table(columns=[*columns, *measures, "error"], rows=rows)
 
 
@@ -70,38 +75,42 @@ def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     return replace(table, title=title + _without_sparse(evaluation.request.rules.exclude_sparse))
 
 
-def worst(evaluation: Evaluation) -> tuple[FrameScores, ...]:
+def worst(evaluation: Evaluation) -> tuple[FrameRecord, ...]:
     """Returns the scored frames by RMSE, worst first, those with NaN at the very end."""
-    rmse = {frame.name: frame.values["rmse"] for frame in evaluation.scored}
-    order = sorted(evaluation.scored, key=lambda f: (math.isnan(rmse[f.name]), -rmse[f.name]))
-    return tuple(order)
+
+    def rank(frame: FrameRecord) -> tuple[bool, float]:
+        rmse = scores_of(frame)["rmse"]
+        unknown = rmse is None or math.isnan(rmse)
+        return unknown, 0.0 if unknown else -(rmse or 0.0)
+
+    return tuple(sorted(evaluation.scored, key=rank))
 
 
-def comparison_table(comparison: Mapping[str, Any]) -> Table:
+def comparison_table(comparison: Comparison) -> Table:
     """Returns a row for each measure and run; all runs but the first have gain and p."""
-    (first, *others), measures = comparison["runs"], _measures(comparison)
+    first, *others = comparison.runs
     rows: list[list[Any]] = []
-    for measure in measures:
-        rows.append([measure.heading, first["name"], measure.text(first["mean"][measure.key])])
+    for measure in comparison.measures:
+        rows.append([measure.heading, first.name, measure.text(first.mean[measure.key])])
         rows[-1] += ["–"] * 4
-        for run, gains in zip(others, comparison["gains"], strict=True):
-            found = gains[measure.key]
-            percent, p = found["percent"], found["p_adjusted"]
-            style: Style = "good" if (percent or 0) > 0 else "bad"
-            ends = (_signed(found[end]) for end in ("low_percent", "high_percent"))
+        for run in others:
+            found = run.gains[measure.key]
+            style: Style = "good" if (found.percent or 0) > 0 else "bad"
+            p = found.p_adjusted
             rows.append([
                 measure.heading,
-                run["name"],
-                measure.text(run["mean"][measure.key]),
-                Cell(_signed(percent), style if p is not None and p < ALPHA else "dim"),
-                *ends,
+                run.name,
+                measure.text(run.mean[measure.key]),
+                Cell(_signed(found.percent), style if p is not None and p < ALPHA else "dim"),
+                _signed(found.low_percent),
+                _signed(found.high_percent),
                 "–" if p is None else f"{p:.4f}",
             ])  # fmt: skip
-    swaps = "all" if comparison["exact_p_values"] else f"{comparison['permutations']:,} random"
+    swaps = "all" if comparison.exact_p_values else f"{PERMUTATIONS:,} random"
     return Table(
         title=(
-            f"{len(comparison['frames']):,} shared frames; gains in per cent of the error of"
-            f" {first['name']}, positive is better; intervals (95 %) and p-values, from {swaps}"
+            f"{len(comparison.frames):,} shared frames; gains in per cent of the error of"
+            f" {first.name}, positive is better; intervals (95 %) and p-values, from {swaps}"
             f" swaps, {_tested(comparison)}"
         ),
         columns=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
@@ -109,42 +118,38 @@ def comparison_table(comparison: Mapping[str, Any]) -> Table:
     )
 
 
-def methods_table(comparison: Mapping[str, Any]) -> Table:
+def methods_table(comparison: Comparison) -> Table:
     """Returns a row for each run and a column for each measure, the best of a column in bold.
 
     Stars mark where a run differs from the first significantly.
     """
-    runs, measures = comparison["runs"], _measures(comparison)
-    rows: list[list[str]] = [[run["name"]] for run in runs]
+    runs, measures = comparison.runs, comparison.measures
+    rows: list[list[str]] = [[run.name] for run in runs]
     for measure in measures:
-        means = [run["mean"][measure.key] for run in runs]
+        key = measure.key
         pick = max if measure.better == "higher" else min
-        best = measure.text(pick((m for m in means if m is not None), default=None))
-        p_values = [1.0, *(gains[measure.key]["p_adjusted"] for gains in comparison["gains"])]
-        for row, mean, p in zip(rows, means, p_values, strict=True):
+        known = [mean for run in runs if (mean := run.mean[key]) is not None]
+        best = measure.text(pick(known, default=None))
+        for row, run in zip(rows, runs, strict=True):
+            text, p = measure.text(run.mean[key]), run.gains[key].p_adjusted if run.gains else None
             stars = "*" * sum(p is not None and p < limit for limit in _STARS)
-            is_best = mean is not None and measure.text(mean) == best and measure.sign != 0
-            row.append(Cell(measure.text(mean) + stars, "bold" if is_best else ""))
+            is_best = run.mean[key] is not None and text == best and measure.sign != 0
+            row.append(Cell(text + stars, "bold" if is_best else ""))
     return Table(
         title=(
-            f"means over {len(comparison['frames']):,} frames, the best in bold; *, **, ***:"
-            f" differs from {runs[0]['name']} with p < 0.05, 0.01, 0.001 {_tested(comparison)}"
+            f"means over {len(comparison.frames):,} frames, the best in bold; *, **, ***:"
+            f" differs from {runs[0].name} with p < 0.05, 0.01, 0.001 {_tested(comparison)}"
         ),
         columns=["", *measures],
         rows=rows,
     )
 
 
-def _measures(comparison: Mapping[str, Any]) -> list[Measure]:
-    return [Measure.from_json(entry) for entry in comparison["measures"]]
-
-
-def _tested(comparison: Mapping[str, Any]) -> str:
-    clusters, runs = comparison["clusters"], len(comparison["gains"])
-    over = f"{clusters['count']:,} {clusters['unit']}"
-    tests = f"{len(comparison['measures'])} measures" + (f" of {runs} runs" if runs > 1 else "")
-    tested = f"over {over}, p adjusted for {tests} (Holm)"
-    return tested + _without_sparse(comparison["scoring"].get("exclude_sparse", False))
+def _tested(comparison: Comparison) -> str:
+    others, measures = len(comparison.runs) - 1, len(comparison.measures)
+    tests = f"{measures} measures" + (f" of {others} runs" if others > 1 else "")
+    tested = f"over {comparison.clusters.describe()}, p adjusted for {tests} (Holm)"
+    return tested + _without_sparse(comparison.scoring.get("exclude_sparse", False))
 
 
 def _without_sparse(excluded: bool) -> str:

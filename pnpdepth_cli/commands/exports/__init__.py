@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import filecmp
 import itertools
-import operator
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,8 +23,8 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import image_of_size, read_image
-from pnpdepth_cli.dataset.frame_camera import Pose
 from pnpdepth_cli.dataset.frame_files import ImageSource, file_of
+from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.dataset.read_options import MODEL_UNITS
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
@@ -209,18 +208,14 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
             f"{result.depth} has no pose in its record; refine it with a COLMAP model, as"
             " `batch --layout colmap` does"
         )
-    try:
-        width, height = map(operator.index, record["size"])
-        sparse = dict(record["inputs"]["sparse"])
-        numbers = float(record["points"]["farthest"]), float(sparse.get("unit_scale") or 1)
-        own = image.name if isinstance(image, Path) else f"{PurePosixPath(result.name).name}.png"
-        name = sparse.get("image") or (PurePosixPath(result.name).parent / own).as_posix()
-        if not all(1e-9 < number < 1e9 for number in numbers) or not _is_fit(name):
-            raise ValueError
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise FileFormatError(
-            f"{result.depth}: the record beside it is damaged; refine it again"
-        ) from error
+    assert record is not None  # it has the camera
+    width, height = record.size or (0, 0)
+    sparse, points = record.inputs.get("sparse"), record.points
+    numbers = (points.farthest if points else 0.0, (sparse and sparse.unit_scale) or 1.0)
+    own = image.name if isinstance(image, Path) else f"{PurePosixPath(result.name).name}.png"
+    name = (sparse and sparse.image) or (PurePosixPath(result.name).parent / own).as_posix()
+    if not all(1e-9 < number < 1e9 for number in numbers) or not _is_fit(name):
+        raise FileFormatError(f"{result.depth}: the record beside it is damaged; refine it again")
     if isinstance(image, Path) and (height, width) not in sizes_of(image):
         raise SizeError(
             f"{result.depth} is not of the size of {image}; refine the whole image"
@@ -238,9 +233,9 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     )
 
 
-def _is_fit(name: Any) -> bool:
+def _is_fit(name: str) -> bool:
     """Whether a name of a record is fit for a file: relative, inside, printable, not long."""
-    path = PurePosixPath(name)  # TypeError if it is no text
+    path = PurePosixPath(name)
     inside = path.parts and not path.is_absolute() and ".." not in path.parts
     long = len(name.encode("utf-8", "surrogateescape")) > _LONGEST_NAME
     return bool(inside) and name.isprintable() and "\\" not in name and not long

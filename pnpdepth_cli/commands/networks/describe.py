@@ -43,7 +43,7 @@ def _listed(definition: ModelDefinition, family: str) -> dict[str, Any]:
     # On the meta device counting needs no memory.
     with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
-    defaults, path = definition.defaults.complete(), definition.checkpoint
+    defaults, path = definition.defaults.closed(), definition.checkpoint
     return {
         "name": definition.name,
         "family": family,

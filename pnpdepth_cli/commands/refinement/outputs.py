@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.output_files import Outputs
-from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.file_record import FigureRecord
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.colours import depth_scale
 from pnpdepth_cli.io.depth import metres, write_depth
-from pnpdepth_cli.io.figure import Content
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
 from pnpdepth_cli.io.record import write_json
 from pnpdepth_cli.io.visualisation import (
@@ -91,14 +92,17 @@ def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:
 
 def write_outputs(
     outputs: Outputs, inputs: Frame, frame: Refined, made_by: tuple[str, str]
-) -> dict[str, Any]:
-    """Writes the depth and its images. Returns their entries of the record.
+) -> tuple[float | None, dict[str, FigureRecord]]:
+    """Writes the depth and its images.
 
     Args:
         outputs: The files by kind.
         inputs: The frame as it was read.
         frame: The refined frame.
         made_by: What the depth before and the depth after are of, for the preview.
+
+    Returns:
+        The fraction of pixels or points whose error fell, where that was drawn, and the figures.
     """
     image = replace(inputs, register=frame.registration).registered().image
     make_folder(outputs["depth"].parent)
@@ -109,9 +113,9 @@ def write_outputs(
         sigma_preview(frame.sigma, outputs["sigma_preview"], inputs.unit)
     if frame.valid is not None and "valid" in outputs:
         write_mask(outputs["valid"], frame.valid)
-    record: dict[str, Any] = {"improved_fraction": None, "figures": {}}
+    improved, figures = None, {}
     if "preview" in outputs:
-        record["figures"]["preview"] = preview(
+        figures["preview"] = preview(
             image,
             inputs.own.xy.numpy(),
             inputs.own.depth.numpy(),
@@ -122,14 +126,12 @@ def write_outputs(
             made_by,
         )
     if "improvement" in outputs:
-        record["improved_fraction"], record["figures"]["improvement"] = _write_improvement(
+        improved, figures["improvement"] = _write_improvement(
             outputs["improvement"], image, inputs, frame
         )
     if "view" in outputs:
         _write_view(outputs["view"], image, inputs, frame)
-    kinds = ("depth", "sigma", "valid", "preview", "improvement", "view")
-    record["outputs"] = {kind: str(outputs[kind]) if kind in outputs else None for kind in kinds}
-    return record
+    return improved, figures
 
 
 def _write_sigma(path: Path, sigma: Image) -> None:
@@ -144,7 +146,7 @@ def _write_sigma(path: Path, sigma: Image) -> None:
 
 def _write_improvement(
     path: Path, image: Image | None, inputs: Frame, frame: Refined
-) -> tuple[float, Content]:
+) -> tuple[float, FigureRecord]:
     if inputs.gt is not None:
         return improvement(frame.before, frame.after, inputs.gt, path, rgb=image)
     points = frame.held_out if len(frame.held_out) else frame.used

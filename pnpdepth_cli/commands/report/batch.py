@@ -8,26 +8,24 @@ where their panels are. So a report also has the frames of earlier runs.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.summary import BatchSummary
 from pnpdepth_cli.commands.error_tables import (
-    BASES,
-    GT,
-    USED,
-    VALIDATION,
     baselines_table,
-    errors_by_basis,
+    bases_of,
+    has_baselines,
     mean_weights_text,
     means_table,
     weights_text,
 )
-from pnpdepth_cli.errors import InputError, OutputError
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
+from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.colours import hex_colours, signed_bar
-from pnpdepth_cli.io.record import read_json
 from pnpdepth_cli.io.report import (
     IMAGES,
     Head,
@@ -38,8 +36,7 @@ from pnpdepth_cli.io.report import (
     write_report,
 )
 from pnpdepth_cli.measures import MEASURES, Measure
-
-Row = Mapping[str, Any]
+from pnpdepth_cli.stages import AFTER, BASES, BEFORE, GT, USED, VALIDATION
 
 _PANELS = {
     "Depth before": "first",
@@ -89,31 +86,30 @@ def check_batch_report(request: BatchRequest, folder: Path, files: Iterable[Path
 def write_batch_report(
     request: BatchRequest,
     folder: Path,
-    summary: Mapping[str, Any],
-    rows: Callable[[], Iterable[Row]],
+    summary: BatchSummary,
+    records: Callable[[], Iterable[FrameRecord]],
 ) -> None:
     """Writes the page, and links the images of all frames.
 
     Args:
         request: Of the batch.
         folder: Of the report.
-        summary: The batch's summary without its frames.
-        rows: Gives the summary's rows, each time anew.
+        summary: The batch's summary.
+        records: Gives the records of the frames, each time anew.
     """
     failed, first = [], None
-    for row in rows():
-        if not row["outputs"]:
-            failed.append((row["name"], row["message"]))
+    for record in records():
+        if not record.outputs:
+            failed.append((record.name, record.message or ""))
         elif first is None:
-            first = row
-    means = summary["mean"] | {"linear": summary["linear"]}
-    basis = next(iter(errors_by_basis(means)), USED)
+            first = record
+    basis = next(iter(bases_of(summary.errors)), USED)
     head = _head(summary, basis, first, failed)
 
     def entries(images: Path) -> Iterator[dict[str, Any]]:
-        for row in rows():
-            if row["outputs"]:
-                yield _entry(row, basis, head.columns) | _views(row, request, images)
+        for record in records():
+            if record.outputs:
+                yield _entry(record, basis, head.columns) | _views(record, request, images)
 
     write_report(folder, _source(request, folder), head, entries, viewer=request.html_3d)
 
@@ -124,52 +120,46 @@ def _source(request: BatchRequest, folder: Path) -> dict[str, Any]:
     return {"command": "batch", "output": output}
 
 
-def _entry(row: Row, basis: str, columns: Sequence[Measure]) -> dict[str, Any]:
+def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[str, Any]:
     """A frame's values on the basis of all frames; where it has none, what it has instead."""
-    errors = errors_by_basis(row)
-    values = _values(row, errors[basis]) if basis in errors else {}
-    own = basis if basis in errors else next(iter(errors), "")
+    own = basis if basis in record.errors else next(iter(bases_of(record.errors)), "")
+    values = _values(record, record.errors[basis]) if own == basis else {}
     tag = BASES[own] if own not in ("", basis) else ""
     return {
-        "name": row["name"],
+        "name": record.name,
         "values": [values.get(measure.key) for measure in columns],
-        "notes": _notes(row, own),
-        "tag": "diverged" if row["status"] == "diverged" else tag,
+        "notes": _notes(record, own),
+        "tag": "diverged" if record.status == "diverged" else tag,
     }
 
 
-def _views(row: Row, request: BatchRequest, images: Path) -> dict[str, Any]:
-    """Links the images of the row's frame; returns the page's entry of them.
+def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str, Any]:
+    """Links the images of the record's frame; returns the page's entry of them.
 
     There are none of a result whose images were deleted.
     """
-    files = {kind: request.output / path for kind, path in row["outputs"].items()}
-    key, views = image_key(row["name"]), dict[str, Any]()
-    if not all(kind in files and files[kind].exists() for kind in ("preview", "improvement")):
-        return {"key": None}
-    try:
-        figures = read_json(files["record"])["figures"]
-    except (KeyError, InputError):
+    files = {kind: request.output / path for kind, path in record.outputs.items()}
+    key, views, figures = image_key(record.name), dict[str, Any](), record.figures
+    shown = ("preview", "improvement")
+    if not all(kind in figures and kind in files and files[kind].exists() for kind in shown):
         return {"key": None}
     for kind, figure in figures.items():
         name = f"{key}_{kind}.png"
         link_image(files[kind], images / name)
-        for title, box in figure["panels"].items():
+        for title, box in figure.panels.items():
             if title in _PANELS:
-                views[_PANELS[title]] = {
-                    "src": f"{IMAGES}/{name}",
-                    "box": box,
-                    "size": figure["size"],
-                }
+                src = f"{IMAGES}/{name}"
+                views[_PANELS[title]] = {"src": src, "box": box, "size": figure.size}
     view_mb = None
     if request.html_3d and "view" in files:
         view_mb = save_view_3d(files["view"], images / f"{key}_view.js")
+    gains = figures["improvement"]
     return {
         "key": key,
         "views": views,
         "view_mb": view_mb,
-        "scale_m": figures["preview"]["scale_m"],
-        "map": {name: figures["improvement"][name] for name in ("ends", "unknown", "footer")},
+        "scale_m": figures["preview"].scale_m,
+        "map": {"ends": gains.ends, "unknown": gains.unknown, "footer": gains.footer},
     }
 
 
@@ -195,43 +185,44 @@ def _columns(basis: str, unit: str) -> list[Measure]:
     return columns
 
 
-def _values(row: Row, errors: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
-    values: dict[str, float | None] = {"improved": row.get("improved_fraction")}
+def _values(record: FrameRecord, stages: dict[str, Scores]) -> dict[str, float | None]:
+    values: dict[str, float | None] = {"improved": record.improved_fraction}
     for key in ("rmse", "mae"):
-        before, after = (errors[stage].get(key) for stage in ("before", "after"))
+        before, after = (stages[stage].get(key) for stage in (BEFORE, AFTER))
         change = after / before - 1 if before and after is not None else None
         values |= {f"{key}_before": before, f"{key}_after": after, f"{key}{_CHANGE}": change}
     return values
 
 
-def _notes(row: Row, basis: str) -> list[str]:
-    notes = [row["message"]] if row["message"] else []
+def _notes(record: FrameRecord, basis: str) -> list[str]:
+    notes = [record.message] if record.message else []
     if basis:
-        after = errors_by_basis(row)[basis]["after"]
+        after = record.errors[basis][AFTER]
         count = f"{after['pixels']:,} pixels" if basis == GT else f"{after['points']:,} points"
         notes.append(f"Errors are {BASES[basis]}, {count}.")
     if basis == USED:
         notes.append("Refinement fits these points, so the change there proves nothing.")
-    if row["weights"]:
-        notes.append(f"Weights: {weights_text(row['weights'])}.")
-    return [*notes, *row["warnings"]]
+    if record.weights:
+        notes.append(f"Weights: {weights_text(record.weights)}.")
+    return [*notes, *record.warnings]
 
 
 def _head(
-    summary: Mapping[str, Any], basis: str, first: Row | None, failed: list[tuple[str, str]]
+    summary: BatchSummary, basis: str, first: FrameRecord | None, failed: list[tuple[str, str]]
 ) -> Head:
-    unit, unmatched, notes = summary["unit"], len(summary["unmatched"]), [*summary["notes"]]
+    unit, unmatched, notes = summary.unit, len(summary.unmatched), [*summary.notes]
     if unmatched:
         notes.append(f"warning: {unmatched:,} files are in no frame; summary.json has them")
     if first is not None and basis == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
     columns = _columns(basis, unit)
-    tables = [means_table(summary)] if first is not None else []
-    if summary.get("baselines"):
-        tables.append(baselines_table(summary["baselines"], unit))
+    errors = summary.errors
+    tables = [means_table(errors, unit, summary.columns)] if first is not None else []
+    if has_baselines(errors):
+        tables.append(baselines_table(errors, unit))
     return Head(
         kind="Batch refinement",
-        title=summary["output"],
+        title=summary.output,
         facts=_facts(summary, first),
         notes=notes,
         tables=tables,
@@ -247,23 +238,23 @@ def _head(
     )
 
 
-def _facts(summary: Mapping[str, Any], first: Row | None) -> list[tuple[str, str]]:
+def _facts(summary: BatchSummary, first: FrameRecord | None) -> list[tuple[str, str]]:
     """What was refined, and how: the settings that decide the results, by their options."""
-    counts, method = summary["counts"], "the default method"
-    settings = dict(summary["settings"])
-    if summary["method"]["kind"] != "default":
+    counts, method = summary.counts, "the default method"
+    settings = dict(summary.settings)
+    if summary.fixed_by:
         method = "the method of these settings"
-        settings |= {} if first is None else first["settings"]
+        settings |= {} if first is None else first.settings
     frames = [
         f"{counts[kind]:,} {kind.replace('_', ' ')}"
         for kind in ("done", "diverged", "failed", "pending", "with_warnings")
         if counts[kind]
     ]
-    weights = summary["weights"] or {}
+    weights = summary.weights
     return [
-        ("frames of", f"{summary['source']} (layout {summary['layout']})"),
+        ("frames of", f"{summary.source} (layout {summary.layout})"),
         ("frames", ", ".join(frames)),
-        ("results in", summary["output"]),
+        ("results in", summary.output),
         ("refined by", method),
         *([("mean weights", mean_weights_text(weights))] if weights else []),
         *((name, str(settings[name])) for name in _SETTINGS if settings.get(name)),

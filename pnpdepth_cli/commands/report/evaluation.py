@@ -11,9 +11,11 @@ import numpy as np
 
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
 from pnpdepth_cli.commands.evaluation.frames import image_of, load_frame
-from pnpdepth_cli.commands.evaluation.scoring import FrameScores, filled
+from pnpdepth_cli.commands.evaluation.pairing import FramePair
+from pnpdepth_cli.commands.evaluation.scoring import filled, scores_of
 from pnpdepth_cli.commands.evaluation.tables import means_table
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
@@ -51,10 +53,11 @@ def write_eval_report(
         OutputError: If the report cannot be written; then the folder is as it was before.
     """
     columns = _columns(evaluation, keys)
-    scored = evaluation.scored
+    frames = zip(evaluation.pairs, evaluation.frames, strict=True)
+    scored = [(pair, frame) for pair, frame in frames if frame.status == "done"]
 
     def entries(images: Path) -> Iterator[dict[str, Any]]:
-        drawn = in_order(lambda frame: _entry(frame, evaluation, columns, images), scored, THREADS)
+        drawn = in_order(lambda each: _entry(*each, evaluation, columns, images), scored, THREADS)
         for done, entry in enumerate(drawn, start=1):
             yield entry
             on_frame(done, len(scored))
@@ -70,7 +73,8 @@ def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[Measure
 
 def _head(evaluation: Evaluation, keys: Sequence[str] | None, columns: list[Measure]) -> Head:
     request = evaluation.request
-    without = [(frame.name, frame.error or "") for frame in evaluation.frames if not frame.scored]
+    frames = evaluation.frames
+    without = [(frame.name, frame.message or "") for frame in frames if frame.status != "done"]
     fill = " (filled in)" if request.is_devkit else ""
     return Head(
         kind="Depth evaluation",
@@ -95,30 +99,34 @@ def _head(evaluation: Evaluation, keys: Sequence[str] | None, columns: list[Meas
 
 
 def _entry(
-    frame: FrameScores, evaluation: Evaluation, columns: list[Measure], images: Path
+    pair: FramePair,
+    frame: FrameRecord,
+    evaluation: Evaluation,
+    columns: list[Measure],
+    images: Path,
 ) -> dict[str, Any]:
-    values = frame.values | {"coverage": frame.coverage}
-    notes = [f"Scored: {frame.pixels:,} of {frame.known:,} pixels of the ground truth."]
-    if frame.given:
-        notes.append(f"{frame.given:,} of them were given to the network as sparse depth.")
-    notes += [f"Prediction: {frame.pair.prediction}", f"Ground truth: {frame.pair.frame.gt}"]
+    scores = scores_of(frame)
+    pixels, known, given = (scores.get(count) for count in ("pixels", "known", "given"))
+    notes = [f"Scored: {pixels:,} of {known:,} pixels of the ground truth."]
+    if given:
+        notes.append(f"{given:,} of them were given to the network as sparse depth.")
+    notes += [f"Prediction: {pair.prediction}", f"Ground truth: {pair.frame.gt}"]
     try:
-        drawn = _drawn(frame, evaluation, images)
+        drawn = _drawn(pair, evaluation, images)
     except InputError as error:  # the file has changed since it was scored
         notes.append(str(error))
         drawn = {"key": None}
     return {
         "name": frame.name,
-        "values": [values.get(measure.key) for measure in columns],
+        "values": [scores.get(measure.key) for measure in columns],
         "notes": notes,
         "tag": "",
         **drawn,
     }
 
 
-def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str, Any]:
+def _drawn(pair: FramePair, evaluation: Evaluation, images: Path) -> dict[str, Any]:
     """Writes the images of a frame and returns the page's entry of them."""
-    pair = frame.pair
     loaded = load_frame(pair, evaluation.request)
     gt, depth = loaded.gt, loaded.depth
     if evaluation.request.is_devkit:
@@ -132,7 +140,7 @@ def _drawn(frame: FrameScores, evaluation: Evaluation, images: Path) -> dict[str
     views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors}
     if image is not None:
         views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
-    key = image_key(frame.name)
+    key = image_key(pair.name)
     amount = f"by {strongest_m:.3g} m or more"
     return {
         "key": key,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import check_size, read_scan_points
 from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import describe_range, read_depth
@@ -76,7 +77,7 @@ class SparseTarget:
         points: Points,
         settings: dict[str, Any],
         *,
-        inputs: dict[str, Any],
+        inputs: Mapping[str, Path | FileRecord | None],
         notes: Sequence[str],
         rgb: NDArray[np.float32] | None = None,
     ) -> dict[str, Any]:
@@ -98,13 +99,7 @@ class SparseTarget:
             overlay(rgb, points.xy, points.depth, self.overlay)
         record = {
             **provenance,
-            "inputs": {
-                name: {"path": str(part), "sha256": sha256_of(part)}
-                if isinstance(part, Path)
-                else part
-                for name, part in inputs.items()
-                if part is not None
-            },
+            "inputs": {name: _record(part).to_json() for name, part in inputs.items() if part},
             "points": {
                 "count": len(points),
                 "fraction_of_pixels": len(points) / image.size,
@@ -122,6 +117,12 @@ class SparseTarget:
         }
         write_json(self.record, record)
         return record
+
+
+def _record(part: Path | FileRecord) -> FileRecord:
+    if isinstance(part, FileRecord):
+        return part
+    return FileRecord(path=str(part), sha256=sha256_of(part))
 
 
 def project_scan(
@@ -146,7 +147,8 @@ def project_scan(
     size = (rgb.shape[0], rgb.shape[1])
     projected = read_scan_points(scan, options, size, image, scale=scale)
     settings = plain(asdict(options))
-    inputs, notes = {"image": image, "scan": projected.record}, projected.notes
+    inputs: dict[str, Path | FileRecord | None] = {"image": image, "scan": projected.record}
+    notes = projected.notes
     return target.write("project", projected.points, settings, inputs=inputs, notes=notes, rgb=rgb)
 
 
@@ -218,8 +220,8 @@ def simulate_scan(
         "translation": scanner.translation.tolist(),
         "seed": seed,
     }
-    read_as = {"path": str(calib), "read_as": calibration.camera.source}
-    inputs = {"depth": depth, "calibration": read_as}
+    read_as = FileRecord(path=str(calib), read_as=calibration.camera.source)
+    inputs: dict[str, Path | FileRecord | None] = {"depth": depth, "calibration": read_as}
     return target.write("simulate", points, settings, inputs=inputs, notes=notes)
 
 

@@ -6,6 +6,7 @@ import os
 import shutil
 import threading
 import weakref
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +16,20 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.cli.tables import print_batch
 from pnpdepth_cli.commands.batch import running as batch_running
 from pnpdepth_cli.commands.batch.batch import run_batch
 from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.batch.summary import _SCORES, Tally, failed_row
+from pnpdepth_cli.commands.batch.summary import Tally
 from pnpdepth_cli.commands.refinement.refine import read_requested
 from pnpdepth_cli.commands.report.batch import write_batch_report
 from pnpdepth_cli.commands.results import result_frames
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.frames.refiner import Refiner
+from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.measures import MEASURES
+from pnpdepth_cli.io.record import plain
 from pnpdepth_cli.sensors import SamplePattern
 from tests.commands.batches import (
     NAMES,
@@ -133,17 +136,17 @@ def test_a_bad_frame_is_reported_counted_skipped_and_done_when_it_is_mended(root
     good = (root / "rgb/b.png").read_bytes()
     (root / "rgb/b.png").write_bytes(good[:200])
     listener = RecordingListener()
-    counts = batch(root, listener).summary["counts"]
+    counts = batch(root, listener).summary.counts
     assert (counts["done"], counts["failed"], counts["pending"]) == (3, 1, 0)
-    assert [row["status"] for row in listener.rows] == ["done", "failed", "done", "done"]
-    assert "b.png: PNG is cut short" in listener.rows[1]["message"]
+    assert [record.status for record in listener.records] == ["done", "failed", "done", "done"]
+    assert "b.png: PNG is cut short" in (listener.records[1].message or "")
     assert not list((root / "out").glob("b*_*"))
     (root / "rgb/b.png").write_bytes(good)
     assert done(root) == ["b"]
     assert summary(root)["counts"]["failed"] == 0
     for bad, name in enumerate(NAMES, start=1):  # the first one, and even all
         (root / f"sparse/{name}.png").write_bytes(b"no depth")
-        counts = batch(root, refine={"iterations": 0}).summary["counts"]
+        counts = batch(root, refine={"iterations": 0}).summary.counts
         assert (counts["done"], counts["failed"]) == (4 - bad, bad)
 
 
@@ -154,7 +157,7 @@ def test_a_divergence_keeps_the_last_good_depth_and_is_counted(root: Path) -> No
     assert formula in text
     exponential = "torch.exp(self.decode(self.middle(self.encode(rgb))))"
     model.write_text(text.replace(formula, exponential))
-    assert batch(root, refine={"lr": "1e4"}).summary["counts"]["diverged"] == 4
+    assert batch(root, refine={"lr": "1e4"}).summary.counts["diverged"] == 4
     assert (read_depth(root / "out/a_depth.png").values > 0).all()
     assert done(root, refine={"lr": "1e4"}) == []
 
@@ -167,7 +170,7 @@ def test_a_network_that_fails_on_one_frame_only_fails_there(root: Path) -> None:
     check = "        assert rgb.shape[2] < rgb.shape[3]\n        return"
     model.write_text(model.read_text().replace("        return", check, 1))
     for _ in range(2):  # the second run has nothing but this frame to do
-        counts = batch(root, refine={"depth_scale": 1000}).summary["counts"]
+        counts = batch(root, refine={"depth_scale": 1000}).summary.counts
         assert (counts["done"], counts["failed"]) == (4, 1)
 
 
@@ -179,7 +182,7 @@ def test_any_name_that_a_file_can_have_will_do(tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive", tuple(names))
     listener = RecordingListener()
     batch(root, listener)
-    assert {row["status"] for row in listener.rows} == {"done"}
+    assert {record.status for record in listener.records} == {"done"}
     written = {
         os.fspath(path.relative_to(root / "out")) for path in root.glob("out/**/*_depth.png")
     }
@@ -266,13 +269,13 @@ def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
         refine=refinement(root, uncertainty=True, iterations=0),
     )
     listener = RecordingListener()
-    counts = run_batch(request, listener).summary["counts"]
+    counts = run_batch(request, listener).summary.counts
     assert listener.names == ["ok", "fin\u00e9"]
     assert sum(f"{why}; rename it" in line for line in listener.messages) == 1
     assert (counts["frames"], counts["done"], counts["failed"], counts["pending"]) == (3, 2, 1, 0)
-    assert [row["status"] for row in listener.rows] == ["done", "done"]
+    assert [record.status for record in listener.records] == ["done", "done"]
     assert not (root / "up_depth.png").exists()
-    assert why in {row["name"]: row["message"] for row in summary(root)["frames"]}[name]
+    assert why in {row["name"]: row.get("message") for row in summary(root)["frames"]}[name]
 
 
 def test_a_folder_cannot_lie_where_the_results_of_a_later_frame_go(root: Path) -> None:
@@ -289,7 +292,7 @@ def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: P
     counts = summary(root)["counts"]
     assert (counts["done"], counts["failed"], counts["pending"]) == (3, 1, 0)
     outcome = batch(root, limit=3, shard=(2, 2), output=root / "few")
-    assert outcome.summary["counts"]["pending"] == 3
+    assert outcome.summary.counts["pending"] == 3
     assert [path.name for path in (root / "few").glob("*_depth.png")] == ["b_depth.png"]
 
 
@@ -298,52 +301,48 @@ def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path
     outcome = batch(root, refine={"holdout": 0.2, "baselines": True})
     content = summary(root)
     rows = content.pop("frames")
-    assert content == json.loads(json.dumps(outcome.summary))
+    assert content == plain(asdict(outcome.summary))
     assert [row["name"] for row in rows] == list(NAMES)
-    for kind in ("sparse_error", "held_out_error", "scores"):
-        assert content["mean"][kind]["frames"] == 4
-        for stage in ("before", "after"):
-            for measure, mean in content["mean"][kind][stage].items():
-                values = [row[kind][stage][measure] for row in rows]
+    assert content["errors"].keys() == {"ground_truth", "held_out", "validation", "used"}
+    for basis, stages in content["errors"].items():
+        assert {"before", "after"} <= stages.keys()
+        assert basis not in ("ground_truth", "validation") or set(BASELINES) <= stages.keys()
+        for stage, means in stages.items():
+            assert means.pop("frames") == 4
+            for measure, mean in means.items():
+                values = [row["errors"][basis][stage][measure] for row in rows]
                 assert mean == pytest.approx(np.mean(values), rel=1e-12)
-    baseline = content["baselines"]["linear"]
-    of_rows = [row["baselines"]["linear"] for row in rows]
-    assert baseline["frames"] == 4
-    assert baseline["mae"] == pytest.approx(np.mean([each["scores"]["mae"] for each in of_rows]))
-    validated = [each["validation_mae"] for each in of_rows]
-    assert baseline["validation_mae"] == pytest.approx(np.mean(validated))
-    row = rows[1]
-    assert row["scores"] == json.loads((root / "out/b.json").read_text())["scores"]
+    errors = rows[1]["errors"]
+    assert errors == json.loads((root / "out/b.json").read_text())["errors"]
     with (root / "out/summary.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     assert [line["name"] for line in table] == list(NAMES)
-    assert float(table[1]["rmse_after"]) == row["scores"]["after"]["rmse"]
-    assert float(table[1]["held_out_error_mae_before"]) == row["held_out_error"]["before"]["mae"]
-    assert [float(line["baseline_linear_validation_mae"]) for line in table] == validated
-    assert set(_SCORES) == {*(measure.key for measure in MEASURES), "coverage"}
+    assert float(table[1]["rmse_after"]) == errors["ground_truth"]["after"]["rmse"]
+    assert float(table[1]["held_out_mae_before"]) == errors["held_out"]["before"]["mae"]
+    assert float(table[1]["validation_mae_linear"]) == errors["validation"]["linear"]["mae"]
 
 
 def test_the_summary_has_the_mean_and_the_range_of_each_weight() -> None:
     tally = Tally()
     for weight in (0.1, 0.4, 0.1):
-        tally.add(failed_row("frame", {}, "") | {"weights": {"net": weight, "other": 1 - weight}})
-    weights = tally.means()["weights"]
+        tally.add(FrameRecord(weights={"net": weight, "other": 1 - weight}))
+    weights = tally.weights
     assert weights["net"] == {"mean": pytest.approx(0.2), "least": 0.1, "largest": 0.4}
     assert list(weights) == ["net", "other"]
 
 
 def test_the_summary_says_that_frames_of_one_sequence_are_not_independent_as_compare_does() -> None:
-    scores = {"before": {}, "after": {"rmse": 1.0, "mae": 1.0, "mre": 0.1, "delta1": 0.9}}
+    after: Scores = {"rmse": 1.0, "mae": 1.0, "mre": 0.1, "delta1": 0.9}
+    errors: dict[str, dict[str, Scores]] = {"ground_truth": {"before": {}, "after": after}}
     tally = Tally()
     for number in range(6):
-        name = f"{'ab'[number % 2]}/{number:04}"
-        tally.add(failed_row(name, {}, "") | {"scores": scores})
+        tally.add(FrameRecord(name=f"{'ab'[number % 2]}/{number:04}", errors=errors))
     (note,) = tally.notes()
     assert note == (
         "frames of one sequence are not independent: 6 frames count as 2 groups of frames"
     )
     alone = Tally()
-    alone.add(failed_row("a/0000", {}, "") | {"scores": scores})
+    alone.add(FrameRecord(name="a/0000", errors=errors))
     assert alone.notes() == []
 
 
@@ -356,23 +355,21 @@ def test_columns_choose_the_measures_of_the_tables_of_a_batch(
     assert "RMSE" not in text
     header = (root / "out/summary.csv").read_text().splitlines()[0].split(",")
     assert [name for name in header if name.endswith("_after")] == [
-        *("sparse_error_mae_after", "held_out_error_mae_after"),
-        *("delta1_after", "mae_after", "coverage_after"),
+        *("delta1_after", "mae_after", "coverage_after", "used_mae_after"),
     ]
     with pytest.raises(UsageError, match="--columns"):
         batch(root, columns=("mse",))
 
 
-def test_a_record_that_lacks_what_the_summary_needs_is_an_error_that_names_it(root: Path) -> None:
+def test_a_record_that_lacks_what_the_summary_needs_is_written_again(root: Path) -> None:
     batch(root)
     path = root / "out/c.json"
-    record = json.loads(path.read_text())
-    lacking = {key: value for key, value in record.items() if key != "scores"}
-    half = record | {"scores": {"before": record["scores"]["before"]}}
-    for damaged in (lacking, half, *(record | {key: 0.5} for key in ("seconds", "points"))):
-        path.write_text(json.dumps(damaged))
-        with pytest.raises(InputError, match=r"c\.json is damaged; remove it, and run again"):
-            batch(root)
+    whole = json.loads(path.read_text())
+    half = {"ground_truth": {"before": whole["errors"]["ground_truth"]["before"]}}
+    for damaged in ({"errors": half}, {"seconds": 0.5}, {"points": 0.5}):
+        path.write_text(json.dumps(whole | damaged))
+        assert done(root) == ["c"]
+        assert json.loads(path.read_text())["errors"] == whole["errors"]
 
 
 def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left(
@@ -384,7 +381,7 @@ def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left
     (root / "out" / "deep").mkdir()
     for folder in ("out", "out/deep"):
         (root / folder / ".0123456789ab").write_bytes(b"half")
-    assert outcome.summary["counts"]["pending"] == 2
+    assert outcome.summary.counts["pending"] == 2
     listener = RecordingListener()
     batch(root, listener)
     assert listener.names == ["c", "d"]
@@ -403,9 +400,9 @@ def test_frames_without_sparse_depth_need_to_be_sampled(root: Path, tmp_path: Pa
         batch(kitchen)
     batch(kitchen, refine={"sample": SamplePattern(kind="uniform", count=50)})
     record = json.loads((kitchen / "out/frame-a.json").read_text())
-    assert record["points"]["used"] == record["inputs"]["sparse"]["count"] == 50
+    assert record["points"]["used"] == record["inputs"]["sparse"]["sampled"]["count"] == 50
     outcome = batch(kitchen, refine={"sample": SamplePattern(kind="uniform", count=10**6)})
-    assert outcome.summary["counts"]["failed"] == 4
+    assert outcome.summary.counts["failed"] == 4
 
 
 def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
@@ -464,7 +461,7 @@ def test_reading_and_writing_go_on_while_the_network_runs(
     read: set[str] = set()
     second_is_read, second_is_refined = threading.Event(), threading.Event()
     refined = 0
-    refine, write = Refiner.refine_frame, batch_running.write_refined
+    refine, write = Method.refine, batch_running.write_refined
 
     def reading(request: Any) -> Any:
         read.add(str(request.files.image))
@@ -472,7 +469,7 @@ def test_reading_and_writing_go_on_while_the_network_runs(
             second_is_read.set()
         return read_requested(request)
 
-    def refining(self: Refiner, inputs: Any) -> Any:
+    def refining(self: Method, inputs: Any) -> Any:
         nonlocal refined
         assert threading.current_thread() is threading.main_thread()
         assert second_is_read.wait(60), "the second frame is not read while the first is refined"
@@ -487,9 +484,9 @@ def test_reading_and_writing_go_on_while_the_network_runs(
 
     monkeypatch.setattr(batch_running, "read_requested", reading)
     monkeypatch.setattr(batch_running, "write_refined", writing)
-    monkeypatch.setattr(Refiner, "refine_frame", refining)
+    monkeypatch.setattr(Method, "refine", refining)
     monkeypatch.setattr(batch_running, "THREADS", 1)
-    assert batch(root).summary["counts"]["done"] == 4
+    assert batch(root).summary.counts["done"] == 4
 
 
 def test_a_plain_prediction_without_scores_ends_no_batch(
@@ -499,18 +496,20 @@ def test_a_plain_prediction_without_scores_ends_no_batch(
     print_batch(outcome.summary)
     assert "against every simple baseline" in capsys.readouterr().err
     assert "against every simple baseline" in (tmp_path / "report/index.html").read_text()
-    content, tally = summary(root), Tally()
-    for row in content["frames"]:
+    records = [FrameRecord.read(root / f"out/{name}.json") for name in NAMES[:2]]
+    tally = Tally()
+    for record in records:
         # what a record holds where no pixel of the plain prediction can be scored
-        row["scores"]["before"] |= dict.fromkeys(_SCORES) | {"pixels": 0}
-        tally.add(row)
-    means = tally.means()
-    assert means["mean"]["scores"]["before"]["rmse"] is None
-    assert means["mean"]["scores"]["after"]["rmse"] > 0
-    print_batch(content | means)
+        before = record.errors["ground_truth"]["before"]
+        before |= dict.fromkeys(before) | {"pixels": 0}
+        tally.add(record)
+    means = replace(outcome.summary, errors=tally.errors())
+    assert means.errors["ground_truth"]["before"]["rmse"] is None
+    assert (means.errors["ground_truth"]["after"]["rmse"] or 0) > 0
+    print_batch(means)
     assert "–" in capsys.readouterr().err
     request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
-    write_batch_report(request, tmp_path / "report", content | means, lambda: content["frames"])
+    write_batch_report(request, tmp_path / "report", means, lambda: records)
     assert frames_of(tmp_path / "report")["a"]["values"]["rmse_before"] is None
 
 
@@ -522,7 +521,7 @@ def test_an_unsure_guess_of_the_input_range_is_repeated_at_the_end(root: Path) -
         record = json.loads(path.read_text())
         path.write_text(json.dumps(record | {"notes": [*record["notes"], note]}))
     listener = RecordingListener()
-    assert batch(root, listener, limit=2).summary["unsure"] == [note]
+    assert batch(root, listener, limit=2).summary.unsure == [note]
     assert listener.messages[-1] == f"warning: {note}"
 
 
@@ -549,11 +548,10 @@ def test_warnings_are_printed_once_a_kind_with_the_frames(
     tally = Tally()
     for name, count in (("a", 7), ("b", 1200), ("c", 3), ("d", 5)):
         note = f"warning: {count:,} of 9,000 pixels clipped"
-        tally.add(failed_row(name, {}, "") | {"warnings": [note]})
+        tally.add(FrameRecord(name=name, notes=[note]))
     (warned,) = tally.warnings
-    assert (warned["frames"], warned["first"]) == (4, ["a", "b", "c"])
-    batch(root)
-    print_batch(summary(root) | {"warnings": tally.warnings})
+    assert (warned.frames, warned.first) == (4, ["a", "b", "c"])
+    print_batch(replace(batch(root).summary, warnings=tally.warnings))
     assert "warning in 4 frames (a, b, c, …): 7 of 9,000 pixels" in capsys.readouterr().err
 
 

@@ -16,6 +16,7 @@ import pytest
 from pnpdepth_cli.commands.batch import ray_workers
 from pnpdepth_cli.commands.batch.records import remove_all_leftovers
 from pnpdepth_cli.commands.batch.request import ClusterOptions
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import ClusterError
 from tests.commands.batches import RecordingListener, add_frame, batch, pairs_on_disk, results
 
@@ -59,15 +60,15 @@ def root(frames: Path) -> Iterator[Path]:
 
 
 class Doing(RecordingListener):
-    """Does something at a row."""
+    """Does something at a record."""
 
     def __init__(self, number: int, what: Callable[[], Any]) -> None:
         super().__init__()
         self._number, self._what = number, what
 
-    def frame(self, row: dict[str, Any]) -> None:
-        super().frame(row)
-        if len(self.rows) == self._number:
+    def frame(self, record: FrameRecord) -> None:
+        super().frame(record)
+        if len(self.records) == self._number:
             self._what()
 
 
@@ -98,7 +99,7 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
     cluster.wait_for_nodes(timeout=120)  # until the lost one counts as dead
     assert sorted(listener.names) == list(NAMES)
     assert different(root) == []
-    assert outcome.summary["counts"]["done"] == len(NAMES)
+    assert outcome.summary.counts["done"] == len(NAMES)
 
 
 def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
@@ -111,11 +112,12 @@ def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
     model.write_text(model.read_text().replace(start, start + DEADLY))
     listener = RecordingListener()
     batch(root, listener, cluster=ClusterOptions(ray=cluster.address))
-    rows = {row["name"]: row for row in listener.rows}
-    assert len(rows) == len(listener.rows) == 6
-    assert rows["bad"]["status"] == "failed"
-    assert rows["bad"]["message"].startswith("its worker died 3 times")
-    assert {row["status"] for name, row in rows.items() if name != "bad"} == {"done"}
+    records = {record.name: record for record in listener.records}
+    assert len(records) == len(listener.records) == 6
+    bad = records.pop("bad")
+    assert bad.status == "failed"
+    assert (bad.message or "").startswith("its worker died 3 times")
+    assert {record.status for record in records.values()} == {"done"}
 
 
 def test_what_is_wrong_with_a_cluster_is_an_error(
@@ -140,9 +142,9 @@ def test_a_stopped_batch_ends_with_the_frames_that_are_begun(cluster: Any, root:
     outcome = batch(
         root,
         listener,
-        stopped=lambda: bool(listener.rows),
+        stopped=lambda: bool(listener.records),
         cluster=ClusterOptions(ray=cluster.address),
     )
     assert outcome.stopped
-    assert 1 <= len(listener.rows) < len(NAMES)
+    assert 1 <= len(listener.records) < len(NAMES)
     assert {path.stem for path in (root / "out").glob("f*.json")} == set(listener.names)

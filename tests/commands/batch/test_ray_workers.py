@@ -15,13 +15,14 @@ from pnpdepth_cli.commands.batch.ray_workers import (
     check_node,
     connected,
     reason_of,
-    rows_of_actors,
+    refine_on_actors,
     software,
 )
 from pnpdepth_cli.commands.batch.request import LOCAL, ClusterOptions, parse_address, ray_workers_of
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import ClusterError, ModelError, StorageError, UsageError
 
-Refine = Callable[[Sequence[int], bool], list[dict[str, Any]]]
+Refine = Callable[[Sequence[int], bool], list[FrameRecord]]
 
 
 class RayError(Exception):
@@ -64,42 +65,48 @@ def results(
     worked: bool = False,
     starts: Callable[[], None] = lambda: None,
     stopped: Callable[[], bool] = lambda: False,
-) -> tuple[dict[Any, Any], list[str]]:
-    """The row of each frame, which is a number, and the messages."""
+) -> tuple[dict[int, FrameRecord], list[str]]:
+    """The record of each frame, which is a number, and the messages."""
     messages: list[str] = []
     to_do: Any = range(count)
     ready = SimpleNamespace(options=lambda **_: SimpleNamespace(remote=lambda: lambda: starts()))
     refining = SimpleNamespace(remote=lambda *given: lambda: (refine(*given), ["note"]))
-    rows = list(
-        rows_of_actors(
+    records = list(
+        refine_on_actors(
             Calls(), [SimpleNamespace(ready=ready, refine=refining) for _ in range(3)], to_do,
             worked=worked, say=messages.append, stopped=stopped,
-            lost=lambda frame, why: {"name": frame, "status": "failed", "message": why},
+            lost=lambda frame, why: record_of(frame, "failed", why),
         )
     )  # fmt: skip
-    by_frame = {row["name"]: row for row in rows}
-    assert len(rows) == len(by_frame), "a frame was reported twice"
+    by_frame = {int(record.name): record for record in records}
+    assert len(records) == len(by_frame), "a frame was reported twice"
     return by_frame, messages
 
 
-def rows_of(frames: Sequence[int], failed: Sequence[int] = ()) -> list[dict[str, Any]]:
-    return [{"name": f, "status": "failed" if f in failed else "done"} for f in frames]
+def record_of(frame: Any, status: Any = "done", message: str | None = None) -> FrameRecord:
+    return FrameRecord(name=str(frame), status=status, message=message)
+
+
+def records_of(frames: Sequence[int], failed: Sequence[int] = ()) -> list[FrameRecord]:
+    return [record_of(frame, "failed" if frame in failed else "done") for frame in frames]
 
 
 def test_a_frame_that_kills_its_workers_is_lost_and_no_other_and_a_note_is_said_once() -> None:
-    rows, messages = results(lambda frames, _: dies() if 17 in frames else rows_of(frames), 40)
-    assert rows.pop(17)["message"].startswith("its worker died 3 times")
-    assert sorted(rows) == [number for number in range(40) if number != 17]
-    assert {row["status"] for row in rows.values()} == {"done"}
+    records, messages = results(
+        lambda frames, _: dies() if 17 in frames else records_of(frames), 40
+    )
+    assert (records.pop(17).message or "").startswith("its worker died 3 times")
+    assert sorted(records) == [number for number in range(40) if number != 17]
+    assert {record.status for record in records.values()} == {"done"}
     assert sum("Ray starts another one" in text for text in messages) == 4
     assert messages.count("note") == 1
 
 
 def raising(bad: Sequence[int], error: Exception) -> Refine:
-    def refine(frames: Sequence[int], worked: bool) -> list[dict[str, Any]]:
+    def refine(frames: Sequence[int], worked: bool) -> list[FrameRecord]:
         if set(frames) & set(bad) and (not worked or isinstance(error, StorageError)):
             raise error
-        return rows_of(frames, failed=bad)
+        return records_of(frames, failed=bad)
 
     return refine
 
@@ -108,8 +115,9 @@ def test_an_error_of_the_settings_is_of_its_frame_alone_once_others_succeeded() 
     with pytest.raises(ModelError, match="bad"):
         results(raising(range(40), ModelError("bad")), 40)
     for worked, bad in ((False, [4]), (True, range(9))):
-        rows, _ = results(raising(bad, ModelError("bad")), 9, worked=worked)
-        assert [name for name in sorted(rows) if rows[name]["status"] == "failed"] == list(bad)
+        records, _ = results(raising(bad, ModelError("bad")), 9, worked=worked)
+        failed = [number for number in sorted(records) if records[number].status == "failed"]
+        assert failed == list(bad)
     with pytest.raises(StorageError, match="full"):
         results(raising([5], StorageError("full")), 9, worked=True)
 
@@ -117,13 +125,13 @@ def test_an_error_of_the_settings_is_of_its_frame_alone_once_others_succeeded() 
 def test_nothing_is_handed_out_once_stopped() -> None:
     begun: list[int] = []
 
-    def refine(frames: Sequence[int], worked: bool) -> list[dict[str, Any]]:
+    def refine(frames: Sequence[int], worked: bool) -> list[FrameRecord]:
         begun.extend(frames)
-        return rows_of(frames)
+        return records_of(frames)
 
-    rows, _ = results(refine, 1000, stopped=lambda: len(begun) > 3)
-    assert 3 < len(rows) < 1000
-    assert sorted(rows) == sorted(begun)
+    records, _ = results(refine, 1000, stopped=lambda: len(begun) > 3)
+    assert 3 < len(records) < 1000
+    assert sorted(records) == sorted(begun)
 
 
 def test_workers_that_do_not_start_end_the_run() -> None:

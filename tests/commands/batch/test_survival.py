@@ -7,10 +7,10 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io import lock
 from tests.commands.batches import NAMES, RecordingListener, batch, done, pairs_on_disk, results
@@ -51,14 +51,14 @@ def test_a_second_run_on_the_same_folder_is_refused_and_other_shards_are_not(
     inner = RecordingListener()
 
     class Beside(RecordingListener):
-        def frame(self, row: dict[str, Any]) -> None:
-            super().frame(row)
+        def frame(self, record: FrameRecord) -> None:
+            super().frame(record)
             for shard in ((1, 2), None):
                 with pytest.raises(OutputError, match="another batch writes there; wait"):
                     batch(root, shard=shard)
             batch(root, inner, shard=(2, 2))
 
     outer = Beside()
-    counts = batch(root, outer, shard=(1, 2)).summary["counts"]
+    counts = batch(root, outer, shard=(1, 2)).summary.counts
     assert (outer.names, inner.names) == (["a"], ["b"])
     assert counts["done"] == 2

@@ -12,6 +12,7 @@ import pytest
 from pnpdepth_cli.commands.evaluation.compare import compare
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.record import write_json
@@ -26,8 +27,15 @@ def run(root: Path, name: str, errors: dict[str, list[float]], **frames: Any) ->
             write_depth(root / folder / f"{frame}.npy", depth.astype(np.float32))
     request = EvalRequest(prediction=root / name, ground_truth=root / "gt", **frames)
     path = root / f"{name}.json"
-    write_json(path, evaluate(request).as_record())
+    write_json(path, evaluate(request).to_json())
     return str(path)
+
+
+def summary(folder: Path, *records: FrameRecord) -> Path:
+    """The summary of a batch of these frames."""
+    path = folder / "summary.json"
+    write_json(path, {"command": "batch", "frames": [record.to_json() for record in records]})
+    return path
 
 
 FIRST = {"a": [2.0, 2.0], "b": [4.0, 4.0], "c": [1.0, 1.0]}
@@ -36,15 +44,15 @@ BETTER = {"a": [1.0, 1.0], "b": [3.0, 3.0], "c": [0.5, 0.5]}
 
 def test_a_lower_error_is_a_positive_gain(tmp_path: Path) -> None:
     comparison = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
-    gain = comparison["gains"][0]["mae"]
-    assert gain["percent"] == pytest.approx(100 * 2.5 / 7)
-    assert gain["difference"] == pytest.approx(-2.5 / 3)
-    assert gain["p_value"] == 2 / 8  # all three got better: two of the eight swaps differ as much
-    assert gain["low_percent"] is gain["high_percent"] is None  # three frames are too few
-    assert comparison["exact_p_values"]
-    assert [r["name"] for r in comparison["runs"]] == ["one", "two"]
-    assert comparison["runs"][0]["mean"]["mae"] == pytest.approx(7 / 3)
-    (note,) = comparison["notes"]
+    gain = comparison.runs[1].gains["mae"]
+    assert gain.percent == pytest.approx(100 * 2.5 / 7)
+    assert gain.difference == pytest.approx(-2.5 / 3)
+    assert gain.p_value == 2 / 8  # all three got better: two of the eight swaps differ as much
+    assert gain.low_percent is gain.high_percent is None  # three frames are too few
+    assert comparison.exact_p_values
+    assert [run.name for run in comparison.runs] == ["one", "two"]
+    assert comparison.runs[0].mean["mae"] == pytest.approx(7 / 3)
+    (note,) = comparison.notes
     assert note == (
         "warning: 3 frames are too few independent ones to conclude anything from 4 tests: the"
         " smallest possible p is 0.25, adjusted 1; there is no interval below 5"
@@ -54,9 +62,9 @@ def test_a_lower_error_is_a_positive_gain(tmp_path: Path) -> None:
 def test_a_run_is_no_better_than_itself(tmp_path: Path) -> None:
     path = run(tmp_path, "one", FIRST)
     comparison = compare([path, path])
-    for gain in comparison["gains"][0].values():
-        assert (gain["percent"], gain["p_value"], gain["p_adjusted"]) == (0, 1, 1)
-    assert [r["name"] for r in comparison["runs"]] == ["one (1)", "one (2)"]
+    for gain in comparison.runs[1].gains.values():
+        assert (gain.percent, gain.p_value, gain.p_adjusted) == (0, 1, 1)
+    assert [run.name for run in comparison.runs] == ["one (1)", "one (2)"]
 
 
 def test_frames_are_paired_by_name_and_the_others_reported(tmp_path: Path) -> None:
@@ -64,18 +72,18 @@ def test_frames_are_paired_by_name_and_the_others_reported(tmp_path: Path) -> No
     (tmp_path / "gt" / "only one.npy").unlink()
     two = run(tmp_path, "two", {"b": [2.0], "a": [1.0]})
     comparison = compare([one, two])
-    assert comparison["frames"] == ["a", "b"]
-    assert comparison["runs"][0]["mean"]["mae"] == pytest.approx(3)
-    note = comparison["notes"][0]
+    assert comparison.frames == ("a", "b")
+    assert comparison.runs[0].mean["mae"] == pytest.approx(3)
+    note = comparison.notes[0]
     assert " 1 frames of" in note
     assert note.endswith("left out: only one")
 
 
 def test_one_frame_has_a_gain_but_nothing_to_resample(tmp_path: Path) -> None:
     comparison = compare([run(tmp_path, "one", {"a": [2.0]}), run(tmp_path, "two", {"a": [1.0]})])
-    gain = comparison["gains"][0]["mae"]
-    assert gain["percent"] == pytest.approx(50)
-    assert gain["low_percent"] is gain["high_percent"] is gain["p_value"] is None
+    gain = comparison.runs[1].gains["mae"]
+    assert gain.percent == pytest.approx(50)
+    assert gain.low_percent is gain.high_percent is gain.p_value is None
 
 
 SIX = {f"{n:04}": [error] for n, error in enumerate((2.0, 5.0, 1.0, 4.0, 1.5, 3.0))}
@@ -93,24 +101,22 @@ def test_six_frames_have_an_interval_around_the_gain_and_p_is_adjusted(tmp_path:
     every = [measure.key for measure in MEASURES]
     everything = compare(paths, columns=every)
     for comparison, count in ((main, 4), (everything, len(every))):
-        (gains,) = comparison["gains"]
-        assert len(comparison["measures"]) == len(gains) == count
-        smallest = min(gains.values(), key=lambda gain: gain["p_value"])
-        assert smallest["p_adjusted"] == pytest.approx(min(1, count * smallest["p_value"]))
-    gain = main["gains"][0]["mae"]
-    assert gain["low_percent"] < gain["percent"] < gain["high_percent"]
-    assert gain["p_value"] == everything["gains"][0]["mae"]["p_value"] == 2 / 64
-    (note,) = main["notes"]
+        gains = comparison.runs[1].gains
+        assert len(comparison.measures) == len(gains) == count
+        smallest = min(gains.values(), key=lambda gain: gain.p_value)
+        assert smallest.p_adjusted == pytest.approx(min(1, count * smallest.p_value))
+    gain = main.runs[1].gains["mae"]
+    assert gain.low_percent < gain.percent < gain.high_percent
+    assert gain.p_value == everything.runs[1].gains["mae"].p_value == 2 / 64
+    (note,) = main.notes
     assert note.endswith("4 tests: the smallest possible p is 0.031, adjusted 0.12")
     of_three = compare([*paths, paths[1]])
-    assert of_three["tests"] == 8
-    for gains in of_three["gains"]:
-        p_value = gains["mae"]["p_value"]
-        assert gains["mae"]["p_adjusted"] >= main["gains"][0]["mae"]["p_adjusted"] > p_value
-    assert [m["key"] for m in compare(paths, columns=("delta1", "silog"))["measures"]] == [
-        "delta1",
-        "silog",
-    ]
+    assert of_three.tests == 8
+    for other in of_three.runs[1:]:
+        gain = other.gains["mae"]
+        assert gain.p_adjusted >= main.runs[1].gains["mae"].p_adjusted > gain.p_value
+    chosen = compare(paths, columns=("delta1", "silog")).measures
+    assert [measure.key for measure in chosen] == ["delta1", "silog"]
 
 
 def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path: Path) -> None:
@@ -121,34 +127,36 @@ def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path
     one, two = [], []
     for path, values in zip(paths, (one, two), strict=True):
         record = json.loads(Path(path).read_text())
-        record["frames"][0]["scores"]["after"]["imae"] = None
-        values += [frame["scores"]["after"]["imae"] for frame in record["frames"][1:]]
+        record["frames"][0]["errors"]["ground_truth"]["after"]["imae"] = None
+        values += [
+            frame["errors"]["ground_truth"]["after"]["imae"] for frame in record["frames"][1:]
+        ]
         Path(path).write_text(json.dumps(record))
     comparison = compare(paths, columns=("mae", "imae"))
-    gain = comparison["gains"][0]["imae"]
-    assert comparison["runs"][0]["mean"]["imae"] == pytest.approx(np.mean(one))
-    assert gain["percent"] == pytest.approx(100 * (1 - np.mean(two) / np.mean(one)))
-    assert gain["p_value"] == 2 / 2**8
-    assert any(note.startswith("iMAE: over 8 of 9 frames") for note in comparison["notes"])
+    gain = comparison.runs[1].gains["imae"]
+    assert comparison.runs[0].mean["imae"] == pytest.approx(np.mean(one))
+    assert gain.percent == pytest.approx(100 * (1 - np.mean(two) / np.mean(one)))
+    assert gain.p_value == 2 / 2**8
+    assert any(note.startswith("iMAE: over 8 of 9 frames") for note in comparison.notes)
 
 
 def test_frames_of_one_group_are_swapped_together(tmp_path: Path) -> None:
     first = {f"{drive}_{n:04}": [2.0 + n] for drive in "abc" for n in range(4)}
     paths = [run(tmp_path, "one", first), run(tmp_path, "two", scaled(first, [0.5] * 12))]
     grouped = compare(paths)
-    assert grouped["clusters"] == {"count": 3, "unit": "groups of frames"}
-    assert grouped["gains"][0]["mae"]["p_value"] == 2 / 8
-    assert grouped["notes"][-1].startswith("warning: 3 groups of frames are too few")
+    assert grouped.clusters.describe() == "3 groups of frames"
+    assert grouped.runs[1].gains["mae"].p_value == 2 / 8
+    assert grouped.notes[-1].startswith("warning: 3 groups of frames are too few")
 
 
 def test_groups_that_the_list_of_a_batch_named_are_swapped_together(tmp_path: Path) -> None:
-    frames = [
-        {"name": f"{number}", "group": "ab"[number % 2], "scores": SCORES} for number in range(6)
+    records = [
+        FrameRecord(name=f"{number}", group="ab"[number % 2], errors={"ground_truth": SCORES})
+        for number in range(6)
     ]
-    path = tmp_path / "summary.json"
-    path.write_text(json.dumps({"counts": {}, "frames": frames}))
+    path = summary(tmp_path, *records)
     comparison = compare([f"{path}:before", str(path)])
-    assert comparison["clusters"] == {"count": 2, "unit": "groups of frames"}
+    assert comparison.clusters.describe() == "2 groups of frames"
 
 
 def test_different_definitions_are_refused_and_named(tmp_path: Path) -> None:
@@ -169,47 +177,46 @@ def test_runs_without_a_common_frame_are_refused(tmp_path: Path) -> None:
 def test_other_pixels_and_other_ground_truth_cause_a_warning(tmp_path: Path) -> None:
     one = run(tmp_path, "one", {"a": [1.0, 1.0]})
     less = run(tmp_path, "less", {"a": [1.0, -10.0]})
-    (note,) = compare([one, less])["notes"]
+    (note,) = compare([one, less]).notes
     assert "coverage differs (100.00% in" in note
     assert "this is no ranking" in note
     other = run(tmp_path, "other", {"a": [1.0, 1.0, 1.0]})
-    (note,) = compare([one, other])["notes"]
+    (note,) = compare([one, other]).notes
     assert "another number of pixels with ground truth" in note
 
 
-SCORES = {
+SCORES: dict[str, Scores] = {
     "before": {"rmse": 2.0, "mae": 1.5, "delta1": 0.5, "pixels": 90, "coverage": 0.9},
     "after": {"rmse": 1.0, "mae": 1.2, "delta1": 0.6, "pixels": 90, "coverage": 0.9},
 }
 
 
-WITH_MRE = {stage: scores | {"mre": 0.5} for stage, scores in SCORES.items()}
+WITH_MRE: dict[str, Scores] = {stage: scores | {"mre": 0.5} for stage, scores in SCORES.items()}
 
 
 def test_a_batch_is_compared_with_what_it_started_from(tmp_path: Path) -> None:
-    frames = [
-        {"name": "drive/1", "status": "done", "scores": SCORES},
-        {"name": "drive/2", "status": "done", "scores": WITH_MRE},
-        {"name": "drive/3", "status": "failed", "scores": None},
-    ]
-    (tmp_path / "summary.json").write_text(json.dumps({"counts": {}, "frames": frames}))
+    summary(
+        tmp_path,
+        FrameRecord(name="drive/1", errors={"ground_truth": SCORES}),
+        FrameRecord(name="drive/2", errors={"ground_truth": WITH_MRE}),
+        FrameRecord(name="drive/3", status="failed"),
+    )
     for result in (tmp_path, tmp_path / "summary.json"):
         comparison = compare([f"{tmp_path}/summary.json:before", str(result)])
-        assert comparison["frames"] == ["drive/1", "drive/2"]
-        assert [m["key"] for m in comparison["measures"]] == ["rmse", "mae", "delta1"]
-        assert comparison["gains"][0]["rmse"]["percent"] == 50
-        assert comparison["gains"][0]["delta1"]["percent"] == pytest.approx(20)
+        assert comparison.frames == ("drive/1", "drive/2")
+        assert [measure.key for measure in comparison.measures] == ["rmse", "mae", "delta1"]
+        assert comparison.runs[1].gains["rmse"].percent == 50
+        assert comparison.runs[1].gains["delta1"].percent == pytest.approx(20)
         name = tmp_path.name
-        assert [r["name"] for r in comparison["runs"]] == [f"{name}:before", name]
+        assert [run.name for run in comparison.runs] == [f"{name}:before", name]
 
 
 BROKEN = [
     "{}",
     '{"frames": []}',
-    '{"scores": null}',
-    '{"command": "eval"}',
-    '{"frames": [{"scores": {}}]}',
+    '{"frames": 1}',
     '{"frames": [1]}',
+    '{"frames": [{"errors": {"ground_truth": {}}}]}',
     '{"command": "eval", "protocol": {"name": "other"}, "measures": []}',
 ]
 
@@ -218,7 +225,7 @@ BROKEN = [
 def test_a_file_without_scores_is_refused(tmp_path: Path, text: str) -> None:
     one = run(tmp_path, "one", FIRST)
     (tmp_path / "broken.json").write_text(text)
-    with pytest.raises(FileFormatError, match="does not hold scores"):
+    with pytest.raises(FileFormatError, match=r"broken\.json"):
         compare([one, str(tmp_path / "broken.json")])
 
 
@@ -234,8 +241,7 @@ def test_runs_are_named_by_their_folders_and_files_or_by_what_tells_them_apart(
     (tmp_path / "a" / "x").mkdir(parents=True)
     (tmp_path / "b" / "x").mkdir(parents=True)
     one, two = (run(tmp_path / folder / "x", "run", FIRST) for folder in "ab")
-    assert [r["name"] for r in compare([one, two])["runs"]] == ["a", "b"]
-    frames = [{"name": "drive/1", "status": "done", "scores": SCORES}]
-    (tmp_path / "a" / "summary.json").write_text(json.dumps({"counts": {}, "frames": frames}))
+    assert [run.name for run in compare([one, two]).runs] == ["a", "b"]
+    summary(tmp_path / "a", FrameRecord(name="drive/1", errors={"ground_truth": SCORES}))
     both = [f"{tmp_path}/a/summary.json:before", f"{tmp_path}/a"]
-    assert [r["name"] for r in compare(both)["runs"]] == ["a:before", "a"]
+    assert [run.name for run in compare(both).runs] == ["a:before", "a"]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,11 @@ import pytest
 
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.commands.evaluation.scoring import filled
+from pnpdepth_cli.commands.evaluation.scoring import filled, is_missing, scores_of
 from pnpdepth_cli.commands.evaluation.tables import worst
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
+from pnpdepth_cli.file_record import FileRecord, Sampling
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.sensors import SamplePattern, as_depth_image, sample_points
 
@@ -45,7 +47,10 @@ def test_each_image_counts_alike(two: Path) -> None:
     per_image = scored(two)
     assert per_image.mean["rmse"] == (1 + 3) / 2
     assert per_image.mean["mre"] == (0.625 + 0.6) / 2
-    assert [(f.pixels, f.known, f.coverage) for f in per_image.frames] == [(2, 2, 1.0), (1, 2, 0.5)]
+    assert [
+        [scores_of(frame)[count] for count in ("pixels", "known", "coverage")]
+        for frame in per_image.frames
+    ] == [[2, 2, 1.0], [1, 2, 0.5]]
     assert any(" 1 pixels (25.00%) of the ground truth have no pred" in n for n in per_image.notes)
 
 
@@ -53,7 +58,7 @@ def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path
     assert scored(two).unscored() == ""
     depth_file(two / "gt" / "c.npy", [[1, 1]])
     result = scored(two)
-    assert [frame.name for frame in result.frames if frame.missing] == ["c"]
+    assert [frame.name for frame in result.frames if is_missing(frame)] == ["c"]
     assert (result.mean["rmse"], result.coverage) == (2, 3 / 6)
     assert result.unscored() == "1 without prediction"
 
@@ -71,9 +76,9 @@ def test_a_failed_frame_is_reported_and_the_others_are_scored(
 ) -> None:
     spoil(two / "out" / "a_depth.npy")
     result = scored(two)
-    assert [frame.name for frame in result.frames if not frame.scored] == ["a"]
+    assert [frame.name for frame in result.frames if frame.status == "failed"] == ["a"]
     assert result.mean["rmse"] == 3
-    assert message in (result.frames[0].error or "")
+    assert message in (result.frames[0].message or "")
     assert any(note.startswith("warning: frame a was not scored") for note in result.notes)
     assert result.unscored() == "1 with a faulty file"
 
@@ -181,7 +186,7 @@ def test_few_groups_of_frames_have_no_interval_but_a_note(tmp_path: Path) -> Non
     result = scored(tmp_path)
     assert result.interval is None
     assert any("no interval: 2 groups of frames are too few" in note for note in result.notes)
-    assert [frame["group"] for frame in result.as_record()["frames"]] == ["a"] * 4 + ["b"] * 4
+    assert [frame["group"] for frame in result.to_json()["frames"]] == ["a"] * 4 + ["b"] * 4
 
 
 def test_the_group_of_a_manifest_goes_before_the_name(tmp_path: Path) -> None:
@@ -193,7 +198,7 @@ def test_the_group_of_a_manifest_goes_before_the_name(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((1, 1, 3), np.uint8))
     (tmp_path / "list.csv").write_text("\n".join(lines))
     result = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "list.csv"))
-    assert [frame.pair.group for frame in result.frames] == ["a", "b", "a"]
+    assert [frame.group for frame in result.frames] == ["a", "b", "a"]
 
 
 @pytest.mark.parametrize(
@@ -229,7 +234,7 @@ def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
     assert scored(tmp_path).mean["rmse"] == 0
     by_option = scored(tmp_path, pred_scale=1000.0, gt_scale=1000.0)
     assert by_option.mean["mae"] == 0
-    assert by_option.frames[0].readings["gt"].scale == 1000
+    assert by_option.frames[0].inputs["gt"].scale == 1000
     nyu = scored(tmp_path, protocol="nyu-eigen")
     assert any("÷ 1000; --gt-scale to change" in note for note in nyu.notes)
     depth_file(tmp_path / "out" / "a.png", np.ones((480, 640)), scale=100)
@@ -290,12 +295,11 @@ def test_scored_pixels_with_a_sparse_point_are_counted_and_can_be_excluded(
     depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", prediction)
     sparse = depth_file(tmp_path / "sparse.npy", points)
-    record = {"inputs": {"sparse": {"path": str(sparse)}}}
-    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
+    FrameRecord(inputs={"sparse": FileRecord(path=str(sparse))}).write(tmp_path / "out" / "a.json")
     (note,) = (n for n in scored(tmp_path).notes if "sparse input" in n)
     assert note.startswith("4 of the scored pixels (4.04%) have a point of the sparse input")
     without = scored(tmp_path, exclude_sparse=True)
-    assert without.frames[0].known == 95
+    assert scores_of(without.frames[0])["known"] == 95
     assert without.mean["mae"] == pytest.approx(1)
     assert not [n for n in without.notes if "sparse input" in n]
     (tmp_path / "out" / "a.json").unlink()
@@ -310,30 +314,30 @@ def test_points_that_were_drawn_from_the_ground_truth_are_drawn_again_to_be_excl
     drawn = as_depth_image(sample_points(gt, SamplePattern(count=30), 7))
     depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", np.where(drawn > 0, gt, gt + 1))
-    entry = {"sampled_from": "gt", "kind": "uniform", "count": 30, "fraction": None, "seed": 7}
-    record = {"inputs": {"sparse": entry}, "size": [10, 10]}
-    (tmp_path / "out" / "a.json").write_text(json.dumps(record))
-    assert scored(tmp_path).frames[0].given == 30
+    sampled = Sampling(kind="uniform", count=30, seed=7)
+    sparse = FileRecord(path=str(tmp_path / "gt" / "a.npy"), sampled=sampled)
+    record = FrameRecord(inputs={"sparse": sparse}, size=(10, 10))
+    record.write(tmp_path / "out" / "a.json")
+    assert scores_of(scored(tmp_path).frames[0])["given"] == 30
     without = scored(tmp_path, exclude_sparse=True)
-    assert (without.frames[0].known, without.mean["mae"]) == (70, pytest.approx(1))
-    for unknown in ({"inputs": {"sparse": {"sampled_from": "gt"}}}, record | {"size": [9, 9]}):
-        (tmp_path / "out" / "a.json").write_text(json.dumps(unknown))
-        assert scored(tmp_path).frames[0].given is None
+    assert (scores_of(without.frames[0])["known"], without.mean["mae"]) == (70, pytest.approx(1))
+    for size in (None, (9, 9)):
+        replace(record, size=size).write(tmp_path / "out" / "a.json")
+        assert scores_of(scored(tmp_path).frames[0])["given"] is None
 
 
 def test_a_sparse_file_that_cannot_be_read_hides_only_how_many_points_were_given(two: Path) -> None:
     sparse = depth_file(two / "s.npy", [[1, 0]])
-    record = {"inputs": {"sparse": {"path": str(sparse)}}}
-    (two / "out" / "a.json").write_text(json.dumps(record))
-    assert [f.given for f in scored(two).frames] == [1, None]
+    FrameRecord(inputs={"sparse": FileRecord(path=str(sparse))}).write(two / "out" / "a.json")
+    assert [scores_of(frame)["given"] for frame in scored(two).frames] == [1, None]
     sparse.write_bytes(b"spoilt")
-    assert [f.given for f in scored(two).frames] == [None, None]
+    assert [scores_of(frame)["given"] for frame in scored(two).frames] == [None, None]
     with pytest.raises(InputError, match="no frame could be scored"):
         scored(two, exclude_sparse=True)
 
 
 def test_a_prediction_in_model_units_is_warned_of_unless_it_is_scaled(two: Path) -> None:
-    (two / "out" / "a.json").write_text('{"unit": "model units"}')
+    FrameRecord(unit="model units").write(two / "out" / "a.json")
     warning = "warning: 1 predictions are in model units, not in metres"
     assert any(note.startswith(warning) for note in scored(two).notes)
     depth_file(two / "out" / "ü b_depth.npy", [[8, 9]])
@@ -347,7 +351,7 @@ def test_a_smaller_prediction_is_resized_on_request(tmp_path: Path) -> None:
     assert scored(tmp_path, resize="bilinear").mean["mae"] == 0.25
     depth_file(tmp_path / "out" / "a.npy", [[0, 3]])
     result = scored(tmp_path, resize="bilinear")
-    assert (result.frames[0].pixels, result.mean["mae"]) == (4, 0)
+    assert (result.pixels, result.mean["mae"]) == (4, 0)
 
 
 def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) -> None:
@@ -358,7 +362,7 @@ def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) 
     assert filled(np.zeros((1, 2), np.float32)).tolist() == [[0, 0]]
     devkit = scored(tmp_path, protocol="kitti-devkit")
     assert devkit.mean["mae"] == pytest.approx((65535 / 256 - 1) / 2)
-    assert scored(tmp_path).frames[0].pixels == 1
+    assert scored(tmp_path).pixels == 1
 
 
 def test_empty_rows_that_the_kit_does_not_fill_are_reported(tmp_path: Path) -> None:
@@ -370,7 +374,7 @@ def test_empty_rows_that_the_kit_does_not_fill_are_reported(tmp_path: Path) -> N
     depth_file(tmp_path / "out" / "a.npy", [[0], [0], [0]])
     assert scored(tmp_path, protocol="kitti-devkit").mean["mae"] == 2  # against −1 m
     assert any("empty rows between filled ones" in note for note in result.notes)
-    assert result.as_record()["mean"]["log_mae"] is None
+    assert result.to_json()["mean"]["log_mae"] is None
 
 
 def test_nyus_own_file_is_scored_at_its_whole_size_with_eigens_crop(tmp_path: Path) -> None:
@@ -435,7 +439,7 @@ def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
     assert list(more.mean)[: len(default.mean)] == list(default.mean)
     assert default.mean.items() <= more.mean.items()
     assert more.request.scoring() == default.request.scoring()
-    first, second, third = (frame.values["rmse_far"] for frame in more.frames)
+    first, second, third = (scores_of(frame)["rmse_far"] for frame in more.frames)
     assert math.isnan(second)  # a wall in 2 m has no far pixels
     assert more.mean["rmse_far"] == pytest.approx((first + third) / 2)
-    assert [frame.values["boundary_f1"] for frame in more.frames][1] == 0
+    assert scores_of(more.frames[1])["boundary_f1"] == 0

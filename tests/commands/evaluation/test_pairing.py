@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,9 @@ from pnpdepth_cli.commands.evaluation.pairing import (
     pair_frames,
 )
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
 
 
@@ -127,10 +128,10 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     out, gt = folders(tmp_path, ["a_depth.png", "b_depth.png", "c_depth.png"],
                       ["a.png", "b.png", "c.png"])  # fmt: skip
     sparse, image = depth_at(tmp_path / "s.png"), depth_at(tmp_path / "i.png")
-    inputs = {"sparse": {"path": str(sparse)}, "image": {"path": str(image)}}
-    (out / "a.json").write_text(json.dumps({"inputs": inputs}))
-    scan = {"sparse": {"path": str(sparse), "calibration": "calib.txt"}}
-    (out / "b.json").write_text(json.dumps({"inputs": scan}))
+    inputs = {"sparse": FileRecord(path=str(sparse)), "image": FileRecord(path=str(image))}
+    FrameRecord(inputs=inputs).write(out / "a.json")
+    scan = FileRecord(path=str(sparse), calibration="calib.txt")
+    FrameRecord(inputs={"sparse": scan}).write(out / "b.json")
     (out / "c.json").write_text("not JSON at all")
     frames, _ = pair_frames(out, gt)
     assert [(f.sparse, f.image) for f in frames] == [(sparse, image), (None, None), (None, None)]

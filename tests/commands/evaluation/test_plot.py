@@ -10,19 +10,19 @@ import pytest
 
 from pnpdepth_cli.commands.evaluation.compare import compare
 from pnpdepth_cli.commands.evaluation.plot import plot_comparison
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.record import write_json
 
 
 def batch(folder: Path, mae: float, **varied: str) -> str:
     """The summary of a batch of one frame whose MAE was 1 m before refinement."""
-    stages = {"before": {"mae": 1.0}, "after": {"mae": mae}}
-    for stage in stages.values():
-        stage |= {"pixels": 4, "coverage": 1.0}
+    counts: Scores = {"pixels": 4, "coverage": 1.0}
+    stages: dict[str, Scores] = {"before": {"mae": 1.0} | counts, "after": {"mae": mae} | counts}
+    record = FrameRecord(name="a", errors={"ground_truth": stages}).to_json()
     name = ",".join(varied.values())
-    record: dict[str, Any] = {"frames": [{"name": "a", "scores": stages}]}
     (folder / name).mkdir()
-    write_json(folder / name / "summary.json", record | ({"varied": varied} if varied else {}))
+    write_json(folder / name / "summary.json", {"frames": [record], "varied": varied})
     return str(folder / name)
 
 
@@ -43,7 +43,7 @@ def test_numbers_lie_along_the_axis_and_names_make_lines(
     errors = {("100", "x"): 0.5, ("20", "x"): 0.75, ("20", "y"): 0.5, ("100", "y"): 1.25}
     runs = [batch(tmp_path, mae, sample=count, loss=loss) for (count, loss), mae in errors.items()]
     comparison = compare(runs)
-    assert [run["name"] for run in comparison["runs"]] == ["100,x", "20,x", "20,y", "100,y"]
+    assert [run.name for run in comparison.runs] == ["100,x", "20,x", "20,y", "100,y"]
     plot_comparison(comparison, tmp_path / "p.svg")
     above, below = figures[0].axes
     assert (below.get_xlabel(), below.get_xscale()) == ("sample", "log")

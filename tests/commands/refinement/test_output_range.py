@@ -12,7 +12,8 @@ import torch
 
 from pnpdepth_cli.commands.refinement.outputs import output_scale, within_range
 from pnpdepth_cli.core.refine import Refinement
-from pnpdepth_cli.frames.frame import Frame, Refined, no_points
+from pnpdepth_cli.frames.frame import Frame, no_points
+from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.points import SparsePoints
 from tests.commands.frames import frame_on_disk, run
@@ -73,6 +74,6 @@ def test_a_refinement_beyond_the_format_is_written_with_a_note(tmp_path: Path) -
     text = frame.model.read_text()
     frame.model.write_text(text.replace("2 + 3 *", "400 + 3 *"))
     record = run(frame, iterations=0).record
-    assert any("pixels clipped to 65.5 m" in note for note in record["notes"])
+    assert any("pixels clipped to 65.5 m" in note for note in record.notes)
     assert read_depth(tmp_path / "out" / "img_depth.png").values.max() == np.float32(65.534)
-    assert json.loads((tmp_path / "out" / "img.json").read_text())["notes"] == record["notes"]
+    assert json.loads((tmp_path / "out" / "img.json").read_text())["notes"] == record.notes

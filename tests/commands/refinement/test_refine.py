@@ -10,7 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from pnpdepth_cli.commands.refinement.refine import _point_error
+from pnpdepth_cli.commands.refinement.record import _at_points
+from pnpdepth_cli.dataset.frame_record import FrameRecord, PointsRecord
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import (
     InputError,
@@ -34,8 +35,21 @@ def files(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def noted(record: dict[str, Any], text: str) -> bool:
-    return any(text in note for note in record["notes"])
+def noted(record: FrameRecord, text: str) -> bool:
+    return any(text in note for note in record.notes)
+
+
+def points_of(record: FrameRecord) -> PointsRecord:
+    assert record.points is not None
+    return record.points
+
+
+def change_of(record: FrameRecord, basis: str) -> float:
+    """The MAE of the result as a fraction of that before."""
+    before, after = (record.errors[basis][stage]["mae"] for stage in ("before", "after"))
+    assert before is not None
+    assert after is not None
+    return after / before
 
 
 def test_refinement_lowers_the_error_and_the_scores_are_those_of_the_file(
@@ -43,15 +57,19 @@ def test_refinement_lowers_the_error_and_the_scores_are_those_of_the_file(
 ) -> None:
     asked = {"gt": frame.gt, "iterations": 40, "lr": "20%", "update": "adam", "format": "npy"}
     record = run(frame, **asked).record
-    for measured in ("sparse_error", "scores"):
-        assert record[measured]["after"]["mae"] < 0.8 * record[measured]["before"]["mae"]
-    assert len(record["loss"]) == 41
-    assert record["loss"][-1] < record["loss"][0]
-    assert 0 < record["improved_fraction"] < 1
+    for basis in ("used", "ground_truth"):
+        assert change_of(record, basis) < 0.8
+    first, *updated = record.loss
+    assert len(updated) == 40
+    assert updated[-1] is not None
+    assert first is not None
+    assert updated[-1] < first
+    assert record.improved_fraction is not None
+    assert 0 < record.improved_fraction < 1
     written = np.load(frame.folder / "out" / "img_depth.npy").astype(np.float64)
     error = np.abs(written - read_depth(frame.gt).values)
-    assert record["scores"]["after"]["mae"] == pytest.approx(error.mean(), abs=1e-9)
-    range_of_points = record["points"]["nearest"], record["points"]["farthest"]
+    assert record.errors["ground_truth"]["after"]["mae"] == pytest.approx(error.mean(), abs=1e-9)
+    range_of_points = points_of(record).nearest, points_of(record).farthest
     known = read_depth(frame.sparse).values
     assert range_of_points == (float(known[known > 0].min()), float(known.max()))
 
@@ -82,7 +100,7 @@ def test_a_point_beyond_everything_is_dropped_with_a_note(frame: FrameOnDisk) ->
     depth[rows[0], columns[0]] = 1e30
     write_depth(frame.folder / "far.npy", depth)
     record = run(frame, sparse=frame.folder / "far.npy", iterations=0).record
-    assert record["points"]["used"] == len(rows) - 1
+    assert points_of(record).used == len(rows) - 1
     assert noted(record, "dropped 1 of 60 points more than 1,000 times")
 
 
@@ -101,9 +119,9 @@ def test_held_out_points_are_a_seeded_share_that_the_loss_never_sees(frame: Fram
         run(frame, holdout=0.25, seed=seed, output=frame.folder / name, gt=frame.gt).record
         for name, seed in (("a", 1), ("b", 1), ("c", 2))
     )
-    assert (first["points"]["held_out"], first["points"]["used"]) == (15, 45)
-    assert first["held_out_error"]["after"]["points"] == 15
-    assert first["loss"] == again["loss"] != other["loss"]
+    assert (points_of(first).held_out, points_of(first).used) == (15, 45)
+    assert first.errors["held_out"]["after"]["points"] == 15
+    assert first.loss == again.loss != other.loss
     for path in (frame.folder / "a").glob("*.png"):
         assert path.read_bytes() == (frame.folder / "b" / path.name).read_bytes()
 
@@ -127,16 +145,16 @@ def test_of_a_result_that_cannot_be_written_whole_nothing_stays(
     def full(*_: object) -> None:
         raise StorageError("the disk is full")
 
-    monkeypatch.setattr("pnpdepth_cli.commands.refinement.refine.write_json", full)
+    monkeypatch.setattr("pnpdepth_cli.dataset.frame_record.write_json", full)
     with pytest.raises(StorageError):
         run(frame)
     assert not list((frame.folder / "out").iterdir())
 
 
 def test_the_record_has_every_setting_that_changes_the_depth(frame: FrameOnDisk) -> None:
-    plain = run(frame, iterations=0).record["settings"]
+    plain = run(frame, iterations=0).record.settings
     for name, value in (("propagate", "gp"), ("normalise", "bytes")):
-        other = run(frame, iterations=0, overwrite=True, **{name: value}).record["settings"]
+        other = run(frame, iterations=0, overwrite=True, **{name: value}).record.settings
         assert {key for key in other if other[key] != plain[key]} == {name}
         assert other[name] == value
 
@@ -148,8 +166,8 @@ def test_sparse_depth_of_another_size_is_moved_if_it_shows_the_same_view(
     write_depth(half, frame.depth[::2, ::2])
     write_depth(part, frame.depth[:, :40])
     record = run(frame, sparse=half).record
-    assert record["points"]["used"] == 23 * 31
-    assert any("31×23" in note and "62×46" in note for note in record["notes"])
+    assert points_of(record).used == 23 * 31
+    assert any("31×23" in note and "62×46" in note for note in record.notes)
     with pytest.raises(SizeError, match=r"40×46"):
         run(frame, sparse=part, overwrite=True)
 
@@ -160,9 +178,9 @@ def test_a_point_between_pixels_is_enough_and_points_outside_are_counted(
     points = frame.folder / "points.csv"
     points.write_text("x,y,depth\n30.25,20.5,2.0\n500,2,3\n")
     record = run(frame, sparse=points, iterations=20).record
-    assert record["points"]["used"] == 1
+    assert points_of(record).used == 1
     assert noted(record, "1 points outside the image")
-    assert record["sparse_error"]["after"]["mae"] < record["sparse_error"]["before"]["mae"]
+    assert change_of(record, "used") < 1
 
 
 def test_a_list_of_points_with_x_and_y_swapped_is_refused(frame: FrameOnDisk) -> None:
@@ -183,7 +201,8 @@ def test_the_networks_crop_leaves_the_rest_unknown_and_refuses_points_only_there
     known = np.load(frame.folder / "d.npy") > 0
     assert (known == ((np.arange(62) >= 8) & (np.arange(62) < 54))).all()
     scored = np.count_nonzero(known & (read_depth(frame.gt).values > 0))
-    assert record["linear"]["scores"]["pixels"] == record["scores"]["after"]["pixels"] == scored
+    stages = record.errors["ground_truth"]
+    assert stages["linear"]["pixels"] == stages["after"]["pixels"] == scored
     left = frame.folder / "left.csv"
     left.write_text("1 5 2.0\n2 9 2.0\n")
     with pytest.raises(NoPointsError, match="none of the 2 sparse points"):
@@ -235,6 +254,9 @@ def test_the_error_at_points_is_of_those_with_a_prediction() -> None:
     points = SparsePoints(
         xy=torch.tensor([[0.0, 0], [1, 0], [2, 0]]), depth=torch.tensor([5, 1.5, 6]), size=(1, 3)
     )
-    errors = _point_error(np.array([[0, 0.5, 9]], np.float32), points)
-    assert errors == {"points": 2, "mae": 2.0, "rmse": 5**0.5}
-    assert _point_error(np.zeros((1, 3), np.float32), points) is None
+    depth = np.array([[0, 0.5, 9]], np.float32)
+    error = {"points": 2, "mae": 2.0, "rmse": 5**0.5}
+    assert _at_points(points, {"before": depth, "after": depth}) == dict.fromkeys(
+        ("before", "after"), error
+    )
+    assert _at_points(points, {"before": depth, "after": 0 * depth}) == {}

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,9 +11,10 @@ import pytest
 import torch
 
 from pnpdepth_cli import Refiner, load_network
-from pnpdepth_cli.commands.refinement.refine import load_refiner, read_requested
+from pnpdepth_cli.commands.refinement.refine import load_method, read_requested
 from pnpdepth_cli.commands.refinement.request import RefineRequest
 from pnpdepth_cli.completion.image_registration import estimated, evidence
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
@@ -37,7 +37,7 @@ def write_frame(folder: Path, seed: int, count: int) -> dict[str, Path]:
     return {"image": image, "sparse": sparse}
 
 
-def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) -> dict[str, Any]:
+def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) -> FrameRecord:
     """The record of the frame, refined with these options."""
     files: dict[str, Any] = write_frame(folder, 0, count)
     return run(own, **files | {"output": folder / "out", "overwrite": True} | options).record
@@ -47,19 +47,20 @@ def test_an_unregistered_image_is_moved_and_the_record_says_so(
     tmp_path: Path, frame: FrameOnDisk
 ) -> None:
     record = refined(tmp_path / "a", frame)
-    assert record["registration"]["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.012)
-    assert any(note.startswith("image: moved into the frame of the") for note in record["notes"])
+    assert record.registration is not None
+    assert record.registration["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.012)
+    assert any(note.startswith("image: moved into the frame of the") for note in record.notes)
 
 
 def test_off_and_the_papers_preset_leave_the_image_and_numbers_are_recorded(
     tmp_path: Path, frame: FrameOnDisk
 ) -> None:
-    assert refined(tmp_path / "a", frame, preset="paper")["registration"] is None
-    assert refined(tmp_path / "a", frame, registration="off")["registration"] is None
+    assert refined(tmp_path / "a", frame, preset="paper").registration is None
+    assert refined(tmp_path / "a", frame, registration="off").registration is None
     request = RefineRequest.from_fields(**write_frame(tmp_path, 0, 500), registration="off")
     assert read_requested(request).one_view
     record = refined(tmp_path / "a", frame, registration=(0.9, -5.0, 3.0))
-    assert record["registration"] == {"zoom": 0.9, "right": -5.0, "down": 3.0}
+    assert record.registration == {"zoom": 0.9, "right": -5.0, "down": 3.0}
 
 
 def test_a_moved_image_gives_what_the_same_image_moved_on_disk_gives(
@@ -89,9 +90,10 @@ def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> Non
     assert all_points is not None
     whole = estimated([all_points])
     assert whole is not None
-    assert record["points"]["used"] == 400
-    assert record["registration"] is not None
-    assert record["registration"]["right"] != whole.right
+    assert record.points is not None
+    assert record.points.used == 400
+    assert record.registration is not None
+    assert record.registration["right"] != whole.right
 
 
 def batch_records(folder: Path, own: FrameOnDisk, count: int) -> list[Any]:
@@ -105,13 +107,13 @@ def batch_records(folder: Path, own: FrameOnDisk, count: int) -> list[Any]:
     network = {"model": str(own.model), "checkpoint": own.checkpoint}
     batch(folder, source=folder / "in", refine=network)
     records = sorted((folder / "out").glob("0*.json"))
-    return [json.loads(path.read_text())["registration"] for path in records]
+    return [FrameRecord.read(path).registration for path in records]
 
 
 def test_the_frames_of_a_batch_share_a_registration_that_none_shows_alone(
     tmp_path: Path, frame: FrameOnDisk
 ) -> None:
-    assert refined(tmp_path / "alone", frame, count=80)["registration"] is None
+    assert refined(tmp_path / "alone", frame, count=80).registration is None
     registrations = batch_records(tmp_path, frame, count=80)
     assert len(registrations) == 8
     assert registrations[0] is not None
@@ -132,10 +134,10 @@ def test_of_frames_that_say_nothing_three_are_read(frame: FrameOnDisk) -> None:
             read.append(number)
             yield few
 
-    refiner = load_refiner(request, inputs)
-    refiner.share_registration(group())
+    method = load_method(request, inputs)
+    method.share_registration(group())
     assert read == [0, 1, 2]
-    assert refiner.registrations == {}
+    assert method.registrations == {}
 
 
 def test_arrays_in_memory_are_registered_too() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 
 from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.report import batch as report_batch
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.colours import paint_signed
 from pnpdepth_cli.io.depth import read_depth
@@ -163,11 +165,10 @@ def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
 
 def test_a_frame_without_depth_at_any_point_has_no_figures(root: Path, report: Path) -> None:
     summary = batch(root).summary
-    written = json.loads((root / "out" / "summary.json").read_text())
-    unknown = dict.fromkeys(("scores", "held_out_error", "sparse_error", "linear"))
-    rows = [row | unknown if row["name"] == "b" else row for row in written["frames"]]
+    records = [FrameRecord.read(root / f"out/{name}.json") for name in NAMES]
+    records[1] = replace(records[1], errors={})
     request = BatchRequest(source=root, output=root / "out", html=report, refine=refinement(root))
-    report_batch.write_batch_report(request, report, summary, lambda: rows)
+    report_batch.write_batch_report(request, report, summary, lambda: records)
     assert {*frames_of(report)["b"]["values"].values()} == {None}
     assert None not in frames_of(report)["a"]["values"].values()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,9 @@ from PIL import Image
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
 from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.report.evaluation import write_eval_report
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import StorageError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
 from tests.io.test_atomic import no_room_on_disk
@@ -98,8 +99,8 @@ def test_the_image_is_shown_where_the_predictions_record_names_one(root: Path) -
     cv2.imwrite(str(root / "img.png"), image)
     cv2.imwrite(str(root / "other.png"), image[:30])
     for name, file in (("a", "img.png"), ("b <i>", "other.png"), ("c\nd", "none.png")):
-        record = {"inputs": {"image": {"path": str(root / file)}}}
-        (root / f"out/{name}.json").write_text(json.dumps(record))
+        inputs = {"image": FileRecord(path=str(root / file))}
+        FrameRecord(inputs=inputs).write(root / f"out/{name}.json")
     reported(root)
     views = [frame["views"] for frame in frames_of(root / "report").values()]
     assert ["image" in each for each in views] == [True, False, False]

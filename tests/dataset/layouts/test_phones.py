@@ -48,7 +48,7 @@ def test_depth_maps_smaller_than_images_are_millimetres(tmp_path: Path) -> None:
     video(tmp_path / "rgb.mov", [90, 90, 90])
     frame = read_frame(read_frames(tmp_path, "pairs")[1], ReadOptions())
     np.testing.assert_allclose(frame.points.depth, 2)
-    assert len(frame.assumed) == 1
+    assert frame.sources["sparse"].assumed
 
 
 def test_what_is_no_video_or_cannot_be_read_is_refused(tmp_path: Path) -> None:

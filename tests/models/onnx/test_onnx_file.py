@@ -27,7 +27,7 @@ from pnpdepth_cli.models.onnx import graph, limits
 from pnpdepth_cli.models.onnx.onnx_file import _as_map, _deviation
 from pnpdepth_cli.models.onnx.table import OPERATORS
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 from tests.models.onnx.onnx_files import write_network
 from tests.models.weights.files import little
 
@@ -195,8 +195,9 @@ def test_a_quantised_network_predicts_by_onnxruntime_and_z_is_not_updated(
         settings = network.definition.defaults
         result = refine(split, (rgb[:1],), points, settings, depth_of=network.depth_of)
         assert torch.equal(result.after, predicted[:1])
+        once = ClosedSettings(iterations=1)
         with pytest.raises(LayerError, match="no gradient"):
-            refine(split, (rgb[:1],), points, Settings(iterations=1), depth_of=network.depth_of)
+            refine(split, (rgb[:1],), points, once, depth_of=network.depth_of)
 
 
 def test_several_outputs_are_listed_and_one_can_be_named(tmp_path: Path) -> None:

@@ -15,25 +15,27 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.core.losses import checked_loss
-from pnpdepth_cli.core.refine import Refinement, refine_from
+from pnpdepth_cli.core.refine import OnIteration, Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.user_code import wrap_user_errors
-from pnpdepth_cli.errors import PnpDepthError
-from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
-from pnpdepth_cli.frames.refine import to_refined_frame
+from pnpdepth_cli.frames.refined import Prediction
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Member:
-    """A network of the default method."""
+    """A network of the method, with nothing left open."""
 
     network: Network
     layer: str  # layer to cut at
-    settings: Settings  # how its output is aligned and z is updated
+    settings: ClosedSettings  # how its output is aligned and z is updated
+    coarse: bool = False
+    """Whether z is updated by the smaller depth that the definition may give, which is sooner."""
 
     @property
     def name(self) -> str:
@@ -52,7 +54,7 @@ class Member:
 
 
 class OpenNetworks:
-    """The networks of the default method, open from frame to frame, as a context manager.
+    """The networks of a method, open from frame to frame, as a context manager.
 
     Args:
         members: The networks, the user's first.
@@ -60,7 +62,7 @@ class OpenNetworks:
 
     def __init__(self, members: Sequence[Member]) -> None:
         self.members = tuple(members)
-        self._opened = {member: OpenNetwork(member.network, member.layer) for member in members}
+        self._opened = {member: OpenNetwork(member) for member in members}
         self._stack = ExitStack()
 
     def __enter__(self) -> OpenNetworks:
@@ -76,29 +78,39 @@ class OpenNetworks:
         for opened in self._opened.values():
             opened.next_image()
 
-    def refine(self, member: Member, frame: Frame, *, updates: bool = True) -> Refined:
-        """Returns the frame refined by one network, its residual not propagated.
+    def refine(
+        self,
+        member: Member,
+        frame: Frame,
+        *,
+        updates: bool = True,
+        on_iteration: OnIteration = lambda done, loss: None,
+    ) -> Prediction:
+        """Returns what one network gives for the frame, its residual not propagated.
 
         Args:
             member: The network.
             frame: The image, the same in all calls until `next_image`, and the points of this call.
             updates: Whether z is updated.
+            on_iteration: Called after each update of z.
 
         Raises:
             PnpDepthError: The refinement fails.
         """
-        settings = member.settings
-        if not updates:
-            settings = replace(settings, iterations=0)
-        return self._opened[member].refine(frame, settings)
+        settings = member.settings if updates else replace(member.settings, iterations=0)
+        return self._opened[member].refine(frame, settings, on_iteration)
+
+    def cut(self, member: Member) -> None:
+        """Cuts the network now. Raises LayerError if it has no such layer."""
+        self._opened[member].cut()
 
 
 class OpenNetwork:
-    """A network that is cut when first refined, as a context manager."""
+    """A network that is cut when z is first updated, as a context manager."""
 
-    def __init__(self, network: Network, layer: str) -> None:
-        self.network, self.layer = network, layer
-        self._of_image_only = network.definition.input_kind == "rgb"
+    def __init__(self, member: Member) -> None:
+        self.member = member
+        self._of_image_only = member.network.definition.input_kind == "rgb"
         self._open = ExitStack()
         self._split: Split | None = None
         self._z0: Tensor | None = None
@@ -106,7 +118,7 @@ class OpenNetwork:
         self._encoded: dict[str, Any] = {}
 
     def __enter__(self) -> OpenNetwork:
-        self._open.enter_context(encoding_once(self.network, self._encoded))
+        self._open.enter_context(encoding_once(self.member.network, self._encoded))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -119,67 +131,83 @@ class OpenNetwork:
         self._z0 = self._output = None
         self._encoded.clear()
 
-    def refine(self, frame: Frame, settings: Settings) -> Refined:
-        """Returns the frame refined by this network, its residual not propagated.
+    def cut(self) -> Split:
+        """Returns the network cut at the layer, open."""
+        if self._split is None:
+            member = self.member
+            self._split = self._open.enter_context(member.network.cut_at(member.layer))
+        return self._split
+
+    def refine(
+        self, frame: Frame, settings: ClosedSettings, on_iteration: OnIteration
+    ) -> Prediction:
+        """Returns what this network gives for the frame; see `OpenNetworks.refine`.
 
         Args:
-            frame: The image, the same in all calls until `next_image`, and the points of this call.
+            frame: The frame.
             settings: How z is updated.
-
-        Raises:
-            PnpDepthError: The refinement fails.
+            on_iteration: Called after each update of z.
         """
-        settings = settings.complete()
-        with out_of_memory_is_a_device_error(self.network.device):
-            prepared = prepare(self.network, frame)
+        network, diverged = self.member.network, None
+        with out_of_memory_is_a_device_error(network.device):
+            prepared = prepare(network, frame)
             if not len(prepared.points):
                 raise prepared.no_points_error()
             reader = prepared.depth_reader(settings.align)
-            if settings.iterations:
-                result = self._updated(prepared, reader, settings)
-            else:
-                result = self._plain(prepared, reader, settings)
-        refined = to_refined_frame(prepared, reader, result)
-        if isinstance(refined, PnpDepthError):
-            raise refined
-        return refined
-
-    def _cut(self) -> Split:
-        """The network cut at the layer, open."""
-        if self._split is None:
-            self._split = self._open.enter_context(self.network.cut_at(self.layer))
-        return self._split
+            try:
+                if settings.iterations:
+                    result = self._updated(prepared, reader, settings, on_iteration)
+                else:
+                    result = self._plain(prepared, reader, settings)
+            except DivergedError as error:
+                if error.last_good is None:
+                    raise
+                diverged, result = error, error.last_good
+        return Prediction(
+            before=prepared.to_image(result.before),
+            after=prepared.to_image(result.after),
+            refinement=result,
+            diverged=diverged,
+            alignment=reader.alignment,
+            notes=reader.notes,
+        )
 
     def _updated(
-        self, prepared: PreparedFrame, reader: AlignedDepth, settings: Settings
-    ) -> Refinement | PnpDepthError:
-        split, z0 = self._cut(), self._z0
+        self,
+        prepared: PreparedFrame,
+        reader: AlignedDepth,
+        settings: ClosedSettings,
+        on_iteration: OnIteration,
+    ) -> Refinement:
+        split, z0 = self.cut(), self._z0
         if z0 is None:
             with torch.no_grad():
                 z0 = split.front(*prepared.arguments)
         if self._of_image_only:
             self._z0 = z0
-        coarse, points = self.network.definition.coarse, (prepared.points,)
+        network, arguments, points = self.member.network, prepared.arguments, prepared.points
+        coarse = network.definition.coarse if self.member.coarse else None
         if coarse is None:
-            return refine_from(split, z0, points, settings, depth_of=(reader,))[0]
-        with coarse(self.network.module) as at_full_size:
-            (result,) = refine_from(split, z0, points, settings, depth_of=(reader,))
-        if isinstance(result, Refinement):
-            before, after = (reader(at_full_size[number]) for number in (0, -1))
-            result = replace(result, before=before, after=after)
-        return result
+            return refine(
+                split, arguments, points, settings,
+                depth_of=reader, z0=z0, on_iteration=on_iteration,
+            )  # fmt: skip
+        with coarse(network.module) as at_full_size:
+            result = refine(split, arguments, points, settings, depth_of=reader, z0=z0)
+        before, after = (reader(at_full_size[number]) for number in (0, -1))
+        return replace(result, before=before, after=after)
 
     def _plain(
-        self, prepared: PreparedFrame, reader: AlignedDepth, settings: Settings
+        self, prepared: PreparedFrame, reader: AlignedDepth, settings: ClosedSettings
     ) -> Refinement:
         """The same without updates: a pass of the whole network, which need not be cut."""
         output = self._output
         if output is None and self._z0 is not None:
             with torch.no_grad():
-                output = self._cut().rear(self._z0)
+                output = self.cut().rear(self._z0)
         elif output is None:
             with torch.no_grad(), wrap_user_errors("the network's forward"):
-                output = self.network.module(*prepared.arguments)
+                output = self.member.network.module(*prepared.arguments)
         if self._of_image_only:
             self._output = output
         depth = reader(output).detach()

@@ -1,0 +1,217 @@
+"""What is kept of a refined frame: its files, network, settings, errors and outputs.
+
+`NAME.json` beside a result is one, and `summary.json` of a batch and `pnpdepth eval --json` hold
+one a frame. Means, tables, reports and comparisons read nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.choices import LENSES
+from pnpdepth_cli.dataset.read_options import METRES
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.file_record import FigureRecord, FileRecord
+from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.io.fingerprint import Fingerprint
+from pnpdepth_cli.io.record import plain, read_json, write_json
+from pnpdepth_cli.stages import AFTER, GT, HELD_OUT, LINEAR, VALIDATION
+
+Pose = NDArray[np.float64]
+"""(3, 4) x_world = pose · (x, 1), in the unit of the depth."""
+Scores = dict[str, int | float | None]
+"""Errors by the key of their measure, with the number of pixels or points that they are of."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraRecord:
+    """The camera of the image, and its pose."""
+
+    intrinsics: list[list[float]]
+    """(3, 3)"""
+    lens: str
+    distortion: list[float]
+    pose: list[list[float]] | None
+    """(3, 4) from the camera's frame to the world's. None: unknown."""
+    source: str
+
+    @classmethod
+    def of(cls, camera: Camera, pose: Pose | None) -> CameraRecord:
+        """Returns what is kept of a camera and its pose."""
+        return cls(
+            intrinsics=camera.intrinsics.tolist(),
+            lens=camera.lens,
+            distortion=list(camera.distortion),
+            pose=None if pose is None else pose.tolist(),
+            source=camera.source,
+        )
+
+    def read(self) -> tuple[Camera, Pose | None]:
+        """Returns the camera and its pose. Raises ValueError if no camera has these numbers."""
+        intrinsics = np.array(self.intrinsics, np.float64).reshape(3, 3)
+        pose = None if self.pose is None else np.array(self.pose, np.float64).reshape(3, 4)
+        focal_px = intrinsics[0, 0], intrinsics[1, 1]
+        if min(focal_px) <= 0 or intrinsics[2].tolist() != [0, 0, 1] or self.lens not in LENSES:
+            raise ValueError("no camera has these intrinsics")
+        camera = Camera(
+            intrinsics=intrinsics,
+            lens=self.lens,
+            distortion=tuple(self.distortion),
+            source=self.source,
+        )
+        return camera, pose
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelRecord:
+    """The user's network."""
+
+    name: str
+    spec: str
+    """What the user called it."""
+    checkpoint: str | None
+    checkpoint_sha256: str | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodRecord:
+    """How the frame was refined."""
+
+    kind: Literal["default", "fixed"]
+    reason: str
+    """The options that fix the method; "default" without."""
+    networks: list[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointsRecord:
+    """The sparse depth."""
+
+    used: int
+    held_out: int
+    nearest: float
+    farthest: float
+    moved: int | None = None
+    """Number of the points used that are of neighbouring frames. None: none was asked for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchState:
+    """By what a batch knows that a frame is done."""
+
+    settings: str
+    """SHA-256 of the settings that decide the result."""
+    inputs: dict[str, Fingerprint] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameRecord:
+    """A refined frame, or one that failed, of which nothing more is known."""
+
+    name: str = ""
+    group: str | None = None
+    """The sequence that the data set says it belongs to."""
+    status: Literal["done", "diverged", "failed"] = "done"
+    message: str | None = None
+    """Why it diverged or failed."""
+    batch: BatchState | None = None
+    """None for `pnpdepth refine`."""
+    inputs: dict[str, FileRecord] = field(default_factory=dict)
+    """The image, the sparse depth and the ground truth."""
+    neighbours: list[FileRecord] = field(default_factory=list)
+    """Points of neighbouring frames."""
+    outputs: dict[str, str] = field(default_factory=dict)
+    """The files by kind; of a batch, below its output folder."""
+    size: tuple[int, int] | None = None
+    """(width, height)"""
+    unit: str = METRES
+    points: PointsRecord | None = None
+    camera: CameraRecord | None = None
+    model: ModelRecord | None = None
+    method: MethodRecord | None = None
+    settings: dict[str, str | int | float | None] = field(default_factory=dict)
+    weights: dict[str, float] = field(default_factory=dict)
+    """Weights of the experts of the default method, by name."""
+    registration: dict[str, float] | None = None
+    """How the image was moved to the points. None: it was not."""
+    alignment: dict[str, str | int | float | list[float] | None] | None = None
+    """How the network's output was aligned with the points."""
+    loss: list[float | None] = field(default_factory=list)
+    """Loss at the points before the first update and after each."""
+    errors: dict[str, dict[str, Scores]] = field(default_factory=dict)
+    """By basis (`BASES`), then by stage: before, after, linear, and those of the method."""
+    improved_fraction: float | None = None
+    """Fraction of the pixels with ground truth, else of the points, whose error fell."""
+    notes: list[str] = field(default_factory=list)
+    figures: dict[str, FigureRecord] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    """By what they were spent on."""
+    peak_memory_mb: dict[str, float] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for errors that are not of the result."""
+        if lacking := [basis for basis, stages in self.errors.items() if AFTER not in stages]:
+            raise ValueError(f"the errors {lacking[0]} are not of the result")
+
+    @property
+    def warnings(self) -> list[str]:
+        """The notes that are warnings."""
+        return [note for note in self.notes if note.startswith("warning")]
+
+    @property
+    def worse_than_linear(self) -> bool | None:
+        """Whether the MAE is above that of linear interpolation of all points.
+
+        By ground truth, else at held-out points, else at validation points; None without any.
+        """
+        for basis in (GT, HELD_OUT, VALIDATION):
+            stages = self.errors.get(basis, {})
+            own, linear = (stages.get(stage, {}).get("mae") for stage in (AFTER, LINEAR))
+            if own is not None and linear is not None:
+                return own > linear
+        return None
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the record in JSON's own types, without what is None or empty."""
+        entry = plain(asdict(self)) | {
+            "inputs": {name: file.to_json() for name, file in self.inputs.items()},
+            "neighbours": [file.to_json() for file in self.neighbours],
+        }
+        return {name: value for name, value in entry.items() if value not in (None, {}, [])}
+
+    @classmethod
+    def from_json(cls, entry: object, source: Path) -> FrameRecord:
+        """Returns the record of an entry that `to_json` gave.
+
+        Args:
+            entry: The content of a JSON file, or a part of it.
+            source: The file, for messages.
+
+        Raises:
+            FileFormatError: It is none.
+        """
+        import msgspec
+
+        try:
+            return msgspec.convert(entry, cls)
+        except (msgspec.ValidationError, OverflowError) as error:
+            raise FileFormatError(
+                f"{source} is no record of a frame as this version writes it"
+                f" ({one_line(str(error))}); remove it, and run again"
+            ) from error
+
+    def write(self, path: Path) -> None:
+        """Writes the record, whole or not at all."""
+        write_json(path, self.to_json())
+
+    @classmethod
+    def read(cls, path: Path) -> FrameRecord:
+        """Returns the record in a file. Raises InputError if it holds none."""
+        return cls.from_json(read_json(path), path)

@@ -1,0 +1,79 @@
+"""What a record keeps of each file: of one that was read, and of a figure that was written."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """How points were sampled from ground truth; see `SamplePattern`."""
+
+    kind: str
+    count: int | None = None
+    fraction: float | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileRecord:
+    """A file of a frame, and how it was read. What does not apply is None or empty."""
+
+    path: str
+    sha256: str | dict[str, str] | None = None
+    """SHA-256 of the content; of a COLMAP model, that of each of its files."""
+    read_as: str | None = None
+    """Format and unit, in words."""
+    scale: float | None = None
+    """Integers per metre. None for a file of metres."""
+    assumed: bool = False
+    """Whether the scale is assumed, as neither the file nor the user nor the data set states it."""
+    dropped: dict[str, int] = field(default_factory=dict)
+    """Number of points that were dropped, by the reason."""
+    sampled: Sampling | None = None
+    """How points were sampled from the file, which is of ground truth."""
+    mask: str | None = None
+    """Path of the mask, or confidence, that was applied."""
+    least: float | None = None
+    """Least confidence of a point that is used."""
+    calibration: str | None = None
+    """Path of the calibration by which a scan was projected."""
+    camera: int | None = None
+    """Number of the camera in the calibration."""
+    extrinsics: str | None = None
+    """Path of the pose of the scanner."""
+    keep_occluded: bool = False
+    """Whether points of a scan that are hidden by nearer ones were kept."""
+    image: str | None = None
+    """Name of the image in a COLMAP model."""
+    unit_scale: float | None = None
+    """Metres per unit of a COLMAP model."""
+    poses: str | None = None
+    """Where the motion to a neighbouring frame is from."""
+    motion: list[list[float]] | None = None
+    """(3, 4) from the camera's frame of the neighbour to that of the frame."""
+    contradicts_images: bool = False
+    """Whether the images show another motion."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns what applies, by name."""
+        return {name: v for name, v in asdict(self).items() if v not in (None, False, {})}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FigureRecord:
+    """A PNG for a person, as a report shows it again."""
+
+    size: tuple[int, int]
+    """(width, height) in pixels."""
+    panels: dict[str, tuple[int, int, int, int]]
+    """(left, top, width, height) of each panel, by its title."""
+    scale_m: tuple[float, float] | None = None
+    """Depths at the ends of the colours, of a figure of depth."""
+    ends: tuple[str, str] | None = None
+    """Texts at the ends of the colours, of a figure of gains."""
+    unknown: str | None = None
+    """What the dark pixels of a figure of gains are. None where there are none."""
+    footer: str | None = None
+    """Text below a figure of gains."""

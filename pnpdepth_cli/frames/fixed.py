@@ -1,0 +1,84 @@
+"""A fixed method for one frame: one network, refined as the settings say."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.completion.propagation import propagate
+from pnpdepth_cli.core.refine import OnIteration
+from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.open_networks import OpenNetworks
+from pnpdepth_cli.frames.refined import Refined, Validation, refined_of
+from pnpdepth_cli.frames.validation import consistency, split_points
+from pnpdepth_cli.stages import AFTER, BEFORE, LINEAR
+
+
+def refine_fixed(
+    networks: OpenNetworks,
+    frame: Frame,
+    *,
+    seed: int = 0,
+    validated: bool = False,
+    on_iteration: OnIteration = lambda done, loss: None,
+) -> Refined:
+    """Returns the frame refined by its one network. A divergence with a last good depth is in it.
+
+    Args:
+        networks: The network, open.
+        frame: The frame, its image moved to its points.
+        seed: Random seed of the validation points.
+        validated: Whether the result is validated, for which the frame is refined again.
+        on_iteration: Called after each update of z.
+
+    Raises:
+        PnpDepthError: The frame cannot be refined.
+    """
+    networks.next_image()
+    (member,) = networks.members
+    networks.cut(member)
+    own = networks.refine(member, frame, on_iteration=on_iteration)
+    depth = _propagated(own.after, frame, member.settings.propagate)
+    validation = _validation(networks, frame, depth, seed) if validated else None
+    return refined_of(frame, own, depth, used=frame.points, validation=validation)
+
+
+def _propagated(depth: Tensor, frame: Frame, kind: str) -> Tensor:
+    """Depth (H, W) with its residual at the points propagated; "none" keeps it."""
+    return depth if kind == "none" else propagate(depth, frame.points, frame.rgb, kind=kind).depth
+
+
+def _validation(
+    networks: OpenNetworks, frame: Frame, depth: Tensor, seed: int
+) -> Validation | None:
+    """Depth at validation points, refined without them.
+
+    None where the points are too few or the method fails.
+
+    Args:
+        networks: The network, open.
+        frame: The frame.
+        depth: (H, W) metres, refined with all points.
+        seed: Random seed of the validation points.
+    """
+    parts = split_points(frame.points, seed)
+    if parts is None:
+        return None
+    kept, points = parts
+    (member,), fewer = networks.members, frame.with_points(kept)
+    try:
+        again = networks.refine(member, fewer)
+    except PnpDepthError:
+        return None
+    return Validation(
+        points=points,
+        kept=kept,
+        network=again.before,
+        weights=consistency(points, depth),
+        predicted={
+            BEFORE: points.sample(again.before),
+            LINEAR: linear(kept, points.xy),
+            AFTER: points.sample(_propagated(again.after, fewer, member.settings.propagate)),
+        },
+    )

@@ -1,0 +1,157 @@
+"""A method of refinement, with nothing left open, for any number of frames in memory.
+
+This is what `refine`, `batch`, Ray workers and the Python API call; reading and writing are around
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+
+import torch
+
+from pnpdepth_cli.completion.image_registration import Evidence, estimated, evidence
+from pnpdepth_cli.core.refine import OnIteration
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.frames.default import refine_default
+from pnpdepth_cli.frames.fixed import refine_fixed
+from pnpdepth_cli.frames.frame import Frame, Register
+from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.refined import Refined
+from pnpdepth_cli.frames.resolve import resolve_definition, resolve_member
+from pnpdepth_cli.frames.uncertainty import with_uncertainty
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.settings import ClosedSettings, Settings
+
+COMPANION = "compact"
+"""The network that is fused with the user's, where there is an image."""
+_TRIED = 3
+"""After so many frames that say nothing of the registration, no more are read."""
+
+
+class Method:
+    """Refines frames with one network, or several that are fused; a context manager.
+
+    The networks are cut when the first frame is refined, and are as before when it closes.
+
+    Args:
+        networks: The user's; several are fused by the default method.
+        asked: What the user sets. With any setting of the method, the network is refined by it
+            alone; without, by the default method.
+        first: The first frame, which decides what definitions leave open.
+        more: Gives further frames, which decide as well; called only if a network needs it.
+        compact: Whether the default method fuses the networks with the included network `compact`,
+            where there is an image.
+        validated: Whether a fixed method is validated, for which each frame is refined again.
+        uncertainty: Whether the standard deviation of the depth is estimated too.
+
+    Raises:
+        UsageError: The settings contradict each other.
+        ModelError: A network cannot be used.
+    """
+
+    def __init__(
+        self,
+        networks: Sequence[Network],
+        asked: Settings,
+        first: Frame,
+        more: Callable[[], Sequence[Frame]] = tuple,
+        *,
+        compact: bool = True,
+        validated: bool = False,
+        uncertainty: bool = False,
+    ) -> None:
+        self.asked, self.is_default = asked, not asked.fixed_by
+        self._uncertainty, self._validated = uncertainty, validated or uncertainty
+        self.registrations: dict[tuple[int, int], Register] = {}
+        """How images of a size are moved to their points, where frames decided it together."""
+        self._stack = ExitStack()
+        self._open: OpenNetworks | None = None
+        if len(networks) > 1 and not self.is_default:
+            raise UsageError(f"several --model are fused, but {asked.fixed_by} fixes one network")
+        # What the definitions leave open is decided.
+        first = first.registered()
+        resolved = [
+            resolve_definition(network, first, lambda: [each.registered() for each in more()])
+            for network in networks
+        ]
+        # The included network joins, unless it is there.
+        named = {network.definition.name for network in resolved}
+        fused = self.is_default and compact and first.rgb is not None
+        if fused and COMPANION not in named:
+            device, precision = str(resolved[0].device), resolved[0].precision
+            companion = load_network(COMPANION, None, device, precision=precision)
+            resolved.append(resolve_definition(companion, first))
+        # Layers and settings are decided.
+        own, *others = resolved
+        self.members = (
+            resolve_member(own, first, asked, is_default=self.is_default),
+            *(resolve_member(n, first, Settings(), is_default=self.is_default) for n in others),
+        )
+
+    def __enter__(self) -> Method:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open = None
+        self._stack.close()
+
+    @property
+    def own(self) -> Member:
+        """The user's network."""
+        return self.members[0]
+
+    @property
+    def network(self) -> Network:
+        """The user's network."""
+        return self.own.network
+
+    @property
+    def settings(self) -> ClosedSettings:
+        """The settings of the user's network."""
+        return self.own.settings
+
+    def refine(
+        self, frame: Frame, *, on_iteration: OnIteration = lambda done, loss: None
+    ) -> Refined:
+        """Returns one frame refined, the same whatever was refined before.
+
+        Args:
+            frame: The frame.
+            on_iteration: Called after each update of z of a fixed method.
+
+        Raises:
+            PnpDepthError: The frame cannot be refined.
+        """
+        if self._open is None:
+            self._open = self._stack.enter_context(OpenNetworks(self.members))
+        seed = self.asked.seed
+        torch.manual_seed(seed)
+        if frame.register == "auto" and frame.size in self.registrations:
+            frame = replace(frame, register=self.registrations[frame.size])
+        frame = frame.registered()
+        if self.is_default:
+            refined = refine_default(self._open, frame, seed=seed)
+        else:
+            refined = refine_fixed(
+                self._open, frame,
+                seed=seed, validated=self._validated, on_iteration=on_iteration,
+            )  # fmt: skip
+        return with_uncertainty(refined) if self._uncertainty else refined
+
+    def share_registration(self, frames: Iterable[Frame]) -> None:
+        """Decides the registration that images of one size share, by all these frames together.
+
+        Images of the size of the first one decide. A frame of another size decides alone.
+        """
+        usable = list[Evidence]()
+        for read, frame in enumerate(frames, 1):
+            if frame.image is not None and frame.register == "auto":
+                known = evidence(frame.image, frame.points)
+                usable += [] if known is None else [known]
+            if read == _TRIED and not usable:  # such as scans, none of which will tell
+                break
+        if usable:
+            self.registrations = {usable[0].size: estimated(usable)}

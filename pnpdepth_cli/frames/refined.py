@@ -1,0 +1,143 @@
+"""What refinement makes of a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pnpdepth_cli.completion.alignment import Alignment
+from pnpdepth_cli.completion.image_registration import ImageRegistration
+from pnpdepth_cli.core.refine import Refinement
+from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.frames.frame import DepthMap, Frame, no_points
+from pnpdepth_cli.points import SparsePoints
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """What one network gives for a frame, in the image frame."""
+
+    before: Tensor  # (H, W) metres, 0 = unknown: aligned with the points
+    after: Tensor  # (H, W) metres, 0 = unknown: z updated
+    refinement: Refinement  # the same in the network's frame, with the losses
+    diverged: DivergedError | None  # why the updates ended early. None if they did not
+    alignment: Alignment | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refined:
+    """A refined frame, all in the image frame."""
+
+    before: DepthMap
+    """(H, W) metres, 0 = unknown: the network's depth before refinement."""
+    after: DepthMap
+    """(H, W) metres, 0 = unknown: the refined depth."""
+    used: SparsePoints
+    """The points that the depth was fitted to."""
+    held_out: SparsePoints
+    refinement: Refinement
+    diverged: DivergedError | None
+    """Why the refinement stopped early. None if it did not."""
+    alignment: Alignment | None = None
+    """Alignment of the network's output with the points. None where the output is in metres."""
+    notes: tuple[str, ...] = ()
+    sigma: DepthMap | None = None
+    """(H, W) metres, standard deviation of `after`. None if it was not asked for."""
+    valid: NDArray[np.bool_] | None = None
+    """(H, W), where points support `after`. None without `sigma`."""
+    stages: Mapping[str, DepthMap] = field(default_factory=dict)
+    """(H, W) metres of stages of the default method, by name; of a frame with ground truth."""
+    validation: Validation | None = None
+    """The stages and the result at validation points. None where nothing was validated."""
+    weights: Mapping[str, float] = field(default_factory=dict)
+    """Weights of the experts of the default method, by name; their sum is 1."""
+    registration: ImageRegistration | None = None
+    """How the image was moved into the frame of the points. None: it was not."""
+
+    @property
+    def depth(self) -> DepthMap:
+        """The refined depth, `after`."""
+        return self.after
+
+    @property
+    def losses(self) -> tuple[float, ...]:
+        """Loss at the points before the first update and after each update."""
+        return self.refinement.losses
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidationPoints:
+    """Points that predictions from the other points are compared with."""
+
+    points: SparsePoints  # the M validation points; none of a frame with few points
+    weights: Tensor  # (M,) 0…1, how consistent each is with its neighbours
+
+    def error(self, at: Tensor) -> float:
+        """Returns the weighted mean absolute error in metres of a prediction (M,).
+
+        A point without prediction counts as far off as a depth of 0 is.
+        """
+        error = (at - self.points.depth).abs()
+        return float((error * self.weights).sum() / self.weights.sum())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validation(ValidationPoints):
+    """Depth at validation points, predicted from the other points.
+
+    Networks that take points predict without updates of z.
+    """
+
+    kept: SparsePoints  # all other points that were given
+    network: Tensor  # (H, W) metres, 0 = unknown: the user's network, aligned with the other points
+    predicted: Mapping[str, Tensor]
+    """(M,) metres at the validation points, by stage; also linear interpolation and the result."""
+
+
+def refined_of(
+    frame: Frame,
+    own: Prediction,
+    depth: Tensor,
+    *,
+    used: SparsePoints,
+    notes: Sequence[str] = (),
+    stages: Mapping[str, Tensor] | None = None,
+    validation: Validation | None = None,
+    weights: Mapping[str, float] | None = None,
+) -> Refined:
+    """Returns the refined frame.
+
+    Args:
+        frame: The frame, its image moved to its points.
+        own: What the user's network gives for it.
+        depth: (H, W) metres, 0 = unknown: the refined depth.
+        used: The points that the depth was fitted to.
+        notes: Lines of the method for a person.
+        stages: (H, W) metres of stages of the method, by name.
+        validation: The stages at the validation points.
+        weights: Weights of the experts by name.
+    """
+    if frame.registration is not None:
+        moved = f"image: moved into the frame of the points by {frame.registration}"
+        notes = (moved, *own.notes, *notes)
+    else:
+        notes = (*own.notes, *notes)
+    return Refined(
+        before=own.before.numpy(),
+        after=depth.numpy(),
+        used=used,
+        held_out=no_points(used) if frame.held_out is None else frame.held_out,
+        refinement=own.refinement,
+        diverged=own.diverged,
+        alignment=own.alignment,
+        notes=notes,
+        stages={name: stage.numpy() for name, stage in (stages or {}).items()},
+        validation=validation,
+        weights=weights or {},
+        registration=frame.registration,
+    )

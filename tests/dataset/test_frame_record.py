@@ -1,0 +1,163 @@
+"""The record of a frame: what its JSON holds, and what is none."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.dataset.frame_record import (
+    BatchState,
+    CameraRecord,
+    FrameRecord,
+    MethodRecord,
+    ModelRecord,
+    PointsRecord,
+)
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.file_record import FigureRecord, FileRecord, Sampling
+from pnpdepth_cli.io.fingerprint import Fingerprint
+
+HUGE = 10**400
+CAMERA = Camera(
+    intrinsics=np.array([[50.1, 0, 31.3], [0, 51, 22], [0, 0, 1]]),
+    distortion=(0.1, 0.2, 0.0, 0.0),
+    lens="fisheye",
+    source="s",
+)
+FILE = Fingerprint(size=3, sha256="1" * 64, mtime_ns=4, ctime_ns=5)
+POSE = np.column_stack([np.eye(3), [0.1, 0.2, 0.3]])
+RECORD = FrameRecord(
+    name="a/ü 1",
+    group="a",
+    status="diverged",
+    message="the loss is not finite",
+    batch=BatchState(settings="0" * 64, inputs={"image": FILE}),
+    inputs={
+        "image": FileRecord(path="a.png", sha256="1" * 64, read_as="PNG"),
+        "sparse": FileRecord(
+            path="model",
+            sha256={"cameras.bin": "2" * 64},
+            scale=256.0,
+            assumed=True,
+            dropped={"too far": 3},
+            sampled=Sampling(kind="uniform", count=30, seed=7),
+        ),
+    },
+    neighbours=[FileRecord(path="b.png", poses="poses.txt", motion=POSE.tolist())],
+    outputs={"depth": "a_depth.png"},
+    size=(64, 48),
+    points=PointsRecord(used=9, held_out=1, nearest=0.5, farthest=4.5, moved=2),
+    camera=CameraRecord.of(CAMERA, POSE),
+    model=ModelRecord(name="net", spec="net.py", checkpoint=None, checkpoint_sha256=None),
+    method=MethodRecord(kind="fixed", reason="--preset paper", networks=["net"]),
+    settings={"layer": "middle", "iterations": 5, "lr": 0.01, "preset": None},
+    weights={"net": 1.0},
+    registration={"zoom": 0.9},
+    alignment={"kind": "affine", "coefficients": [1.0, 0.0], "order": None},
+    loss=[1.0, None],
+    errors={"used": {"before": {"mae": 1.0, "points": 9}, "after": {"mae": None, "points": 9}}},
+    improved_fraction=0.5,
+    notes=["warning: far"],
+    figures={"preview": FigureRecord(size=(9, 8), panels={"Image": (0, 1, 2, 3)}, scale_m=(1, 2))},
+    seconds={"read": 0.1},
+    peak_memory_mb={"cpu": 9.0},
+    versions={"pnpdepth": "1"},
+)
+
+
+def read_again(record: FrameRecord) -> FrameRecord:
+    text = json.dumps(record.to_json(), allow_nan=False)
+    return FrameRecord.from_json(json.loads(text), Path("a.json"))
+
+
+@pytest.mark.parametrize("record", [RECORD, FrameRecord()])
+def test_a_record_is_read_as_it_was_written_and_keeps_no_empty_entry(record: FrameRecord) -> None:
+    entry = record.to_json()
+    assert read_again(record) == record
+    assert not [name for name, value in entry.items() if value in (None, {}, [])]
+    assert FrameRecord.from_json(entry | {"of a later version": 1}, Path("a.json")) == record
+
+
+scores = st.dictionaries(st.text(), st.none() | st.integers(0, 2**53) | st.floats(0, 1e9))
+
+
+@given(
+    name=st.text(),
+    notes=st.lists(st.text()),
+    seconds=st.dictionaries(st.text(), st.floats(0, 1e9)),
+    settings=st.dictionaries(
+        st.text(), st.none() | st.text() | st.integers(-(2**53), 2**53) | st.floats(-1e9, 1e9)
+    ),
+    stages=st.fixed_dictionaries({"after": scores}, optional={"before": scores}),
+)
+def test_any_texts_and_numbers_are_read_as_they_were_written(
+    name: str, notes: list[str], stages: dict[str, Any], **values: Any
+) -> None:
+    record = FrameRecord(name=name, notes=notes, errors={"used": stages}, **values)
+    assert read_again(record) == record
+
+
+def test_numbers_that_are_none_are_unknown() -> None:
+    errors = {"used": {"after": {"mae": float("nan"), "rmse": float("inf")}}}
+    assert read_again(FrameRecord(errors=errors)).errors == {
+        "used": {"after": {"mae": None, "rmse": None}}
+    }
+
+
+def test_the_camera_is_kept_exactly() -> None:
+    camera = read_again(RECORD).camera
+    assert camera is not None
+    again, pose = camera.read()
+    assert CameraRecord.of(again, pose) == RECORD.camera
+    assert (again.intrinsics == CAMERA.intrinsics).all()
+    assert pose is not None
+    assert (pose == POSE).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"intrinsics": [[0.0, 0.0, 0.0]] * 3},
+        {"intrinsics": [[1.0, 2.0]]},
+        {"pose": [[1.0, 2.0]]},
+        {"lens": "pinhole"},
+    ],
+)
+def test_numbers_of_no_camera_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"camera|reshape"):
+        replace(CameraRecord.of(CAMERA, POSE), **change).read()
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        [],
+        None,
+        "text",
+        {"name": 1},
+        {"status": "unknown"},
+        {"notes": "text"},
+        {"seconds": 0.5},
+        {"points": {"farthest": 4.5}},
+        {"size": [64, 1.5]},
+        {"size": [64]},
+        {"improved_fraction": HUGE},
+        {"errors": {"used": {"before": {"mae": 1.0}}}},
+        {"loss": [HUGE]},
+        {"camera": {"intrinsics": [1, 2]}},
+        {"inputs": {"sparse": {"path": "s.png", "unit_scale": "x"}}},
+        {"inputs": {"sparse": {"path": "s.png", "image": 7}}},
+        {"inputs": {"sparse": "s.png"}},
+    ],
+)
+def test_what_is_no_record_is_refused_with_the_name_of_its_file(entry: object) -> None:
+    with pytest.raises(FileFormatError, match=r"a\.json"):
+        FrameRecord.from_json(entry, Path("a.json"))
