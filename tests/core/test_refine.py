@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -16,8 +15,6 @@ from pnpdepth_cli.errors import (
     DivergedError,
     LayerError,
     ModelError,
-    NoPointsError,
-    PnpDepthError,
 )
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
