@@ -54,15 +54,6 @@ def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.floa
     return rgb
 
 
-def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Returns (H, W), true where an image has any channel above 0, or an array a number above 0.
-
-    Raises:
-        InputError: The file holds no mask.
-    """
-    return np.asarray(read_levels(path) > 0)
-
-
 def read_levels(path: Path) -> NDArray[Any]:
     """Returns (H, W) the numbers of an array, or the largest code of the channels of an image.
 
@@ -87,7 +78,7 @@ def masked(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[np.fl
         SizeError: A mask has another size.
     """
     for path in masks:
-        mask = read_mask(path)
+        mask = read_levels(path) > 0
         if mask.shape != depth.shape:
             raise SizeError(
                 f"mask {path} is {mask.shape[1]}×{mask.shape[0]} but the ground truth is"

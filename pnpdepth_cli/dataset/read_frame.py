@@ -101,7 +101,7 @@ def read_frame(
     if files.gt is not None:
         truth, of_truth, truth_notes = _read_ground_truth(files, options, files.gt, whole)
         gt, truth_reading = np.ascontiguousarray(crop(truth.values)), truth.reading
-        if whole not in (None, truth.values.shape):
+        if whole is not None and whole != truth.values.shape:
             raise _size_error(files, truth.values.shape, whole)
         if not bool((gt > 0).any()):
             raise InputError(f"ground truth {files.gt} has no pixel with known depth")
@@ -431,10 +431,7 @@ def _leak_warning(sparse: ImageArray, gt: ImageArray) -> list[str]:
     ]
 
 
-def _size_error(
-    files: FrameFiles, size: tuple[int, ...], image_size: tuple[int, ...] | None
-) -> SizeError:
-    assert image_size is not None
+def _size_error(files: FrameFiles, size: tuple[int, ...], image_size: tuple[int, int]) -> SizeError:
     return SizeError(
         f"ground truth {files.gt} is {size[1]}×{size[0]} but the image is"
         f" {image_size[1]}×{image_size[0]}"
