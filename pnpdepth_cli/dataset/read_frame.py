@@ -84,6 +84,8 @@ def read_frame(
     """
     if files.min_confidence is not None and files.sparse_mask is None:
         raise UsageError("--min-confidence needs --sparse-mask, the confidence of the sparse depth")
+    if options.sparse_range and files.sparse is None:
+        raise UsageError("--sparse-range is of sparse depth from a file, and there is none")
     crop = files.part.apply
     notes, sources = list[str](), dict[str, FileRecord]()
     rgb: ImageArray | None = None

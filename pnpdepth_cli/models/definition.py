@@ -297,16 +297,21 @@ def graph_definition(
             f"{file} has {len(shapes)} input(s), {listed[:80]}, where {' and '.join(wanted)} is"
             " expected, the image as 1×3×H×W or 1×H×W×3; `input_kind` of a definition says others"
         )
-    last = [len(s) == 4 and s[3] in (1, 3) and s[1] not in (1, 3) for s in shapes]
     height, width = image[1:] if image[0] == channels else image[:2]
+
+    def fitted(tensor: Tensor, shape: Sequence[Any]) -> Tensor:
+        """The tensor without a batch axis, or with the channels last, where the graph has it so."""
+        if tensor.ndim > len(shape):
+            return tensor[0]
+        last = len(shape) == 4 and shape[3] in (1, 3) and shape[1] not in (1, 3)
+        return tensor.permute(0, 2, 3, 1).contiguous() if last else tensor
 
     def arguments(*given: Tensor | None) -> tuple[Tensor, ...]:
         tensors = (tensor for tensor in given if tensor is not None)
-        return tuple(
-            tensor.permute(0, 2, 3, 1).contiguous() if is_last else tensor
-            for tensor, is_last in zip(tensors, last, strict=True)
-        )
+        return tuple(fitted(*pair) for pair in zip(tensors, shapes, strict=True))
 
+    if "rgb" not in kind:
+        known["normalisation"] = Normalisation()
     if isinstance(height, int) and isinstance(width, int):
         claim = f"{file} takes images of {width}×{height} pixels"
         limit = "allow more with --max-pixels"

@@ -70,6 +70,13 @@ def test_an_image_of_a_graph_has_three_channels_first_or_last(
     assert argument.shape == ((1, 32, 48, 3) if shape[1] == 32 else (1, 3, 32, 48))
 
 
+def test_inputs_are_given_with_the_axes_of_the_graph() -> None:
+    stated = {"input_kind": "sparse", "takes_intrinsics": True}
+    sparse = graph_definition([[1, 8, 8, 1], [3, 3]], Path("x.pt2"), stated, build=nn.Identity)
+    inputs = sparse.call_arguments(None, torch.zeros(1, 1, 8, 8), torch.eye(3)[None])
+    assert [tuple(each.shape) for each in inputs] == [(1, 8, 8, 1), (3, 3)]
+
+
 # ------------------------------------------------------------------ fields that make no sense
 
 NAN, INF = math.nan, math.inf

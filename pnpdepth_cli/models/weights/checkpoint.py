@@ -250,6 +250,8 @@ def _state_in(content: Any, path: Path, key: str) -> tuple[dict[str, Tensor], li
         others = _some([repr(name) for name in states if name != chosen])
         note = f"checkpoint {path.name}: {chosen!r} is read, not {others}; {path.name}:KEY chooses"
         return states[chosen], [note] * (len(states) > 1)
+    if key in content:  # with a state dict in it, beside other things
+        return _state_in(content[key], path, "")
     fact = f"no state dict {key!r}" if key else "no state dict of plain tensors"
     held = _some([str(name) for name in content]) or "nothing"
     way_out = f"; --checkpoint {path}:KEY reads that of {_some(list(states), ' or ')}"

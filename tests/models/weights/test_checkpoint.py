@@ -151,6 +151,8 @@ def test_a_state_dictionary_of_another_name_is_read_if_it_is_named(tmp_path: Pat
     with pytest.raises(CheckpointError, match="KEY reads that of teacher"):
         loaded(tmp_path / "w.pth")
     assert equal(loaded(tmp_path / "w.pth:teacher")[0], weights())
+    torch.save({"ema": {"state_dict": weights(), "decay": 0.9}, "epoch": 7}, tmp_path / "w.pth")
+    assert equal(loaded(tmp_path / "w.pth:ema")[0], weights())
 
 
 def test_a_prefix_of_some_keys_or_of_the_network_itself_is_kept(tmp_path: Path) -> None:
