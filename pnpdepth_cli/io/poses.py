@@ -90,9 +90,9 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
             if len(found) != 1:
                 raise InputError(f"{path} has {len(found)} frames of the name {name!r}, not one")
             poses[index] = np.array(found[0][1], np.float64)[:3, :4]
-            if not is_rotation(poses[index, :, :3]):
+            if not np.isfinite(poses[index]).all() or not is_rotation(poses[index, :, :3]):
                 raise ValueError(f"the pose of {name} is no rotation")
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError) as error:
         raise FileFormatError(f"{path} is no transforms.json ({one_line(error)})") from error
     return poses * (1, -1, -1, 1)
 
@@ -101,7 +101,8 @@ def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
     """The poses (N, 3, 4) of the frames of these names in a file of rows, and how they join."""
     rows = _rows(path)
     poses = np.stack([pose for _, _, pose in rows])
-    numbers = [_last_number(name) for name in names]
+    ends = [re.search(r"\d+(?:\.\d+)?$", name) for name in names]
+    numbers = [None if end is None else float(end[0]) for end in ends]
     if None not in numbers and all(len(values) == _TUM_COLUMNS for _, values, _ in rows):
         times_s, wanted_s = np.array([v[0] for _, v, _ in rows]), np.array(numbers, np.float64)
         order = np.argsort(times_s)
@@ -120,12 +121,6 @@ def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
         f"{path} has {len(rows)} poses for {len(names)} frames; it needs one row for each, in their"
         " order, or a time that is the frame's name"
     )
-
-
-def _last_number(name: str) -> float | None:
-    """The number at the end of a frame's name; None without one."""
-    found = re.search(r"\d+(?:\.\d+)?$", name)
-    return None if found is None else float(found[0])
 
 
 def _rows(path: Path) -> list[tuple[int, Floats, Floats]]:

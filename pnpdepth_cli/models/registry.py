@@ -87,15 +87,11 @@ def find_definition(spec: str) -> ModelDefinition:
     for definitions in families().values():
         if spec in definitions:
             return definitions[spec]
+    near = difflib.get_close_matches(spec, names(), n=1)
+    way_out = f"did you mean {near[0]!r}?" if near else "`pnpdepth models` lists all names"
     raise ModelError(
-        f"model {spec!r} is neither a known name nor a file or folder of a network;"
-        f" {_near_names(spec)}"
+        f"model {spec!r} is neither a known name nor a file or folder of a network; {way_out}"
     )
-
-
-def _near_names(name: str) -> str:
-    near = difflib.get_close_matches(name, names(), n=1)
-    return f"did you mean {near[0]!r}?" if near else "`pnpdepth models` lists all names"
 
 
 def _from_file(spec: str) -> ModelDefinition | None:
