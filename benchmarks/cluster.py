@@ -21,9 +21,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pnpdepth_cli.commands.batch.batch import run_batch
-from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.run_batch import run_batch
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import write_depth
 
@@ -118,7 +118,7 @@ def measured(program: str, *arguments: str) -> dict[str, float]:
 RESUME = """
 import sys; from pathlib import Path
 from benchmarks.cluster import Quiet, request_of
-from pnpdepth_cli.commands.batch.batch import run_batch
+from pnpdepth_cli.commands.batch.run_batch import run_batch
 counts = run_batch(request_of(Path(sys.argv[1])), Quiet()).summary.counts
 assert counts["done"] == counts["frames"], counts
 """

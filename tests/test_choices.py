@@ -31,14 +31,14 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OpenList:
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    return OpenList("io", "__name__", group="test_table", noun="entry", first=("record",))
+    return OpenList("io", "__name__", group="test_table", noun="entry", first=("json-file",))
 
 
 def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_there(
     table: OpenList,
 ) -> None:
     names = list(table)
-    assert names == ["record", *sorted(set(names) - {"record"})]
+    assert names == ["json-file", *sorted(set(names) - {"json-file"})]
     assert {"scans", "elsewhere"} <= set(names)
     assert "--init--" not in table
     assert len(table) == len(names)

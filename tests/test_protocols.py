@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.batch.frames import find_frames, task_of
-from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.find_frames import find_frames, task_of
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.scoring import scores_of
-from pnpdepth_cli.commands.refinement.refine import read_requested
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_image import read_requested
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints

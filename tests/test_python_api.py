@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import pnpdepth_cli as pnp
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.frames.arrays import frame_of_arrays
+from pnpdepth_cli.frames.from_arrays import frame_of_arrays
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 

@@ -37,19 +37,19 @@ _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """What the operating system says of a disk that takes no more; anything else is of an input."""
 
 COMMANDS = {
-    "refine": "refine:refine",
-    "batch": "batch:batch",
-    "models": "models:models",
-    "layers": "models:layers",
-    "project": "sparse:project",
-    "frames": "sparse:frames",
-    "sample": "sparse:sample",
-    "simulate": "sparse:simulate",
-    "cloud": "cloud:cloud",
-    "export": "export:export",
-    "eval": "evaluate:evaluate",
-    "compare": "compare:compare",
-    "doctor": "doctor:doctor",
+    "refine": "refine_command:refine",
+    "batch": "batch_command:batch",
+    "models": "models_command:models",
+    "layers": "models_command:layers",
+    "project": "sparse_commands:project",
+    "frames": "sparse_commands:frames",
+    "sample": "sparse_commands:sample",
+    "simulate": "sparse_commands:simulate",
+    "cloud": "cloud_command:cloud",
+    "export": "export_command:export",
+    "eval": "eval_command:evaluate",
+    "compare": "compare_command:compare",
+    "doctor": "doctor_command:doctor",
 }
 """The subcommands in the order of the help, as `module:function` in `pnpdepth_cli.cli`."""
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.commands.refinement.request import (
+from pnpdepth_cli.commands.refinement.refine_request import (
     HoldOut,
     NetworkChoice,
     OutputOptions,
@@ -72,7 +72,7 @@ def options_of_groups(
     """Returns a decorator that adds the options of these groups of a request to a command.
 
     Args:
-        *groups: Dataclasses of `pnpdepth_cli.commands.refinement.request`.
+        *groups: Dataclasses of `pnpdepth_cli.commands.refinement.refine_request`.
         without: Names of fields that are left out.
     """
     wanted = [each for group in groups for each in options_of(group) if each.name not in without]

@@ -20,7 +20,7 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.fingerprint import Fingerprint
-from pnpdepth_cli.io.record import plain, read_json, write_json
+from pnpdepth_cli.io.json_file import plain, read_json, write_json
 from pnpdepth_cli.stages import AFTER, GT, HELD_OUT, LINEAR, VALIDATION
 
 Pose = NDArray[np.float64]

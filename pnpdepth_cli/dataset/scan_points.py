@@ -22,7 +22,7 @@ from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.extrinsics import read_extrinsics
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.record import sha256_of
+from pnpdepth_cli.io.json_file import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.points import SparsePoints, in_frame

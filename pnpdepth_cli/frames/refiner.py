@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from pnpdepth_cli.errors import DivergedError, UsageError
 from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
-from pnpdepth_cli.frames.arrays import Unit, frame_of_arrays
 from pnpdepth_cli.frames.frame import Frame, Registration, registration_to_make
+from pnpdepth_cli.frames.from_arrays import Unit, frame_of_arrays
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import resolve_definition

@@ -33,7 +33,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.extrinsics import checked_pose, numbers_in, pose_of_matrix
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_text_size, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.record import read_json
+from pnpdepth_cli.io.json_file import read_json
 from pnpdepth_cli.io.yaml_file import parse_yaml
 
 CAMERA = 2

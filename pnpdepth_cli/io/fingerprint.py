@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import cannot_read
-from pnpdepth_cli.io.record import sha256_of
+from pnpdepth_cli.io.json_file import sha256_of
 
 
 @dataclass(frozen=True, kw_only=True)

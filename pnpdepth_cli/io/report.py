@@ -29,7 +29,7 @@ from pnpdepth_cli.io.atomic import (
 )
 from pnpdepth_cli.io.colours import LOGARITHMIC_FROM, DepthScale, Pixels, hex_colours
 from pnpdepth_cli.io.figure import resized
-from pnpdepth_cli.io.record import plain, read_json, write_json
+from pnpdepth_cli.io.json_file import plain, read_json, write_json
 from pnpdepth_cli.measures import Measure
 
 PAGE = "index.html"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import damaged, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.arrays import parse_npy
+from pnpdepth_cli.io.formats.array_files import parse_npy
 from pnpdepth_cli.io.sparse_files import read_rows
 
 _FIELD_COUNTS = (3, 4, 5, 6, 7, 8)

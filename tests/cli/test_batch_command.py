@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pnpdepth_cli.cli import batch as command
+from pnpdepth_cli.cli import batch_command as command
 from pnpdepth_cli.cli import progress
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.progress import BatchProgress

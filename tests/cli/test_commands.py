@@ -9,7 +9,7 @@ import pytest
 
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.options import request_of
-from pnpdepth_cli.cli.refine import refine as refine_command
+from pnpdepth_cli.cli.refine_command import refine as refine_command
 from tests.commands.frames import FrameOnDisk
 
 

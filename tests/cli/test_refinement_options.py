@@ -8,10 +8,10 @@ from pathlib import Path
 import click
 import pytest
 
-from pnpdepth_cli.cli.batch import batch
+from pnpdepth_cli.cli.batch_command import batch
 from pnpdepth_cli.cli.options import taken
-from pnpdepth_cli.cli.refine import refine
-from pnpdepth_cli.commands.refinement.request import OutputOptions, RefineRequest
+from pnpdepth_cli.cli.refine_command import refine
+from pnpdepth_cli.commands.refinement.refine_request import OutputOptions, RefineRequest
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple

@@ -12,7 +12,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from pnpdepth_cli.cli.export import export
+from pnpdepth_cli.cli.export_command import export
 from pnpdepth_cli.cli.main import cli, run
 from pnpdepth_cli.commands import doctor
 from pnpdepth_cli.io.depth import write_depth

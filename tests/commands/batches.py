@@ -10,10 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pnpdepth_cli.commands.batch.batch import BatchOutcome, run_batch
-from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.refinement.refine import refine_image
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.run_batch import BatchOutcome, run_batch
+from pnpdepth_cli.commands.refinement.refine_image import refine_image
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.frames import frame_on_disk
 

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 
-from pnpdepth_cli.commands.refinement.refine import RefineOutcome, refine_image
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_image import RefineOutcome, refine_image
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.io.depth import write_depth
 
 NETWORK = """

@@ -15,15 +15,15 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.sparse.make import SparseTarget, sample_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, UsageError
-from pnpdepth_cli.frames.arrays import frame_of_arrays
 from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.from_arrays import frame_of_arrays
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors import SamplePattern
 

@@ -19,7 +19,7 @@ from pnpdepth_cli.dataset.scan_points import (
 )
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.record import read_json
+from pnpdepth_cli.io.json_file import read_json
 from pnpdepth_cli.io.scans import read_scan
 from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
 

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Extrinsics
-from pnpdepth_cli.commands.refinement.refine import read_requested
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_image import read_requested
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions

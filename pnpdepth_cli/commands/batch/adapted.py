@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.batch.frames import Task, task_of
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.find_frames import Task, task_of
 from pnpdepth_cli.commands.batch.records import settings_of
-from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import DivergedError, InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.io.record import read_json, write_json
+from pnpdepth_cli.io.json_file import read_json, write_json
 
 if TYPE_CHECKING:
     from pnpdepth_cli.frames.adapt import Learnt
@@ -89,7 +89,7 @@ def _learn(
     stopped: Callable[[], bool],
 ) -> str | None:
     """Writes adapted weights if they are better beyond chance; returns why they are not."""
-    from pnpdepth_cli.commands.refinement.refine import read_requested  # these import torch
+    from pnpdepth_cli.commands.refinement.refine_image import read_requested  # these import torch
     from pnpdepth_cli.frames.adapt import learn, too_little
     from pnpdepth_cli.frames.resolve import resolve_definition
     from pnpdepth_cli.models.network import load_network

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import chosen_max_pixels, set_max_pixels
-from pnpdepth_cli.commands.batch.frames import task_of
+from pnpdepth_cli.commands.batch.batch_request import LOCAL, BatchRequest, RayWorkers
+from pnpdepth_cli.commands.batch.find_frames import task_of
 from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
-from pnpdepth_cli.commands.batch.request import LOCAL, BatchRequest, RayWorkers
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import ClusterError, ModelError, UsageError

@@ -17,23 +17,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.commands.batch.frames import Task
+from pnpdepth_cli.commands.batch.find_frames import Task
 from pnpdepth_cli.commands.batch.summary import CSV, JSON
 from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs, stale_outputs
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.file_bytes import cannot_read
 from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
+from pnpdepth_cli.io.json_file import parse_json, plain, sha256_of
 from pnpdepth_cli.io.lock import LOCKS
-from pnpdepth_cli.io.record import parse_json, plain, sha256_of
 from pnpdepth_cli.models.definition import file_and_part
 from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.commands.refinement.refine import RefineOutcome
+    from pnpdepth_cli.commands.refinement.refine_image import RefineOutcome
 
 _OWN_SUMMARY = b'{\n  "command": "batch"'
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-from pnpdepth_cli.commands.batch.frames import Task, task_of
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.find_frames import Task, task_of
 from pnpdepth_cli.commands.batch.records import Records
-from pnpdepth_cli.commands.batch.request import BatchRequest
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
-from pnpdepth_cli.commands.refinement.refine import load_method, read_requested, write_refined
+from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested, write_refined
 from pnpdepth_cli.commands.stopwatch import Stopwatch
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord

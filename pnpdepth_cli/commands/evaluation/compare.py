@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.evaluation.eval_request import scoring_of
 from pnpdepth_cli.commands.evaluation.pairing import some_names
-from pnpdepth_cli.commands.evaluation.request import scoring_of
 from pnpdepth_cli.commands.statistics import (
     MIN_CLUSTERS,
     Clusters,
@@ -27,7 +27,7 @@ from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.record import plain, read_json
+from pnpdepth_cli.io.json_file import plain, read_json
 from pnpdepth_cli.measures import MEASURES, FrameMeans, Measure, chosen_measures
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.stages import AFTER, BEFORE, GT

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.scoring import (
     PREDICTION,
     TRUTH,
@@ -36,7 +36,7 @@ from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.io.json_file import plain
 from pnpdepth_cli.measures import OF_SIGMA, FrameMeans, Measure
 
 _LISTED = 3

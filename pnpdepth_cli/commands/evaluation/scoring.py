@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from pnpdepth_cli.commands.evaluation.frames import Depth, LoadedFrame, load_frame
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
+from pnpdepth_cli.commands.evaluation.load_depths import Depth, LoadedFrame, load_frame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import PnpDepthError

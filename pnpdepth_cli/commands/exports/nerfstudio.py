@@ -22,7 +22,7 @@ from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.formats import LARGEST_CODE
-from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.io.json_file import write_json
 
 _CODES_PER_UNIT = 1000.0
 _START = "start.ply"

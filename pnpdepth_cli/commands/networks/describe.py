@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.commands.refinement.request import NetworkChoice
+from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import ModelError, UsageError

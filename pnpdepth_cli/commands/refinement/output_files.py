@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES

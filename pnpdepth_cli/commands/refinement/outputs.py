@@ -22,7 +22,7 @@ from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.colours import depth_scale
 from pnpdepth_cli.io.depth import metres, write_depth
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
-from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.io.json_file import write_json
 from pnpdepth_cli.io.visualisation import (
     improvement,
     improvement_at_points,

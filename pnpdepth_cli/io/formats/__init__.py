@@ -7,7 +7,7 @@ point of the group `pnpdepth.formats`.
 from __future__ import annotations
 
 from pnpdepth_cli.choices import FORMATS
-from pnpdepth_cli.io.formats import arrays, images
+from pnpdepth_cli.io.formats import array_files, images
 from pnpdepth_cli.io.formats.depth_format import KITTI_SCALE as KITTI_SCALE
 from pnpdepth_cli.io.formats.depth_format import LARGEST_CODE as LARGEST_CODE
 from pnpdepth_cli.io.formats.depth_format import SATURATED_CODE as SATURATED_CODE
@@ -21,9 +21,9 @@ from pnpdepth_cli.io.formats.depth_format import eight_bits as eight_bits
 TABLE: dict[str, DepthFormat] = {
     "png": images.PNG,
     "exr": images.EXR,
-    "npy": arrays.NPY,
-    "npz": arrays.NPZ,
-    "pfm": arrays.PFM,
+    "npy": array_files.NPY,
+    "npz": array_files.NPZ,
+    "pfm": array_files.PFM,
     "tiff": images.TIFF,
 }
 """The formats of this package by name."""

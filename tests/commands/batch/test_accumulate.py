@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.commands.batch.frames import find_frames
-from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest, SequenceOptions
+from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.sensors import SamplePattern

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.commands.batch.batch import run_batch
-from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.run_batch import run_batch
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.frames import adapt as adapting
 from tests.commands.batches import RecordingListener
 from tests.commands.drives import drive_on_disk

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.batch import ray_workers
+from pnpdepth_cli.commands.batch.batch_request import ClusterOptions
 from pnpdepth_cli.commands.batch.records import remove_all_leftovers
-from pnpdepth_cli.commands.batch.request import ClusterOptions
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import ClusterError
 from tests.commands.batches import RecordingListener, add_frame, batch, pairs_on_disk, results

@@ -11,6 +11,12 @@ from typing import Any
 
 import pytest
 
+from pnpdepth_cli.commands.batch.batch_request import (
+    LOCAL,
+    ClusterOptions,
+    parse_address,
+    ray_workers_of,
+)
 from pnpdepth_cli.commands.batch.ray_workers import (
     check_node,
     connected,
@@ -18,7 +24,6 @@ from pnpdepth_cli.commands.batch.ray_workers import (
     refine_on_actors,
     software,
 )
-from pnpdepth_cli.commands.batch.request import LOCAL, ClusterOptions, parse_address, ray_workers_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import ClusterError, ModelError, StorageError, UsageError
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.evaluation.compare import compare
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.io.record import write_json
+from pnpdepth_cli.io.json_file import write_json
 from pnpdepth_cli.measures import MEASURES
 
 

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
+from pnpdepth_cli.commands.evaluation.eval_tables import worst
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.commands.evaluation.scoring import filled, is_missing, scores_of
-from pnpdepth_cli.commands.evaluation.tables import worst
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, Sampling

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.pairing import (
     FramePair,
     frame_name,
     pair_frames,
 )
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord

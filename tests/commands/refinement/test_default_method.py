@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.refinement.refine import load_method, read_requested
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
 from tests.commands.frames import FrameOnDisk, run

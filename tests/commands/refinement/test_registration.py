@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from pnpdepth_cli import Refiner, load_network
-from pnpdepth_cli.commands.refinement.refine import load_method, read_requested
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.completion.image_registration import estimated, evidence
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.frames.frame import Frame

@@ -9,15 +9,15 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from pnpdepth_cli.commands.batch.frames import find_frames, unpacked
-from pnpdepth_cli.commands.batch.request import BatchRequest, SequenceOptions
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest, SequenceOptions
+from pnpdepth_cli.commands.batch.find_frames import find_frames, unpacked
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.sparse import bag_frames
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.bags.transforms import camera_trajectory
+from pnpdepth_cli.io.json_file import read_json
 from pnpdepth_cli.io.poses import read_poses
-from pnpdepth_cli.io.record import read_json
 from tests.bags import write_bag
 from tests.commands.sparse.test_bags import KINDS, written
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.batch.frames import task_of
-from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.refinement.refine import read_requested
-from pnpdepth_cli.commands.refinement.request import RefineRequest, sample_pattern
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.find_frames import task_of
+from pnpdepth_cli.commands.refinement.refine_image import read_requested
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, sample_pattern
 from pnpdepth_cli.dataset.arrays import masked, moved_to
 from pnpdepth_cli.dataset.frame_files import FrameFiles, file_of
 from pnpdepth_cli.dataset.layouts import LAYOUTS, find_layout, list_frames

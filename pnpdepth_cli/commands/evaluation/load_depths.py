@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
 from pnpdepth_cli.dataset.arrays import depth_of, masked, read_image
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError

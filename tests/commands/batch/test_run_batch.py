@@ -17,19 +17,19 @@ import torch
 from safetensors.torch import load_file
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.cli.tables import print_batch
+from pnpdepth_cli.cli.printing import print_batch
 from pnpdepth_cli.commands.batch import running as batch_running
-from pnpdepth_cli.commands.batch.batch import run_batch
-from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.run_batch import run_batch
 from pnpdepth_cli.commands.batch.summary import Tally
-from pnpdepth_cli.commands.refinement.refine import read_requested
-from pnpdepth_cli.commands.report.batch import write_batch_report
+from pnpdepth_cli.commands.refinement.refine_image import read_requested
+from pnpdepth_cli.commands.report.batch_report import write_batch_report
 from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.io.json_file import plain
 from pnpdepth_cli.sensors import SamplePattern
 from tests.commands.batches import (
     NAMES,

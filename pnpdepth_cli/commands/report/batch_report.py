@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.commands.batch.request import BatchRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import BatchSummary
 from pnpdepth_cli.commands.error_tables import (
     baselines_table,

@@ -12,14 +12,14 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from typing import NamedTuple, Protocol, TypeVar
 
-from pnpdepth_cli.commands.batch.frames import Task, find_frames, source_files, task_of
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest, ray_workers_of
+from pnpdepth_cli.commands.batch.find_frames import Task, find_frames, source_files, task_of
 from pnpdepth_cli.commands.batch.records import (
     Records,
     model_identity,
     remove_all_leftovers,
     settings_of,
 )
-from pnpdepth_cli.commands.batch.request import BatchRequest, ray_workers_of
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, sequences_of
 from pnpdepth_cli.commands.batch.summary import TEXT, BatchSummary, Tally, write_summaries
 from pnpdepth_cli.commands.ordered_pool import in_order
@@ -153,7 +153,7 @@ class _Batch:
         request = self.request
         if request.html is None:
             return
-        from pnpdepth_cli.commands.report.batch import check_batch_report
+        from pnpdepth_cli.commands.report.batch_report import check_batch_report
 
         files = (path for frame in self.found.frames for path in source_files(frame))
         check_batch_report(request, request.html, files)
@@ -272,7 +272,7 @@ class _Batch:
 
             write_summaries(request.output, summary, file, records)
             if request.html is not None:
-                from pnpdepth_cli.commands.report.batch import write_batch_report
+                from pnpdepth_cli.commands.report.batch_report import write_batch_report
 
                 write_batch_report(request, request.html, summary, records)
         return summary

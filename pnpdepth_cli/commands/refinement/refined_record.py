@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
@@ -28,7 +28,7 @@ from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import normalisation_name
-from pnpdepth_cli.io.record import sha256_of
+from pnpdepth_cli.io.json_file import sha256_of
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 
-from pnpdepth_cli.commands.batch.request import BatchRequest, FrameSelection
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest, FrameSelection
 from pnpdepth_cli.commands.batch.sequence import with_neighbours
 from pnpdepth_cli.commands.batch.summary import CSV, JSON
 from pnpdepth_cli.commands.refinement.output_files import Outputs, outputs_in
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
-from pnpdepth_cli.commands.evaluation.frames import scaled
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
+from pnpdepth_cli.commands.evaluation.load_depths import scaled
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import write_depth
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
-from pnpdepth_cli.commands.evaluation.request import EvalRequest
-from pnpdepth_cli.commands.report.evaluation import write_eval_report
+from pnpdepth_cli.commands.report.eval_report import write_eval_report
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import StorageError
 from pnpdepth_cli.file_record import FileRecord

@@ -10,7 +10,7 @@ import click
 from pnpdepth_cli.choices import SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.streams import say
-from pnpdepth_cli.commands.refinement.request import parse_sample
+from pnpdepth_cli.commands.refinement.refine_request import parse_sample
 from pnpdepth_cli.dataset.read_options import ScanOptions
 
 
@@ -44,7 +44,7 @@ def project(
     the foreground are dropped and counted. Beside the output, NAME_overlay.png is the image with
     the points, and a JSON file records the settings.
     """
-    from pnpdepth_cli.cli.tables import print_sparse
+    from pnpdepth_cli.cli.printing import print_sparse
     from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 
     target = SparseTarget(output=output, overwrite=overwrite)
@@ -98,7 +98,7 @@ def sample(
 
     The settings, with the seed, are stored in the file (PNG, CSV) and in a JSON file beside it.
     """
-    from pnpdepth_cli.cli.tables import print_sparse
+    from pnpdepth_cli.cli.printing import print_sparse
     from pnpdepth_cli.commands.sparse import make
 
     values["scale"] = values.pop("depth_scale")
@@ -156,7 +156,7 @@ def simulate(
     pnpdepth simulate gt.png --sensor vlp-16 --calib calib.txt -o sparse.exr
     pnpdepth simulate gt.png --beams 40 --vertical-fov 15 -25 --calib calib.txt -o sparse.exr
     """
-    from pnpdepth_cli.cli.tables import print_sparse
+    from pnpdepth_cli.cli.printing import print_sparse
     from pnpdepth_cli.commands.sparse.make import SparseTarget, find_sensor, simulate_scan
 
     scanner = find_sensor(sensor, beams, vertical_fov)
@@ -198,7 +198,12 @@ def simulate(
     help="Only the frames of these numbers, from 0.",
 )
 @click.option(
-    "--every", type=click.IntRange(1), default=1, metavar="N", help="Only every N-th of them."
+    "--every",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Only every N-th of them.",
 )
 @options.overwrite
 def frames(bag: Path, output: Path, **values: Any) -> None:

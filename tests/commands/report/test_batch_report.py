@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.batch.request import BatchRequest
-from pnpdepth_cli.commands.report import batch as report_batch
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.report import batch_report as report_batch
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io.colours import paint_signed

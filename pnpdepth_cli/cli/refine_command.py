@@ -9,7 +9,7 @@ import click
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.cli.streams import print_json
-from pnpdepth_cli.commands.refinement.request import (
+from pnpdepth_cli.commands.refinement.refine_request import (
     HoldOut,
     NetworkChoice,
     OutputOptions,
@@ -76,8 +76,8 @@ def refine(as_json: bool, **values: Any) -> None:
     Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>_improvement.png
     (blue better, orange worse) and <name>.json.
     """
-    from pnpdepth_cli.cli.tables import print_refinement
-    from pnpdepth_cli.commands.refinement.refine import refine_image
+    from pnpdepth_cli.cli.printing import print_refinement
+    from pnpdepth_cli.commands.refinement.refine_image import refine_image
 
     request = options.request_of(values)
     with progress_bar("refine", "update") as show:

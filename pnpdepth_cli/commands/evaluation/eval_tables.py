@@ -12,7 +12,7 @@ from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
 from pnpdepth_cli.commands.evaluation.scoring import PREDICTION, TRUTH, scores_of
 from pnpdepth_cli.commands.tables import Cell, Style, Table
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.io.record import plain
+from pnpdepth_cli.io.json_file import plain
 from pnpdepth_cli.measures import COVERAGE, chosen_measures
 
 _FRAMES_SHOWN = 12

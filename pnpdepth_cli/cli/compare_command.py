@@ -57,10 +57,10 @@ def compare(
     single sequence over blocks as long as its errors are correlated, adjusted for the number of
     measures and runs (Holm); it is exact for few groups, else with random permutations.
     """
-    from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
+    from pnpdepth_cli.cli.printing import TableFiles, print_notes, print_table
     from pnpdepth_cli.commands.evaluation.compare import compare as compare_runs
+    from pnpdepth_cli.commands.evaluation.eval_tables import comparison_table, methods_table
     from pnpdepth_cli.commands.evaluation.plot import plot_comparison
-    from pnpdepth_cli.commands.evaluation.tables import comparison_table, methods_table
 
     files = TableFiles(**table_files)
     files.check([Path(run) for run in runs])

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS, PROTOCOLS
-from pnpdepth_cli.commands.refinement.request import RefineRequest, parse_sample
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.measures import MEASURES, chosen_measures, parse_keys

@@ -12,7 +12,7 @@ import click
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.cli.streams import print_json, say
-from pnpdepth_cli.commands.refinement.request import NetworkChoice
+from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice
 
 
 class _Models(click.Group):
@@ -43,7 +43,7 @@ def list_command(as_json: bool) -> None:
     if as_json:
         print_json(listed)
         return
-    from pnpdepth_cli.cli.tables import print_table
+    from pnpdepth_cli.cli.printing import print_table
     from pnpdepth_cli.commands.tables import Table
 
     print_table(Table(
@@ -124,7 +124,7 @@ def layers(every: bool, as_json: bool, **values: Any) -> None:
     if as_json:
         print_json([asdict(row) for row in rows])
         return
-    from pnpdepth_cli.cli.tables import print_table
+    from pnpdepth_cli.cli.printing import print_table
     from pnpdepth_cli.commands.tables import Table
 
     fields = ("field\nin z", "field\nin depth")

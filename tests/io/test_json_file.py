@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError
-from pnpdepth_cli.io.record import read_json, sha256_of, write_json
+from pnpdepth_cli.io.json_file import read_json, sha256_of, write_json
 
 
 @dataclass

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pnpdepth_cli.commands.refinement.record import _at_points
+from pnpdepth_cli.commands.refinement.refined_record import _at_points
 from pnpdepth_cli.dataset.frame_record import FrameRecord, PointsRecord
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import (

@@ -9,8 +9,8 @@ from typing import NamedTuple
 from pnpdepth_cli.commands.error_tables import made_by
 from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs, stale_outputs
 from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
-from pnpdepth_cli.commands.refinement.record import record_of
-from pnpdepth_cli.commands.refinement.request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.refinement.refined_record import record_of
 from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.read_frame import read_frame

@@ -17,13 +17,13 @@ import click
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.streams import INTERRUPTED, say
 from pnpdepth_cli.cli.vary import Combination, combinations_of
-from pnpdepth_cli.commands.batch.request import (
+from pnpdepth_cli.commands.batch.batch_request import (
     BatchRequest,
     ClusterOptions,
     FrameSelection,
     SequenceOptions,
 )
-from pnpdepth_cli.commands.refinement.request import (
+from pnpdepth_cli.commands.refinement.refine_request import (
     HoldOut,
     NetworkChoice,
     OutputOptions,
@@ -121,7 +121,7 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
 
     The results of a combination of varied options lie in a folder of its own.
     """
-    from pnpdepth_cli.commands.batch.frames import unpacked
+    from pnpdepth_cli.commands.batch.find_frames import unpacked
 
     values = dict(values)
     own = options.taken(BatchRequest, values)
@@ -143,9 +143,9 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
 
 def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSummary, bool]:
     """Returns the batch's summary, which it prints, and whether the batch was stopped."""
+    from pnpdepth_cli.cli.printing import print_batch
     from pnpdepth_cli.cli.progress import BatchProgress
-    from pnpdepth_cli.cli.tables import print_batch
-    from pnpdepth_cli.commands.batch.batch import run_batch
+    from pnpdepth_cli.commands.batch.run_batch import run_batch
 
     with BatchProgress() as progress:
         try:

@@ -9,10 +9,10 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.compare import columns
+from pnpdepth_cli.cli.compare_command import columns
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.cli.streams import print_json, say
-from pnpdepth_cli.commands.evaluation.request import EvalRequest, ScoringRules
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest, ScoringRules
 from pnpdepth_cli.errors import FramesFailedError
 
 _OUTPUT = ("--csv", "--latex", "--columns", "--html", "--overwrite", "--json")
@@ -70,10 +70,10 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     kitti-devkit  figures of KITTI's development kit: missing depth filled in, metres, 1/m
     eigen, garg   0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
     """
-    from pnpdepth_cli.cli.tables import TableFiles, print_notes, print_table
-    from pnpdepth_cli.commands.evaluation import tables
+    from pnpdepth_cli.cli.printing import TableFiles, print_notes, print_table
+    from pnpdepth_cli.commands.evaluation import eval_tables as tables
     from pnpdepth_cli.commands.evaluation.evaluate import evaluate as run_evaluation
-    from pnpdepth_cli.commands.report import evaluation as report_eval
+    from pnpdepth_cli.commands.report import eval_report as report_eval
     from pnpdepth_cli.measures import OF_SIGMA, chosen_measures
 
     files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
