@@ -42,7 +42,8 @@ except SystemExit as stop:
 files = [Path(frame.filename) for frame in stacks[0]]
 own = [frame for frame, file in zip(stacks[0], files) if file.is_relative_to(package)]
 own = [frame for frame in own if "core/split" not in Path(frame.filename).as_posix()]
-starts = [number for number, frame in enumerate(own) if frame.filename.endswith("cli/refine_command.py")]
+in_cli = [frame.filename.endswith("cli/refine_command.py") for frame in own]
+starts = [number for number, there in enumerate(in_cli) if there]
 names = [f"{Path(f.filename).stem}.{f.name}" for f in own[starts[0]:]]
 print("HOPS", " > ".join(names))
 """

@@ -203,7 +203,7 @@ def simulate(
     default=1,
     show_default=True,
     metavar="N",
-    help="Only every N-th of them.",
+    help="Only every N-th of these.",
 )
 @options.overwrite
 def frames(bag: Path, output: Path, **values: Any) -> None:

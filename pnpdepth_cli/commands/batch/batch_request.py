@@ -46,7 +46,11 @@ class FrameSelection:
         "Crop and points of the frames, by which `eval` scores too.  [default: the layout's own]",
         choices=PROTOCOLS,
     )
-    limit: int | None = option(None, "Only the first N frames.", metavar="N", least=1)
+    names: str | None = option(
+        None, "Only frames whose names match, such as 'drive_1/*'.", metavar="GLOB", flag="--frames"
+    )
+    every: int = option(1, "Only every N-th of these.", metavar="N", least=1, show_default=True)
+    limit: int | None = option(None, "Only the first N of these.", metavar="N", least=1)
 
     @property
     def reading(self) -> ReadOptions:
@@ -107,9 +111,6 @@ class ClusterOptions:
         parse=parse_address,
         value_if_bare=LOCAL,
     )
-    cpus_per_worker: int = option(
-        1, "CPU cores, and threads, of a Ray worker.", metavar="N", least=1, show_default=True
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,13 +164,11 @@ class RayWorkers(NamedTuple):
     """Kind of device that every worker computes on: cpu or cuda."""
     indices: tuple[int, ...]
     """Which GPUs of this machine; empty for all."""
-    options: ClusterOptions
 
     @property
     def each(self) -> str:
         """What a worker has, in words."""
-        cpus = self.options.cpus_per_worker
-        return "one GPU" if self.device == "cuda" else f"{cpus} CPU core{'s' if cpus > 1 else ''}"
+        return "one GPU" if self.device == "cuda" else "one CPU core"
 
 
 def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
@@ -184,8 +183,6 @@ def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
     """
     names = device.split(",")
     if options.ray is None and len(names) == 1 and device != "all":
-        if options != ClusterOptions():
-            raise UsageError("--cpus-per-worker is of Ray workers; add --ray")
         return None
     kinds = {"cuda" if name == "all" else name.partition(":")[0] for name in names}
     kind = kinds.pop()
@@ -199,4 +196,4 @@ def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
         raise UsageError(
             f"device {device!r}: GPUs of a cluster have no numbers; take --device cuda"
         )
-    return RayWorkers(address, kind, indices, options)
+    return RayWorkers(address, kind, indices)

@@ -6,7 +6,7 @@ import functools
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatch
+from fnmatch import fnmatch, fnmatchcase
 from pathlib import Path
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest, FrameSelection
@@ -44,7 +44,7 @@ class BatchFrames:
     frames: Sequence[FrameFiles]
     """All frames of the source whose results have files of their own."""
     chosen: Sequence[FrameFiles]
-    """Those within the limit and the shard."""
+    """Those of the names, the limit and the shard."""
     refused: Sequence[tuple[FrameFiles, str]]
     """Frames whose results would have no files of their own, and why."""
     unmatched: tuple[Unmatched, ...]
@@ -86,7 +86,8 @@ def unpacked(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, write_frames, written_before
 
     folder = request.output.with_name(f"{request.output.name}_frames")
-    between = None if request.limit is None else (0, request.limit - 1)
+    whole = request.limit is None or request.names is not None
+    between = None if whole else (0, request.every * (request.limit or 1) - 1)
     frames = FramesRequest(bag=request.source, output=folder, between=between, overwrite=True)
     if not written_before(frames):
         record = write_frames(frames, say)
@@ -127,10 +128,15 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         poses = sequence.poses or _poses_beside(source, frames)
         frames = with_neighbours(frames, sequence.accumulate, poses)
     number, of = request.shard or (1, 1)
+    chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
+    if frames and not chosen:
+        raise UsageError(
+            f"no frame of {source} has a name like {request.names!r}; the first is {frames[0].name}"
+        )
     return BatchFrames(
         layout=layout,
         frames=frames,
-        chosen=frames[: request.limit][number - 1 :: of],
+        chosen=chosen[:: request.every][: request.limit][number - 1 :: of],
         refused=refused,
         unmatched=tuple(unmatched),
     )

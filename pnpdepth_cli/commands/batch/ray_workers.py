@@ -53,8 +53,8 @@ class Worker:
         shared: Sequence[Path],
         folder: Path,
         max_pixels: int | None,
+        threads: int,
     ) -> None:
-        threads = request.cluster.cpus_per_worker
         for name in _THREADS:  # before torch and OpenCV are imported
             os.environ[name] = str(threads)
         with suppress(OSError):  # `ready` reports what cannot be seen
@@ -139,7 +139,8 @@ def refine_on_workers(
         options = {"scheduling_strategy": "SPREAD", "max_restarts": _RESTARTS, **resources}
         actor, model = ray.remote(Worker).options(**options), records.model
         job = request, references, model, software(), shared, Path.cwd(), chosen_max_pixels()
-        actors = [actor.remote(*job) for _ in range(count)]
+        threads = resources["num_cpus"]
+        actors = [actor.remote(*job, threads) for _ in range(count)]
         try:
             yield from refine_on_actors(
                 ray, actors, to_do, worked=settings_worked,
@@ -277,18 +278,17 @@ def _connect(ray: ModuleType, workers: RayWorkers) -> None:
 
 def _planned(ray: ModuleType, workers: RayWorkers) -> tuple[int, dict[str, Any]]:
     """The number of workers that the devices of the cluster allow, and the resources of each."""
-    options, resources = workers.options, {"num_cpus": workers.options.cpus_per_worker}
-    if workers.device == "cuda":
-        there = int(ray.cluster_resources().get("GPU", 0))
-        resources["num_gpus"] = 1
-    else:
-        nodes = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
-        there = sum(int(count) // options.cpus_per_worker for count in nodes)
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    kind, resources = ("GPU" if workers.device == "cuda" else "CPU"), {"num_cpus": 1}
+    there = sum(int(node.get(kind, 0)) for node in nodes)
+    if workers.device == "cuda":  # the workers of a machine share its cores
+        shares = [node.get("CPU", 1) // node["GPU"] for node in nodes if node.get("GPU", 0) >= 1]
+        resources = {"num_cpus": max(1, int(min(shares, default=1))), "num_gpus": 1}
     wanted = len(workers.indices) or there
     if wanted > there or not there:
         where = "this machine" if workers.address == LOCAL else f"Ray cluster {workers.address!r}"
         raise ClusterError(
             f"{where} has devices for {there} Ray workers with {workers.each} each, and"
-            f" {max(1, wanted)} asked for; change --device or --cpus-per-worker"
+            f" {max(1, wanted)} asked for; change --device"
         )
     return wanted, resources

@@ -171,11 +171,8 @@ class _Batch:
             yield f"frames: {', '.join(cut)}; --protocol whole keeps all of them"
         if poses := note_of_poses(frames):
             yield poses
-        if request.limit is not None:
-            yield f"limit: the first {request.limit:,} of them"
-        if request.shard is not None:
-            number, of = request.shard
-            yield f"shard {number}/{of}: {_count(len(self.found.chosen), 'frame')} of them"
+        if len(self.found.chosen) < len(frames):
+            yield f"chosen: {_count(len(self.found.chosen), 'frame')} of them"
         for frame, why in self.found.refused:
             yield f"failed: {frame.name}: {why}"
         for each in unmatched[:_MAX_LISTED]:

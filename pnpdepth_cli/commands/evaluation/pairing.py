@@ -18,11 +18,12 @@ from pnpdepth_cli.dataset.frame_files import (
     groups_by_name,
 )
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.dataset.layouts import find_layout, list_frames
+from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.json_file import read_json
 from pnpdepth_cli.protocols import WHOLE, FramePart
 from pnpdepth_cli.sensors import SamplePattern
 
@@ -91,10 +92,7 @@ def pair_frames(
     for path in filter(None, (prediction, ground_truth)):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
-    try:
-        layout = find_layout(ground_truth)
-    except (InputError, OSError):  # files and folders of files
-        layout = None
+    layout, true_frames = _data_set(prediction, ground_truth)
     if layout is None and prediction.is_dir() != ground_truth.is_dir():
         raise UsageError(
             f"give two files or two folders, not one of each: {prediction}, {ground_truth}"
@@ -104,7 +102,7 @@ def pair_frames(
     notes: list[str] = []
     if prediction.is_dir():
         predictions, notes = depth_files(prediction)
-        frames, more_notes = _true_frames(ground_truth, layout, part)
+        frames, more_notes = _true_frames(ground_truth, layout, true_frames, part)
         notes += more_notes
     else:
         name = frame_name(prediction.stem)
@@ -127,14 +125,28 @@ def pair_frames(
     ], notes
 
 
+def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFiles]]:
+    """The layout and the frames of a data set: as the batch read it, else recognised anew.
+
+    None and none of files and folders of files.
+    """
+    summary = prediction / "summary.json"
+    stated = read_json(summary).get("layout") if summary.is_file() else None
+    for layout in (stated if stated in LAYOUTS else None, None):
+        with contextlib.suppress(InputError, OSError):
+            found, listing = list_frames(folder, layout)
+            return found, listing.frames
+    return None, []
+
+
 def _true_frames(
-    folder: Path, layout: str | None, part: FramePart | None
+    folder: Path, layout: str | None, found: Sequence[FrameFiles], part: FramePart | None
 ) -> tuple[list[FrameFiles], list[str]]:
     """The frames with ground truth of a folder of files or a data set, and notes."""
     if layout is None:
         files, notes = depth_files(folder)
         return [FrameFiles(name=name, gt=path) for name, path in files.items()], notes
-    frames = [frame for frame in list_frames(folder, layout)[1].frames if frame.gt is not None]
+    frames = [frame for frame in found if frame.gt is not None]
     if not frames:
         raise InputError(f"{folder} looks like {layout!r}, and no frame in it has ground truth")
     if part is not None:

@@ -197,7 +197,6 @@ def test_addresses_of_clusters_and_what_is_none() -> None:
         ("cuda:0,cuda:2", {}, (LOCAL, "cuda", (0, 2))),
         ("all", {}, (LOCAL, "cuda", ())),
         ("cpu", {"ray": "auto"}, ("auto", "cpu", ())),
-        ("cuda:1", {"cpus_per_worker": 2}, "is of Ray workers; add --ray"),
         ("cuda:0,cuda:0", {}, "name each GPU once"),
         ("cuda,cuda", {}, "name each GPU once"),
         ("cpu,cuda:0", {}, "workers run on cpu, cuda"),

@@ -296,6 +296,14 @@ def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: P
     assert [path.name for path in (root / "few").glob("*_depth.png")] == ["b_depth.png"]
 
 
+def test_frames_are_chosen_by_name_then_by_step_then_by_number(root: Path) -> None:
+    assert done(root, names="[b-d]", every=2) == ["b", "d"]
+    assert done(root, names="[a-c]", every=2, limit=1) == ["a"]
+    assert summary(root)["counts"]["pending"] == 1
+    with pytest.raises(UsageError, match="has a name like"):
+        batch(root, names="A*")
+
+
 def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path) -> None:
     batch(root, limit=2, refine={"holdout": 0.2, "baselines": True})
     outcome = batch(root, refine={"holdout": 0.2, "baselines": True})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
+from tests.empty_files import touch
 
 
 def depth_at(path: Path) -> Path:
@@ -117,6 +119,19 @@ def test_what_cannot_be_matched_is_refused(
     folders(tmp_path, predictions, truths)
     with pytest.raises(error, match=message):
         pair_frames(tmp_path / first, tmp_path / second)
+
+
+@pytest.mark.parametrize("stated", [None, "image-depth"])
+def test_a_folder_of_data_sets_is_read_as_a_batch_reads_it(
+    stated: str | None, tmp_path: Path
+) -> None:
+    for place in ("north", "south"):
+        touch(tmp_path / f"sets/{place}/image/0.png", tmp_path / f"sets/{place}/depth/0.png")
+        depth_at(tmp_path / f"out/{place}/0_depth.png")
+    (tmp_path / "out/summary.json").write_text(json.dumps({"layout": stated}))
+    pairs, _ = pair_frames(tmp_path / "out", tmp_path / "sets")
+    assert [pair.name for pair in pairs] == ["north/0", "south/0"]
+    assert all(pair.prediction is not None for pair in pairs)
 
 
 def test_two_files_are_one_frame_whatever_they_are_called(tmp_path: Path) -> None:
