@@ -17,7 +17,7 @@ from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.fixed import refine_fixed
 from pnpdepth_cli.frames.frame import Frame, Register, tensor_of
 from pnpdepth_cli.frames.method import Method
-from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
@@ -187,8 +187,8 @@ def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Frame:
 
 def refined(network: Network, layer: str, settings: ClosedSettings, inputs: Frame) -> Refined:
     """The refinement of a frame with all of its points."""
-    with OpenNetworks([Member(network=network, layer=layer, settings=settings)]) as networks:
-        return refine_fixed(networks, inputs.registered())
+    with OpenNetwork(Member(network=network, layer=layer, settings=settings)) as opened:
+        return refine_fixed(opened, inputs.registered())
 
 
 WEIGHTS = {

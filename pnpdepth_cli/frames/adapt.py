@@ -27,7 +27,7 @@ from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame, is_dense
-from pnpdepth_cli.frames.open_networks import encoding_once
+from pnpdepth_cli.frames.open_network import encoding_once
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network

@@ -29,24 +29,25 @@ from pnpdepth_cli.frames.fuse import (
     weighted_mean,
     without_doubt,
 )
-from pnpdepth_cli.frames.open_networks import OpenNetworks
+from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.refined import Prediction, Refined, Validation, refined_of
 from pnpdepth_cli.frames.validation import FOLDS, ValidationSplit, split_frame
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
 
-def refine_default(networks: OpenNetworks, frame: Frame, *, seed: int = 0) -> Refined:
+def refine_default(networks: Sequence[OpenNetwork], frame: Frame, *, seed: int = 0) -> Refined:
     """Returns the frame refined by the default method.
 
     Args:
-        networks: The networks, open.
+        networks: The networks, open, the user's first.
         frame: The frame, its image moved to its points.
         seed: Random seed of the validation points.
 
     Raises:
         PnpDepthError: The user's network gives no depth.
     """
-    networks.next_image()
+    for each in networks:
+        each.next_image()
     # Points that contradict their neighbours are outliers.
     inliers, judged = without_outliers(networks, frame)
     # A fifth of the inliers are validation points, which every expert predicts from the others.
@@ -76,7 +77,7 @@ def refine_default(networks: OpenNetworks, frame: Frame, *, seed: int = 0) -> Re
     )
 
 
-def without_outliers(networks: OpenNetworks, frame: Frame) -> tuple[Frame, Prediction]:
+def without_outliers(networks: Sequence[OpenNetwork], frame: Frame) -> tuple[Frame, Prediction]:
     """Returns the frame without its outliers, and what the network that judged them gives for it.
 
     That is the network that weighs its points, else the user's: a useless network does not decide
@@ -91,18 +92,18 @@ def without_outliers(networks: OpenNetworks, frame: Frame) -> tuple[Frame, Predi
     any_suspected = bool(suspected.any())
     consistent = frame.with_points(points.select(~suspected)) if any_suspected else frame
     weighs = any_suspected and weighs_points(judge)
-    judged = predicted_by(networks, judge, consistent, updates=not weighs)
+    judged = predicted_by(judge, consistent, updates=not weighs)
     outlying = outliers(judged.before, points, frame.rgb)
     if len(points) >= FEW_POINTS:
         outlying = outlying | suspected
     inliers = frame.without(outlying)
     # A network that weighs its points is given the outliers too, now that they are known.
     if weighs or not torch.equal(outlying, suspected):
-        judged = predicted_by(networks, judge, inliers)
+        judged = predicted_by(judge, inliers)
     return inliers, judged
 
 
-def without_far_points(networks: OpenNetworks, frame: Frame, judged: Prediction) -> Frame:
+def without_far_points(networks: Sequence[OpenNetwork], frame: Frame, judged: Prediction) -> Frame:
     """Returns the frame without points far from the depth of a network that weighs them."""
     if not weighs_points(judge_of(networks)) or is_dense(frame.points):
         return frame
@@ -150,7 +151,8 @@ def _validation(
     user, alone, part = experts[0], _alone(experts), torch.arange(len(split.points)) % FOLDS
     own = user.updated if user.of_scanner else user.at
     predicted = {BEFORE: split.points.sample(user.aligned), PROPAGATED: own}
-    if user.network is not None and not user.network.takes_points:  # else z was not updated here
+    # Of networks that take points, z was not updated here.
+    if user.network is not None and not user.network.member.takes_points:
         predicted[UPDATED] = user.updated
     if alone is not None:
         predicted[ALONE] = alone.at

@@ -9,14 +9,14 @@ from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.open_networks import OpenNetworks
+from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.refined import Refined, Validation, refined_of
 from pnpdepth_cli.frames.validation import consistency, split_points
 from pnpdepth_cli.stages import AFTER, BEFORE, LINEAR
 
 
 def refine_fixed(
-    networks: OpenNetworks,
+    network: OpenNetwork,
     frame: Frame,
     *,
     seed: int = 0,
@@ -26,7 +26,7 @@ def refine_fixed(
     """Returns the frame refined by its one network. A divergence with a last good depth is in it.
 
     Args:
-        networks: The network, open.
+        network: The network, open.
         frame: The frame, its image moved to its points.
         seed: Random seed of the validation points.
         validated: Whether the result is validated, for which the frame is refined again.
@@ -35,12 +35,11 @@ def refine_fixed(
     Raises:
         PnpDepthError: The frame cannot be refined.
     """
-    networks.next_image()
-    (member,) = networks.members
-    networks.cut(member)
-    own = networks.refine(member, frame, on_iteration=on_iteration)
-    depth = _propagated(own.after, frame, member.settings.propagate)
-    validation = _validation(networks, frame, depth, seed) if validated else None
+    network.next_image()
+    network.cut()
+    own = network.refine(frame, on_iteration=on_iteration)
+    depth = _propagated(own.after, frame, network.member.settings.propagate)
+    validation = _validation(network, frame, depth, seed) if validated else None
     return refined_of(frame, own, depth, used=frame.points, validation=validation)
 
 
@@ -49,15 +48,13 @@ def _propagated(depth: Tensor, frame: Frame, kind: str) -> Tensor:
     return depth if kind == "none" else propagate(depth, frame.points, frame.rgb, kind=kind).depth
 
 
-def _validation(
-    networks: OpenNetworks, frame: Frame, depth: Tensor, seed: int
-) -> Validation | None:
+def _validation(network: OpenNetwork, frame: Frame, depth: Tensor, seed: int) -> Validation | None:
     """Depth at validation points, refined without them.
 
     None where the points are too few or the method fails.
 
     Args:
-        networks: The network, open.
+        network: The network, open.
         frame: The frame.
         depth: (H, W) metres, refined with all points.
         seed: Random seed of the validation points.
@@ -66,9 +63,9 @@ def _validation(
     if parts is None:
         return None
     kept, points = parts
-    (member,), fewer = networks.members, frame.with_points(kept)
+    fewer, kind = frame.with_points(kept), network.member.settings.propagate
     try:
-        again = networks.refine(member, fewer)
+        again = network.refine(fewer)
     except PnpDepthError:
         return None
     return Validation(
@@ -79,6 +76,6 @@ def _validation(
         predicted={
             BEFORE: points.sample(again.before),
             LINEAR: linear(kept, points.xy),
-            AFTER: points.sample(_propagated(again.after, fewer, member.settings.propagate)),
+            AFTER: points.sample(_propagated(again.after, fewer, kind)),
         },
     )

@@ -21,7 +21,7 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate_at
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, is_dense
-from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.refined import Prediction
 from pnpdepth_cli.frames.validation import MIN_POINTS, ValidationSplit, log_depth
 from pnpdepth_cli.stages import LINEAR
@@ -69,44 +69,51 @@ class Expert:
     aligned: Tensor  # (H, W) metres: a network's, from the others, before updates
     updated: Tensor  # (M,) metres: `at` before the residual is propagated
     prediction: Prediction | None = None  # from all points. None without a network
-    network: Member | None = None  # that predicts. None: linear interpolation
-    user: Member | None = None  # the user's network whose depth it is, or has as a prior
+    network: OpenNetwork | None = None  # that predicts. None: linear interpolation
+    user: OpenNetwork | None = None  # the user's network whose depth it is, or has as a prior
     of_scanner: bool = False  # whether it is a completion network of the user's, given scan lines
 
 
-def predictions(networks: OpenNetworks, split: ValidationSplit, judged: Prediction) -> list[Expert]:
+def predictions(
+    networks: Sequence[OpenNetwork], split: ValidationSplit, judged: Prediction
+) -> list[Expert]:
     """Returns the experts, the user's network first.
 
     Without a network that takes a prior, the networks are the experts, with equal prior weights.
 
+    Args:
+        networks: The networks, open, the user's first.
+        split: The frame and its validation points.
+        judged: What the network that judged the outliers gives for the frame.
+
     Raises:
         PnpDepthError: The user's network gives no depth.
     """
-    fusing = _fusing(networks)
+    fusing, judge = _fusing(networks), judge_of(networks)
     own = list[Expert]()
-    for member in networks.members:
+    for each in networks:
         try:
-            if member is not fusing:
-                known = judged if member is judge_of(networks) else None
-                own.append(_expert(networks, member, split, member.name, known=known, user=member))
+            if each is not fusing:
+                known = judged if each is judge else None
+                own.append(_expert(each, split, each.member.name, known=known, user=each))
         except PnpDepthError:  # a further network that fails is left out
-            if member is networks.members[0]:
+            if each is networks[0]:
                 raise
     if fusing is None:
-        return [replace(each, weight=1 / len(own)) for each in own]
-    known = judged if fusing is judge_of(networks) else None
-    alone = _expert(networks, fusing, split, fusing.name, known=known)
+        return [replace(expert, weight=1 / len(own)) for expert in own]
+    name = fusing.member.name
+    alone = _expert(fusing, split, name, known=judged if fusing is judge else None)
     experts, with_prior = list[Expert](), list[Expert]()
-    for each in own:
-        share = trust(each, split, alone) / len(own)
-        experts.append(replace(each, weight=0.0 if each.of_scanner else OWN * share))
+    for expert in own:
+        share = trust(expert, split, alone) / len(own)
+        experts.append(replace(expert, weight=0.0 if expert.of_scanner else OWN * share))
         if share > 0:
-            name = f"{fusing.name} with {each.name}"
+            with_name = f"{name} with {expert.name}"
             guided = _expert(
-                networks, fusing, split, name, prior=each, user=each.user, updates=False
+                fusing, split, with_name, prior=expert, user=expert.user, updates=False
             )
             with_prior.append(replace(guided, weight=WITH_PRIOR * share))
-    rest = 1 - sum(each.weight for each in (*experts, *with_prior))
+    rest = 1 - sum(expert.weight for expert in (*experts, *with_prior))
     return [*experts, *with_prior, replace(alone, weight=rest), _interpolation(split)]
 
 
@@ -125,7 +132,7 @@ def trust(expert: Expert, split: ValidationSplit, alone: Expert) -> float:
         alone: The network that takes a prior, without one.
     """
     assert expert.prediction is not None
-    if expert.network is not None and expert.network.takes_points:
+    if expert.network is not None and expert.network.member.takes_points:
         if not len(split.points):
             return 0.0
         ratio = split.error(expert.updated) / max(split.error(alone.at), 1e-9)
@@ -144,7 +151,7 @@ def trust(expert: Expert, split: ValidationSplit, alone: Expert) -> float:
 
 
 def without_doubt(
-    networks: OpenNetworks, split: ValidationSplit, experts: list[Expert]
+    networks: Sequence[OpenNetwork], split: ValidationSplit, experts: list[Expert]
 ) -> tuple[list[Expert], tuple[str, ...]]:
     """Returns the experts, with one that sees a grey image where the image is in doubt.
 
@@ -155,17 +162,19 @@ def without_doubt(
     if fusing is None or rgb is None or split.whole.one_view or count < ENOUGH_FOR_DOUBT:
         return experts, ()
     at = {each.name: each.at for each in experts}
-    of_linear = split.gain(at[fusing.name], at[LINEAR])
+    name = fusing.member.name
+    of_linear = split.gain(at[name], at[LINEAR])
     if of_linear >= DOUBT:
         return experts, ()
-    networks.next_image()
+    for each in networks:
+        each.next_image()
     grey = torch.full_like(rgb, 0.5)
     blind = replace(split, whole=replace(split.whole, rgb=grey), kept=replace(split.kept, rgb=grey))
-    expert = _expert(networks, fusing, blind, f"{fusing.name} without the image", updates=False)
+    expert = _expert(fusing, blind, f"{name} without the image", updates=False)
     experts = [*experts, replace(expert, weight=WITHOUT_IMAGE)]
-    if (of_linear + split.gain(at[fusing.name], expert.at)) / 2 >= NO_GAIN:
+    if (of_linear + split.gain(at[name], expert.at)) / 2 >= NO_GAIN:
         return experts, ()
-    with_image = split.error(at[fusing.name])
+    with_image = split.error(at[name])
     without = min(split.error(at[LINEAR]), split.error(expert.at))
     warning = (
         f"warning: the image does not lower the error: at {count:,} validation points it is"
@@ -270,49 +279,50 @@ def weighted_mean(depths: Sequence[tuple[Tensor, float]]) -> Tensor:
     return torch.where(total > 0, (logarithm / total.clamp_min(1e-6)).exp(), 0.0)
 
 
-def judge_of(networks: OpenNetworks) -> Member:
+def judge_of(networks: Sequence[OpenNetwork]) -> OpenNetwork:
     """Returns the network that weighs its points, else the user's."""
-    return next(filter(weighs_points, networks.members), networks.members[0])
+    return next(filter(weighs_points, networks), networks[0])
 
 
-def _fusing(networks: OpenNetworks) -> Member | None:
+def _fusing(networks: Sequence[OpenNetwork]) -> OpenNetwork | None:
     """The network that takes another one's depth as a prior. None without one."""
-    return next((member for member in networks.members if member.takes_prior), None)
+    return next((each for each in networks if each.member.takes_prior), None)
 
 
-def weighs_points(member: Member) -> bool:
+def weighs_points(network: OpenNetwork) -> bool:
     """Returns whether a network weighs its points."""
-    return member.network.definition.weighs_points
+    return network.member.network.definition.weighs_points
 
 
-def predicted_by(
-    networks: OpenNetworks, member: Member, frame: Frame, *, updates: bool = True
-) -> Prediction:
+def predicted_by(network: OpenNetwork, frame: Frame, *, updates: bool = True) -> Prediction:
     """Returns what one network gives for the frame, its residual not propagated.
 
     Updates of a network that takes the points gain 2 to 3 % with 500 points, 1 % with 100, nothing
     with 20, and 1 % with a LiDAR's, where they take as long as everything else (even frames).
+
+    Args:
+        network: The network, open.
+        frame: The frame.
+        updates: Whether z is updated, where that gains anything.
     """
     gains = len(frame.points) >= FEW_POINTS and not is_dense(frame.points)
-    return networks.refine(member, frame, updates=updates and (gains or not member.takes_points))
+    return network.refine(frame, updates=updates and (gains or not network.member.takes_points))
 
 
 def _expert(
-    networks: OpenNetworks,
-    member: Member,
+    network: OpenNetwork,
     split: ValidationSplit,
     name: str,
     *,
     known: Prediction | None = None,
     prior: Expert | None = None,
-    user: Member | None = None,
+    user: OpenNetwork | None = None,
     updates: bool = True,
 ) -> Expert:
     """The predictions of one network, without a prior weight yet.
 
     Args:
-        networks: The networks, open.
-        member: The network that predicts.
+        network: The network that predicts, open.
         split: The frame and its validation points.
         name: What the expert is called.
         known: What it gives from all points, where that was computed already.
@@ -320,16 +330,16 @@ def _expert(
         user: The user's network whose depth it is, or has as a prior.
         updates: Whether z is updated with all points, which takes as long as all else.
     """
-    whole, kept = split.whole, split.kept
+    whole, kept, takes_points = split.whole, split.kept, network.member.takes_points
     if prior is not None:
         assert prior.prediction is not None
         whole = replace(whole, prior=prior.prediction.before)
         kept = replace(kept, prior=prior.aligned)
-    own = known or predicted_by(networks, member, whole, updates=updates)
+    own = known or predicted_by(network, whole, updates=updates)
     aligned = own.before
     updated = at = torch.empty(0)
     if len(split.points):
-        again = predicted_by(networks, member, kept, updates=not member.takes_points)
+        again = predicted_by(network, kept, updates=not takes_points)
         aligned, updated = again.before, split.points.sample(again.after)
         at = propagate_at(
             again.after, kept.points, kept.rgb, split.points.xy, kind=split.propagation
@@ -342,9 +352,9 @@ def _expert(
         aligned=aligned,
         updated=updated,
         prediction=own,
-        network=member,
+        network=network,
         user=user,
-        of_scanner=user is member and member.takes_points and split.has_scan_lines,
+        of_scanner=user is network and takes_points and split.has_scan_lines,
     )
 
 

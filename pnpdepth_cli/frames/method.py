@@ -18,7 +18,7 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.default import refine_default
 from pnpdepth_cli.frames.fixed import refine_fixed
 from pnpdepth_cli.frames.frame import Frame, Register
-from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_member
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
@@ -68,7 +68,7 @@ class Method:
         self.registrations: dict[tuple[int, int], Register] = {}
         """How images of a size are moved to their points, where frames decided it together."""
         self._stack = ExitStack()
-        self._open: OpenNetworks | None = None
+        self._open: list[OpenNetwork] = []
         if len(networks) > 1 and not self.is_default:
             raise UsageError(f"several --model are fused, but {asked.fixed_by} fixes one network")
         # What the definitions leave open is decided.
@@ -95,7 +95,7 @@ class Method:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._open = None
+        self._open = []
         self._stack.close()
 
     @property
@@ -125,8 +125,8 @@ class Method:
         Raises:
             PnpDepthError: The frame cannot be refined.
         """
-        if self._open is None:
-            self._open = self._stack.enter_context(OpenNetworks(self.members))
+        if not self._open:
+            self._open = [self._stack.enter_context(OpenNetwork(m)) for m in self.members]
         seed = self.asked.seed
         torch.manual_seed(seed)
         if frame.register == "auto" and frame.size in self.registrations:
@@ -136,7 +136,7 @@ class Method:
             refined = refine_default(self._open, frame, seed=seed)
         else:
             refined = refine_fixed(
-                self._open, frame,
+                self._open[0], frame,
                 seed=seed, validated=self._validated, on_iteration=on_iteration,
             )  # fmt: skip
         return with_uncertainty(refined) if self._uncertainty else refined

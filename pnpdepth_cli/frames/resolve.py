@@ -11,7 +11,7 @@ from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import METRES, Frame
-from pnpdepth_cli.frames.open_networks import Member
+from pnpdepth_cli.frames.open_network import Member
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
@@ -9,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.open_networks import Member
+from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
@@ -85,3 +87,10 @@ def member(
     )
     settings = settings or ClosedSettings(iterations=0, align="none")
     return Member(network=network, layer="layer", settings=settings)
+
+
+@contextmanager
+def opened(*members: Member) -> Iterator[list[OpenNetwork]]:
+    """The networks, open."""
+    with ExitStack() as stack:
+        yield [stack.enter_context(OpenNetwork(member)) for member in members]

@@ -24,7 +24,7 @@ from pnpdepth_cli.frames.fuse import (
     trust,
     weighted_mean,
 )
-from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Prediction, Refined
 from pnpdepth_cli.frames.uncertainty import calibration, relative_shape, with_uncertainty
 from pnpdepth_cli.frames.validation import FOLDS, MIN_POINTS, ValidationSplit, split_points
@@ -39,6 +39,7 @@ from tests.frames.scenes import (
     depth_of_scene,
     frame_in_memory,
     member,
+    opened,
 )
 
 UPDATES = ClosedSettings(iterations=3, lr="5%", update="sign", align="scale")
@@ -55,14 +56,14 @@ class Noise(Brightness):
 
 def refined(frame: Frame, *members: Member, seed: int = 0) -> Refined:
     """The frame by the default method with these networks."""
-    with OpenNetworks(members) as networks:
+    with opened(*members) as networks:
         return refine_default(networks, frame, seed=seed)
 
 
 def predicted_by(own: Member, frame: Frame) -> Prediction:
     """What the network alone gives for the frame."""
-    with OpenNetworks([own]) as networks:
-        return networks.refine(own, frame)
+    with OpenNetwork(own) as network:
+        return network.refine(frame)
 
 
 def with_gt(frame: Frame) -> Frame:
@@ -126,13 +127,13 @@ def test_the_dense_depth_is_fused_by_the_weights_that_the_result_names() -> None
     result = refined(frame, own, compact())
     assert sum(result.weights.values()) == pytest.approx(1)
     assert list(result.weights) == ["brightness", "compact with brightness", "compact", "linear"]
-    with OpenNetworks([own, compact()]) as networks:
-        of_own = networks.refine(networks.members[0], frame)
+    with opened(own, compact()) as networks:
+        of_own = networks[0].refine(frame)
         prior = replace(frame, prior=of_own.before)
         depths = [
             of_own.after,
-            networks.refine(networks.members[1], prior).after,
-            networks.refine(networks.members[1], frame).after,
+            networks[1].refine(prior).after,
+            networks[1].refine(frame).after,
             linear(frame.points),
         ]
     fused = weighted_mean(list(zip(depths, result.weights.values(), strict=True)))
@@ -178,7 +179,11 @@ def test_trust_in_a_network_that_takes_points_falls_with_its_error_at_validation
     alone, own = expert("compact", depth + 0.1), member(Nearest)
     found = [
         trust(
-            replace(expert("own", depth + off), prediction=predicted_by(own, frame), network=own),
+            replace(
+                expert("own", depth + off),
+                prediction=predicted_by(own, frame),
+                network=OpenNetwork(own),
+            ),
             split,
             alone,
         )
@@ -378,10 +383,12 @@ def test_few_points_at_few_positions_are_enough(count: int, positions: int) -> N
 
 def test_the_same_frame_gives_the_same_depth_whatever_was_refined_before() -> None:
     frames = [frame_in_memory(60), frame_in_memory(60, seed=2)]
-    with OpenNetworks([member(Brightness, settings=UPDATES), compact()]) as networks:
+    with opened(member(Brightness, settings=UPDATES), compact()) as networks:
         first, _, again = (refine_default(networks, frames[n]) for n in (0, 1, 0))
     assert np.array_equal(first.after, again.after)
-    assert np.array_equal(first.after, refined(frames[0], *networks.members).after)
+    assert np.array_equal(
+        first.after, refined(frames[0], *(each.member for each in networks)).after
+    )
 
 
 def test_the_front_runs_once_for_all_sets_of_points_of_an_image(
@@ -390,12 +397,12 @@ def test_the_front_runs_once_for_all_sets_of_points_of_an_image(
     frame, fronts, front = frame_in_memory(60), [], Cut.front
     monkeypatch.setattr(Cut, "front", lambda *args: fronts.append(args) or front(*args))
     fewer = frame.with_points(frame.points.select(torch.arange(60) < 40))
-    with OpenNetworks([member(Brightness, settings=UPDATES)]) as networks:
-        (one,) = networks.members
-        together = [networks.refine(one, each).after for each in (frame, fewer)]
+    with opened(member(Brightness, settings=UPDATES)) as networks:
+        (one,) = networks
+        together = [one.refine(each).after for each in (frame, fewer)]
         assert len(fronts) == 1
-        networks.next_image()
-        again = networks.refine(one, fewer).after
+        one.next_image()
+        again = one.refine(fewer).after
         assert len(fronts) == 2
     assert np.array_equal(together[1], again)
 
@@ -408,14 +415,14 @@ def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stay
     frame, settings = frame_in_memory(60), ClosedSettings(iterations=1, lr="5%")
     fewer = frame.with_points(frame.points.select(torch.arange(60) < 55))
     own = Member(network=network, layer="decoder.s8", settings=settings, coarse=True)
-    with OpenNetworks([own]) as opened:
-        opened.refine(own, frame)
+    with OpenNetwork(own) as one:
+        one.refine(frame)
         count = len(runs)
-        shared = opened.refine(own, fewer)
-        plain = opened.refine(own, fewer, updates=False)
+        shared = one.refine(fewer)
+        plain = one.refine(fewer, updates=False)
         assert len(runs) == count > 0
-        opened.next_image()
-        alone = opened.refine(own, fewer)
+        one.next_image()
+        alone = one.refine(fewer)
     handle.remove()
     assert (shared.after == alone.after).all()
     assert (plain.after == alone.before).all()
@@ -431,7 +438,7 @@ def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:
 
 def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
     frame, bad = spoiled(frame_in_memory(60))
-    with OpenNetworks([member(Brightness)]) as networks:
+    with opened(member(Brightness)) as networks:
         inliers, _ = without_outliers(networks, frame)
         clean, _ = without_outliers(networks, frame_in_memory(60))
     assert inliers.outliers is not None
@@ -449,7 +456,7 @@ def test_outliers_among_few_points_are_those_beside_the_network_and_else_those_o
     frame, bad = spoiled(frame_in_memory(count))
     found = iter([bad & alone, bad & beside])
     monkeypatch.setattr(default, "outliers", lambda *_: next(found))
-    with OpenNetworks([member(Brightness)]) as networks:
+    with opened(member(Brightness)) as networks:
         inliers, _ = without_outliers(networks, frame)
     expected = frame.points.select(~(bad & (beside or count >= FEW_POINTS)))
     assert torch.equal(inliers.points.xy, expected.xy)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.errors import DivergedError, ModelError, NoPointsError
 from pnpdepth_cli.frames.fixed import refine_fixed
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.open_networks import Member, OpenNetworks
+from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import Network, load_network
@@ -46,8 +46,8 @@ def frame_of(seed: int, height: int = 46, width: int = 62, depth: float = 2.0) -
 def refined(
     network: Network, settings: ClosedSettings, frame: Frame, layer: str = "middle"
 ) -> Refined:
-    with OpenNetworks([Member(network=network, layer=layer, settings=settings)]) as networks:
-        return refine_fixed(networks, frame)
+    with OpenNetwork(Member(network=network, layer=layer, settings=settings)) as opened:
+        return refine_fixed(opened, frame)
 
 
 def test_a_frame_without_a_point_in_the_networks_view_is_an_error(network: Network) -> None:

@@ -6,8 +6,8 @@ once, and so does the image encoder that a definition names.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -53,60 +53,11 @@ class Member:
         return self.network.definition.takes_prior
 
 
-class OpenNetworks:
-    """The networks of a method, open from frame to frame, as a context manager.
-
-    Args:
-        members: The networks, the user's first.
-    """
-
-    def __init__(self, members: Sequence[Member]) -> None:
-        self.members = tuple(members)
-        self._opened = {member: OpenNetwork(member) for member in members}
-        self._stack = ExitStack()
-
-    def __enter__(self) -> OpenNetworks:
-        for opened in self._opened.values():
-            self._stack.enter_context(opened)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def next_image(self) -> None:
-        """Forgets what was computed for the last image."""
-        for opened in self._opened.values():
-            opened.next_image()
-
-    def refine(
-        self,
-        member: Member,
-        frame: Frame,
-        *,
-        updates: bool = True,
-        on_iteration: OnIteration = lambda done, loss: None,
-    ) -> Prediction:
-        """Returns what one network gives for the frame, its residual not propagated.
-
-        Args:
-            member: The network.
-            frame: The image, the same in all calls until `next_image`, and the points of this call.
-            updates: Whether z is updated.
-            on_iteration: Called after each update of z.
-
-        Raises:
-            PnpDepthError: The refinement fails.
-        """
-        settings = member.settings if updates else replace(member.settings, iterations=0)
-        return self._opened[member].refine(frame, settings, on_iteration)
-
-    def cut(self, member: Member) -> None:
-        """Cuts the network now. Raises LayerError if it has no such layer."""
-        self._opened[member].cut()
-
-
 class OpenNetwork:
-    """A network that is cut when z is first updated, as a context manager."""
+    """A network that stays open from frame to frame, as a context manager.
+
+    It is cut when z is first updated.
+    """
 
     def __init__(self, member: Member) -> None:
         self.member = member
@@ -132,33 +83,48 @@ class OpenNetwork:
         self._encoded.clear()
 
     def cut(self) -> Split:
-        """Returns the network cut at the layer, open."""
+        """Returns the network cut at the layer, open. Raises LayerError if it has no such layer."""
         if self._split is None:
             member = self.member
             self._split = self._open.enter_context(member.network.cut_at(member.layer))
         return self._split
 
     def refine(
-        self, frame: Frame, settings: ClosedSettings, on_iteration: OnIteration
+        self,
+        frame: Frame,
+        *,
+        updates: bool = True,
+        on_iteration: OnIteration = lambda done, loss: None,
     ) -> Prediction:
-        """Returns what this network gives for the frame; see `OpenNetworks.refine`.
+        """Returns what this network gives for the frame, its residual not propagated.
 
         Args:
-            frame: The frame.
-            settings: How z is updated.
+            frame: The image, the same in all calls until `next_image`, and the points of this call.
+            updates: Whether z is updated.
             on_iteration: Called after each update of z.
+
+        Raises:
+            PnpDepthError: The refinement fails.
         """
-        network, diverged = self.member.network, None
+        network, settings, diverged = self.member.network, self.member.settings, None
         with out_of_memory_is_a_device_error(network.device):
             prepared = prepare(network, frame)
             if not len(prepared.points):
                 raise prepared.no_points_error()
             reader = prepared.depth_reader(settings.align)
             try:
-                if settings.iterations:
-                    result = self._updated(prepared, reader, settings, on_iteration)
+                if not (updates and settings.iterations):
+                    result = self._plain(prepared, reader)
                 else:
-                    result = self._plain(prepared, reader, settings)
+                    z0 = self._front(prepared)
+                    with self._coarse() as at_full_size:
+                        result = refine(
+                            self.cut(), prepared.arguments, prepared.points, settings,
+                            depth_of=reader, z0=z0, on_iteration=on_iteration,
+                        )  # fmt: skip
+                    if at_full_size:
+                        before, after = reader(at_full_size[0]), reader(at_full_size[-1])
+                        result = replace(result, before=before, after=after)
             except DivergedError as error:
                 if error.last_good is None:
                     raise
@@ -172,34 +138,22 @@ class OpenNetwork:
             notes=reader.notes,
         )
 
-    def _updated(
-        self,
-        prepared: PreparedFrame,
-        reader: AlignedDepth,
-        settings: ClosedSettings,
-        on_iteration: OnIteration,
-    ) -> Refinement:
-        split, z0 = self.cut(), self._z0
+    def _front(self, prepared: PreparedFrame) -> Tensor:
+        """z_0, which of a network that takes the image alone is the same for all points."""
+        z0, split = self._z0, self.cut()
         if z0 is None:
             with torch.no_grad():
                 z0 = split.front(*prepared.arguments)
-        if self._of_image_only:
-            self._z0 = z0
-        network, arguments, points = self.member.network, prepared.arguments, prepared.points
-        coarse = network.definition.coarse if self.member.coarse else None
-        if coarse is None:
-            return refine(
-                split, arguments, points, settings,
-                depth_of=reader, z0=z0, on_iteration=on_iteration,
-            )  # fmt: skip
-        with coarse(network.module) as at_full_size:
-            result = refine(split, arguments, points, settings, depth_of=reader, z0=z0)
-        before, after = (reader(at_full_size[number]) for number in (0, -1))
-        return replace(result, before=before, after=after)
+        self._z0 = z0 if self._of_image_only else None
+        return z0
 
-    def _plain(
-        self, prepared: PreparedFrame, reader: AlignedDepth, settings: ClosedSettings
-    ) -> Refinement:
+    def _coarse(self) -> AbstractContextManager[list[Any]]:
+        """Inside, the network gives the smaller depth that its definition may have for updates."""
+        network = self.member.network
+        coarse = network.definition.coarse if self.member.coarse else None
+        return nullcontext([]) if coarse is None else coarse(network.module)
+
+    def _plain(self, prepared: PreparedFrame, reader: AlignedDepth) -> Refinement:
         """The same without updates: a pass of the whole network, which need not be cut."""
         output = self._output
         if output is None and self._z0 is not None:
@@ -213,7 +167,8 @@ class OpenNetwork:
         depth = reader(output).detach()
         at_points = prepared.points.sample(depth)
         known = at_points.isfinite()
-        loss = checked_loss(settings.loss)(at_points[known], prepared.points.depth[known])
+        loss_of = checked_loss(self.member.settings.loss)
+        loss = loss_of(at_points[known], prepared.points.depth[known])
         return Refinement(before=depth, after=depth, losses=(float(loss),), step=0.0)
 
 
