@@ -34,7 +34,8 @@ _AS_MUCH = 0.85
 _LEAST_EXPLAINED = 0.03
 """Of the variance; numbers in any order have less."""
 
-_PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
+_PCD_TYPES = {k + n: k.lower() + n for k in "IUF" for n in "1248" if k + n not in ("F1", "F2")}
+"""NumPy types by TYPE and SIZE of a PCD."""
 _PLY_KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -107,7 +108,7 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     size = np.log10(np.abs(numbers) + _SMALLEST)
     features = np.stack([np.sign(numbers), size, numbers == np.rint(numbers)])
     # beams without return say nothing: more zeros in a row than a point has numbers
-    zeros = np.convolve(numbers == 0, np.ones(max(_FIELD_COUNTS) + 1), "same")
+    zeros = np.convolve(numbers == 0, np.ones(max(_FIELD_COUNTS) + 1), "same")[: len(numbers)]
     counted = zeros <= max(_FIELD_COUNTS)
     explained = {count: _explained(features, counted, count) for count in _FIELD_COUNTS}
     most = max(explained.values())
@@ -169,7 +170,7 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
     if not len(names) == len(kinds) == len(sizes) == len(counts):
         raise damaged(path, "PCD", "names another number of fields than it describes")
     columns = [
-        (name, f"{_PCD_KINDS.get(kind, '?')}{size}", _whole(path, count))
+        (name, _PCD_TYPES.get(kind + size, f"?{size}"), _whole(path, count))
         for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True)
     ]
     number, stored = _whole(path, entries["POINTS"][0]), entries["DATA"][0].lower()

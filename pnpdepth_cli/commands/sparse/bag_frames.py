@@ -277,8 +277,10 @@ def _sensors(bag: Bag, wanted: Sequence[str], say: Say) -> _Sensors:
 
     Of several depth images, that in the frame of the images.
     """
-    counts = {name: count for name, count in bag.topics(IMAGES).items() if count}
-    first = {name: next(bag.messages([name]))[2] for name in counts}
+    topics = bag.topics(IMAGES)
+    found = {name: next(bag.messages([name]), None) for name in topics}
+    first = {name: message[2] for name, message in found.items() if message is not None}
+    counts = {name: topics[name] for name in first}
     depths = {name: count for name, count in counts.items() if is_depth(first[name], name)}
     colours = {name: count for name, count in counts.items() if name not in depths}
     images, clouds = topic_of(bag, wanted, colours, "images"), bag.topics(CLOUDS)
