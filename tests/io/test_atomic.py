@@ -75,19 +75,19 @@ def test_a_folder_in_the_output_is_no_link_but_the_output_itself_may_be(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("name", "fact"),
+    "name",
     [
-        ("missing/out.png", "its folder does not exist"),
-        ("file.txt/out.png", "not a directory"),
-        ("folder", "is a folder"),
-        ("/proc/out.png", "cannot be written|its folder does not exist"),
-        ("/dev/null", "not a regular file"),
+        "missing/out.png",
+        "file.txt/out.png",
+        "folder",
+        "/proc/out.png",
+        "/dev/null",
     ],
 )
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str, fact: str) -> None:
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / "file.txt").write_text("x")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(OutputError, match=fact) as caught, atomic_path(tmp_path / name):
+    with pytest.raises(OutputError) as caught, atomic_path(tmp_path / name):
         pytest.fail("must not get here")
     assert str(caught.value).startswith(str(tmp_path / name))
     assert "\n" not in str(caught.value)

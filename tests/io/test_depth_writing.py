@@ -83,25 +83,24 @@ def test_other_programs_read_what_is_written(tmp_path: Path) -> None:
 
 
 ONE = [[1.0]]
-SUFFIXES = r"\.png, \.exr, \.npy, \.npz, \.pfm, \.tif, \.tiff"
 
 
 @pytest.mark.parametrize(
-    ("name", "depth", "scale", "error", "message"),
+    ("name", "depth", "scale", "error"),
     [
-        ("d.png", [[1, 65.535]], 1000, OutputError, r"largest depth, 65\.535 m, does not fit"),
-        ("d.png", [[1, 256]], 256, OutputError, r"largest depth, 256 m.*write \.exr"),
-        ("d.png", [[1, 1e30]], 256, OutputError, r"largest depth, 1e\+30 m"),
-        ("d.png", [[1, 1e-3, 1e-4]], 256, OutputError, r"2 depths down to 0\.0001 m would become"),
-        *(("d.png", ONE, s, UsageError, "--depth-scale") for s in (0, -1, np.nan, np.inf)),
-        *((name, ONE, 256, OutputError, SUFFIXES) for name in ("d.jpg", "d", "d.json")),
-        ("d.npy", [1.0], 256, SizeError, r"is no image; give \(H, W\)"),
-        ("d.npy", np.ones((0, 4)), 256, SizeError, "is no image"),
+        ("d.png", [[1, 65.535]], 1000, OutputError),
+        ("d.png", [[1, 256]], 256, OutputError),
+        ("d.png", [[1, 1e30]], 256, OutputError),
+        ("d.png", [[1, 1e-3, 1e-4]], 256, OutputError),
+        *(("d.png", ONE, s, UsageError) for s in (0, -1, np.nan, np.inf)),
+        *((name, ONE, 256, OutputError) for name in ("d.jpg", "d", "d.json")),
+        ("d.npy", [1.0], 256, SizeError),
+        ("d.npy", np.ones((0, 4)), 256, SizeError),
     ],
 )
 def test_what_a_format_cannot_hold_is_refused_and_nothing_is_written(
-    tmp_path: Path, name: str, depth: list, scale: float, error: type[PnpDepthError], message: str
+    tmp_path: Path, name: str, depth: list, scale: float, error: type[PnpDepthError]
 ) -> None:
-    with pytest.raises(error, match=message):
+    with pytest.raises(error):
         write_depth(tmp_path / name, np.array(depth, np.float32), scale=scale)
     assert list(tmp_path.iterdir()) == []

@@ -27,5 +27,5 @@ def test_a_file_is_known_by_its_digest_whatever_its_times_say(tmp_path: Path) ->
         assert not is_unchanged(path, known)
     path.unlink()
     assert not is_unchanged(path, known)
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError):
         fingerprint(path)

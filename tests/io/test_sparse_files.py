@@ -110,35 +110,32 @@ def test_a_header_says_whether_rows_are_of_a_scan(tmp_path: Path) -> None:
         assert holds_scan(path) is of_scan
 
 
-NONE = (NoPointsError, "holds no depth above 0")
-
-
 @pytest.mark.parametrize(
-    ("name", "content", "error", "message"),
+    ("name", "content", "error"),
     [
-        ("s.csv", "1 2 3\n4 5\n", FileFormatError, "line 2: '4 5' is not 3 numbers"),
-        ("s.csv", "1 2 3 4\n", FileFormatError, "4 numbers a row .* give --calib"),
-        ("s.csv", "1 2 3\nx y depth\n", FileFormatError, "line 2: 'x y depth' is not"),
-        ("s.csv", "u v w\n1 2 3\n", FileFormatError, "line 1"),
-        ("s.csv", "1,5;2,5;3,5\n", FileFormatError, "6 numbers a row"),
-        ("s.csv", b"\xff\xfe1\x00", FileFormatError, "is not a text file"),
-        ("s.csv", "1 2 3\n", SizeError, "which needs an image to say the frame's size"),
-        ("none.csv", None, InputError, r"none\.csv: no such file"),
-        ("s.npy", [[1, 1, 2]], FileFormatError, "save x, y, depth as float metres"),
-        ("s.npy", [[0.0] * 3] * 5, *NONE),
-        ("s.npy", [[0.0] * 4] * 5, *NONE),
-        ("s.txt", "# nothing\n", *NONE),
+        ("s.csv", "1 2 3\n4 5\n", FileFormatError),
+        ("s.csv", "1 2 3 4\n", FileFormatError),
+        ("s.csv", "1 2 3\nx y depth\n", FileFormatError),
+        ("s.csv", "u v w\n1 2 3\n", FileFormatError),
+        ("s.csv", "1,5;2,5;3,5\n", FileFormatError),
+        ("s.csv", b"\xff\xfe1\x00", FileFormatError),
+        ("s.csv", "1 2 3\n", SizeError),
+        ("none.csv", None, InputError),
+        ("s.npy", [[1, 1, 2]], FileFormatError),
+        ("s.npy", [[0.0] * 3] * 5, NoPointsError),
+        ("s.npy", [[0.0] * 4] * 5, NoPointsError),
+        ("s.txt", "# nothing\n", NoPointsError),
     ],
 )
-def test_what_is_no_sparse_depth_is_refused_by_its_place(
-    tmp_path: Path, name: str, content: object, error: type[PnpDepthError], message: str
+def test_what_is_no_sparse_depth_is_refused_by_its_name(
+    tmp_path: Path, name: str, content: object, error: type[PnpDepthError]
 ) -> None:
     path = tmp_path / name
     if isinstance(content, list):
         np.save(path, content)
     elif content is not None:
         path.write_bytes(content if isinstance(content, bytes) else str(content).encode())
-    with pytest.raises(error, match=message):
+    with pytest.raises(error, match=name):
         read_sparse(path)
 
 

@@ -11,16 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, SizeError
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.io.colours import UNKNOWN, DepthScale, depth_scale, paint_signed, round_steps
-from pnpdepth_cli.io.figure import MARGIN, _labels, draw_discs, magnification, resized
+from pnpdepth_cli.io.colours import UNKNOWN, DepthScale, depth_scale
 from pnpdepth_cli.io.visualisation import (
     error_map,
     improvement,
-    improvement_at_points,
     preview,
-    sigma_preview,
 )
 
 BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
@@ -85,15 +81,6 @@ def test_a_preview_has_its_panels_in_columns_and_the_image_as_it_is(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_equal_depths_have_equal_panels_and_other_depths_other_ones(tmp_path: Path) -> None:
-    _, depth, _ = scene(48, 64)
-    for after, equal in ((depth, True), (depth[::-1].copy(), False)):
-        panels = previewed(tmp_path, depth, after)
-        assert np.array_equal(panels["Depth before"], panels["Depth after"]) == equal
-        top, bottom = (panels["No image"][row].mean() for row in (0, -1))
-        assert (top > bottom) == equal  # what is near after refinement is bright
-
-
 def test_depths_that_are_unknown_or_all_alike_still_make_a_preview(tmp_path: Path) -> None:
     none, one = np.zeros((6, 8), np.float32), np.full((6, 8), 3, np.float32)
     nan = np.full((6, 8), np.nan, np.float32)
@@ -104,26 +91,6 @@ def test_depths_that_are_unknown_or_all_alike_still_make_a_preview(tmp_path: Pat
         assert (panels["Depth before"] == UNKNOWN).all() == (not known)
         # where one is unknown nothing has changed, and the map is dark
         assert (panels["Change"][-9:, -9:] > 100).any() == (known and known_after)
-
-
-def test_parts_of_different_size_or_number_and_a_place_that_is_none_are_refused(
-    tmp_path: Path,
-) -> None:
-    rgb, depth, xy = scene(6, 8)
-    path, none, points = tmp_path / "f" / "p.png", depth[0, :0], at(depth, xy)
-    with pytest.raises(SizeError, match=r"depth and after differ in size \(8x6 and 6x8\)"):
-        previewed(tmp_path, depth, depth.T)
-    with pytest.raises(SizeError, match="depth and image differ"):
-        improvement(depth, depth, depth, path, rgb=rgb[:3])
-    with pytest.raises(SizeError, match="differ in number"):
-        improvement_at_points(rgb, xy, points, points[:3], points[:3], True, path)
-    with pytest.raises(NoPointsError, match="no sparse point"):
-        improvement_at_points(rgb, none.reshape(0, 2), none, none, none, True, path)
-    with pytest.raises(InputError, match="no pixel with known depth"):
-        improvement(depth, depth, 0 * depth, path)
-    path.parent.write_text("a file, not a folder")
-    with pytest.raises(OutputError):
-        improvement(depth, depth, depth, path)
 
 
 def improved(
@@ -150,15 +117,6 @@ def test_better_worse_equal_and_unknown_have_their_own_colours(tmp_path: Path) -
     assert improved(tmp_path, [5, 5], [6, 5], [5, 6])[2].unknown is None
 
 
-def test_only_known_ground_truth_counts_and_a_depth_that_becomes_finite_is_better(
-    tmp_path: Path,
-) -> None:
-    gt = [4, 0, np.nan, np.inf, -1]
-    assert improved(tmp_path, gt, [6] * 5, [5] * 5)[0] == 1
-    assert improved(tmp_path, gt, [6] * 5, [6] * 5)[0] == 0
-    assert improved(tmp_path, [4, 4], [np.nan, np.nan], [5, np.nan])[0] == 0.5
-
-
 def test_the_preview_shows_the_signed_change(tmp_path: Path) -> None:
     before = np.full((80, 120), 4, np.float32)
     after = before.copy()
@@ -168,44 +126,6 @@ def test_the_preview_shows_the_signed_change(tmp_path: Path) -> None:
     farther, unchanged = change[65 * factor, 95 * factor], change[10 * factor, 10 * factor]
     assert farther.tolist() == [1, 102, 94]
     assert len(set(unchanged.tolist())) == 1
-
-
-def test_a_large_standard_deviation_is_warm(tmp_path: Path) -> None:
-    path = tmp_path / "s.png"
-    sigma_preview(np.linspace(0.1, 1, 4800, dtype=np.float32).reshape(60, 80), path)
-    page = pixels_of(path).astype(int)
-    height = page.shape[0] - 2 * MARGIN
-    small, large = page[MARGIN + height // 10, 2 * MARGIN], page[-2 * MARGIN, 2 * MARGIN]
-    assert small[0] < small[2]
-    assert large[0] > large[2]
-
-
-@pytest.mark.parametrize("held_out", [True, False])
-@pytest.mark.parametrize("grey", [True, False])
-def test_points_are_coloured_discs_where_they_lie(
-    tmp_path: Path, held_out: bool, grey: bool
-) -> None:
-    rgb = np.full((30, 40, 3), 0.5, np.float32)
-    xy, truth = np.array([[5, 5], [30, 20]], np.float32), np.array([2, 3], np.float32)
-    before, after = (truth + np.array(error, np.float32) for error in ([1, 0], [0, 1]))
-    image, path = rgb[:, :, 0] if grey else rgb, tmp_path / "i.png"
-    share, content = improvement_at_points(image, xy, truth, before, after, held_out, path)
-    assert share == 0.5
-    factor = int(magnification((30, 40), columns=1, legend=False))
-    colours = panels_of(path, content)["Change of error"][
-        factor // 2 :: factor, factor // 2 :: factor
-    ]
-    assert colours[5, 5].tolist() == BLUE
-    assert colours[20, 30].tolist() == ORANGE
-    assert len(set(colours[12, 17].tolist())) == 1
-    assert ("held-out" in content.footer) == held_out
-
-
-def test_points_outside_the_image_do_no_harm() -> None:
-    xy = np.array([[-50, 3], [4, 400]], dtype=np.float32)
-    ground = np.zeros((10, 10), np.float32)
-    discs = draw_discs(ground, xy, np.full((2, 3), 255, np.uint8), 1.0, np.arange(2))
-    assert (discs == 20).all()
 
 
 @given(low=st.floats(0.001, 1e4), ratio=st.floats(1.02, 1e5))
@@ -220,45 +140,6 @@ def test_ticks_lie_within_the_scale_and_in_order(low: float, ratio: float) -> No
     assert (positions[0], positions[-1]) == (0, pytest.approx(1))
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "ticks"),
-    [
-        (1.5, 9.5, [2, 3, 4, 5, 6, 7, 8, 9]),
-        (1.5, 62, [2, 3, 5, 7, 10, 20, 30, 50]),
-        (0.6, 60, [1, 2, 5, 10, 20, 50]),
-        (0.6, 600, [1, 10, 100]),
-    ],
-)
-def test_ticks_of_more_decades_have_fewer_digits(low: float, high: float, ticks: Any) -> None:
-    assert DepthScale(low_m=low, high_m=high).ticks() == ticks
-
-
-def test_steps_are_round_and_a_few_wild_depths_do_not_stretch_the_scale() -> None:
-    assert round_steps(0.9, 3.1) == [1.0, 1.5, 2.0, 2.5, 3.0]
-    assert round_steps(2, 63) == [10, 20, 30, 40, 50, 60]
-    assert round_steps(0, 10) == list(range(11))
-    depth = np.linspace(1, 2, 1000)
-    depth[:5] = 1e6
-    assert depth_scale(depth).high_m < 2.1
-
-
-def test_near_is_warm_far_is_cold_and_unknown_is_grey() -> None:
-    scale = DepthScale(low_m=1, high_m=10)
-    near, far, unknown, nan = scale.paint(np.array([1, 10, 0, np.nan])).astype(int)
-    assert near[0] > near[2]
-    assert far[2] > far[0]
-    assert unknown.tolist() == nan.tolist() == [UNKNOWN] * 3
-
-
-def test_stronger_change_is_stronger_colour() -> None:
-    strength = np.array([0, 0.3, 1, 7, -0.3, -1])
-    colours = paint_signed(strength, np.full(6, 0.9), "gain").astype(int)
-    assert colours[2].tolist() == colours[3].tolist() == BLUE
-    assert colours[5].tolist() == ORANGE
-    spread = np.ptp(colours, axis=1)
-    assert spread[0] == 0 < spread[1] < spread[2]
-
-
 def test_the_error_map_has_different_colours_for_too_far_and_too_near() -> None:
     truth = np.full((1, 4), 2, np.float32)
     pixels, strongest_m = error_map(np.array([[3, 1, 2, 0]], np.float32), truth, None)
@@ -269,25 +150,3 @@ def test_the_error_map_has_different_colours_for_too_far_and_too_near() -> None:
     assert right[0] > 150 > 80 > none[0]
     pixels, _ = error_map(truth, truth, np.full((1, 4), 0.5, np.float32))
     assert (pixels == pixels[0, 0, 0]).all()
-
-
-def test_a_reduced_image_has_means_and_an_enlarged_one_squares() -> None:
-    pixels = np.array([[0, 2], [4, 6]], np.float32)
-    assert resized(pixels, 0.5).tolist() == [[3]]
-    assert resized(pixels, 2).tolist() == pixels.repeat(2, 0).repeat(2, 1).tolist()
-
-
-@pytest.mark.parametrize(
-    ("ticks", "labels"),
-    [
-        ([1.0, 1.05, 1.1], ["1.00", "1.05", "1.10"]),
-        ([0.25, 8], ["0.2", "8.0"]),
-        ([10, 2000], ["10", "2,000"]),
-        ([0, 0.5], ["0.0", "0.5"]),
-        ([], []),
-    ],
-)
-def test_ticks_have_as_many_decimals_as_tell_them_apart(
-    ticks: list[float], labels: list[str]
-) -> None:
-    assert _labels(ticks) == list(zip(ticks, labels, strict=True))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.sensors.point_cloud import View, consistent_depth, neighbouring_views
@@ -58,10 +57,3 @@ def test_neighbours_are_the_nearest_that_look_the_same_way() -> None:
     )
     assert neighbouring_views(poses, 0) == [3, 1]
     assert neighbouring_views(poses, 2) == []
-
-
-@pytest.mark.parametrize("min_views", [1, 2])
-def test_one_view_agrees_with_itself_alone(min_views: int) -> None:
-    here = view_of_a_wall(0.0)
-    kept = consistent_depth(here, [], min_views)
-    assert np.array_equal(kept, here.depth) == (min_views == 1)

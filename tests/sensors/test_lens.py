@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.sensors.lens import (
-    LENS_MODELS,
     distort,
     largest_radius,
     pixels_of,
@@ -31,10 +30,6 @@ EXAMPLES: dict[str, tuple[float, ...]] = {
 
 def directions(seed: int, widest: float = 0.9) -> NDArray[np.float64]:
     return np.random.default_rng(seed).uniform(-widest, widest, (60, 2))
-
-
-def test_every_lens_of_the_list_is_implemented() -> None:
-    assert tuple(LENS_MODELS) == LENSES == tuple(EXAMPLES)
 
 
 @settings(max_examples=60)
@@ -80,31 +75,11 @@ def test_a_fisheye_that_turns_back_shows_nothing_beyond() -> None:
     np.testing.assert_allclose(shown, np.column_stack([angle - 0.2 * angle**3, [0, 0]]))
 
 
-@pytest.mark.parametrize(
-    ("lens", "radial"),
-    [
-        ("radial-tangential", "11001"),
-        ("fisheye", "1111"),
-    ],
-)
-def test_a_lens_turns_back_by_its_radial_coefficients_alone(lens: str, radial: str) -> None:
-    for number, turns in enumerate(radial):
-        alone = tuple(-9.0 if i == number else 0.0 for i in range(len(radial)))
-        assert (largest_radius(lens, alone) < np.inf) == (turns == "1")
-
-
 def test_a_point_that_the_lens_shows_nothing_at_has_no_direction() -> None:
     barrel = (-0.4, 0.0, 0.0, 0.0)  # r − 0.4 r³ has its maximum of 0.61 at 0.91
     plane = undistort(np.array([[0.7, 0.0], [0.5, 0.3]]), "radial-tangential", barrel)
     assert np.isnan(plane[0]).all()
     np.testing.assert_allclose(distort(plane[1:], "radial-tangential", barrel), [[0.5, 0.3]])
-
-
-@pytest.mark.parametrize("lens", LENSES)
-def test_no_points_are_shown_and_undone_as_none(lens: str) -> None:
-    nothing = np.zeros((0, 2))
-    assert distort(nothing, lens, EXAMPLES[lens]).shape == (0, 2)
-    assert undistort(nothing, lens, EXAMPLES[lens]).shape == (0, 2)
 
 
 def test_the_rays_of_an_image_are_those_of_its_own_cameras_pixels() -> None:

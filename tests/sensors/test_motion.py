@@ -68,9 +68,3 @@ def test_a_motion_beyond_the_median_depth_is_refused() -> None:
     estimate = motion_of_images(*seen_from(points, (1.5 * median, 0, 0)), points, ROOM_CAMERA)
     assert estimate.motion is None
     assert "of motion at a median depth of" in estimate.basis
-
-
-def test_too_few_points_give_no_motion() -> None:
-    points = points_of(1)
-    few = points.select(np.arange(len(points)) < 5)
-    assert motion_of_images(image(0), image(1), few, CAMERA).motion is None

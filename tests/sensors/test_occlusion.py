@@ -56,40 +56,6 @@ def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None
     assert scan[removed, 0].min() == 20  # the foreground itself stays
 
 
-def test_ground_at_a_grazing_angle_hides_no_ground() -> None:
-    elevation, azimuth = np.meshgrid(
-        np.radians(np.arange(-20, -4.5, 0.4)), np.radians(np.arange(-20, 20, 0.2)), indexing="ij"
-    )
-    distance = 1.7 / np.tan(-elevation)
-    scan = np.column_stack(
-        [
-            (distance * np.cos(azimuth)).ravel(),
-            (distance * np.sin(azimuth)).ravel(),
-            np.full(distance.size, -1.7),
-        ]
-    )
-    scanner = Extrinsics(FORWARD_LEFT_UP, np.array([0.06, -0.08, -0.27]))
-    got = project_velodyne(scan, CAMERA, scanner, SIZE)
-    assert got.dropped["hidden by foreground"] == 0
-
-
-def test_the_scanner_in_front_of_the_camera_needs_no_parallax_to_be_defined() -> None:
-    xy = np.array([[100.0, 100.0], [101.0, 100.0], [109.0, 100.0], [300.0, 200.0]])
-    depth = np.array([1.0, 5.0, 5.0, 5.0])
-    scanner = np.array([640.0, 480.0, 2.0])
-    hidden = hidden_points(xy, depth, SIZE, focal_px=700.0, scanner=scanner)
-    assert hidden.tolist() == [False, True, False, False]
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("pixels", [-11, -10, 10, 11])
-def test_what_hides_a_point_is_at_most_ten_pixels_away(axis: int, pixels: int) -> None:
-    step = np.eye(3)[axis] * np.sign(pixels)  # the beam passes 6.4 pixels to that side
-    xy = 100.0 + np.array([abs(pixels) * step[:2], (0, 0)])
-    hidden = hidden_points(xy, np.array([1.0, 5.0]), SIZE, focal_px=700.0, scanner=8 * step)
-    assert hidden.tolist() == [False, abs(pixels) == 10]  # 0.8 degrees
-
-
 @pytest.mark.parametrize("focal_px", [240.0, 300.0])
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.3, -0.1, -0.2)])
 def test_a_point_is_hidden_by_a_nearer_one_beside_its_beam(

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.sensors import point_cloud as module
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.point_cloud import PointCloud, VoxelGrid, cloud_from_depth, depth_edges
 
@@ -77,38 +76,12 @@ def test_unknown_and_excluded_pixels_have_no_point() -> None:
     assert np.linalg.norm(cloud.normals, axis=1) == pytest.approx(np.ones(len(cloud.xyz)), abs=1e-5)
 
 
-def test_a_lone_pixel_has_no_normal() -> None:
-    depth = np.zeros((HEIGHT, WIDTH), np.float32)
-    depth[4, 4] = 2
-    assert (whole(depth, CAMERA).normals == 0).all()
-
-
-def test_colours_are_those_of_the_pixels() -> None:
-    depth = np.full((HEIGHT, WIDTH), 3, np.float32)
-    codes = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3))
-    cloud = whole(depth, CAMERA, rgb=(codes / 255).astype(np.float32))
-    assert cloud.rgb is not None
-    assert (cloud.rgb == codes.reshape(-1, 3)).all()
-
-
 def test_a_pose_moves_points_and_turns_normals() -> None:
     cloud = whole(np.full((HEIGHT, WIDTH), 3, np.float32), CAMERA)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     moved = cloud.transformed(np.column_stack([turn, [1.0, 2, 3]]))
     assert moved.xyz == pytest.approx(cloud.xyz @ turn.T + [1, 2, 3], abs=1e-5)
     assert moved.normals == pytest.approx(np.tile([-1.0, 0, 0], (len(cloud.xyz), 1)), abs=1e-5)
-
-
-def test_a_cloud_in_parts_is_that_of_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(5)
-    depth = plane_depth((0.2, 0.1, 1.0), 4.0) * rng.choice([0, 1, 1.01], (HEIGHT, WIDTH))
-    rgb = rng.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
-    at_once = whole(depth.astype(np.float32), CAMERA, rgb=rgb)
-    monkeypatch.setattr(module, "_PART_PIXELS", 5 * WIDTH)
-    parts = list(cloud_from_depth(depth.astype(np.float32), CAMERA, rgb=rgb))
-    assert len(parts) == 5
-    for one, other in zip(joined(parts), at_once, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_merged_clouds_have_one_mean_point_per_voxel_in_any_order() -> None:

@@ -82,19 +82,12 @@ def test_sampled_points_are_no_projected_scan(kind: str) -> None:
     assert occluded_in_map(points_of(as_depth_image(samples))) is None
 
 
-def test_points_between_pixels_and_a_few_points_are_left_alone() -> None:
-    points = boards_before_a_wall()
-    off_grid = Points(xy=points.xy + np.float32(0.25), depth=points.depth, size=points.size)
-    assert occluded_in_map(off_grid) is None
-    assert occluded_in_map(points.select(np.arange(len(points)) < 900)) is None
-
-
 def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: Path) -> None:
     points = boards_before_a_wall()
     write_depth(tmp_path / "sparse.png", as_depth_image(points), scale=256)
     files = FrameFiles(sparse=tmp_path / "sparse.png")
     read = read_requested(RefineRequest(files=files))
-    count = read.sources["sparse"]["dropped"]["hidden by foreground"]
+    count = read.sources["sparse"].dropped["hidden by foreground"]
     assert len(read.points) == len(points) - count < len(points)
     assert sum("--preset paper" in note for note in read.notes) == 1
     kept = read_frame(files, ReadOptions(scan=ScanOptions(keep_occluded=True)))

@@ -45,13 +45,6 @@ def test_of_two_points_on_a_pixel_the_nearer_wins_and_keeps_its_subpixel_positio
     assert as_depth_image(got)[40, 50] == 10
 
 
-def test_the_outermost_half_pixels_belong_to_the_image_and_no_more() -> None:
-    # u = 50 - 10 y: the left border of the image is at -0.5, the right one at 100.5
-    scan = np.array([[10.0, y, 0] for y in (5.0499, 5.0501, -5.0499, -5.0501)])
-    got = project_velodyne(scan, CAMERA, HERE, SIZE, keep_occluded=True)
-    np.testing.assert_allclose(got.xy[:, 0], [-0.499, 100.499], atol=1e-4)
-
-
 def test_a_lens_model_does_not_fold_points_from_outside_into_the_image() -> None:
     # 1 - 0.4 r² turns back at r = 0.91: a point at r = 1.58 would land on the axis
     eye = Camera(intrinsics=K, distortion=(-0.4, 0.0, 0.0, 0.0))
