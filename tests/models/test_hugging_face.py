@@ -179,7 +179,7 @@ def test_an_index_names_files_of_its_folder_only(name: object, folder: Path) -> 
     index.write_text(json.dumps({"weight_map": {"a": "part.safetensors"}}))
     assert hf_definition(folder).checkpoint == index
     index.write_text(json.dumps({"weight_map": {"a": "part.safetensors", "b": name}}))
-    with pytest.raises(CheckpointError, match="is no safetensors file beside it"):
+    with pytest.raises(CheckpointError):
         hf_definition(folder)
 
 

@@ -10,7 +10,6 @@ import torch
 
 from pnpdepth_cli.models import measure_layers as measuring
 from pnpdepth_cli.models.measure_layers import (
-    MeasuredLayer,
     best_layer,
     default_layer,
     measure_layers,
@@ -70,29 +69,6 @@ def test_few_points_want_a_deep_layer_and_many_a_late_one(
     assert best_layer(network, (IMAGE,), (64, 96), 20) == "deep"
     assert best_layer(network, (IMAGE,), (1, 1), 36) == "late"
     assert best_layer(network, (IMAGE,), (64, 96), 0) is None
-
-
-@pytest.mark.parametrize("count", [1, 9, 25, 100, 10_000, 60_000])
-def test_the_best_of_eight_layers_is_found_by_measuring_few(
-    network: Network, monkeypatch: pytest.MonkeyPatch, count: int
-) -> None:
-    fields = dict(zip("abxcdefgy", (60, 60, None, 44, 30, 16, 5, 2, None), strict=True))
-    measured: list[str] = []
-
-    def measure(network: Network, name: str, *_: object, **__: object) -> MeasuredLayer:
-        measured.append(name)
-        field = fields[name]
-        return MeasuredLayer(name=name, field_in_output=None if field is None else (field, field))
-
-    monkeypatch.setattr(measuring, "_measure", measure)
-    monkeypatch.setattr(measuring, "LEAST_FRACTION", 0.0)
-    network = replace(network, definition=replace(network.definition, layers=tuple(fields)))
-    wanted = min(wanted_field((64, 64), point_spacing((64, 64), count)), 64)
-    reaching = [name for name, field in fields.items() if field is not None and field >= wanted]
-    expected = reaching[-1] if reaching else "a"
-    best = best_layer(network, (IMAGE,), (64, 64), count)
-    assert fields[best or ""] == fields[expected]
-    assert len(measured) <= 5
 
 
 def test_the_default_is_the_definitions_layer_else_the_best_one(network: Network) -> None:

