@@ -231,11 +231,6 @@ def test_a_gradient_that_is_not_finite_stops_with_the_depth_it_came_from() -> No
     assert len(error.value.last_good.losses) == 1
 
 
-def test_a_bad_prediction_without_updates_is_handed_over_as_it_is() -> None:
-    result = refined(Breaking(1, float("nan")), "cut", ClosedSettings(iterations=0))
-    assert bool(result.after.isnan().all())
-
-
 # ------------------------------------------------------------------ no gradient to z
 
 

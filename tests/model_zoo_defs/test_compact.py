@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from model_zoo_defs._compact.cloud import Cloud
-from model_zoo_defs._compact.decoder import SpatialPropagation
-from model_zoo_defs._compact.points import Points, residual_of
+from model_zoo_defs._compact.points import Points
 from model_zoo_defs._compact.prior import Prior
 from model_zoo_defs.compact import Compact, definitions
 from pnpdepth_cli.core.split import Split
@@ -85,19 +84,6 @@ def test_samples_of_a_batch_do_not_see_each_other(shaken: Compact, with_prior: b
     torch.testing.assert_close(together, apart, rtol=1e-3, atol=1e-4)
 
 
-def test_a_plane_seen_at_some_points_is_continued_as_a_plane(network: Compact) -> None:
-    """The untrained network is its point fit, and a fit of planes knows planes."""
-    torch.manual_seed(0)
-    untrained = Compact().eval()
-    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
-    ground_truth = torch.exp(0.002 * rows - 0.003 * columns).view(1, 1, 96, 128)
-    rgb, points = frame(96, 128, 400)
-    with torch.no_grad():
-        depth = untrained(torch.zeros_like(rgb), ground_truth * (points > 0))
-    error = (torch.log(depth) - torch.log(ground_truth)).abs()
-    assert float(error.mean()) < 0.03
-
-
 def prior_of(sparse: Tensor, seed: int = 3) -> Tensor:
     """A rough depth near that of the points, with a window in which it is unknown."""
     generator = torch.Generator().manual_seed(seed)
@@ -144,73 +130,12 @@ def test_a_prior_that_is_unknown_everywhere_changes_nothing(shaken: Compact) -> 
         )
 
 
-def test_a_prior_changes_the_depth_and_leaves_it_finite(shaken: Compact) -> None:
-    for count in (0, 1, 300):
-        rgb, sparse = frame(96, 128, count)
-        with torch.no_grad():
-            depth = shaken(rgb, sparse, prior_of(sparse))
-            assert not torch.equal(depth, shaken(rgb, sparse))
-        assert bool(torch.isfinite(depth).all())
-        assert bool((depth > 0).all())
-
-
 @pytest.mark.parametrize("useless", ["constant", "shuffled"])
 def test_a_prior_that_does_not_explain_the_points_is_unknown_everywhere(useless: str) -> None:
     rgb, sparse = frame(96, 128, 200)
     points = Points(sparse)
     prior = torch.full_like(sparse, 3.0) if useless == "constant" else shuffled(sparse)
     assert not bool(Prior.of(prior, points, Cloud.of(points, rgb)).valid.any())
-
-
-def test_a_prior_that_is_less_exact_than_the_nearest_point_is_unknown_everywhere() -> None:
-    rgb, sparse = frame(96, 128, 200)
-    sparse[..., 1::2] = sparse[..., ::2]  # pairs of equal depth
-    points, prior = Points(sparse), sparse * torch.exp(0.4 * rgb[:, :1])
-    assert not bool(Prior.of(prior, points, Cloud.of(points, rgb)).valid.any())
-
-
-def test_each_image_of_a_batch_keeps_or_loses_its_own_prior() -> None:
-    one, other = frame(64, 96, 90, seed=1), frame(64, 96, 300, seed=2)
-    rgb, sparse = (torch.cat(pair) for pair in zip(one, other, strict=True))
-    points = Points(sparse)
-    priors = torch.cat([prior_of(sparse[:1]), shuffled(sparse[1:])])
-    valid = Prior.of(priors, points, Cloud.of(points, rgb)).valid
-    assert torch.equal(valid[0] > 0, priors[0] > 0)
-    assert not bool(valid[1].any())
-
-
-def test_outliers_among_the_points_do_not_hide_that_a_prior_explains_the_others() -> None:
-    rgb, sparse = frame(96, 128, 200)
-    points, prior, outlier = Points(sparse), sparse.clone(), torch.zeros_like(sparse)
-    outlier.view(-1)[torch.nonzero(sparse.view(-1)).squeeze(1)[::4]] = 1.0
-    prior = torch.where(outlier > 0, 80.0, prior)
-    cloud = Cloud.of(points, rgb)
-    assert not bool(Prior.of(prior, points, cloud).valid.any())
-    points.weigh(1.0 - outlier)
-    assert bool(Prior.of(prior, points, cloud).valid.any())
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_a_prior_is_used_where_no_two_points_can_tell(count: int) -> None:
-    rgb, sparse = frame(64, 96, count)
-    points, prior = Points(sparse), torch.full((1, 1, 64, 96), 2.0)
-    assert bool(Prior.of(prior, points, Cloud.of(points, rgb)).valid.all())
-
-
-def test_an_exact_prior_lets_the_untrained_network_know_what_no_point_shows() -> None:
-    """A step between two points is known to the prior alone."""
-    torch.manual_seed(0)
-    untrained = Compact().eval()
-    ground_truth = torch.full((1, 1, 96, 128), 2.0)
-    ground_truth[..., 64:] = 4.0
-    rgb, sparse = torch.zeros(1, 3, 96, 128), torch.zeros(1, 1, 96, 128)
-    sparse[..., 48, 30], sparse[..., 48, 98] = 2.0, 4.0
-    with torch.no_grad():
-        errors = [
-            (torch.log(depth) - torch.log(ground_truth)).abs().mean()
-            for depth in (untrained(rgb, sparse, ground_truth), untrained(rgb, sparse))
-        ]
-    assert errors[0] < 0.7 * errors[1]
 
 
 @pytest.mark.parametrize("with_prior", [False, True])
@@ -238,77 +163,6 @@ def test_no_gradient_is_infinite(shaken: Compact, with_prior: bool) -> None:
     for name, parameter in net.named_parameters():
         if parameter.grad is not None:
             assert bool(torch.isfinite(parameter.grad).all()), name
-
-
-def test_coarse_forwards_end_at_a_quarter_and_some_go_on_to_full_size(network: Compact) -> None:
-    rgb, sparse = frame(64, 96, 60)
-    with torch.no_grad():
-        depths = network.outputs(rgb, sparse).depths
-    with network.coarse() as at_full_size:
-        for gradients, gone_on in ((True, 1), (True, 1), (False, 2)):
-            with torch.set_grad_enabled(gradients):
-                assert torch.equal(network(rgb, sparse), depths[2])
-            assert len(at_full_size) == gone_on
-    for depth in (*at_full_size, network(rgb, sparse)):
-        assert torch.equal(depth, depths[-1])
-    assert not at_full_size[0].requires_grad
-
-
-def test_untrained_inlier_weights_are_one() -> None:
-    rgb, sparse = frame(64, 96, 100)
-    weights = weights_of(Compact(), sparse, rgb)
-    assert torch.equal(weights, torch.ones_like(weights))
-
-
-def test_a_point_without_weight_moves_nothing() -> None:
-    sparse = frame(64, 96, 100)[1]
-    changed = sparse.clone()
-    changed[..., 32, 48] = 900.0
-    weight = torch.ones_like(sparse)
-    weight[..., 32, 48] = 0.0
-    depths = []
-    for depth in (sparse, changed):
-        points = Points(torch.where(weight > 0, depth, 0.0)) if depth is sparse else Points(depth)
-        points.weigh(weight)
-        moments = points.moments()
-        depths.append(residual_of(moments, torch.zeros(1, 1, 8, 12) - points.median, 8).mean)
-    torch.testing.assert_close(depths[0], depths[1], rtol=1e-4, atol=1e-4)
-
-
-def propagation(stay: float, pull: float) -> SpatialPropagation:
-    """With the same weights everywhere, as logits of staying and of being pulled."""
-    module = SpatialPropagation(2)
-    torch.nn.init.zeros_(module.weigh.weight)
-    assert module.weigh.bias is not None
-    with torch.no_grad():
-        module.weigh.bias[4], module.weigh.bias[9] = stay, pull
-    return module
-
-
-@pytest.mark.parametrize("stride", [2, 4])
-def test_propagation_keeps_a_constant_depth_and_smooths_another(stride: int) -> None:
-    size = (32 // stride, 64 // stride)
-    features, none = torch.randn(1, 2, *size), torch.zeros(1, 4, 16, 32)
-    constant = torch.full((1, 1, *size), 0.7)
-    module = propagation(0.0, 0.0)
-    torch.testing.assert_close(module(features, constant, none, stride), constant)
-    rough = torch.randn(1, 1, *size)
-    smoothed = module(features, rough, none, stride).detach()
-    assert float(smoothed.std()) < 0.3 * float(rough.std())
-
-
-def test_propagated_depth_is_pulled_to_points_by_their_inlier_weight() -> None:
-    sparse = torch.zeros(1, 1, 16, 16)
-    sparse[..., 4, 4], sparse[..., 12, 12] = 2.0, 8.0  # log depth ∓0.69 about the median
-    points = Points(sparse)
-    weight = torch.ones_like(sparse)
-    weight[..., 12, 12] = 0.0
-    points.weigh(weight)
-    module, depth = propagation(20.0, 4.0), torch.full((1, 1, 8, 8), 0.3)
-    pulled = module(torch.zeros(1, 2, 8, 8), depth, points.moments(), 2).detach()
-    assert float(pulled[..., 2, 2]) == pytest.approx(float(points.value[..., 4, 4]), abs=1e-3)
-    pulled[..., 2, 2] = 0.3
-    torch.testing.assert_close(pulled, depth, atol=1e-4, rtol=0)
 
 
 def test_sigma_is_positive_and_its_gradient_reaches_no_depth(shaken: Compact) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from benchmarks.frames import kitti_dc
-from model_zoo_defs.nconv import NConv, NormalisedConv, halved
+from model_zoo_defs.nconv import NConv, NormalisedConv
 from model_zoo_defs.pncnn import Pncnn
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.frame_map import FrameMap
@@ -30,16 +30,6 @@ def test_a_constant_depth_stays_in_the_whole_network(network: type[nn.Module]) -
     depth = torch.full((1, 1, 32, 48), 7.0)
     with torch.no_grad():
         assert torch.allclose(network().eval()(depth), depth, atol=1e-3)
-
-
-def test_halving_keeps_the_depth_of_the_most_confident_pixel() -> None:
-    depth = torch.arange(16.0).reshape(1, 1, 4, 4)
-    confidence = torch.zeros(1, 1, 4, 4)
-    confidence[0, 0, 1, 1], confidence[0, 0, 2, 3] = 0.8, 0.4
-    picked, fraction = halved(depth, confidence)
-    assert picked[0, 0, 0, 0] == 5
-    assert picked[0, 0, 1, 1] == 11
-    assert fraction[0, 0, 0, 0] == pytest.approx(0.2)
 
 
 def test_the_networks_have_as_many_values_as_published() -> None:

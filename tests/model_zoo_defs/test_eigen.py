@@ -9,8 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from model_zoo_defs.eigen import Eigen, definitions, read_two_files
-from pnpdepth_cli.errors import CheckpointError
+from model_zoo_defs.eigen import Eigen, definitions
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
@@ -83,25 +82,6 @@ def test_a_folder_with_both_published_files_loads_and_gives_what_their_tensors_s
         definition=definitions["eigen"], module=network, device=rgb.device, checkpoint=None
     ).depth_of(log_depth)
     assert torch.equal(depth, log_depth.exp())
-
-
-def test_one_file_alone_is_an_error_that_names_what_is_missing(
-    folder: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "coarse_model_12.pth").symlink_to(folder / "coarse_model_12.pth")
-    for part, path in (
-        ("coarse", folder / "coarse_model_12.pth"),
-        ("fine", folder / "fine_model_7.pth"),
-        ("coarse", tmp_path),
-    ):
-        with pytest.raises(CheckpointError, match=f"this is the {part} network only; name a fold"):
-            load_checkpoint(Eigen(hidden=2), definitions["eigen"], path)
-
-
-def test_two_files_for_one_part_are_named() -> None:
-    state = {f"{file}.conv1.weight": torch.zeros(1) for file in ("fine_model_1", "fine_model_2")}
-    with pytest.raises(ValueError, match="fine_model_1 and fine_model_2 are both the fine netw"):
-        read_two_files(state)
 
 
 def test_it_has_the_published_shapes_and_the_papers_output() -> None:

@@ -15,12 +15,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model_zoo_defs.fcrn import FCRN, definitions, read_authors
-from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.network import load_network
+from model_zoo_defs.fcrn import FCRN, definitions
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
-from tests.model_zoo_defs.cuts import built
-from tests.models.weights.files import write_npy
+from tests.models.weights.files import npy_of, pickled
 
 Arrays = dict[str, dict[str, NDArray[np.float32]]]
 Fill = Callable[[tuple[int, ...]], NDArray[np.float32]]
@@ -170,7 +167,7 @@ def narrow(arrays: Arrays, path: Path, width: int = 4) -> FCRN:
     """A network of this width with these arrays, loaded from a file."""
     network = FCRN(width)
     definition = replace(definitions["fcrn"], build=partial(FCRN, width))
-    load_checkpoint(network, definition, write_npy(path / "x.npy", arrays))
+    load_checkpoint(network, definition, npy_of(path / "x.npy", pickled(arrays, 2)))
     return network.eval()
 
 
@@ -187,51 +184,3 @@ def test_the_graph_is_the_authors_for_even_and_odd_sizes(
     assert size != (228, 304) or tuple(depth.shape[-2:]) == (128, 160)
     assert float(expected.amax()) > 0.1
     assert torch.allclose(depth, expected, rtol=1e-3, atol=1e-3 * float(expected.amax()))
-
-
-def test_an_array_that_is_missing_or_left_over_is_named(tmp_path: Path) -> None:
-    arrays = authors(4, random_arrays(1))
-    del arrays["conv1"]["biases"], arrays["bn3b_branch2a"]["variance"]
-    arrays["res4g_branch2a"] = {"weights": np.zeros((1, 1, 64, 16), np.float32)}
-    message = (
-        r"2 missing \(conv1\.bias, res3b\.bn_branch2a\.running_var\)"
-        r"; 1 unexpected \(res4g_branch2a\.weight\)"
-    )
-    with pytest.raises(CheckpointError, match=message):
-        narrow(arrays, tmp_path)
-    arrays["conv1"]["momentum"] = np.zeros(4, np.float32)
-    with pytest.raises(CheckpointError, match=r"conv1\.momentum is none of weights"):
-        narrow(arrays, tmp_path)
-
-
-def test_what_the_optimiser_left_in_a_tensorflow_checkpoint_is_no_weight() -> None:
-    left = {"conv1.weights.Momentum": torch.zeros(7, 7, 3, 4), "global_step": torch.tensor(7)}
-    weights = {"conv1.weights": torch.ones(7, 7, 3, 4), "conv1.biases": torch.ones(4)}
-    assert list(read_authors(weights | left)) == ["conv1.weight", "conv1.bias"]
-
-
-@pytest.mark.parametrize(
-    ("key", "port"),
-    [
-        ("up1.conv1_1.weight", "XPFly1989"),
-        ("upSample.layer1.upper_branch.conv1.weight", "dontLoveBugs"),
-    ],
-)
-def test_files_of_ports_are_an_error_that_names_another_network(
-    key: str, port: str, tmp_path: Path
-) -> None:
-    torch.save({"epoch": 1, "state_dict": {key: torch.zeros(1)}}, tmp_path / "checkpoint.pth.tar")
-    with pytest.raises(CheckpointError, match=rf"of the port {port}.*NYU_ResNet-UpProj\.npy"):
-        load_network("fcrn", tmp_path / "checkpoint.pth.tar")
-
-
-def test_depth_is_never_negative_and_rgb_goes_in_as_bytes() -> None:
-    network = built(replace(definitions["fcrn"], build=partial(FCRN, 4)))
-    normalisation = network.definition.normalisation
-    assert normalisation is not None
-    assert [(1.0 - m) / s for m, s in zip(normalisation.mean, normalisation.std, strict=True)] == [
-        pytest.approx(255.0)
-    ] * 3
-    network.module.ConvPred.bias.data.fill_(-100.0)
-    with torch.no_grad():
-        assert float(network.module(torch.zeros(1, 3, 64, 64)).min()) == 0.0

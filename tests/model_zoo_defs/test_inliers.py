@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from model_zoo_defs._compact import cloud as clouds
-from model_zoo_defs._compact import inliers
 from model_zoo_defs._compact.cloud import NEIGHBOURS, Cloud, neighbours
 from model_zoo_defs._compact.inliers import InlierWeights
 from model_zoo_defs._compact.points import Points
@@ -80,35 +79,3 @@ def test_images_of_a_batch_do_not_influence_each_other(shaken: InlierWeights) ->
         expected = shaken.log_odds(cloud)
         torch.testing.assert_close(log_odds[number], expected, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(weights[number], shaken(alone, cloud)[0], rtol=1e-3, atol=1e-4)
-
-
-def test_the_size_of_the_chunks_changes_nothing(
-    shaken: InlierWeights, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    points = Points(sparse_map(300))
-    whole = Cloud.of(points, images(1))
-    expected = shaken.log_odds(whole)
-    monkeypatch.setattr(clouds, "CHUNK", 7)
-    monkeypatch.setattr(inliers, "CHUNK", 7)
-    assert torch.equal(Cloud.of(points, images(1)).near, whole.near)
-    torch.testing.assert_close(shaken.log_odds(whole), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_the_colour_of_a_point_is_the_mean_of_25_pixels() -> None:
-    rgb = images(1)
-    sparse = torch.zeros(1, 1, *SIZE)
-    sparse[..., 10, 20] = sparse[..., 0, 95] = 2.0
-    corner, inside = Cloud.of(Points(sparse), rgb).colour
-    torch.testing.assert_close(inside, rgb[0, :, 8:13, 18:23].mean((1, 2)))
-    # at the corner, its own pixel counts nine times
-    rows, columns = [0, 0, 0, 1, 2], [93, 94, 95, 95, 95]
-    torch.testing.assert_close(corner, rgb[0][:, rows][:, :, columns].mean((1, 2)))
-
-
-def test_only_differences_of_colour_count(shaken: InlierWeights) -> None:
-    points, rgb = Points(sparse_map(200)), images(1)
-    log_odds = shaken.log_odds(Cloud.of(points, rgb)).detach()
-    brighter = shaken.log_odds(Cloud.of(points, rgb + 1.0))
-    torch.testing.assert_close(log_odds, brighter, rtol=1e-3, atol=1e-3)
-    other = shaken.log_odds(Cloud.of(points, images(1, seed=1)))
-    assert float((log_odds - other.detach()).abs().max()) > 0.01

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from model_zoo_defs.latefusion import Encoder, Halved, LateFusion, averaged, definitions
+from model_zoo_defs.latefusion import Encoder, LateFusion, definitions
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from tests.model_zoo_defs.cuts import built
 
@@ -32,19 +32,6 @@ def test_nothing_normalises_behind_the_first_strided_convolution() -> None:
     sparse = 5 * (torch.rand(1, 1, 64, 96) < 0.1).float()
     twice, once = encoder(2 * sparse)[0], encoder(sparse)[0]
     torch.testing.assert_close(twice, 2 * once, rtol=1e-5, atol=1e-4)
-
-
-def test_a_mean_counts_pixels_inside_the_image_only() -> None:
-    assert torch.equal(averaged(torch.full((1, 1, 5, 6), 3.0)), torch.full((1, 1, 5, 6), 3.0))
-
-
-def test_halving_sees_even_and_odd_pixels() -> None:
-    layer = Halved(1, 2).eval().requires_grad_(False)
-    layer.even.weight.fill_(1)
-    layer.odd.weight.fill_(1)
-    halves = layer(torch.arange(16.0).reshape(1, 1, 4, 4))
-    expected = torch.tensor([[[0, 2], [8, 10]], [[5, 7], [13, 15]]]).float()
-    torch.testing.assert_close(halves[0], expected, rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.01, 1.0])

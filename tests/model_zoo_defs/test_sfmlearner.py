@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from model_zoo_defs.sfmlearner import DispNet, definitions
-from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
 from tests.model_zoo_defs.cuts import built
 
@@ -114,10 +113,3 @@ def test_disparity_is_inverse_depth_between_its_bounds_at_four_sizes() -> None:
         assert float(disparity.min()) >= 0.01 - 1e-6
         assert float(disparity.max()) <= 10.01 + 1e-6
     assert float(network.depth_of(torch.full((1, 1, 2, 2), 0.01)).max()) == pytest.approx(100)
-
-
-def test_the_published_pose_network_is_refused_by_name(tmp_path: Path) -> None:
-    path = tmp_path / "exp_pose_model_best.pth.tar"
-    torch.save({"epoch": 200, "state_dict": {"pose_pred.weight": torch.zeros(12, 256, 1, 1)}}, path)
-    with pytest.raises(CheckpointError, match="this is the pose network"):
-        load_network("sfmlearner", path)

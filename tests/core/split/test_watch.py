@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -125,19 +124,3 @@ def test_every_form_of_writing_is_seen(write: Callable[[Tensor], object]) -> Non
     assert saved.copied
     saved.fresh().zero_()
     assert torch.equal(saved.value, torch.tensor([-1.0, 2.0, 3.0]))
-
-
-def test_what_other_threads_do_with_tensors_meanwhile_is_their_own_matter() -> None:
-    watch, z = Watch(()), torch.ones(3)
-    watch.touch(z)
-
-    def in_a_thread(read: Callable[[], object]) -> None:
-        thread = threading.Thread(target=read)
-        thread.start()
-        thread.join()
-
-    with watch, watch.seeing_escapes():
-        in_a_thread(lambda: (z.numpy(), z.tolist(), torch.zeros(2).numpy()))
-        assert not watch.data_dependent
-        z.numpy()
-        assert watch.data_dependent
