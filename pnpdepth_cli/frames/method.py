@@ -139,7 +139,10 @@ class Method:
                 self._open[0], frame,
                 seed=seed, validated=self._validated, on_iteration=on_iteration,
             )  # fmt: skip
-        return with_uncertainty(refined) if self._uncertainty else refined
+        if not self._uncertainty:
+            return refined
+        source = frame.sources.get("sparse")  # only a COLMAP model names an image
+        return with_uncertainty(refined, of_matches=bool(source and source.image))
 
     def share_registration(self, frames: Iterable[Frame]) -> None:
         """Decides the registration that images of one size share, by all these frames together.

@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points
-from pnpdepth_cli.frames.frame import DepthMap
+from pnpdepth_cli.frames.frame import DepthMap, is_dense
 from pnpdepth_cli.frames.refined import Refined, Validation
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.stages import AFTER
 
 MIN_INLIER_WEIGHT = 0.05
@@ -53,9 +54,23 @@ _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point are val
 _BEYOND_HULL = 2.0  # typical distances to the nearest point, outside the hull of the points
 _SAMPLED = 4000  # pixels, for the typical distance
 
+_OF_MATCHES = (
+    "warning: of points that were matched in images, ±2σ holds about 80 % of the true depths: they"
+    " lie on texture, where depth is easy"
+)
+_OF_MAP = (
+    "warning: σ is that of the interpolation between points; so dense, they share the errors of"
+    " their sensor, of which validation points show nothing: add those of its data sheet"
+)
 
-def with_uncertainty(frame: Refined) -> Refined:
-    """Returns a refined frame with its standard deviation, calibrated by its check."""
+
+def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
+    """Returns a refined frame with its standard deviation, calibrated by its check.
+
+    Args:
+        frame: The refined frame.
+        of_matches: Whether its points were matched in images, as those of COLMAP.
+    """
     points, depth = frame.used, frame.after
     network = torch.from_numpy(frame.before)
     shape = relative_shape(points, network, torch.from_numpy(depth))
@@ -68,8 +83,15 @@ def with_uncertainty(frame: Refined) -> Refined:
     sigma_m = (factor * shape.numpy() * depth).astype(np.float32)
     valid = valid_depth(points, depth, sigma_m)
     if not valid.all():
-        note += f"; {100 * float((~valid).mean()):.0f} % of the pixels have no valid depth"
-    return replace(frame, sigma=sigma_m, valid=valid, notes=(*frame.notes, note))
+        part = 100 * float((~valid).mean())
+        note += f"; {part:.0f} % of the depth is beyond what the points support, and not valid"
+    limits = [*[_OF_MATCHES] * of_matches, *[_OF_MAP] * _is_map(points)]
+    return replace(frame, sigma=sigma_m, valid=valid, notes=(*frame.notes, note, *limits))
+
+
+def _is_map(points: SparsePoints) -> bool:
+    """Whether the points are as dense as those of a depth camera, without scan lines."""
+    return is_dense(points) and not scan_pattern(points.xy.numpy(), points.size).has_scan_lines
 
 
 def _calibrating(validation: Validation) -> tuple[Tensor, Tensor]:

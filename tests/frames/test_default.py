@@ -15,7 +15,7 @@ from pnpdepth_cli.core.split import Split as Cut
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames import default, fuse, validation
 from pnpdepth_cli.frames.default import refine_default, without_outliers
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.frame import Frame, is_dense
 from pnpdepth_cli.frames.fuse import (
     FEW_POINTS,
     OWN_SCANNER,
@@ -336,6 +336,19 @@ def test_without_validation_the_uncertainty_has_the_typical_scale() -> None:
     expected = typical * relative_shape(result.used, *depths).numpy() * result.after
     assert np.array_equal(got.sigma, expected.astype(np.float32))
     assert "too few points to calibrate it with" in got.notes[-1]
+
+
+CASES = [(60, True, 1), (400, False, 1), (60, False, 0)]
+
+
+@pytest.mark.parametrize(("count", "of_matches", "warnings"), CASES)
+def test_the_limits_of_sigma_are_said_of_matches_and_of_dense_points(
+    count: int, of_matches: bool, warnings: int
+) -> None:
+    result = refined(frame_in_memory(count), member(Brightness))
+    assert is_dense(result.used) == (count == 400)
+    notes = with_uncertainty(result, of_matches=of_matches).notes
+    assert sum(note.startswith("warning: ") and "σ" in note for note in notes) == warnings
 
 
 @pytest.mark.parametrize("fold", [0, 1])
