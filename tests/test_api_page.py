@@ -19,9 +19,9 @@ PAGE = Path(__file__).parent.parent / "docs" / "python-api.md"
 BEGIN = "<!-- signatures, written by `python -m tests.test_api_page` -->\n"
 END = "<!-- end of the signatures -->\n"
 FOR_THE_PROGRAM = {
-    "Refiner": {"refine_frame", "decide", "share_registration"},
+    "Refiner": set(),
     "Scores": {"to_json"},
-    "Settings": {"fixed_by", "with_preset", "given", "opened", "over", "complete"},
+    "Settings": {"fixed_by", "with_preset", "given", "opened", "over", "closed"},
     "SparsePoints": {"cropped", "joined", "select", "tensors"},
     "Split": {"static_graph", "in_half"},
     "Network": {

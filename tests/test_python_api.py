@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,19 @@ def test_a_refiner_stays_open_and_takes_maps_rows_and_points_alike(
     assert all(np.array_equal(depths[0], depth) for depth in depths[1:])
     assert all(torch.equal(before[n], v) for n, v in network.module.state_dict().items())
     assert not any("forward" in module.__dict__ for module in network.module.modules())
+
+
+def test_frames_of_two_threads_are_refined_as_those_of_one(
+    network: pnp.Network, frame: Frame
+) -> None:
+    rgb, sparse = frame
+    fewer = np.where(np.arange(sparse.shape[1]) % 2, sparse, 0)
+    with pnp.Refiner(network, pnp.Settings(iterations=1)) as refiner:
+        alone = [refiner.refine(rgb, given).depth for given in (sparse, fewer)]
+        with ThreadPoolExecutor(2) as pool:
+            given = [sparse, fewer] * 3
+            together = list(pool.map(lambda each: refiner.refine(rgb, each).depth, given))
+    assert all(np.array_equal(depth, alone[n % 2]) for n, depth in enumerate(together))
 
 
 def test_integers_are_scaled_images_by_their_type_and_depth_by_its_unit(

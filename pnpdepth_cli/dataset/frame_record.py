@@ -115,6 +115,7 @@ class FrameRecord:
     """A refined frame, or one that failed, of which nothing more is known."""
 
     name: str = ""
+    """The frame's name; a slash stands for a folder."""
     group: str | None = None
     """The sequence that the data set says it belongs to."""
     status: Literal["done", "diverged", "failed"] = "done"
@@ -131,11 +132,17 @@ class FrameRecord:
     size: tuple[int, int] | None = None
     """(width, height)"""
     unit: str = METRES
+    """Unit of all depths: "m", or "model units" of a COLMAP model without scale."""
     points: PointsRecord | None = None
+    """The sparse depth."""
     camera: CameraRecord | None = None
+    """The camera in pixels of the image. None: unknown."""
     model: ModelRecord | None = None
+    """The user's network."""
     method: MethodRecord | None = None
+    """How the frame was refined."""
     settings: dict[str, str | int | float | None] = field(default_factory=dict)
+    """The settings of the user's network, with nothing left open."""
     weights: dict[str, float] = field(default_factory=dict)
     """Weights of the experts of the default method, by name."""
     registration: dict[str, float] | None = None
@@ -149,11 +156,15 @@ class FrameRecord:
     improved_fraction: float | None = None
     """Fraction of the pixels with ground truth, else of the points, whose error fell."""
     notes: list[str] = field(default_factory=list)
+    """Lines for a person; a warning begins with "warning"."""
     figures: dict[str, FigureRecord] = field(default_factory=dict)
+    """Where the panels of the PNGs for a person lie, by kind."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """By what they were spent on."""
+    """Seconds by what they were spent on."""
     peak_memory_mb: dict[str, float] = field(default_factory=dict)
+    """In 10^6 bytes: of the process, and of the GPU if one is used."""
     versions: dict[str, str] = field(default_factory=dict)
+    """Versions of the program, Python and the numerical libraries."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for errors that are not of the result."""
