@@ -28,7 +28,7 @@ def export(**values: Any) -> None:
     colmap              stereo/depth_maps, stereo/normal_maps, for `colmap stereo_fusion`
     nerfstudio          transforms.json (also for Instant-NGP), depths/ (16-bit PNG), images/,
                         start.ply
-    gaussian-splatting  inverse_depths/ (its option -d), depth_masks/, sparse/0/depth_params.json,
+    gaussian-splatting  inverse_depths/ (its option -d), sparse/0/depth_params.json,
                         and images/ and a model in sparse/0/ unless they are there
 
     Camera and pose come from the records, so RESULTS are best those of a COLMAP project

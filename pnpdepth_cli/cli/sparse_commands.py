@@ -62,22 +62,12 @@ def project(
 )
 @click.option("--image", type=options.FILE, help="Image for `features`.")
 @options.seed
-@click.option(
-    "--noise",
-    metavar="M|P%",
-    help="Standard deviation of Gaussian noise of the depth, metres or %.",
-)
-@click.option(
-    "--outliers", metavar="P%", help="Points whose depth is random, between the least and the most."
-)
 @options.depth_scale
 @options.sparse_output
 @options.overwrite
 def sample(
     depth: Path,
     count: str,
-    noise: str | None,
-    outliers: str | None,
     output: Path,
     overwrite: bool,
     **values: Any,
@@ -86,7 +76,6 @@ def sample(
 
     \b
     pnpdepth sample gt.png --count 500 --seed 1 -o sparse.png
-    pnpdepth sample gt.png --count 500 --noise 2% --outliers 5% -o noisy.png
     pnpdepth sample gt.png --count features:300 --image rgb.png -o sparse.png
 
     \b
@@ -103,9 +92,9 @@ def sample(
 
     values["scale"] = values.pop("depth_scale")
     target = make.SparseTarget(output=output, overwrite=overwrite)
-    added, pattern = make.read_noise(noise, outliers), parse_sample(count)
+    pattern = parse_sample(count)
     assert pattern is not None
-    print_sparse(make.sample_depth(depth, target, pattern, noise=added, **values))
+    print_sparse(make.sample_depth(depth, target, pattern, **values))
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")

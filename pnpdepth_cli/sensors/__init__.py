@@ -21,6 +21,5 @@ from pnpdepth_cli.sensors.projection import edge_agreement as edge_agreement
 from pnpdepth_cli.sensors.projection import occluded_in_map as occluded_in_map
 from pnpdepth_cli.sensors.projection import project_velodyne as project_velodyne
 from pnpdepth_cli.sensors.samplers import PATTERNS as PATTERNS
-from pnpdepth_cli.sensors.samplers import SampleNoise as SampleNoise
 from pnpdepth_cli.sensors.samplers import SamplePattern as SamplePattern
 from pnpdepth_cli.sensors.samplers import sample_points as sample_points

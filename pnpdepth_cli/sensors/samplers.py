@@ -1,4 +1,4 @@
-"""Sparse depth sampled from dense depth by a pattern, with the noise of a sensor."""
+"""Sparse depth sampled from dense depth by a pattern."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
-from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors.pixels import FARTHEST_M, DropCounter, Points
+from pnpdepth_cli.sensors.pixels import Points
 
 Image = NDArray[np.float32]
 Pixels = NDArray[np.intp]
@@ -45,23 +44,6 @@ class SamplePattern:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SampleNoise:
-    """Noise that a sensor adds to true depth; all zero for none."""
-
-    metres: float = 0.0  # standard deviation of the depth, metres
-    relative: float = 0.0  # standard deviation of the depth as a fraction of it
-    outliers: float = 0.0
-    """Fraction of points whose depth is redrawn between the smallest and the largest."""
-
-    def __post_init__(self) -> None:
-        sizes = (self.metres, self.relative)
-        if not all(0 <= size < np.inf for size in sizes) or not 0 <= self.outliers <= 1:
-            raise UsageError(
-                "give noise that is not negative, and a fraction of outliers from 0 to 1"
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
 class Scene:
     """A dense depth map that is sampled."""
 
@@ -84,19 +66,17 @@ def sample_points(
     seed: int,
     *,
     image: Image | None = None,
-    noise: SampleNoise | None = None,
 ) -> Points:
     """Returns points sampled from a dense depth map; the same seed gives the same points.
 
     Args:
         depth: (H, W) metres, 0 = unknown.
         pattern: Which pixels are sampled.
-        seed: Of the pattern and the noise.
+        seed: Of the pattern.
         image: (H, W, 3) in 0..1 of the same view, for `features`.
-        noise: Added to the points; None for none.
 
     Raises:
-        NoPointsError: The depth map, the pattern or the noise leaves no point.
+        NoPointsError: The depth map or the pattern leaves no point.
         UsageError: More points are asked for than are known.
         SizeError: Image and depth differ in size.
     """
@@ -114,12 +94,11 @@ def sample_points(
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, size[1])
-    points = Points(
+    return Points(
         xy=np.stack([column, row], axis=1).astype(np.float32),
         depth=depth.ravel()[chosen].astype(np.float32),
         size=size,
     )
-    return with_noise(points, noise or SampleNoise(), rng)
 
 
 def _uniform(scene: Scene) -> Pixels:
@@ -183,36 +162,3 @@ def _features(scene: Scene) -> Pixels:
 _FUNCTIONS = (_uniform, _shuffle, _grid, _lines, _features)
 PATTERNS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
 """The patterns by name, as in `choices.PATTERNS`; each returns row-major indices of pixels."""
-
-
-def with_noise(points: Points, noise: SampleNoise, rng: np.random.Generator) -> Points:
-    """Returns the points with noise, without those that it makes impossible or moves outside.
-
-    Raises:
-        NoPointsError: No point is left.
-    """
-    xy, values = points.xy.astype(np.float64), points.depth.astype(np.float64)
-    low, high = values.min(), values.max()
-    with np.errstate(over="ignore", invalid="ignore"):
-        if noise.metres > 0:
-            values = values + rng.normal(0, noise.metres, len(values))
-        if noise.relative > 0:
-            values = values * (1 + rng.normal(0, noise.relative, len(values)))
-    if noise.outliers > 0:
-        outliers = rng.permutation(len(values))[: round(noise.outliers * len(values))]
-        values[outliers] = rng.uniform(low, high, len(outliers))
-    drops = DropCounter()
-    if noise.metres > 0 or noise.relative > 0:
-        near = drops.keep(np.abs(values) < FARTHEST_M, "noise put it too far")
-        xy, values = xy[near], values[near]
-    positive = drops.keep(values.astype(np.float32) > 0, "noise left no depth")
-    xy, values = xy[positive], values[positive]
-    inside = drops.keep(in_frame(xy, points.size), "outside the image")
-    if not inside.any():
-        raise NoPointsError(f"noise leaves no point ({drops}); make it smaller")
-    return Points(
-        xy=xy[inside].astype(np.float32),
-        depth=values[inside].astype(np.float32),
-        size=points.size,
-        dropped={why: count for why, count in drops.dropped.items() if count},
-    )

@@ -36,8 +36,6 @@ COMMANDS = {
         ("batch", "--adapt --shard 1/2", 2, "--adapt does not go with --shard"),
         ("batch", "--device cuda:9", 6, "--device cpu"),
         ("sample", "--count many", 2, "neither a number such as 500 nor 5%"),
-        ("sample", "--count 5 --noise much", 2, "--noise 'much' is neither a number"),
-        ("sample", "--count 5 --outliers 0.1", 2, "--outliers 0.1 is not a percentage"),
         ("simulate", "--beams 9 --vertical-fov 9 -9", 2, "give --sensor, or --beams"),
         ("sample", "--seed -1", 2, "--seed"),
         ("simulate", "--seed 99999999999999999999", 2, "--seed"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
-from pnpdepth_cli.sensors import PATTERNS, SampleNoise, SamplePattern, sample_points
+from pnpdepth_cli.sensors import PATTERNS, SamplePattern, sample_points
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)
 HOLES = np.where(np.random.default_rng(8).random((60, 80)) < 0.3, 0, DEPTH).astype(np.float32)
@@ -70,20 +70,6 @@ def test_features_lie_at_the_corners_of_the_image() -> None:
     assert away.min(axis=1).max() <= 6
     assert len(got.depth) == 8
     assert (away.min(axis=0) <= 6).all()
-
-
-def test_noise_has_the_requested_size() -> None:
-    every = SamplePattern(count=DEPTH.size)
-    clean = sample_points(DEPTH, every, 3)
-    metres = sample_points(DEPTH, every, 3, noise=SampleNoise(metres=0.05))
-    assert (metres.depth - clean.depth).std() == pytest.approx(0.05, rel=0.1)
-    relative = sample_points(DEPTH, every, 3, noise=SampleNoise(relative=0.02))
-    assert (relative.depth / clean.depth - 1).std() == pytest.approx(0.02, rel=0.1)
-    noisy = sample_points(DEPTH, every, 3, noise=SampleNoise(outliers=0.1))
-    assert np.count_nonzero(noisy.depth != clean.depth) == DEPTH.size // 10
-    assert clean.depth.min() <= noisy.depth.min() <= noisy.depth.max() <= clean.depth.max()
-    redrawn = noisy.depth[noisy.depth != clean.depth]
-    assert np.ptp(redrawn) > 0.95 * np.ptp(clean.depth)
 
 
 def test_what_the_depth_map_cannot_give_is_refused() -> None:

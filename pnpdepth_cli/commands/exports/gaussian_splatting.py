@@ -5,7 +5,7 @@ png / 2^16 · scale + offset: NAME.png of 16 bits in the folder of its option -d
 each image in sparse/0/depth_params.json. It ignores images whose scale is below 0.2 or above 5
 times the median, so all images have one scale here. It takes 0 for infinitely far and reads no
 masks, so every pixel has a depth: one that is not valid its own, one that is unknown that of the
-nearest known pixel. depth_masks/NAME.png is 0 at both, for other programs. Unless a model is there,
+nearest known pixel. Unless a model is there,
 sparse/0/ gets one of the refined images with points of their depth.
 """
 
@@ -45,12 +45,8 @@ def _parameters(folder: Path) -> Path:
     return folder / "sparse" / "0" / "depth_params.json"
 
 
-def _mask(folder: Path, frame: ExportFrame) -> Path:
-    return folder / "depth_masks" / f"{frame.stem}.png"
-
-
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
-    images = [path(folder, frame) for frame in frames for path in (_depth_image, _mask)]
+    images = [_depth_image(folder, frame) for frame in frames]
     copies = [frame.image_in(folder) for frame in frames if not frame.is_in(folder)]
     model = [_parameters(folder).with_name(f"{part}.txt") for part in MODEL_PARTS]
     return [*copies, *images, _parameters(folder), *(model if _needs_model(folder, frames) else [])]
@@ -77,7 +73,6 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         clipped += int((codes > _CODES - 1).sum())
         pixels += codes.size
         save_png(_depth_image(folder, frame), np.minimum(codes, _CODES - 1).astype(np.uint16))
-        save_png(_mask(folder, frame), valid.astype(np.uint8) * np.uint8(255))
         frame.copy_image(folder)
         done()
     make_folder(_parameters(folder).parent)
@@ -87,7 +82,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     if masked:
         notes.append(
             f"warning: {masked:,} pixels are unknown or not valid; they have the depth before"
-            " the mask or that of the nearest pixel, and are 0 in depth_masks/"
+            " the mask or that of the nearest pixel, as 3DGS reads no masks"
         )
     return [*notes, *distortion_note(frames, "3DGS")]
 

@@ -30,7 +30,6 @@ from pnpdepth_cli.sensors import (
     LIDARS,
     Lidar,
     Points,
-    SampleNoise,
     SamplePattern,
     as_depth_image,
     ideal_lidar,
@@ -157,7 +156,6 @@ def sample_depth(
     target: SparseTarget,
     pattern: SamplePattern,
     *,
-    noise: SampleNoise | None = None,
     image: Path | None = None,
     seed: int = 0,
     **reading: Any,
@@ -168,22 +166,19 @@ def sample_depth(
         depth: The file of the map.
         target: Files to write.
         pattern: Which pixels are sampled.
-        noise: Added to the points; None for none.
         image: For `features`.
-        seed: Of all random choices.
+        seed: Of the pattern.
         **reading: Options of `read_depth`.
     """
     target.check((depth, image))
-    noise = noise or SampleNoise()
     dense, notes = _dense(depth, **reading)
     rgb = None if image is None else read_rgb(image).values
-    points = sample_points(dense, pattern, seed, image=rgb, noise=noise)
+    points = sample_points(dense, pattern, seed, image=rgb)
     wanted = pattern.wanted(int(np.count_nonzero(dense)))
-    sampled = len(points) + sum(points.dropped.values())
-    if pattern.kind == "features" and sampled < wanted:
-        notes.append(f"warning: the image has {sampled:,} of the {wanted:,} points asked for")
+    if pattern.kind == "features" and len(points) < wanted:
+        notes.append(f"warning: the image has {len(points):,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
-    settings = {"pattern": asdict(pattern), "noise": asdict(noise), "seed": seed}
+    settings = {"pattern": asdict(pattern), "seed": seed}
     inputs = {"depth": depth, "image": image}
     return target.write("sample", points, settings, inputs=inputs, notes=notes)
 
@@ -230,28 +225,6 @@ def _dense(path: Path, scale: float | None = None) -> tuple[NDArray[np.float32],
     dense = read_depth(path, scale=scale)
     values, notes = plausible_map(dense.values, dense.reading, "depth", "--depth-scale", scale)
     return values, [f"depth: {describe_range(values, dense.reading, noun='pixels')}", *notes]
-
-
-def read_noise(noise: str | None, outliers: str | None) -> SampleNoise:
-    """Returns the noise of the depth, `0.05` metres or `2%`, and of `5%` outliers.
-
-    Raises:
-        UsageError: One of the texts is of another form.
-    """
-    metres, relative = _metres_or_fraction("--noise", noise or "0")
-    if outliers is not None and not outliers.endswith("%"):
-        raise UsageError(f"--outliers {outliers} is not a percentage such as 5%")
-    _, redrawn = _metres_or_fraction("--outliers", outliers or "0%")
-    return SampleNoise(metres=metres, relative=relative, outliers=redrawn)
-
-
-def _metres_or_fraction(option: str, text: str) -> tuple[float, float]:
-    """(metres, fraction) of `0.05` or `5%`; the other is 0."""
-    try:
-        value = float(text.removesuffix("%"))
-    except ValueError:
-        raise UsageError(f"{option} {text!r} is neither a number such as 0.05 nor 5%") from None
-    return (0.0, value / 100) if text.endswith("%") else (value, 0.0)
 
 
 def find_sensor(
