@@ -35,7 +35,6 @@ register(
         "Transpose": lambda node, i: i[0].permute(node.get("perm", [*range(i[0].ndim)][::-1])),
         "Concat": lambda node, i: torch.cat(i, node.get("axis", 1)),
         "CastLike": lambda _, i: i[0].to(i[1].dtype),
-        "Dropout": lambda _, i: i[0].clone(),
         "Flatten": lambda node, i: i[0].reshape(math.prod(i[0].shape[: node.get("axis", 1)]), -1),
         "GatherElements": lambda node, i: i[0].gather(
             node.get("axis", 0), _from_start(i[1], i[0].shape[node.get("axis", 0)])
@@ -134,9 +133,18 @@ def depth_to_space(node: Node, inputs: Inputs) -> Tensor:
     return x.reshape(n, c // b**2, h * b, w * b)
 
 
+@operator("Dropout")
+def dropout(node: Node, inputs: Inputs) -> Tensor:
+    if node.outputs > 1:
+        raise Unsupported("its second output, the mask")
+    return inputs[0].clone()
+
+
 @operator("SpaceToDepth")
 def space_to_depth(node: Node, inputs: Inputs) -> Tensor:
     x, b = inputs[0], node.get("blocksize")
+    if node.get("mode", "DCR") == "CRD":
+        return F.pixel_unshuffle(x, b)
     n, c, h, w = x.shape
     x = x.reshape(n, c, h // b, b, w // b, b).permute(0, 3, 5, 1, 2, 4)
     return x.reshape(n, c * b * b, h // b, w // b)
