@@ -8,6 +8,7 @@ import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import bags as bounds
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.bags.messages import cloud_points, image_file
+from pnpdepth_cli.io.bags.transforms import camera_info_topic, camera_of_bag
 from tests.bags import write_bag
 
 pytest.importorskip("rosbags")
@@ -171,3 +173,35 @@ def test_a_database_that_computes_what_is_read_is_refused(statements: str, tmp_p
     for path in (bag, file):
         with pytest.raises(FileFormatError):
             read_all(path)
+
+
+@pytest.mark.parametrize(("name", "rectified"), [("", ["P"]), ("p", []), ("r", []), ("k", None)])
+def test_a_camera_info_of_a_bag_may_lack_parts(name: str, rectified: list[str] | None) -> None:
+    """P and R with a NaN are ignored; with a K of zeros there is no camera."""
+    k, p = [500, 0, 320, 0, 500, 240, 0, 0, 1], [400, 0, 320, 0, 0, 400, 240, 0, 0, 0, 1, 0]
+    values: dict[str, Any] = {"d": [], "k": k, "p": p, "r": [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+    values |= {name: [0] * 9 if name == "k" else [*values[name][1:], np.nan]} if name else {}
+    header = SimpleNamespace(frame_id="/camera")
+    message = SimpleNamespace(**values, width=640, height=480, header=header)
+    bag: Any = SimpleNamespace(path=Path("a.bag"), messages=lambda _: [("", 0, message)])
+    found = camera_of_bag(bag, "/camera_info")
+    assert (found and (list(found[0].rectified), found[1])) == (
+        None if rectified is None else (rectified, "camera")
+    )
+
+
+@pytest.mark.parametrize(
+    ("topics", "expected"),
+    [
+        (["/left/camera_info", "/right/camera_info"], "/right/camera_info"),
+        (["/info"], "/info"),
+        (["/left/camera_info", "/info"], None),
+        ([], None),
+    ],
+)
+def test_an_image_has_the_camera_info_beside_it_or_the_only_one(
+    topics: list[str], expected: str | None
+) -> None:
+    bag: Any = SimpleNamespace(topics=lambda kinds: dict.fromkeys(topics, 1))
+    for topic in ("/right/image_raw", "/right/image_raw/compressed"):
+        assert camera_info_topic(bag, topic) == expected

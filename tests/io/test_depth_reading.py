@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -200,3 +201,37 @@ def test_ambiguous_channels_or_arrays_are_refused_and_listed(
     listing = ", ".join(sorted(names) if suffix == ".exr" else names)
     with pytest.raises(FileFormatError, match=re.escape(f"({listing}); ")):
         read_depth(path)
+
+
+@pytest.mark.parametrize(
+    ("corner", "rows", "columns"),
+    [
+        ((1, 1), (1, 3), (1, 4)),
+        ((-1, -1), (0, 1), (0, 2)),
+        ((3, 2), (2, 4), (3, 5)),
+        ((9, 9), 0, 0),
+    ],
+)
+def test_a_cropped_exr_is_placed_in_its_display_window(
+    tmp_path: Path, corner: tuple[int, int], rows: Any, columns: Any
+) -> None:
+    window = (np.array([0, 0], np.int32), np.array([4, 3], np.int32))
+    crop = (np.array(corner, np.int32), np.array(corner, np.int32) + np.array([2, 1], np.int32))
+    write_exr(tmp_path / "d.exr", {"Z": KNOWN + 1}, displayWindow=window, dataWindow=crop)
+    expected = np.zeros((4, 5), np.float32)
+    if rows:
+        inside = expected[slice(*rows), slice(*columns)]
+        top, left = (max(-start, 0) for start in corner[::-1])
+        inside[:] = (KNOWN + 1)[top : top + inside.shape[0], left : left + inside.shape[1]]
+    assert np.array_equal(read_depth(tmp_path / "d.exr").values, expected)
+
+
+def test_the_parts_of_an_exr_are_read(tmp_path: Path) -> None:
+    header = {"type": OpenEXR.scanlineimage}
+    parts = [
+        OpenEXR.Part(dict(header), {"Y": METRES * 2}, "left"),
+        OpenEXR.Part(dict(header), {"Z": METRES}, "right"),
+    ]
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "d.exr"))
+    assert read_depth(tmp_path / "d.exr").reading.source == "EXR channel right.Z"

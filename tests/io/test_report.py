@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import base64
+import errno
 import hashlib
+import os
 import re
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -15,7 +17,9 @@ from hypothesis import strategies as st
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.report import (
     Head,
+    check_report_folder,
     image_key,
+    link_image,
     visible,
     write_report,
 )
@@ -102,3 +106,36 @@ def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:
         written(tmp_path, HEAD, broken())
     assert [each["name"] for each in page_data(tmp_path)["frames"]] == ["old"]
     assert {p.name for p in tmp_path.iterdir()} == {"index.html", "images", "report.json"}
+
+
+def test_a_linked_image_is_the_file_itself_or_on_another_disk_a_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EXDEV, "Invalid cross-device link")
+
+    source, target = tmp_path / "source.png", tmp_path / "linked.png"
+    source.write_bytes(b"first")
+    link_image(source, target)
+    assert target.samefile(source)
+    monkeypatch.setattr(os, "link", refuse)
+    link_image(source, tmp_path / "copy.png")
+    assert (tmp_path / "copy.png").read_bytes() == b"first"
+    assert not (tmp_path / "copy.png").samefile(source)
+
+
+@pytest.mark.parametrize(
+    "folder", ["in", "in/deep/report", ".", "file", "file/deep", "full", "link"]
+)
+def test_inputs_and_other_files_are_safe(
+    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("in", "full"):
+        Path(name).mkdir()
+    Path("file").write_text("mine")
+    Path("full/notes.txt").write_text("mine")
+    Path("link").symlink_to("in")
+    for overwrite in (False, folder != "full"):
+        with pytest.raises(OutputError):
+            check_report_folder(Path(folder), [Path("in")], made_of=None, overwrite=overwrite)

@@ -13,10 +13,13 @@ from PIL import Image
 
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.colours import UNKNOWN, DepthScale, depth_scale
+from pnpdepth_cli.io.figure import MARGIN, magnification
 from pnpdepth_cli.io.visualisation import (
     error_map,
     improvement,
+    improvement_at_points,
     preview,
+    sigma_preview,
 )
 
 BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
@@ -150,3 +153,34 @@ def test_the_error_map_has_different_colours_for_too_far_and_too_near() -> None:
     assert right[0] > 150 > 80 > none[0]
     pixels, _ = error_map(truth, truth, np.full((1, 4), 0.5, np.float32))
     assert (pixels == pixels[0, 0, 0]).all()
+
+
+def test_a_large_standard_deviation_is_warm(tmp_path: Path) -> None:
+    path = tmp_path / "s.png"
+    sigma_preview(np.linspace(0.1, 1, 4800, dtype=np.float32).reshape(60, 80), path)
+    page = pixels_of(path).astype(int)
+    height = page.shape[0] - 2 * MARGIN
+    small, large = page[MARGIN + height // 10, 2 * MARGIN], page[-2 * MARGIN, 2 * MARGIN]
+    assert small[0] < small[2]
+    assert large[0] > large[2]
+
+
+@pytest.mark.parametrize("held_out", [True, False])
+@pytest.mark.parametrize("grey", [True, False])
+def test_points_are_coloured_discs_where_they_lie(
+    tmp_path: Path, held_out: bool, grey: bool
+) -> None:
+    rgb = np.full((30, 40, 3), 0.5, np.float32)
+    xy, truth = np.array([[5, 5], [30, 20]], np.float32), np.array([2, 3], np.float32)
+    before, after = (truth + np.array(error, np.float32) for error in ([1, 0], [0, 1]))
+    image, path = rgb[:, :, 0] if grey else rgb, tmp_path / "i.png"
+    share, content = improvement_at_points(image, xy, truth, before, after, held_out, path)
+    assert share == 0.5
+    factor = int(magnification((30, 40), columns=1, legend=False))
+    colours = panels_of(path, content)["Change of error"][
+        factor // 2 :: factor, factor // 2 :: factor
+    ]
+    assert colours[5, 5].tolist() == BLUE
+    assert colours[20, 30].tolist() == ORANGE
+    assert len(set(colours[12, 17].tolist())) == 1
+    assert ("held-out" in content.footer) == held_out
