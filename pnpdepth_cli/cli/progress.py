@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli.cli.streams import printable, say
@@ -19,19 +19,12 @@ _LINE_EVERY_S = 60.0
 _SHOWN_AFTER_S = 1.0
 
 
-def open_bar(title: str, unit: str, **settings: Any) -> tqdm[Any]:
-    """Returns a bar on stderr, which stays hidden where that is not a terminal."""
-    from tqdm import tqdm
-
-    tqdm.monitor_interval = 0  # without a thread of its own, image libraries can be silenced
-    return tqdm(desc=title, unit=unit, disable=None, dynamic_ncols=True, **settings)
-
-
 @contextmanager
-def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
+def progress_bar(title: str, unit: str, *, stays: bool = False) -> Iterator[Callable[..., None]]:
     """Yields `show(done, total, text="")`, which draws a bar for work of more than a second.
 
     Not on a terminal, it prints a line per minute. The time counts from the first call of `show`.
+    A bar that stays is drawn from the beginning, and left at the end.
     """
     bar: tqdm[Any] | None = None
     began = printed_at = 0.0
@@ -40,11 +33,17 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
         nonlocal bar, began, printed_at
         now = time.monotonic()
         if bar is None:
-            bar = open_bar(title, unit, total=total, leave=False, delay=_SHOWN_AFTER_S)
+            from tqdm import tqdm
+
+            tqdm.monitor_interval = 0  # without its thread, image libraries can be silenced
+            bar = tqdm(
+                desc=title, unit=unit, total=total, disable=None, dynamic_ncols=True,
+                leave=stays, delay=0 if stays else _SHOWN_AFTER_S,
+            )  # fmt: skip
             began = printed_at = now
         if bar.disable and done and now - printed_at >= _LINE_EVERY_S:
             printed_at = now
-            say(_pace(done, total, unit, now - began))
+            say(_pace(done, total, unit, now - began) + (f", {text}" if text else ""))
         bar.set_postfix_str(text, refresh=False)
         bar.update(done - bar.n)
 
@@ -64,28 +63,25 @@ class BatchProgress:
     def __init__(self) -> None:
         self.done = self.to_do = self.failed = 0
         self._said: set[str] = set()
-        self._bar: tqdm[Any] | None = None
+        self._open = ExitStack()
+        self._show = self._open.enter_context(progress_bar("batch", "frame", stays=True))
 
     def __enter__(self) -> BatchProgress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
+        self._open.close()
 
     def say(self, text: str) -> None:
         """Prints a line on stderr, above the bar."""
-        if self._bar is None:
-            say(text)
-        else:
-            self._bar.write(printable(text), file=sys.stderr)
+        from tqdm import tqdm
+
+        tqdm.write(printable(text), file=sys.stderr)
 
     def begin(self, to_do: int) -> None:
         """Starts counting; `to_do` frames follow."""
         self.to_do = to_do
-        self._began = self._printed_at = time.monotonic()
-        if sys.stderr.isatty():
-            self._bar = open_bar("batch", "frame", total=to_do)
+        self._show(0, to_do)
 
     def frame(self, record: FrameRecord) -> None:
         """Counts a frame, and prints why it failed if it did; what was said of it is not again."""
@@ -95,14 +91,7 @@ class BatchProgress:
             self.say(line)
         self.done += 1
         self.failed += record.status == "failed"
-        if self._bar is not None:
-            self._bar.update()
-            if self.failed:
-                self._bar.set_postfix_str(f"{self.failed:,} failed")
-        elif time.monotonic() - self._printed_at >= _LINE_EVERY_S:
-            self._printed_at = time.monotonic()
-            pace = _pace(self.done, self.to_do, "frame", self._printed_at - self._began)
-            self.say(pace + (f", {self.failed:,} failed" if self.failed else ""))
+        self._show(self.done, self.to_do, f"{self.failed:,} failed" if self.failed else "")
 
 
 def _pace(done: int, total: int, unit: str, spent_s: float) -> str:

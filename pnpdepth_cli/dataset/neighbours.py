@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.arrays import read_image
@@ -131,7 +132,7 @@ def _off_images(
         return None
     given, other = (
         f"{np.linalg.norm(m[:, 3]):.2f} m and"
-        f" {np.degrees(np.arccos(np.clip((np.trace(m[:, :3]) - 1) / 2, -1, 1))):.2f}°"
+        f" {np.degrees(Rotation.from_matrix(m[:, :3]).magnitude()):.2f}°"
         for m in motions
     )
     return (

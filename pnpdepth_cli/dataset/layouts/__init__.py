@@ -19,7 +19,7 @@ from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest, nyu, phones, 
 from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import InputError
 
-__all__ = ["LAYOUTS", "Layout", "Listing", "find_layout", "list_frames"]
+__all__ = ["LAYOUTS", "Layout", "Listing", "list_frames"]
 
 TABLE: dict[str, Layout] = {
     **rows.ROWS,
@@ -43,34 +43,6 @@ class Listing(NamedTuple):
     frames: list[FrameFiles]  # complete frames, in a fixed order
     broken: list[Unmatched]  # files of frames that lack a part, or cannot be read
     spare: list[Unmatched]  # other files beside them
-
-
-def find_layout(root: Path, name: str | None = None) -> str:
-    """Returns the name of the layout that a folder or file is of.
-
-    Args:
-        name: The only layout to consider; None for all, in the order of `choices.LAYOUTS`.
-
-    Raises:
-        UsageError: There is no layout of this name.
-        InputError: The folder does not exist, or matches no layout.
-    """
-    if not root.exists():
-        raise InputError(f"{root}: no such folder; check the path")
-    found = _match(root, name)
-    if found is not None:
-        return found
-    if root.suffix.lower() == ".r3d":
-        raise InputError(
-            f"{root}: the depth in it is compressed with LZFSE, which is not read; export 'EXR +"
-            " RGB' in Record3D, and give the folder EXR_RGBD"
-        )
-    if name is not None:
-        needed = ", ".join(LAYOUTS[name].needs)
-        raise InputError(
-            f"{root} does not look like {name!r}" + (f", which needs {needed}" if needed else "")
-        )
-    raise InputError(f"{root} does not look like any layout; {_nearest(root)}")
 
 
 def _match(root: Path, name: str | None) -> str | None:
@@ -130,18 +102,29 @@ def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
     Raises:
         InputError: Neither is, or the folders in it are of several layouts.
     """
-    try:
-        return [root], find_layout(root, name)
-    except InputError as error:
-        inside = sorted(root.iterdir()) if root.is_dir() else []
-        folders = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
-        found = {path: layout for path in folders if (layout := _match(path, name)) is not None}
-        layouts = sorted(set(found.values()))
-        if len(layouts) > 1:
-            raise InputError(
-                f"{root} holds folders of several layouts ({', '.join(layouts)}); give one of"
-                " them, or name the layout"
-            ) from error
-        if not found:
-            raise
+    if not root.exists():
+        raise InputError(f"{root}: no such folder; check the path")
+    if (layout := _match(root, name)) is not None:
+        return [root], layout
+    inside = sorted(root.iterdir()) if root.is_dir() else []
+    folders = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
+    found = {path: each for path in folders if (each := _match(path, name)) is not None}
+    layouts = sorted(set(found.values()))
+    if len(layouts) > 1:
+        raise InputError(
+            f"{root} holds folders of several layouts ({', '.join(layouts)}); give one of them, or"
+            " name the layout"
+        )
+    if found:
         return list(found), layouts[0]
+    if root.suffix.lower() == ".r3d":
+        raise InputError(
+            f"{root}: the depth in it is compressed with LZFSE, which is not read; export 'EXR +"
+            " RGB' in Record3D, and give the folder EXR_RGBD"
+        )
+    if name is None:
+        raise InputError(f"{root} does not look like any layout; {_nearest(root)}")
+    needed = ", ".join(LAYOUTS[name].needs)
+    raise InputError(
+        f"{root} does not look like {name!r}" + (f", which needs {needed}" if needed else "")
+    )

@@ -64,13 +64,10 @@ class _FilePart:
 
     def video(self, place: Path) -> Path | None:
         """Returns the video that lies there instead of the folder of images."""
-        paths = [place / f"{name}{suffix}" for name in self.folders for suffix in VIDEO_SUFFIXES]
-        is_video = self._suffix == "IMAGE" and not self.path(place).is_dir()
-        return next((path for path in paths if path.is_file()), None) if is_video else None
-
-    def is_in(self, place: Path) -> bool:
-        """Returns whether the place has the folder, or the video."""
-        return self.path(place).is_dir() or self.video(place) is not None
+        if self._suffix != "IMAGE" or self.path(place).is_dir():
+            return None
+        paths = (place / f"{name}{suffix}" for name in self.folders for suffix in VIDEO_SUFFIXES)
+        return next((path for path in paths if path.is_file()), None)
 
     def files(self, place: Path) -> tuple[dict[str, Path], list[Unmatched]]:
         """Returns the files by stem, sorted by number, and what belongs to no frame."""
@@ -133,7 +130,7 @@ def row(
         return sorted(
             place
             for place in found
-            if all(kind.is_in(place) for kind in wanted)
+            if all(kind.path(place).is_dir() or kind.video(place) for kind in wanted)
             and all(next(place.glob(mark), None) for mark in marks)
         )
 

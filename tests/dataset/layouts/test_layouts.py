@@ -15,7 +15,7 @@ from pnpdepth_cli.commands.refinement.refine_image import read_requested
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, sample_pattern
 from pnpdepth_cli.dataset.arrays import masked, moved_to
 from pnpdepth_cli.dataset.frame_files import FrameFiles, file_of
-from pnpdepth_cli.dataset.layouts import LAYOUTS, find_layout, list_frames
+from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.protocols import NYU_PART, ODOMETRY_PART, FramePart, find_protocol
@@ -384,7 +384,7 @@ def test_an_unknown_folder_names_the_nearest_layout_and_what_it_lacks(
 ) -> None:
     tree(tmp_path, files)
     with pytest.raises(InputError, match=rf"nearest is {re.escape(nearest)}.* lacks {lacking}$"):
-        find_layout(tmp_path)
+        list_frames(tmp_path)
 
 
 def test_protocols_cut_what_the_paper_says() -> None:
