@@ -20,17 +20,17 @@ from pnpdepth_cli.frames.fuse import (
     FEW_POINTS,
     LEAST_PART,
     Expert,
-    fitted_weights,
+    add_blind_expert,
+    fit_weights,
     judge_of,
-    predicted_by,
+    predict,
     predictions,
     scanner_shares,
     weighs_points,
     weighted_mean,
-    without_doubt,
 )
 from pnpdepth_cli.frames.open_network import OpenNetwork
-from pnpdepth_cli.frames.refined import Prediction, Refined, Validation, refined_of
+from pnpdepth_cli.frames.refined import Prediction, Refined, Validation, make_refined
 from pnpdepth_cli.frames.validation import FOLDS, ValidationSplit, split_frame
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
@@ -54,18 +54,18 @@ def refine_default(networks: Sequence[OpenNetwork], frame: Frame, *, seed: int =
     split = split_frame(inliers, judged.before, seed)
     experts = predictions(networks, split, judged)
     # Where the image does not help, an expert that does not see it joins.
-    experts, warnings = without_doubt(networks, split, experts)
+    experts, warnings = add_blind_expert(networks, split, experts)
     # The weights that predict the validation points best, close to prior weights, fuse the depths.
-    weights = fitted_weights(experts, split)
+    weights = fit_weights(experts, split)
     fused = weighted_mean([(e.dense(), weights[e.name]) for e in experts if weights[e.name] > 0])
     # The residual at the inliers is propagated to every pixel.
     inliers = without_far_points(networks, inliers, judged)
-    depth = _propagated(fused, inliers, split.propagation)
+    depth = _propagate(fused, inliers, split.propagation)
     # On scan lines, a completion network of that scanner has most of the result.
     shares = scanner_shares(experts, split, weights)
     depth = _with_shares(depth, {e.name: e.dense() for e in experts if e.name in shares}, shares)
     weights = {name: (1 - sum(shares.values())) * w for name, w in weights.items()} | shares
-    return refined_of(
+    return make_refined(
         frame,
         _user(experts),
         depth,
@@ -80,9 +80,9 @@ def refine_default(networks: Sequence[OpenNetwork], frame: Frame, *, seed: int =
 def without_outliers(networks: Sequence[OpenNetwork], frame: Frame) -> tuple[Frame, Prediction]:
     """Returns the frame without its outliers, and what the network that judged them gives for it.
 
-    That is the network that weighs its points, else the user's: a useless network does not decide
-    which points are used. Outliers contradict their neighbours beside what it predicts from the
-    other points. Of many points, those that contradict their neighbours alone are outliers too.
+    The network that weighs its points judges, else the user's: a useless network does not decide
+    which points are used. Outliers differ from its prediction otherwise than their neighbours do.
+    Of many points, those that contradict their neighbours by themselves are outliers too.
 
     Raises:
         PnpDepthError: The network gives no depth.
@@ -92,14 +92,14 @@ def without_outliers(networks: Sequence[OpenNetwork], frame: Frame) -> tuple[Fra
     any_suspected = bool(suspected.any())
     consistent = frame.with_points(points.select(~suspected)) if any_suspected else frame
     weighs = any_suspected and weighs_points(judge)
-    judged = predicted_by(judge, consistent, updates=not weighs)
+    judged = predict(judge, consistent, updates=not weighs)
     outlying = outliers(judged.before, points, frame.rgb)
     if len(points) >= FEW_POINTS:
         outlying = outlying | suspected
     inliers = frame.without(outlying)
     # A network that weighs its points is given the outliers too, now that they are known.
     if weighs or not torch.equal(outlying, suspected):
-        judged = predicted_by(judge, inliers)
+        judged = predict(judge, inliers)
     return inliers, judged
 
 
@@ -110,7 +110,7 @@ def without_far_points(networks: Sequence[OpenNetwork], frame: Frame, judged: Pr
     return frame.without(far_points(judged.before, frame.points))
 
 
-def _propagated(depth: Tensor, frame: Frame, kind: str) -> Tensor:
+def _propagate(depth: Tensor, frame: Frame, kind: str) -> Tensor:
     """Depth (H, W) with its residual at the points propagated."""
     return propagate(depth, frame.points, frame.rgb, kind=kind).depth
 
@@ -135,9 +135,9 @@ def _alone(experts: Sequence[Expert]) -> Expert | None:
 def _stages(experts: Sequence[Expert], frame: Frame, kind: str) -> dict[str, Tensor]:
     """The user's network after each step of its own, and the network that takes a prior alone."""
     user, alone, own = _user(experts), _alone(experts), experts[0].dense()
-    propagated = own if experts[0].of_scanner else _propagated(own, frame, kind)
+    propagated = own if experts[0].of_scanner else _propagate(own, frame, kind)
     stages = {BEFORE: user.before, UPDATED: user.after, PROPAGATED: propagated}
-    of_alone = {} if alone is None else {ALONE: _propagated(alone.dense(), frame, kind)}
+    of_alone = {} if alone is None else {ALONE: _propagate(alone.dense(), frame, kind)}
     return stages | of_alone
 
 
@@ -158,7 +158,7 @@ def _validation(
         predicted[ALONE] = alone.at
     result = torch.empty(len(split.points))
     for fold in range(FOLDS):
-        weights = fitted_weights(experts, split, part != fold)
+        weights = fit_weights(experts, split, part != fold)
         fused = weighted_mean([(each.at, weights[each.name]) for each in experts])
         result[part == fold] = fused[part == fold]
     given = split.kept.points

@@ -10,7 +10,7 @@ from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import OpenNetwork
-from pnpdepth_cli.frames.refined import Refined, Validation, refined_of
+from pnpdepth_cli.frames.refined import Refined, Validation, make_refined
 from pnpdepth_cli.frames.validation import consistency, split_points
 from pnpdepth_cli.stages import AFTER, BEFORE, LINEAR
 
@@ -23,14 +23,14 @@ def refine_fixed(
     validated: bool = False,
     on_iteration: OnIteration = lambda done, loss: None,
 ) -> Refined:
-    """Returns the frame refined by its one network. A divergence with a last good depth is in it.
+    """Returns the frame refined by its one network, also if it diverged after a good depth.
 
     Args:
         network: The network, open.
         frame: The frame, its image moved to its points.
         seed: Random seed of the validation points.
         validated: Whether the result is validated, for which the frame is refined again.
-        on_iteration: Called after each update of z.
+        on_iteration: Callback after each update of z.
 
     Raises:
         PnpDepthError: The frame cannot be refined.
@@ -38,12 +38,12 @@ def refine_fixed(
     network.next_image()
     network.cut()
     own = network.refine(frame, on_iteration=on_iteration)
-    depth = _propagated(own.after, frame, network.member.settings.propagate)
+    depth = _propagate(own.after, frame, network.member.settings.propagate)
     validation = _validation(network, frame, depth, seed) if validated else None
-    return refined_of(frame, own, depth, used=frame.points, validation=validation)
+    return make_refined(frame, own, depth, used=frame.points, validation=validation)
 
 
-def _propagated(depth: Tensor, frame: Frame, kind: str) -> Tensor:
+def _propagate(depth: Tensor, frame: Frame, kind: str) -> Tensor:
     """Depth (H, W) with its residual at the points propagated; "none" keeps it."""
     return depth if kind == "none" else propagate(depth, frame.points, frame.rgb, kind=kind).depth
 
@@ -76,6 +76,6 @@ def _validation(network: OpenNetwork, frame: Frame, depth: Tensor, seed: int) ->
         predicted={
             BEFORE: points.sample(again.before),
             LINEAR: linear(kept, points.xy),
-            AFTER: points.sample(_propagated(again.after, fewer, kind)),
+            AFTER: points.sample(_propagate(again.after, fewer, kind)),
         },
     )

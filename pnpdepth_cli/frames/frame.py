@@ -33,26 +33,26 @@ class Frame:
     """An image and its sparse depth."""
 
     rgb: Tensor | None  # (3, H, W) float32 in 0…1. None without an image.
-    points: SparsePoints  # sparse depth in the image frame, on the CPU
+    points: SparsePoints  # sparse depth at pixel coordinates of the image, on the CPU
     gt: DepthMap | None = None  # (H, W) metres, 0 = unknown. None without ground truth.
-    held_out: SparsePoints | None = None  # points that are kept out, to score at
+    held_out: SparsePoints | None = None  # points that nothing uses, to score at
     unit: str = METRES  # of all depths: "m", or "model units" of a COLMAP model without scale
-    register: Register = None  # how `rgb` is to be moved into the frame of the points
+    register: Register = None  # how `rgb` is to be moved to the points
     one_view: bool = False
     """Whether image and points are stated to be of one view, so that the image is not doubted."""
     outliers: SparsePoints | None = None
-    """Points that were left out as outliers, for networks that weigh their points."""
+    """Outliers, which are not in `points`; for networks that weigh their points."""
     prior: Tensor | None = None
     """(H, W) metres, 0 = unknown: another network's depth, aligned with the points, for networks
     that take one. None without."""
     registration: ImageRegistration | None = None
-    """How `rgb` was moved into the frame of the points. None: it was not."""
+    """How `rgb` was moved to the points. None: it was not."""
     given: SparsePoints | None = None
     """All points of the frame's own files, also those held out. None: `points`."""
     camera: Camera | None = None
-    """The camera in pixels of the image frame. None: unknown."""
+    """The camera in pixels of the image. None: unknown."""
     pose: NDArray[np.float64] | None = None
-    """(3, 4) from the camera's frame to the world's, in `unit`. None: unknown."""
+    """(3, 4) from the camera's coordinates to the world's, in `unit`. None: unknown."""
     depth_scale: float | None = None
     """Integers per metre of the file of the sparse depth. None if it holds metres."""
     sources: Mapping[str, FileRecord] = field(default_factory=dict)
@@ -68,7 +68,7 @@ class Frame:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(H, W) of the image frame."""
+        """(H, W) of the image."""
         return self.points.size
 
     @property
@@ -78,12 +78,12 @@ class Frame:
 
     @functools.cached_property
     def _registration_of_points(self) -> Register:
-        """What the points say of the registration: asked for more than once of most frames."""
+        """The registration that the points tell; kept, because most frames need it twice."""
         assert self.image is not None
         return estimated([evidence(self.image, self.points)])
 
     def registered(self) -> Frame:
-        """Returns the frame with its image moved into the frame of the points, if it has to be."""
+        """Returns the frame with its image moved to the points, if it has to be."""
         image, how = self.image, self.register
         if image is None or how is None:
             return self
@@ -97,7 +97,7 @@ class Frame:
         return replace(self, points=points)
 
     def without(self, outliers: Tensor) -> Frame:
-        """Returns the frame with those points, of (N,) bool, added to the outliers left out."""
+        """Returns the frame with some of its points, (N,) bool, moved to its outliers."""
         if not bool(outliers.any()):
             return self
         left_out = self.points.select(outliers)

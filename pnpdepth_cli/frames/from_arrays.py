@@ -16,7 +16,7 @@ FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 
 Unit = Literal["m", "mm"]
 UNITS = {"m": 1.0, "mm": 1000.0}
-"""Units of depth, so many to the metre."""
+"""How many of each unit of depth make a metre."""
 
 FARTHEST_MEDIAN_M = 200.0
 """No frame has half of its depths farther than this; a larger median is in another unit."""
@@ -26,9 +26,9 @@ def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[
     """Returns depth as float32 metres; not finite or <= 0 is unknown.
 
     Args:
-        depth: Of any shape.
-        what: What it is, for messages.
-        unit: Of the depth; needed for integers, and for depth that is too large for metres.
+        depth: Depth in an array of any shape.
+        what: Name of the depth in messages.
+        unit: Unit of the depth; needed for integers, and for depth that is too large for metres.
 
     Raises:
         InputError: The unit is needed.
@@ -50,7 +50,7 @@ def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[
 
 
 def _numbers(values: ArrayLike, what: str) -> NDArray[Any]:
-    """The array, of real numbers. InputError if it is none."""
+    """An array of real numbers. Raises InputError if the values are none."""
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, RuntimeError) as error:  # ragged rows, a tensor on a GPU
@@ -123,17 +123,21 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
 def _points(
     sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None, unit: Unit | None
 ) -> tuple[SparsePoints, int]:
-    """The points in their own frame, which is the image's for rows of x, y, depth; and how many
-    rows are none."""
+    """The points, and how many rows have no depth.
+
+    Points of a map have the map's size, rows of x, y and depth the image's.
+    """
     unknown = 0
     if isinstance(sparse, SparsePoints):
         return sparse.tensors(), unknown
+    # Axes of length 1, such as a batch's, go.
     values = _numbers(sparse, "sparse depth")
     shape = values.shape
     if values.ndim in (3, 4):
         values = values.reshape([side for side in shape if side != 1])
     if values.ndim != 2:
         raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {shape}")
+    # Three columns are rows of x, y and depth, unless the image is as narrow as that.
     if values.shape[1] == 3 and values.shape != size:
         if size is None:
             raise SizeError("rows of x, y and depth need an image for the size of the frame")
@@ -142,6 +146,7 @@ def _points(
         xy, depth = values[known, :2].astype(np.float32), column[known]
         unknown = int(np.count_nonzero(~known))
     else:
+        # Anything else is a depth map, of which the known pixels are points.
         if size is not None and values.shape != size:
             raise SizeError(f"the sparse depth map is {values.shape} but the image is {size}")
         size, values = (

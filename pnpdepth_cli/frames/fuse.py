@@ -34,25 +34,25 @@ OWN, WITH_PRIOR, WITHOUT_IMAGE = 0.15, 0.45, 0.05
 """Prior weights: of a network that explains the points, of `compact` with its depth as a prior, and
 of every expert that leaves the image out. `compact` without a prior has the rest."""
 USELESS, USEFUL = 0.25, 0.75
-"""Fractions of the variance of log depth that a network explains at points its alignment was not
-fitted to: up to which it has no prior weight, and from which it has all of it. A network of random
-weights has less than 0.25 in 86 % of the runs with 20 points, 97 % with more."""
+"""Fractions of the variance of log depth that a network explains at points that its alignment was
+not fitted to. Up to the first it has no prior weight, from the second all of it. A network of
+random weights has less than 0.25 in 86 % of the runs with 20 points, 97 % with more."""
 STRENGTH = 60.0
 """Validation points that the prior weights count as."""
 DOUBT, NO_GAIN = 2.0, 0.5
-"""Standard errors by which the image lowers the error at the validation points: from which it is
-not doubted, and below which there is a warning. With 500 points, 25 even frames with their own
+"""Standard errors by which the image lowers the error at the validation points. From the first it
+is not doubted, below the second there is a warning. With 500 points, 25 even frames with their own
 image have at least 0.7, but 2 of 18 odd ones less than 0.5; 8 of 9 with another image have at most
 0.4."""
 ENOUGH_FOR_DOUBT = 50
 """Fewer validation points do not tell an image that belongs to its points from another one."""
 OWN_SCANNER = 0.75
-"""Weight of a completion network on scan lines, which validation points cannot judge: hidden lines
-are gaps that its scanner does not leave. On even KITTI frames this changes its MAE by −0.9 (pncnn)
-and −2.8 % (nconv)."""
+"""Weight of a completion network on scan lines. Validation points cannot judge it: the lines that
+they leave are gaps that its scanner does not leave. On even KITTI frames this changes its MAE by
+−0.9 (pncnn) and −2.8 % (nconv)."""
 FEW_POINTS = 50
-"""With fewer points, updates of a network that takes them gain nothing, and one that contradicts
-its neighbours may be all that is seen of a small object."""
+"""With fewer points, updates of a network that takes them gain nothing. A point that contradicts
+its neighbours may then be all that is seen of a small object."""
 LEAST_PART = 0.01
 """A network with less weight has no part in the result, which is said."""
 
@@ -84,11 +84,12 @@ def predictions(
     Args:
         networks: The networks, open, the user's first.
         split: The frame and its validation points.
-        judged: What the network that judged the outliers gives for the frame.
+        judged: Prediction of the network that judged the outliers.
 
     Raises:
         PnpDepthError: The user's network gives no depth.
     """
+    # The user's networks predict.
     fusing, judge = _fusing(networks), judge_of(networks)
     own = list[Expert]()
     for each in networks:
@@ -99,32 +100,38 @@ def predictions(
         except PnpDepthError:  # a further network that fails is left out
             if each is networks[0]:
                 raise
+    # Without a network that takes a prior, they are all.
     if fusing is None:
         return [replace(expert, weight=1 / len(own)) for expert in own]
     name = fusing.member.name
+    # That network predicts without a prior.
     alone = _expert(fusing, split, name, known=judged if fusing is judge else None)
+    # Each one's depth is its prior in turn; the prior weights follow what the depth explains.
     experts, with_prior = list[Expert](), list[Expert]()
     for expert in own:
         share = trust(expert, split, alone) / len(own)
         experts.append(replace(expert, weight=0.0 if expert.of_scanner else OWN * share))
         if share > 0:
             with_name = f"{name} with {expert.name}"
-            guided = _expert(
+            informed = _expert(
                 fusing, split, with_name, prior=expert, user=expert.user, updates=False
             )
-            with_prior.append(replace(guided, weight=WITH_PRIOR * share))
+            with_prior.append(replace(informed, weight=WITH_PRIOR * share))
+    # The rest of the prior weights is that of the network without a prior.
     rest = 1 - sum(expert.weight for expert in (*experts, *with_prior))
     return [*experts, *with_prior, replace(alone, weight=rest), _interpolation(split)]
 
 
 def trust(expert: Expert, split: ValidationSplit, alone: Expert) -> float:
-    """Returns 0…1: how much of the prior weights a network gets, by what it explains.
+    """Returns 0…1, the part of its prior weights that a network gets, by what it explains.
 
     The aligned depth of a network that takes the image alone explains a fraction of the variance of
-    log depth: 1 − PRESS / SS, by a line through the other points (Allen, "The relationship between
-    variable selection and data augmentation and a method for prediction", 1974). A network that
-    takes the points has seen them. It has all of the prior weights if its error at the validation
-    points is that of `alone`, and none if it is twice that.
+    log depth. The fraction is 1 − PRESS / SS, by a line through the other points (Allen, "The
+    relationship between variable selection and data augmentation and a method for prediction",
+    1974).
+
+    A network that takes the points has seen them. It has all of the prior weights if its error at
+    the validation points is that of `alone`, and none if it is twice that.
 
     Args:
         expert: The network's own depth.
@@ -150,12 +157,12 @@ def trust(expert: Expert, split: ValidationSplit, alone: Expert) -> float:
     return min(1.0, max(0.0, (explained - USELESS) / (USEFUL - USELESS)))
 
 
-def without_doubt(
+def add_blind_expert(
     networks: Sequence[OpenNetwork], split: ValidationSplit, experts: list[Expert]
 ) -> tuple[list[Expert], tuple[str, ...]]:
-    """Returns the experts, with one that sees a grey image where the image is in doubt.
+    """Returns the experts, joined by one that sees a grey image where the image is in doubt.
 
-    Also a warning where the image does not lower the error at the validation points.
+    The second value is a warning where the image does not lower the error at validation points.
     """
     fusing = _fusing(networks)
     rgb, count = split.whole.rgb, len(split.points)
@@ -183,14 +190,14 @@ def without_doubt(
     return experts, (warning,)
 
 
-def fitted_weights(
+def fit_weights(
     experts: Sequence[Expert], split: ValidationSplit, chosen: Tensor | None = None
 ) -> dict[str, float]:
     """Returns the weights of the experts by name, >= 0, their sum 1.
 
-    They minimise the squared residuals of log depth at the validation points, large ones linearly
-    (Huber), plus `STRENGTH` times the squared distance from the prior weights. An expert without
-    prior weight has none. Where an expert predicts nothing, the others' mean stands for it.
+    They minimise the residuals of log depth at the validation points by Huber's loss, plus
+    `STRENGTH` times the squared distance from the prior weights. An expert without prior weight has
+    none. Where an expert predicts nothing, the others' mean stands for it.
 
     Args:
         experts: The experts.
@@ -249,8 +256,8 @@ def scanner_shares(
 ) -> dict[str, float]:
     """Returns the weights of completion networks of the scanner, by name.
 
-    The error of such a network at the points, which it was given, is at most that of the others at
-    the validation points.
+    A network has a weight if its error at the points, which it was given, is at most the error of
+    the experts' mean at the validation points.
     """
     own = [each for each in experts if each.of_scanner and len(split.points)]
     if not own:
@@ -294,11 +301,12 @@ def weighs_points(network: OpenNetwork) -> bool:
     return network.member.network.definition.weighs_points
 
 
-def predicted_by(network: OpenNetwork, frame: Frame, *, updates: bool = True) -> Prediction:
+def predict(network: OpenNetwork, frame: Frame, *, updates: bool = True) -> Prediction:
     """Returns what one network gives for the frame, its residual not propagated.
 
-    Updates of a network that takes the points gain 2 to 3 % with 500 points, 1 % with 100, nothing
-    with 20, and 1 % with a LiDAR's, where they take as long as everything else (even frames).
+    On even frames, updates of a network that takes the points gain 2 to 3 % with 500 points, 1 %
+    with 100 and nothing with 20. They gain 1 % with a LiDAR's, where they take as long as
+    everything else.
 
     Args:
         network: The network, open.
@@ -324,22 +332,25 @@ def _expert(
     Args:
         network: The network that predicts, open.
         split: The frame and its validation points.
-        name: What the expert is called.
-        known: What it gives from all points, where that was computed already.
+        name: Name of the expert.
+        known: Its prediction from all points, where that was computed already.
         prior: The expert whose depth is the network's prior.
         user: The user's network whose depth it is, or has as a prior.
         updates: Whether z is updated with all points, which takes as long as all else.
     """
     whole, kept, takes_points = split.whole, split.kept, network.member.takes_points
+    # A prior is given with all points, and made from the others where the others are used.
     if prior is not None:
         assert prior.prediction is not None
         whole = replace(whole, prior=prior.prediction.before)
         kept = replace(kept, prior=prior.aligned)
-    own = known or predicted_by(network, whole, updates=updates)
+    # The network predicts from all points.
+    own = known or predict(network, whole, updates=updates)
     aligned = own.before
+    # It predicts the validation points from the others.
     updated = at = torch.empty(0)
     if len(split.points):
-        again = predicted_by(network, kept, updates=not takes_points)
+        again = predict(network, kept, updates=not takes_points)
         aligned, updated = again.before, split.points.sample(again.after)
         at = propagate_at(
             again.after, kept.points, kept.rgb, split.points.xy, kind=split.propagation

@@ -28,7 +28,7 @@ from pnpdepth_cli.settings import ClosedSettings, Settings
 COMPANION = "compact"
 """The network that is fused with the user's, where there is an image."""
 _TRIED = 3
-"""After so many frames that say nothing of the registration, no more are read."""
+"""After so many frames that tell nothing of the registration, no more are read."""
 
 
 class Method:
@@ -37,11 +37,11 @@ class Method:
     The networks are cut when the first frame is refined, and are as before when it closes.
 
     Args:
-        networks: The user's; several are fused by the default method.
-        asked: What the user sets. With any setting of the method, the network is refined by it
-            alone; without, by the default method.
+        networks: Networks of the user; several are fused by the default method.
+        asked: Settings that the user gives. With any setting of the method, the network is refined
+        by it alone; without, by the default method.
         first: The first frame, which decides what definitions leave open.
-        more: Gives further frames, which decide as well; called only if a network needs it.
+        more: Function of further frames, which decide as well; called only if a network needs it.
         compact: Whether the default method fuses the networks with the included network `compact`,
             where there is an image.
         validated: Whether a fixed method is validated, for which each frame is refined again.
@@ -66,7 +66,7 @@ class Method:
         self.asked, self.is_default = asked, not asked.fixed_by
         self._uncertainty, self._validated = uncertainty, validated or uncertainty
         self.registrations: dict[tuple[int, int], Register] = {}
-        """How images of a size are moved to their points, where frames decided it together."""
+        """How images of a size are moved to their points, where several frames decided it."""
         self._stack = ExitStack()
         self._open: list[OpenNetwork] = []
         if len(networks) > 1 and not self.is_default:
@@ -120,7 +120,7 @@ class Method:
 
         Args:
             frame: The frame.
-            on_iteration: Called after each update of z of a fixed method.
+            on_iteration: Callback after each update of z of a fixed method.
 
         Raises:
             PnpDepthError: The frame cannot be refined.
@@ -147,7 +147,7 @@ class Method:
     def share_registration(self, frames: Iterable[Frame]) -> None:
         """Decides the registration that images of one size share, by all these frames together.
 
-        Images of the size of the first one decide. A frame of another size decides alone.
+        The size is that of the first image that tells it. A frame of another size decides alone.
         """
         usable = list[Evidence]()
         for read, frame in enumerate(frames, 1):

@@ -35,11 +35,11 @@ class Member:
     layer: str  # layer to cut at
     settings: ClosedSettings  # how its output is aligned and z is updated
     coarse: bool = False
-    """Whether z is updated by the smaller depth that the definition may give, which is sooner."""
+    """Whether z is updated by a smaller depth, which is faster, if the definition gives one."""
 
     @property
     def name(self) -> str:
-        """What the network is called."""
+        """The network's name."""
         return self.network.definition.name
 
     @property
@@ -101,21 +101,24 @@ class OpenNetwork:
         Args:
             frame: The image, the same in all calls until `next_image`, and the points of this call.
             updates: Whether z is updated.
-            on_iteration: Called after each update of z.
+            on_iteration: Callback after each update of z.
 
         Raises:
             PnpDepthError: The refinement fails.
         """
         network, settings, diverged = self.member.network, self.member.settings, None
         with out_of_memory_is_a_device_error(network.device):
+            # The frame is made the network's input, and its output is read as metres.
             prepared = prepare(network, frame)
             if not len(prepared.points):
                 raise prepared.no_points_error()
             reader = prepared.depth_reader(settings.align)
             try:
+                # Without updates one pass of the whole network is enough.
                 if not (updates and settings.iterations):
                     result = self._plain(prepared, reader)
                 else:
+                    # z is updated; the first and the last depth have full size.
                     z0 = self._front(prepared)
                     with self._coarse() as at_full_size:
                         result = refine(
@@ -126,6 +129,7 @@ class OpenNetwork:
                         before, after = reader(at_full_size[0]), reader(at_full_size[-1])
                         result = replace(result, before=before, after=after)
             except DivergedError as error:
+                # A refinement that diverges ends with its last good depth.
                 if error.last_good is None:
                     raise
                 diverged, result = error, error.last_good
@@ -139,7 +143,7 @@ class OpenNetwork:
         )
 
     def _front(self, prepared: PreparedFrame) -> Tensor:
-        """z_0, which of a network that takes the image alone is the same for all points."""
+        """z_0. It is the same for all points if the network takes the image alone."""
         z0, split = self._z0, self.cut()
         if z0 is None:
             with torch.no_grad():
@@ -148,13 +152,13 @@ class OpenNetwork:
         return z0
 
     def _coarse(self) -> AbstractContextManager[list[Any]]:
-        """Inside, the network gives the smaller depth that its definition may have for updates."""
+        """Inside, the network gives a smaller depth for the updates, if its definition has one."""
         network = self.member.network
         coarse = network.definition.coarse if self.member.coarse else None
         return nullcontext([]) if coarse is None else coarse(network.module)
 
     def _plain(self, prepared: PreparedFrame, reader: AlignedDepth) -> Refinement:
-        """The same without updates: a pass of the whole network, which need not be cut."""
+        """The depth without updates: one pass of the whole network, which need not be cut."""
         output = self._output
         if output is None and self._z0 is not None:
             with torch.no_grad():
@@ -174,11 +178,11 @@ class OpenNetwork:
 
 @contextmanager
 def encoding_once(network: Network, encoded: dict[str, Any]) -> Iterator[None]:
-    """Inside, the image encoder, if the definition names one, runs once; then its output is known.
+    """Inside, the image encoder runs once, if the definition names one; its output is kept.
 
     Args:
         network: The network.
-        encoded: What is known, by the encoder's name; cleared for another image.
+        encoded: Kept outputs by the encoder's name; the caller clears them for another image.
     """
     name = network.definition.image_encoder
     if name is None:

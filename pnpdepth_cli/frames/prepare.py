@@ -1,4 +1,4 @@
-"""From the image frame to the network's frame, and back."""
+"""A frame as a network takes it, and the network's depth at the size of the image."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ class PreparedFrame:
     """A frame as the network takes it."""
 
     network: Network
-    frame: Frame  # the same in the image frame
-    map: FrameMap  # from the image frame to the network's frame
-    image: Tensor | None  # none if the network takes none
+    frame: Frame  # the same at the size of the image
+    map: FrameMap  # from pixels of the image to those of the network
+    image: Tensor | None  # None if the network takes none
     arguments: tuple[Tensor, ...]
     points: SparsePoints
-    """The points that the network sees, in its frame and on its device, without outliers."""
+    """The points that the network sees, in its pixels and on its device, without outliers."""
     prior: Tensor | None = None
-    """(1, 1, h, w) metres, 0 = unknown: the dense prior in the network's frame. None without."""
+    """(1, 1, h, w) metres, 0 = unknown: the dense prior in the network's pixels. None without."""
     intrinsics: Tensor | None = None
-    """(1, 3, 3): the camera matrix in the network's frame. None where it is unknown."""
+    """(1, 3, 3): the camera matrix in the network's pixels. None where it is unknown."""
 
     def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
         """Returns the arguments of the network for some of the points; the image is the same."""
@@ -39,12 +39,12 @@ class PreparedFrame:
         """Returns a new reader of the network's output in metres, (1, 1, h, w).
 
         Args:
-            align: How it is aligned with the points, one of `choices.ALIGNMENTS`.
+            align: Kind of alignment with the points, one of `choices.ALIGNMENTS`.
         """
         return AlignedDepth(self.network, self.points, align)
 
     def to_image(self, depth: Tensor) -> Tensor:
-        """Returns depth (1, 1, h, w) of the network's frame as (H, W) of the image frame.
+        """Returns depth (1, 1, h, w) of the network's pixels as (H, W) of the image.
 
         0 where it is unknown.
         """

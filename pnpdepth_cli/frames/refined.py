@@ -19,11 +19,11 @@ from pnpdepth_cli.points import SparsePoints
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """What one network gives for a frame, in the image frame."""
+    """What one network gives for a frame, at the image's size."""
 
     before: Tensor  # (H, W) metres, 0 = unknown: aligned with the points
     after: Tensor  # (H, W) metres, 0 = unknown: z updated
-    refinement: Refinement  # the same in the network's frame, with the losses
+    refinement: Refinement  # the same at the network's size, with the losses
     diverged: DivergedError | None  # why the updates ended early. None if they did not
     alignment: Alignment | None
     notes: tuple[str, ...]
@@ -31,7 +31,7 @@ class Prediction:
 
 @dataclass(frozen=True, kw_only=True)
 class Refined:
-    """A refined frame, all in the image frame."""
+    """A refined frame; maps have the image's size."""
 
     before: DepthMap
     """(H, W) metres, 0 = unknown: the network's depth before refinement."""
@@ -57,7 +57,7 @@ class Refined:
     weights: Mapping[str, float] = field(default_factory=dict)
     """Weights of the experts of the default method, by name; their sum is 1."""
     registration: ImageRegistration | None = None
-    """How the image was moved into the frame of the points. None: it was not."""
+    """How the image was moved to the points. None: it was not."""
 
     @property
     def depth(self) -> DepthMap:
@@ -99,7 +99,7 @@ class Validation(ValidationPoints):
     """(M,) metres at the validation points, by stage; also linear interpolation and the result."""
 
 
-def refined_of(
+def make_refined(
     frame: Frame,
     own: Prediction,
     depth: Tensor,
@@ -114,7 +114,7 @@ def refined_of(
 
     Args:
         frame: The frame, its image moved to its points.
-        own: What the user's network gives for it.
+        own: Prediction of the user's network for it.
         depth: (H, W) metres, 0 = unknown: the refined depth.
         used: The points that the depth was fitted to.
         notes: Lines of the method for a person.

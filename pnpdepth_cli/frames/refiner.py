@@ -32,14 +32,14 @@ class Refiner:
     Frames of several threads are refined one after the other.
 
     Args:
-        network: From `load_network`; several are fused by the default method.
-        settings: What is left open, the network decides. With any setting of the method, `network`
-            alone is refined by it; without, by the default method.
+        network: Network from `load_network`; several are fused by the default method.
+        settings: Settings of the refinement; what they leave open, the network decides. With any
+        setting of the method, `network` alone is refined by it; without, by the default method.
         uncertainty: Whether the standard deviation of the depth is estimated too.
         compact: Whether the default method fuses `network` with the included network `compact`,
             where there is an image. Without, `network` alone is refined.
-        registration: Whether images are moved into the frame of the points: "auto", if their depth
-            edges show that they are not registered; "off"; or by (zoom, right, down), pixels.
+        registration: Whether images are moved to their points: "auto", if their depth edges show
+        that they are not registered; "off"; or by (zoom, right, down), pixels.
         adapt: Frames of the same sequence, (image, sparse) each, whose points the weights of
             `network`, which must take points, learn from before the first frame is refined. The
             learnt weights are used while the refiner is open, if hidden points show that they are
@@ -103,8 +103,8 @@ class Refiner:
                 or channels first. None for a network that takes sparse depth only.
             sparse: Depth map (H, W) in metres with 0 for unknown, rows (N, 3) of x, y and depth
                 (pixel centres at whole numbers), or SparsePoints.
-            unit: Of the depth of an array, "m" or "mm"; needed for integers, and where half of the
-                depths are beyond 200.
+            unit: Unit of the depth of an array, "m" or "mm"; needed for integers, and where half of
+            the depths are beyond 200.
 
         Raises:
             InputError: Image or points cannot be used.

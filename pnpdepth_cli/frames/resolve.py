@@ -64,7 +64,7 @@ def resolve_definition(
 
     Args:
         frame: The first frame, registered.
-        more_frames: Gives further frames; called only where the input range is open.
+        more_frames: Function of further frames; called only where the input range is open.
 
     Raises:
         ModelError: The network's own check fails.
@@ -120,7 +120,7 @@ def resolve_settings(
 
     Args:
         definition: The network's definition.
-        settings: What the user asks for.
+        settings: Settings that the user gives.
         metric: Whether the points are in metres.
 
     Raises:
@@ -145,7 +145,7 @@ def resolve_member(network: Network, frame: Frame, asked: Settings, *, is_defaul
     Args:
         network: A network whose definition is resolved.
         frame: The first frame, registered.
-        asked: What the user asks for.
+        asked: Settings that the user gives.
         is_default: Whether the default method refines it.
     """
     definition, layer = network.definition, asked.layer
@@ -169,7 +169,7 @@ def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[N
         for name, how in NORMALISATIONS.items()
     }
     errors = {name: _mean_alignment_error(each, frames) for name, each in candidates.items()}
-    chosen, rival = chosen_input_range(errors)
+    chosen, rival = choose_input_range(errors)
     listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
     if len(frames) > 1:
         listed += f", mean of {len(frames)} frames"
@@ -181,7 +181,7 @@ def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[N
     return candidates[chosen], note
 
 
-def chosen_input_range(errors: Mapping[str, float]) -> tuple[str, str | None]:
+def choose_input_range(errors: Mapping[str, float]) -> tuple[str, str | None]:
     """Returns the input range of a network that states none, and a rival where that is unsure.
 
     0…1 is kept unless another range fits far better: which range fits a single frame best is

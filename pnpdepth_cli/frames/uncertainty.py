@@ -10,8 +10,8 @@ depth, which are large where depth is uncertain:
 - among the 8 nearest points,
 - of the network's own depth over a small window.
 
-The exponents are constants. The scale is fitted to held-out points, at the distance from other
-points at which depth is asked for: a LiDAR's are whole scan lines.
+The exponents are constants. The scale is fitted to validation points. They are as far from the
+other points as the pixels whose depth is asked for: a LiDAR's are whole scan lines.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.stages import AFTER
 
 MIN_INLIER_WEIGHT = 0.05
-"""Held-out points with less weight do not calibrate."""
+"""Validation points with less weight do not calibrate."""
 CALIBRATION_RANGE = (0.01, 1000.0)
 """Bounds of the calibration factor, whatever a few points give."""
 VALID_SIGMA = 0.25
@@ -77,7 +77,7 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
     residual = sigma = torch.empty(0)
     note = "uncertainty: too few points to calibrate it with"
     if frame.validation is not None:
-        residual, sigma = _calibrating(frame.validation)
+        residual, sigma = _residuals(frame.validation)
         note = f"uncertainty: calibrated with {len(residual):,} validation points"
     factor = calibration(residual, sigma, len(points))
     sigma_m = (factor * shape.numpy() * depth).astype(np.float32)
@@ -94,7 +94,7 @@ def _is_map(points: SparsePoints) -> bool:
     return is_dense(points) and not scan_pattern(points.xy.numpy(), points.size).has_scan_lines
 
 
-def _calibrating(validation: Validation) -> tuple[Tensor, Tensor]:
+def _residuals(validation: Validation) -> tuple[Tensor, Tensor]:
     """Residual of log depth and uncalibrated standard deviation, (M,), at validation points."""
     predicted, points = validation.predicted[AFTER], validation.points
     sigma = relative_shape(validation.kept, validation.network, predicted, points.xy)
@@ -113,12 +113,14 @@ def relative_shape(
         depth: (H, W), or (M,), metres.
         xy: (M, 2) pixel coordinates of `depth`. None: every pixel.
     """
+    # How far the network's own log depth ranges over a window, at every pixel.
     log_depth = depth.clamp_min(1e-6).log().double()
     known = network > 0
     middle = network[known].median() if bool(known.any()) else network.new_tensor(1.0)
     own = torch.where(known, network, middle).log()[None, None]
     half = _WINDOW // 2
     steps = F.max_pool2d(own, _WINDOW, 1, half) + F.max_pool2d(-own, _WINDOW, 1, half)
+    # Where the standard deviation is asked for, and that range there.
     if xy is None:
         height, width = depth.shape
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -126,16 +128,19 @@ def relative_shape(
     else:
         queries = xy
         step = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size).sample(steps[0, 0])
+    # Log depth of the nearest points.
     _, near = nearest_points(points, queries.double(), min(_AMONG, len(points)))
     near_depths = points.depth.double().log()[near.reshape(len(queries), -1)]
     low, high = near_depths.aminmax(dim=1)
     flat = log_depth.flatten()
+    # The four differences of log depth, as in the module's list.
     differences = (
         (linear(points, xy).clamp_min(1e-6).log().double().flatten() - flat).abs(),
         (near_depths[:, :_MEAN_OF].mean(dim=1) - flat).abs(),
         high - low,
         step.double(),
     )
+    # The product of their powers.
     parts = zip(_EXPONENTS, differences, strict=True)
     logarithm = torch.stack([power * (each + _LEAST).log() for power, each in parts]).sum(dim=0)
     return logarithm.exp().reshape(depth.shape).float()
@@ -144,13 +149,14 @@ def relative_shape(
 def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
     """Returns the factor of sigma that brings residuals within ± one and ± two sigma.
 
-    The geometric mean, with weights, of the factors with which 68 % lie within ± one and 95 %
-    within ± two sigma; they agree for normal errors. Ranks are those of split conformal prediction
-    (Lei et al., "Distribution-free predictive inference for regression", 2018). Few residuals give
-    an uncertain factor, so it is averaged with the typical one for that number of points.
+    The factor is the weighted geometric mean of two: with one, 68 % lie within ± one sigma, with
+    the other, 95 % within ± two. They agree for normal errors. Ranks are those of split conformal
+    prediction (Lei et al., "Distribution-free predictive inference for regression", 2018). Few
+    residuals give an uncertain factor, so it is averaged with the typical one for that number of
+    points.
 
     Args:
-        residual: (M,) true − predicted at points held out of refinement and propagation.
+        residual: (M,) true − predicted at points that neither refinement nor propagation used.
         sigma: (M,) their standard deviations, in the same unit.
         points: Number of points that the depth was fitted to.
     """
@@ -172,12 +178,12 @@ def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
 def valid_depth(points: SparsePoints, depth: DepthMap, sigma: DepthMap) -> NDArray[np.bool_]:
     """Returns (H, W) true where the depth map is supported by the points.
 
-    False where depth is unknown or far beyond the farthest point, where σ is above a quarter of the
-    depth, and outside the hull of the points, such as in the sky above a LiDAR's scan lines, except
-    at pixels about as near to a point as the pixels inside the hull are.
+    False where depth is unknown or far beyond the farthest point, and where σ is above a quarter of
+    the depth. Also false outside the hull of the points, such as in the sky above a LiDAR's scan
+    lines, except at pixels about as near to a point as the pixels inside the hull are.
 
     Args:
-        points: Sparse depth in the image frame.
+        points: Sparse depth of the image.
         depth: (H, W) metres.
         sigma: (H, W) metres.
     """

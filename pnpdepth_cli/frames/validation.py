@@ -16,11 +16,11 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_pattern
 
 FOLDS = 5
-"""One of so many folds of the points is for validation."""
+"""Number of folds of the points, one of which is for validation."""
 MIN_POINTS = 5
 """With fewer points none is for validation."""
 MOST_VALIDATION_POINTS = 1000
-"""Of more a random part is predicted."""
+"""Of more validation points, so many at random are predicted."""
 
 
 @dataclass(frozen=True, kw_only=True)

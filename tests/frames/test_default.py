@@ -20,7 +20,7 @@ from pnpdepth_cli.frames.fuse import (
     FEW_POINTS,
     OWN_SCANNER,
     Expert,
-    fitted_weights,
+    fit_weights,
     trust,
     weighted_mean,
 )
@@ -197,7 +197,7 @@ def test_the_weights_stay_near_the_prior_weights_where_few_points_speak() -> Non
         depth = torch.full((count,), 2.0)
         noise = torch.rand(count, generator=torch.Generator().manual_seed(1)) - 0.5
         good, poor = expert("good", depth * 1.01), expert("poor", depth * (1 + noise))
-        return fitted_weights([good, poor], split_of(depth))["good"]
+        return fit_weights([good, poor], split_of(depth))["good"]
 
     few, many = weight(4), weight(2000)
     assert 0.5 <= few < 0.6
@@ -212,7 +212,7 @@ def test_weights_are_those_that_predict_the_validation_points_best_beside_the_pr
         expert(str(k), at, w) for k, (at, w) in enumerate(zip(noisy, (0.2, 0.3, 0.5), strict=True))
     ]
     split = split_of(truth)
-    found = np.array(list(fitted_weights(experts, split).values()))
+    found = np.array(list(fit_weights(experts, split).values()))
     logs = np.stack([at.log().numpy() for at in noisy], axis=1)
     prior, y = np.array([0.2, 0.3, 0.5]), truth.log().numpy()
     first = y - logs @ prior
@@ -231,9 +231,9 @@ def test_weights_are_those_that_predict_the_validation_points_best_beside_the_pr
 def test_an_expert_without_prior_weight_or_prediction_decides_nothing() -> None:
     depth = torch.full((50,), 2.0)
     none, exact = expert("none", depth, weight=0.0), expert("exact", depth * 1.001)
-    weights = fitted_weights([none, exact, expert("poor", depth * 1.2)], split_of(depth))
+    weights = fit_weights([none, exact, expert("poor", depth * 1.2)], split_of(depth))
     assert weights["none"] == 0
-    blank = fitted_weights([expert("a", depth * 0), expert("b", depth * 0)], split_of(depth))
+    blank = fit_weights([expert("a", depth * 0), expert("b", depth * 0)], split_of(depth))
     assert blank == {"a": pytest.approx(0.5), "b": pytest.approx(0.5)}
 
 

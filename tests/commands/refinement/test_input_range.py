@@ -17,7 +17,7 @@ from pnpdepth_cli.commands.batch.running import reference_frames, registering
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames import resolve
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.resolve import NORMALISATIONS, chosen_input_range
+from pnpdepth_cli.frames.resolve import NORMALISATIONS, choose_input_range
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from tests.commands.batches import batch, pairs_on_disk
@@ -35,7 +35,7 @@ from tests.commands.batches import batch, pairs_on_disk
 def test_0_to_1_is_kept_unless_clearly_beaten(
     errors: dict[str, float], expected: tuple[str, str | None]
 ) -> None:
-    assert chosen_input_range(errors) == expected
+    assert choose_input_range(errors) == expected
 
 
 def test_the_ranges_are_those_of_their_names() -> None:
