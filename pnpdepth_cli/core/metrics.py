@@ -64,7 +64,7 @@ def score(
     Args:
         predicted: Depth in metres, of any shape; 0, negative or not finite where missing.
         ground_truth: Ground truth depth of the same shape, likewise.
-        thresholds: Of δ1 to δ3.
+        thresholds: Thresholds of δ1 to δ3.
     """
     sums = error_sums(predicted, ground_truth, thresholds)
     known, pixels = (int(total) for total in sums[:2])
@@ -88,10 +88,10 @@ def error_sums(
     Sums of more measures begin with those of the first ones.
 
     Args:
-        predicted: As of `score`.
-        ground_truth: As of `score`.
-        thresholds: As of `score`.
-        measures: Those of a `Formula` are meant.
+        predicted: Depth in metres, of any shape; 0, negative or not finite where missing.
+        ground_truth: Ground truth depth of the same shape, likewise.
+        thresholds: Thresholds of δ1 to δ3.
+        measures: Measures, of which those with a `Formula` count.
     """
     if predicted.shape != ground_truth.shape:
         raise ValueError(
@@ -114,8 +114,8 @@ def measures_of(sums: Tensor, measures: Sequence[Measure] = MEASURES) -> Tensor:
     """Returns measures (…, M) of sums (…, S); NaN where no pixel was scored.
 
     Args:
-        sums: From `error_sums` of the same measures.
-        measures: The M of a `Formula` among them are meant.
+        sums: Sums from `error_sums` of the same measures.
+        measures: Measures, of which the M with a `Formula` count.
     """
     place = {term: number for number, term in enumerate(_terms_of(measures), start=1)}
     formulas = [each.formula for each in measures if isinstance(each.formula, Formula)]

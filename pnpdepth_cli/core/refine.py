@@ -23,7 +23,7 @@ from torch import Tensor
 from pnpdepth_cli.choices import UPDATES
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.core.update_rules import SCHEDULES, Update, blurred, step_size
+from pnpdepth_cli.core.update_rules import SCHEDULES, Update, blur, step_size
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import DivergedError, LayerError, ModelError
 from pnpdepth_cli.points import SparsePoints
@@ -65,10 +65,10 @@ def refine(
         split: The network cut at a layer, open.
         arguments: The arguments of the network for the frame.
         points: Sparse depth on the grid of the predicted depth's field of view.
-        settings: How z is updated.
+        settings: Update rule, loss, step size and number of updates.
         depth_of: Turns the network's output into depth (1, 1, h, w) in metres, differentiably.
         z0: f_front of the arguments, where the front has run. None: it has not.
-        on_iteration: Called after each update; gets the loss before it.
+        on_iteration: Callback after each update; gets the loss before it.
 
     Raises:
         DivergedError: The loss or its gradient is not finite; `last_good` is the Refinement until
@@ -98,7 +98,7 @@ def refine(
             loss = loss_of(at_points, points.depth)
         if settings.iterations and not bool(loss.isfinite()):
             raise _diverged("loss", updates, step, so_far)
-        so_far = _appended(so_far, depth.detach(), float(loss.detach()), step)
+        so_far = _append(so_far, depth.detach(), float(loss.detach()), step)
         if is_last:
             break
         # Its gradient at z_k.
@@ -115,7 +115,7 @@ def refine(
             raise _diverged("gradient", updates, step, so_far)
         # z_{k+1} = z_k − α·U(gradient)
         with torch.no_grad():
-            gradient = blurred(gradient, points, settings.blur)
+            gradient = blur(gradient, points, settings.blur)
             with wrap_user_errors(f"update rule {settings.update!r}"):
                 direction = rule(gradient).reshape(gradient.shape)
             alpha = step * SCHEDULES[settings.schedule](updates / settings.iterations)
@@ -125,7 +125,7 @@ def refine(
     return so_far
 
 
-def _appended(so_far: Refinement | None, depth: Tensor, loss: float, step: float) -> Refinement:
+def _append(so_far: Refinement | None, depth: Tensor, loss: float, step: float) -> Refinement:
     """The refinement with the depth of one more z."""
     if so_far is None:
         return Refinement(before=depth, after=depth, losses=(loss,), step=step)

@@ -87,8 +87,8 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
     Args:
         beta1: Decay of the mean of the gradients.
         beta2: Decay of the mean of their squares.
-        eps: Added to the denominator. Smaller than the common 1e-8, because the gradient of a mean
-            over many points is tiny at most elements of z and 1e-8 would suppress them.
+        eps: Summand of the denominator. It is smaller than the common 1e-8, because the gradient of
+            a mean over many points is tiny at most elements of z and 1e-8 would suppress them.
     """
     first: Tensor | None = None
     second: Tensor | None = None
@@ -112,13 +112,13 @@ def lbfgs(memory: int = 10) -> Update:
     step, whereas here each of the K updates has exactly one rear pass and one gradient. The first
     direction is the normalised gradient.
 
-    After the first update, the displacement of z does not depend on α: the rule takes its last
-    direction for the displacement of z, which is too large by 1/α, so its inverse Hessian is too
-    large by 1/α and the step α cancels it. Pairs of negative curvature are skipped, and directions
-    are shortened to MAX_RMS.
+    After the first update, the displacement of z does not depend on α. The rule takes its last
+    direction for the displacement of z, which is too large by 1/α. So its inverse Hessian is too
+    large by 1/α, and the step α cancels that. Pairs of negative curvature are skipped, and
+    directions are shortened to MAX_RMS.
 
     Args:
-        memory: How many of the last pairs of displacement and gradient change are used.
+        memory: Number of the last pairs of displacement and gradient change that are used.
     """
     pairs: deque[tuple[Tensor, Tensor]] = deque(maxlen=memory)  # of −direction and the change of g
     last: tuple[Tensor, Tensor] | None = None  # gradient and direction
@@ -181,7 +181,7 @@ def step_size(lr: float | str, z0: Tensor) -> float:
     return value / 100 * float(z0.float().std(correction=0)) if text.endswith("%") else value
 
 
-def blurred(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
+def blur(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
     """Returns the gradient convolved with a Gaussian, so that it also reaches between the points.
 
     The Gaussian's standard deviation is proportional to the mean spacing of the points: few points
@@ -189,7 +189,7 @@ def blurred(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
 
     Args:
         gradient: (1, C, h, w) at z. Any other shape is returned unchanged.
-        points: The N sparse points of the frame of H × W pixels.
+        points: The N sparse points of an image of H × W pixels.
         spacings: Standard deviation in units of √(HW/N) pixels; 0 returns the gradient unchanged.
     """
     if not spacings or gradient.ndim != 4:

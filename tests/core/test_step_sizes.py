@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from pnpdepth_cli.core.update_rules import SCHEDULES, blurred, step_size
+from pnpdepth_cli.core.update_rules import SCHEDULES, blur, step_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 
@@ -46,16 +46,16 @@ def test_a_linear_schedule_falls_by_the_same_amount_every_time() -> None:
 
 def test_no_blur_and_a_z_that_is_no_map_leave_the_gradient_itself() -> None:
     gradient = torch.randn(1, 3, 5, 7)
-    assert blurred(gradient, points(4, (50, 70)), 0.0) is gradient
+    assert blur(gradient, points(4, (50, 70)), 0.0) is gradient
     tokens = torch.randn(1, 35, 3)
-    assert blurred(tokens, points(4, (50, 70)), 2.0) is tokens
+    assert blur(tokens, points(4, (50, 70)), 2.0) is tokens
 
 
 def test_the_reach_is_a_gaussian_of_so_many_spacings_of_the_points() -> None:
     # 4 points on 40 × 80 pixels are √800 pixels apart; a cell is 4 pixels high and 2 wide
     gradient = torch.zeros(1, 1, 10, 40)
     gradient[0, 0, 5, 20] = 1
-    result = blurred(gradient, points(4, (40, 80)), 0.25)[0, 0]
+    result = blur(gradient, points(4, (40, 80)), 0.25)[0, 0]
 
     def weight(cell: int, cells: int, of: int, sigma: float) -> float:
         """What cell `of` weighs in the mean that `cell` becomes."""

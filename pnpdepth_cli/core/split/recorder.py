@@ -36,7 +36,7 @@ class Recorder:
     """Notes the calls of one pass that the replay's recording does not know yet.
 
     Args:
-        cut: Where the network is cut.
+        cut: Layer where the network is cut.
         watch: Sees the operations of the pass.
         replay: Handles the pass; gets the longer recording when the pass is over.
         uncacheable: Submodules that contain something which forbids to cache them as a whole;

@@ -143,8 +143,8 @@ class Replay:
     In the learning passes, calls that the recording does not know go to the `recorder`.
 
     Args:
-        cut: Where the network is cut.
-        arguments: Of the network, for the first frame.
+        cut: Layer where the network is cut.
+        arguments: Arguments of the network for the first frame.
     """
 
     def __init__(self, cut: CutPoint, arguments: Sequence[Any]) -> None:
@@ -152,7 +152,7 @@ class Replay:
         self.recording = Recording()
         self.arguments = SavedTensors(_copies(arguments))
         self.outputs: list[SavedTensors | None] = []
-        """Of each recorded call; None where it is not cached or did not run yet."""
+        """Output of each recorded call; None where it is not cached or did not run yet."""
         self.z0: Tensor | None = None
         self.z: Tensor | None = None
         self.calls: Counter[nn.Module] = Counter()

@@ -90,7 +90,7 @@ class NetworkState:
     """Values, gradient flags and modes of a network at the time this object is created.
 
     Attributes:
-        tensors: Its parameters and buffers; a `Watch` that protects them saves those that change.
+        tensors: Parameters and buffers; a `Watch` that protects them saves those that change.
     """
 
     def __init__(self, network: nn.Module) -> None:
