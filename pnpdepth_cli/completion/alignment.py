@@ -60,10 +60,10 @@ class Alignment:
         line = self.scale * x + self.shift
         near, far = self.bounds
         if self.space == "inverse":
-            return _clamped(line, 1 / far, 1 / near).reciprocal()
+            return _clamp(line, 1 / far, 1 / near).reciprocal()
         if self.space == "log":
-            return _clamped(line, math.log(near), math.log(far)).exp()
-        return _clamped(line, near, far)
+            return _clamp(line, math.log(near), math.log(far)).exp()
+        return _clamp(line, near, far)
 
     def beyond(self, x: Tensor) -> float:
         """Returns the fraction of the values that `depth` clamps."""
@@ -108,7 +108,7 @@ def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -
         raise ModelError("the network's output is not finite at any sparse point; nothing to align")
     x, d = x[good], d[good]
     kinds = ("none", "scale", "affine") if kind == "auto" else (kind,)
-    fits = [fit for s in spaces for k in kinds if (fit := _fitted(x, d, s, k)) is not None]
+    fits = [fit for s in spaces for k in kinds if (fit := _fit(x, d, s, k)) is not None]
     if not fits and len(x) < 2:
         raise NoPointsError(
             f"alignment {kind!r} needs at least 2 sparse points where the network sees them,"
@@ -127,13 +127,13 @@ def aligned(prediction: Tensor, points: SparsePoints, *, kind: str, space: str =
 
     Args:
         prediction: (H, W) depth, metric or not; not positive or not finite is unknown.
-        points: Sparse depth in the same frame.
+        points: Sparse depth of the same image.
         kind: One of `choices.ALIGNMENTS`.
         space: Quantity in which the line is fitted, one of `choices.SPACES`.
 
     Raises:
         NoPointsError: No point has a prediction.
-        ModelError: As of `align`.
+        ModelError: The prediction is the same at all points, or zero, so that no line fits.
     """
     known, points = where_predicted(prediction, points)
     x = to_space(torch.where(known, prediction, 1.0), space)
@@ -156,7 +156,7 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
     return known, seen
 
 
-def _fitted(x: Tensor, d: Tensor, space: str, kind: str) -> Alignment | None:
+def _fit(x: Tensor, d: Tensor, space: str, kind: str) -> Alignment | None:
     y = to_space(d, space)
     line = (1.0, 0.0) if kind == "none" else _LINES[kind](x, y, space)
     if line is None or not all(map(math.isfinite, line)) or line[0] == 0:
@@ -193,14 +193,14 @@ def _scale(x: Tensor, y: Tensor, space: str) -> tuple[float, float] | None:
         return None
     if space == "log":
         one = torch.ones_like(x)
-        return 1.0, _reweighted(one, y - x, (start[1], 0.0), shifted=False)[0]
-    return _reweighted(x, y, start, shifted=False)
+        return 1.0, _fit_reweighted(one, y - x, (start[1], 0.0), shifted=False)[0]
+    return _fit_reweighted(x, y, start, shifted=False)
 
 
 def _affine(x: Tensor, y: Tensor, space: str) -> tuple[float, float] | None:
     if float(x.max() - x.min()) <= 1e-9 * float(x.abs().max()):
         return None
-    return _reweighted(x, y, _least_median(x, y), shifted=True)
+    return _fit_reweighted(x, y, _least_median(x, y), shifted=True)
 
 
 _LINES = {"median": _median, "scale": _scale, "affine": _affine}
@@ -227,7 +227,7 @@ def _least_median(x: Tensor, y: Tensor) -> tuple[float, float]:
     return float(slope[best]), float(shift[best])
 
 
-def _reweighted(
+def _fit_reweighted(
     x: Tensor, y: Tensor, start: tuple[float, float], *, shifted: bool
 ) -> tuple[float, float]:
     """Least squares of y = a·x + b from a start; points far off the line have no weight."""
@@ -259,7 +259,7 @@ def from_space(value: Tensor, space: str) -> Tensor:
     return {"depth": lambda: value, "inverse": value.reciprocal, "log": value.exp}[space]()
 
 
-def _clamped(x: Tensor, low: float, high: float) -> Tensor:
+def _clamp(x: Tensor, low: float, high: float) -> Tensor:
     """x within low … high; the gradient is that of x."""
     clamped = x.clamp(low, high)
     return clamped if not x.requires_grad else clamped.detach() + (x - x.detach())

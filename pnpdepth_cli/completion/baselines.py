@@ -64,11 +64,11 @@ class Baseline:
         return bound.depth(points, prediction)
 
 
-def _aligned(title: str, kind: str, space: str) -> Baseline:
+def _align_by(title: str, kind: str, space: str) -> Baseline:
     return Baseline(title=title, of_prediction=partial(aligned, kind=kind, space=space))
 
 
-def locally_aligned(
+def align_locally(
     prediction: Tensor, points: SparsePoints, xy: Tensor | None = None, *, space: str = "depth"
 ) -> Tensor:
     """Returns the locally aligned depth (H, W) float32 metres, within a global alignment's bounds.
@@ -76,7 +76,7 @@ def locally_aligned(
     Args:
         prediction: (H, W) depth, metric or not; not positive or not finite is unknown, and 0 in the
             result.
-        points: Sparse depth in the same frame.
+        points: Sparse depth of the same image.
         xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel.
         space: Quantity in which the lines are fitted, one of `choices.SPACES`.
 
@@ -113,12 +113,12 @@ TABLE = {
     ),
     "idw": Baseline(title="inverse distance weighting", of_points=inverse_distance, pointwise=True),
     "morphological": Baseline(title="morphological fill (IP-Basic)", of_points=morphological),
-    "median": _aligned("median of ratios", kind="median", space="depth"),
-    "scale": _aligned("scale", kind="scale", space="depth"),
-    "affine": _aligned("scale and shift", kind="affine", space="depth"),
-    "scale-disparity": _aligned("scale, in disparity", kind="scale", space="inverse"),
-    "affine-disparity": _aligned("scale and shift, in disparity", kind="affine", space="inverse"),
+    "median": _align_by("median of ratios", kind="median", space="depth"),
+    "scale": _align_by("scale", kind="scale", space="depth"),
+    "affine": _align_by("scale and shift", kind="affine", space="depth"),
+    "scale-disparity": _align_by("scale, in disparity", kind="scale", space="inverse"),
+    "affine-disparity": _align_by("scale and shift, in disparity", kind="affine", space="inverse"),
     "local": Baseline(
-        title="scale and shift around each pixel", of_prediction=locally_aligned, pointwise=True
+        title="scale and shift around each pixel", of_prediction=align_locally, pointwise=True
     ),
 }

@@ -1,11 +1,11 @@
 """Folds of sparse points, to score a method at points that it was not given.
 
-A held-out point must be as far from the remaining points as an ordinary pixel is from all points,
-or the score is that of something else than the image's depth. Points at random pixels are so by
-themselves. LiDAR points lie close together along a scan line and far apart across; held out one by
-one, each would be predicted from its neighbour on the line. There whole scan lines are held out.
-Of other clustered points whole cells of a grid are held out (blocked cross-validation, Roberts et
-al. 2017), as large as makes the distances agree.
+A point that was not given must be as far from the given points as an ordinary pixel is from all
+points. Else the score is not that of the image's depth. Points at random pixels are so by
+themselves. LiDAR points lie close together along a scan line and far apart across. Each would be
+predicted from its neighbour on the line, so a fold has whole scan lines. Of other clustered points
+it has whole cells of a grid (blocked cross-validation, Roberts et al. 2017). The cells are as large
+as makes the distances agree.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ def _folds_of_cells(
 def _distance_of_pixels(points: SparsePoints, generator: torch.Generator) -> float:
     """The median distance from pixels to their nearest point.
 
-    Of pixels in the box around the middle 96 % of the points: a LiDAR has no points in the sky.
+    The pixels are in the box around the middle 96 % of the points: a LiDAR has no points in the
+    sky.
     """
     low, high = (torch.quantile(_some(points.xy.cpu(), generator), q, dim=0) for q in (0.02, 0.98))
     xy = low + (high - low) * torch.rand(_SAMPLED, 2, generator=generator)

@@ -28,15 +28,18 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 FOUND = 4.0
-"""Log of the Bayes factor over an image that is registered already, from which the image is moved.
+"""The image is moved from this evidence for a registration on.
 
-The constants here were chosen on rendered frames, of which 1 % of the registered ones exceed it
-with 500 to 5,000 points, none with 100."""
+It is the log of the Bayes factor over an image that is registered already. The constants here were
+chosen on rendered frames. Of registered ones with 500 to 5,000 points 1 % exceed it, with 100
+none."""
 
 REGISTERED, CHANCE = 3.0, 3.0
-"""Log of the Bayes factor of an image that belongs to its points over one that is unrelated: from
-which it is not moved, and which the best of all registrations exceeds by chance: once for one
-frame, twice for more."""
+"""Evidence that an image belongs to its points: the log of the Bayes factor over an unrelated one.
+
+From `REGISTERED` on, an image is not moved. An unrelated image reaches `CHANCE` by
+chance somewhere. So the best of all registrations must have it for one frame, and twice it for
+more."""
 
 _ZOOMS = np.exp(np.linspace(-0.4, 0.4, 81))  # 0.67 to 1.49
 _LARGEST_SHIFT = 0.05  # of the image's sides
@@ -50,9 +53,10 @@ _STEPS = 12  # samples between two points
 _JUMP = 0.15  # of log depth between two neighbouring points
 _LEAST_SHORT = 1 / 3
 """Share of the jumps that lie between points nearer to each other than half of all neighbours are.
-It is 0.39 to 0.58 in the maps of five RGB-D sets, 0 to 0.28 where points within 8 px of the jumps
-are missing, as of phones whose depth of low confidence is left out: what is left says nothing of
-where in between the jump is."""
+
+It is 0.39 to 0.58 in the maps of five RGB-D sets. It is 0 to 0.28 where points within 8 px of the
+jumps are missing, as of phones whose depth of low confidence is dropped. The points that are left
+tell nothing of where in between the jump is."""
 _SMALLEST_CHANGE = 0.03  # of log depth; smaller ones are noise
 _LEAST_SPREAD = 0.4  # standard deviation of the log of that change; a noisy wall has 0.4, rooms 0.6
 _LARGEST_EVIDENCE = 2.5  # standard deviations
@@ -60,12 +64,12 @@ _LEAST_CONTRAST = 0.02  # of an image with edges
 _EDGE_SIGMA, _EDGE_REACH, _EDGE_BAND = 1.0, 8.0, 6.0  # pixels of the reduced image
 _WEIGHT = 0.1  # log likelihood per unit of correlation
 _INDEPENDENT = 37.0  # norm of the evidence from which pairs are no longer independent
-_NO_EVIDENCE, _EVIDENCE = 25, 0.85  # points that say nothing, and what each e-fold of more says
+_NO_EVIDENCE, _EVIDENCE = 25, 0.85  # points that tell nothing, and what each e-fold of more tells
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageRegistration:
-    """Where in the image the colour of a pixel of the points' frame is.
+    """Where in the image the colour of a pixel of the depth camera is.
 
     The colour of pixel x is at c + zoom (x − c) + (right, down), where c is the image's centre.
     """
@@ -83,8 +87,8 @@ class ImageRegistration:
             zoom=1 / self.zoom, right=-self.right / self.zoom, down=-self.down / self.zoom
         )
 
-    def applied(self, rgb: Image) -> Image:
-        """Returns the image (H, W, 3) in the points' frame; its border is repeated."""
+    def apply_to(self, rgb: Image) -> Image:
+        """Returns the image (H, W, 3) at the pixels of the depth camera, its border repeated."""
         height, width = rgb.shape[:2]
         centre = np.array([(width - 1) / 2, (height - 1) / 2])
         offset = (1 - self.zoom) * centre + (self.right, self.down)
@@ -98,14 +102,14 @@ class ImageRegistration:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What one frame says of the registration, at the reduced size."""
+    """What one frame tells of the registration, at the reduced size."""
 
     edges: Image
     """(h, w) strength of the image's edges."""
     ends: Floats
     """(M, 2, 2) x and y of neighbouring points, by pairs."""
     weight: Floats
-    """(M,) by how much depth changes between the two."""
+    """(M,) change of depth between the two, as a weight."""
     size: tuple[int, int]
     """(H, W) of the image."""
     points: int
@@ -113,7 +117,7 @@ class Evidence:
     jumps: int
     """Number of pairs across a jump of depth."""
     short_jumps: int
-    """Of these, shorter than those that have half of the length of all pairs."""
+    """Number of these that are short: all pairs as short have half of the length of all pairs."""
 
     @functools.cached_property
     def unmoved(self) -> Floats:
@@ -121,10 +125,10 @@ class Evidence:
         return self.log_likelihood(1.0)
 
     def log_likelihood(self, zoom: float) -> Floats:
-        """Returns (rows, columns): of each shift, in pixels of the reduced image.
+        """Returns (rows, columns), the log likelihood of each shift in pixels of the reduced image.
 
-        The sum over the pairs of weight × mean edge strength between their ends; 0 is assumed
-        outside of the image.
+        It is the sum over the pairs of weight × mean edge strength between their ends. Edges
+        outside the image have strength 0.
         """
         reach, padded, between, weights = self._drawn
         centre = np.array(self.edges.shape[::-1]) / 2
@@ -150,41 +154,47 @@ class Evidence:
 
 
 def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
-    """Returns what the frame says of the registration of its image.
+    """Returns what the frame tells of the registration of its image.
 
     Args:
         rgb: (H, W, 3) in 0…1.
 
     Returns:
-        None where they cannot tell: points too few, in a part of the image only, scan lines of a
-        LiDAR, or points that were found in the image, such as SfM points.
+        The evidence. None where the points tell nothing: they are too few, in a part of the image
+        only, scan lines of a LiDAR, or were matched in the image, as SfM points are.
     """
     xy, depth = points.xy.numpy().astype(np.float64), points.depth.numpy().astype(np.float64)
+    # Points that cannot tell.
     if len(xy) < _MIN_POINTS or scan_pattern(xy, points.size).has_scan_lines:
         return None
     if len(xy) > _MOST_POINTS:
         chosen = np.linspace(0, len(xy) - 1, _MOST_POINTS).astype(np.intp)
         xy, depth = xy[chosen], depth[chosen]
+    # They must spread over the image.
     hull = cv2.convexHull(xy.astype(np.float32))
     if cv2.contourArea(hull) < _LEAST_HULL * points.size[0] * points.size[1]:
         return None
+    # The edges of the image, at a reduced size.
     scale = min(1.0, _LONGEST_PX / max(points.size))
     rows, columns = (round(side * scale) for side in points.size)
     small = cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA)
     if np.ptp(small) < _LEAST_CONTRAST:
         return None
     edges = _edges(np.asarray(small, np.float32))
+    # Points that lie on edges were matched in the image.
     at = (xy + 0.5) * scale
     x, y = at.astype(np.intp).T
     at_edges = edges[y.clip(0, rows - 1), x.clip(0, columns - 1)].mean() * np.sqrt(len(at))
     if at_edges > _MOST_AT_EDGES:
         return None
+    # Pairs of neighbouring points, weighted by how much depth changes between them.
     pairs = _pairs(at)
     if pairs is None:
         return None
     weight = _depth_edges(at, np.log(depth), pairs)
     if weight is None:
         return None
+    # Jumps of depth, and how many of them lie between close points.
     length = np.linalg.norm(np.diff(at[pairs], axis=1)[:, 0], axis=1)
     ordered = np.sort(length)
     half = ordered[np.searchsorted(ordered.cumsum(), ordered.sum() / 2)]
@@ -200,25 +210,29 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
     )
 
 
-def estimated(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
+def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
     """Returns the registration that frames of one size have in common: the posterior's mean.
 
-    None where the evidence is no better than for an image that is registered already, or than
-    chance, and where points are missing beside the jumps of depth.
+    None where the evidence is no better than chance, or than for an image that is registered
+    already, and where points are missing beside the jumps of depth.
 
     Args:
-        frames: Their evidence; None of a frame that says nothing. The first decides the size.
+        frames: Evidence of the frames; None of a frame that tells nothing. The first decides the
+            size.
     """
     known = [frame for frame in frames if frame is not None]
     if not known:
         return None
     size = known[0].size
     usable = [frame for frame in known if frame.size == size]
+    # Beside jumps of depth there must be points.
     if sum(e.short_jumps for e in usable) < _LEAST_SHORT * sum(e.jumps for e in usable):
         return None
+    # An image that belongs to its points as it is stays.
     middle = tuple(count // 2 for count in usable[0].unmoved.shape)
-    if _related(usable, [frame.unmoved for frame in usable], middle) > REGISTERED:
+    if _bayes_factor(usable, [frame.unmoved for frame in usable], middle) > REGISTERED:
         return None
+    # The posterior over zoom, down and right: likelihood of all frames, and prior.
     total = np.stack(
         [np.sum([frame.log_likelihood(zoom) for frame in usable], axis=0) for zoom in _ZOOMS]
     )
@@ -229,13 +243,16 @@ def estimated(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
         + ((right / size[1] / _SHIFT_SIGMA) ** 2 / 2)[None, None, :]
     )
     logits = total - prior - logsumexp(-prior)
+    # It must be far better than no registration.
     unmoved = sum(float(frame.unmoved[middle]) for frame in usable)
     if logsumexp(logits) - unmoved < FOUND:
         return None
+    # The best registration must be better than chance.
     number, *place = np.unravel_index(logits.argmax(), logits.shape)
     maps = [frame.log_likelihood(float(_ZOOMS[number])) for frame in usable]
-    if _related(usable, maps, tuple(place)) < CHANCE * min(len(usable), 2):
+    if _bayes_factor(usable, maps, tuple(place)) < CHANCE * min(len(usable), 2):
         return None
+    # The posterior's mean.
     probability = np.exp(logits - logsumexp(logits))
     return ImageRegistration(
         zoom=round(float(_ZOOMS @ probability.sum((1, 2))), 4),
@@ -244,13 +261,13 @@ def estimated(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
     )
 
 
-def _related(
+def _bayes_factor(
     frames: Sequence[Evidence], maps: Sequence[Floats], place: tuple[np.intp, ...]
 ) -> float:
     """Log of the Bayes factor of images that belong to their points at one shift over chance.
 
-    By how many standard deviations over all shifts the log likelihood there exceeds its mean: of an
-    unrelated image 0 ± 1, of one that belongs there a number that grows with the logarithm of the
+    The log likelihood there exceeds its mean over all shifts by so many standard deviations. For an
+    unrelated image these are 0 ± 1. For one that belongs there they grow with the logarithm of the
     number of points (even frames of 7-Scenes and ICL-NUIM).
     """
     standing = np.array([(each[place] - each.mean()) / (each.std() + 1e-9) for each in maps])

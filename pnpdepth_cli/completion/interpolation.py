@@ -45,14 +45,14 @@ def nearest(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
     """Returns the depth of the nearest point in the image."""
     points = distinct(points)
     _, number = nearest_points(points, _queries(points, xy), 1)
-    return _shaped(points.depth.cpu()[number[:, 0]], points, xy)
+    return _reshape(points.depth.cpu()[number[:, 0]], points, xy)
 
 
 def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "depth") -> Tensor:
     """Returns linear interpolation in the Delaunay triangles of the points.
 
-    Linear is a quantity of `choices.SPACES`. Outside the points' hull, and everywhere if all are
-    on one line, the nearest point's depth.
+    The quantity that is linear is `space`, one of `choices.SPACES`. The nearest point's depth is
+    taken outside the points' hull, and everywhere if all are on one line.
     """
     points = distinct(points)
     pixels = _queries(points, xy)
@@ -65,7 +65,7 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
     outside = dense.isnan()
     _, number = nearest_points(points, pixels[outside], 1)
     dense[outside] = points.depth.double().cpu()[number[:, 0]]
-    return _shaped(dense, points, xy)
+    return _reshape(dense, points, xy)
 
 
 def in_hull(points: SparsePoints) -> Tensor:
@@ -94,17 +94,17 @@ def inverse_distance(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
         distance, number = nearest_points(points, some, min(_IDW_NEIGHBOURS, len(points)))
         weight = distance.clamp_min(_AT_A_POINT).pow(-_IDW_POWER)
         means.append((weight * value[number]).sum(dim=1) / weight.sum(dim=1))
-    return _shaped(torch.cat(means).exp(), points, xy)
+    return _reshape(torch.cat(means).exp(), points, xy)
 
 
 def morphological(points: SparsePoints) -> Tensor:
     """Returns depth filled by morphology: near depth grows over far depth, holes are closed.
 
-    The steps of Ku, Harakeh, Waslander, "In Defense of Classical Image Processing: Fast Depth
-    Completion on the CPU", 2018: dilation by a 5 × 5 diamond, closing by 5 × 5, holes filled by a
-    7 × 7 dilation, median and Gaussian blur of 5 × 5. Their kernels are for a LiDAR's density;
-    with fewer points the grid is coarser in proportion. Holes that they fill by a 31 × 31 dilation
-    and by each column's topmost value are filled with the nearest depth here, which is better.
+    The steps are those of Ku, Harakeh, Waslander, "In Defense of Classical Image Processing: Fast
+    Depth Completion on the CPU", 2018: dilation by a 5 × 5 diamond, closing by 5 × 5, holes filled
+    by a 7 × 7 dilation, median and Gaussian blur of 5 × 5. The kernels are for a LiDAR's density;
+    with fewer points the grid is coarser in proportion. The paper fills other holes by a 31 × 31
+    dilation and by each column's topmost value. Here the nearest depth fills them, which is better.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -112,20 +112,23 @@ def morphological(points: SparsePoints) -> Tensor:
     height, width = points.size
     shrink = min(1.0, math.sqrt(len(points) / (FILL_SHARE * height * width)))
     coarse = points.resized(max(1, round(height * shrink)), max(1, round(width * shrink)))
-    # points outside the frame are moved onto its outermost pixels
+    # Points outside the image are moved onto its outermost pixels.
     last = coarse.xy.new_tensor([coarse.size[1] - 1, coarse.size[0] - 1])
     coarse = replace(coarse, xy=torch.minimum(coarse.xy.clamp_min(0), last))
     sparse = coarse.scatter().cpu()[0, 0]
-    # minus depth: the maximum is the nearest, and minus infinity is unknown
+    # Of minus depth the maximum is the nearest, and minus infinity is unknown.
     value = torch.where(sparse > 0, -sparse, -torch.inf).numpy()
+    # Dilation, closing, and small holes.
     five, seven = (np.ones((side, side), np.uint8) for side in (5, 7))
-    value = _dilated(value, _DIAMOND)
-    value = -_dilated(-_dilated(value, five), five)
-    value = np.where(np.isinf(value), _dilated(value, seven), value)
+    value = _dilate(value, _DIAMOND)
+    value = -_dilate(-_dilate(value, five), five)
+    value = np.where(np.isinf(value), _dilate(value, seven), value)
+    # The nearest depth in what is left.
     nearest_known = distance_transform_edt(
         np.isinf(value), return_distances=False, return_indices=True
     )
     smooth = torch.from_numpy(cv2.medianBlur(value[tuple(nearest_known)], 5))
+    # The blur, and the image's own size.
     kernel = torch.exp(-0.5 * (torch.arange(-2.0, 3.0) / _BLUR_SIGMA) ** 2)
     kernel = (kernel / kernel.sum()).reshape(1, 1, 1, 5)
     padded = F.pad(smooth[None, None], (2, 2, 2, 2), mode="replicate")
@@ -162,7 +165,7 @@ def _queries(points: SparsePoints, xy: Tensor | None) -> Tensor:
     return torch.cartesian_prod(rows, columns).flip(1)
 
 
-def _shaped(values: Tensor, points: SparsePoints, xy: Tensor | None) -> Tensor:
+def _reshape(values: Tensor, points: SparsePoints, xy: Tensor | None) -> Tensor:
     """The values (M,) in the shape that was asked for, on the points' device."""
     shape = points.size if xy is None else (len(xy),)
     return values.float().reshape(shape).to(points.depth.device)
@@ -177,7 +180,7 @@ def nearest_points(points: SparsePoints, xy: Tensor, count: int) -> tuple[Tensor
     return torch.from_numpy(distance), torch.from_numpy(number)
 
 
-def remembered(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def remember(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Returns a decorator that remembers a function's last `maxsize` results, by its arguments.
 
     Arguments are float64 arrays (N, 2), which the function gets read-only, and whole numbers.
@@ -185,7 +188,7 @@ def remembered(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any
     same points, and each asks for their neighbours and triangles.
     """
 
-    def decorated(function: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.lru_cache(maxsize)
         def known(*keys: bytes | int) -> Any:
             return function(
@@ -200,23 +203,23 @@ def remembered(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any
 
         return call
 
-    return decorated
+    return decorate
 
 
-@remembered(8)
+@remember(8)
 def _nearest(points: NDArray[np.float64], xy: NDArray[np.float64], count: int) -> Any:
-    """The same of coordinates (N, 2) and (M, 2)."""
+    """Distances and numbers of the points (N, 2) nearest to xy (M, 2)."""
     among = np.arange(1, count + 1)
     many = len(xy) * count > _WORTH_THREADS
     return _tree(points).query(xy, among, workers=-1 if many else 1)
 
 
-@remembered(2)
+@remember(2)
 def _tree(points: NDArray[np.float64]) -> cKDTree:
     return cKDTree(points)
 
 
-@remembered(2)
+@remember(2)
 def _triangles(points: NDArray[np.float64]) -> Delaunay | None:
     """The points' triangulation; None if there is no triangle."""
     try:
@@ -225,6 +228,6 @@ def _triangles(points: NDArray[np.float64]) -> Delaunay | None:
         return None
 
 
-def _dilated(value: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _dilate(value: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[np.float32]:
     # What lies outside has no effect: a replicated pixel is below the kernel itself.
     return np.asarray(cv2.dilate(value, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)

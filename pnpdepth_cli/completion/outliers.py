@@ -1,8 +1,8 @@
 """Outliers: points whose depth is inconsistent with their neighbours'.
 
 A point on a small object is as alone as an outlier. So points are removed only where the others
-predict each other far better without all that are alone; and points that are alone together are no
-outliers, but something that the network has not seen, such as a corridor behind a door.
+predict each other far better without all that are alone. Points that are alone together are no
+outliers. They are something that the network has not seen, such as a corridor behind a door.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def outliers(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Te
 
     Args:
         prediction: (H, W) metres.
-        points: Sparse depth in the same frame.
+        points: Sparse depth of the same image.
         rgb: (3, H, W) in 0…1, or None.
 
     Raises:
@@ -57,9 +57,9 @@ def outliers(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Te
 def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
     """Returns (N,) bool: the points whose log depth differs by more than `FAR` from a prediction.
 
-    The points of a wrong track of structure from motion agree with each other, so that only a
-    network that sees the image and weighs its points tells that they are outliers. A prediction far
-    from half of the points or more is of no use: then none is far.
+    The points of a wrong track of structure from motion agree with each other. Only a network that
+    sees the image and weighs its points tells that they are outliers. A prediction far from half of
+    the points or more is of no use: then none is far.
 
     Args:
         prediction: (H, W) metres, 0 = unknown, of a network that weighs its points.
@@ -102,8 +102,9 @@ def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
 def inlier_mask(field: ResidualField) -> Tensor:
     """Returns (N,) bool: the points that are inliers; all of them unless some clearly are not.
 
-    Points are weighted by how well their neighbours predict them: first by `inlier_weights`, then,
-    unless there are very many, by the Gaussian process from the other points as they are weighted.
+    Points are weighted by how well their neighbours predict them, at first by `inlier_weights`.
+    Unless there are very many, the Gaussian process from the other points, with their weights,
+    predicts each point then.
     """
     weight, near = inlier_weights(field.points, field.residual), neighbourhoods(field, _MAX_EXACT)
     if len(near) == 1 and near.shape[1] >= _MIN_POINTS:

@@ -3,9 +3,9 @@
 With r the residual in log depth, the result is exp(r) · prediction, so that it is positive
 everywhere. r stays within its values at the points. Outliers are removed first.
 
-How r is predicted is a table, `choices.PROPAGATIONS`: the entries of `TABLE`. A
-prediction of 0, or not finite, is unknown and stays 0; points there and points outside the frame
-have no effect. Of points at the same coordinates the nearest counts.
+The ways to predict r are the entries of `TABLE`, listed in `choices.PROPAGATIONS`. A prediction
+of 0, or not finite, is unknown and stays 0. Points there and points outside the image have no
+effect. Of points at the same coordinates the nearest counts.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def propagate(
 
     Args:
         prediction: (H, W) metres.
-        points: Sparse depth in the same frame.
+        points: Sparse depth of the same image.
         rgb: (3, H, W) in 0…1, or None.
         kind: A name in `choices.PROPAGATIONS`, or "none".
 
@@ -98,7 +98,7 @@ def propagate(
     if propagation is None:
         return Propagated(depth=torch.where(known, prediction, 0.0).float())
     field = propagation.fit(without_outliers(residual_field(prediction, points, rgb)))
-    factor = _clamped(propagation.dense(field), field).exp().to(prediction.device)
+    factor = _clamp(propagation.dense(field), field).exp().to(prediction.device)
     depth = torch.where(known, prediction * factor, 0.0).float()
     return Propagated(depth=depth, kernel=field.kernel)
 
@@ -116,11 +116,14 @@ def propagate_at(
 
     Args:
         prediction: (H, W) metres.
-        points: Sparse depth in the same frame.
+        points: Sparse depth of the same image.
         rgb: (3, H, W) in 0…1, or None.
         xy: (M, 2) pixel coordinates.
-        kind: As of `propagate`, which has the errors too.
-        kernel: Of an earlier propagation. None: it is fitted.
+        kind: A name in `choices.PROPAGATIONS`, or "none".
+        kernel: Kernel of an earlier propagation. None: it is fitted.
+
+        Raises:
+            NoPointsError: No point has a prediction, except with "none".
     """
     propagation = None if kind == NONE else PROPAGATIONS[kind]
     queries = SparsePoints(xy=xy, depth=torch.ones_like(xy[:, 0]), size=points.size)
@@ -135,9 +138,9 @@ def propagate_at(
         residual = queries.sample(propagation.dense(field))
     else:
         residual = propagation.at(field, queries)
-    return (predicted * _clamped(residual, field).exp().to(predicted.device)).float()
+    return (predicted * _clamp(residual, field).exp().to(predicted.device)).float()
 
 
-def _clamped(residual: Tensor, field: ResidualField) -> Tensor:
+def _clamp(residual: Tensor, field: ResidualField) -> Tensor:
     """The residual within its range at the points."""
     return residual.clamp(float(field.residual.min()), float(field.residual.max()))

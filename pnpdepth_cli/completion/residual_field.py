@@ -45,14 +45,14 @@ class ResidualField:
     """A residual that is known at N points of an image."""
 
     features: tuple[Tensor, ...]  # 3 or 6 maps (H, W), see `features_of`
-    points: SparsePoints  # the points in the image frame, on the CPU
+    points: SparsePoints  # the points at pixel coordinates of the image, on the CPU
     at: Tensor  # (N, 3 or 6), features at the points
     residual: Tensor  # (N,) float64, log measured − log predicted depth
     kernel: Kernel = Kernel()  # covariance; `gaussian_process.fit` chooses it
 
     def features_at(self, queries: SparsePoints) -> Tensor:
         """Returns the features (M, 3 or 6) at the coordinates of M points."""
-        return _sampled(self.features, queries)
+        return _sample(self.features, queries)
 
     def select(self, mask: Tensor) -> ResidualField:
         """Returns the field with only the points where mask (N,) is true."""
@@ -61,13 +61,13 @@ class ResidualField:
 
 
 def residual_field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> ResidualField:
-    """Returns the residual at the points that lie in the frame and have a prediction.
+    """Returns the residual at the points that lie in the image and have a prediction.
 
     Of several points at the same coordinates the nearest counts.
 
     Args:
         prediction: (H, W) metres; not positive or not finite is unknown.
-        points: Sparse depth in the same frame.
+        points: Sparse depth of the same image.
         rgb: (3, H, W) in 0…1, or None.
 
     Raises:
@@ -84,7 +84,7 @@ def residual_field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None)
     return ResidualField(
         features=features,
         points=points,
-        at=_sampled(features, points),
+        at=_sample(features, points),
         residual=points.depth.double().log() - predicted.log(),
     )
 
@@ -110,7 +110,7 @@ def features_of(log_depth: Tensor, rgb: Tensor | None) -> tuple[Tensor, ...]:
     return maps if rgb is None else (*maps, *_colour(rgb))
 
 
-def _sampled(features: tuple[Tensor, ...], points: SparsePoints) -> Tensor:
+def _sample(features: tuple[Tensor, ...], points: SparsePoints) -> Tensor:
     """(N, 3 or 6): the features at the points."""
     return torch.stack([points.sample(one) for one in features], dim=1)
 

@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.completion.image_registration import ImageRegistration, estimated, evidence
+from pnpdepth_cli.completion.image_registration import (
+    ImageRegistration,
+    estimate_registration,
+    evidence,
+)
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.models.definition import DENSE_SPACING
@@ -80,7 +84,7 @@ class Frame:
     def _registration_of_points(self) -> Register:
         """The registration that the points tell; kept, because most frames need it twice."""
         assert self.image is not None
-        return estimated([evidence(self.image, self.points)])
+        return estimate_registration([evidence(self.image, self.points)])
 
     def registered(self) -> Frame:
         """Returns the frame with its image moved to the points, if it has to be."""
@@ -90,7 +94,7 @@ class Frame:
         how = self._registration_of_points if how == "auto" else how
         if how is None or isinstance(how, str):
             return replace(self, register=None)
-        return replace(self, rgb=tensor_of(how.applied(image)), register=None, registration=how)
+        return replace(self, rgb=tensor_of(how.apply_to(image)), register=None, registration=how)
 
     def with_points(self, points: SparsePoints) -> Frame:
         """Returns the same image with other sparse depth."""

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import torch
 
-from pnpdepth_cli.completion.image_registration import Evidence, estimated, evidence
+from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration, evidence
 from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.default import refine_default
@@ -157,4 +157,4 @@ class Method:
             if read == _TRIED and not usable:  # such as scans, none of which will tell
                 break
         if usable:
-            self.registrations = {usable[0].size: estimated(usable)}
+            self.registrations = {usable[0].size: estimate_registration(usable)}

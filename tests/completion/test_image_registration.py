@@ -7,7 +7,7 @@ import torch
 from pnpdepth_cli.completion.image_registration import (
     Evidence,
     ImageRegistration,
-    estimated,
+    estimate_registration,
     evidence,
 )
 from pnpdepth_cli.points import SparsePoints
@@ -35,7 +35,7 @@ def evidence_of(
 def test_zoom_and_shift_between_the_cameras_are_found(
     seed: int, registration: ImageRegistration
 ) -> None:
-    found = estimated([evidence_of(seed, registration)])
+    found = estimate_registration([evidence_of(seed, registration)])
     assert isinstance(found, ImageRegistration)
     assert found.zoom == pytest.approx(registration.zoom, abs=0.012)
     assert found.right == pytest.approx(registration.right, abs=1.5)
@@ -45,20 +45,20 @@ def test_zoom_and_shift_between_the_cameras_are_found(
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("count", [20, 100, 500, 4000])
 def test_a_registered_image_stays(seed: int, count: int) -> None:
-    assert estimated([evidence_of(seed, count=count)]) is None
+    assert estimate_registration([evidence_of(seed, count=count)]) is None
 
 
 @pytest.mark.parametrize("gap_px", [5, 8])
 def test_a_registered_image_stays_where_points_beside_jumps_are_missing(gap_px: int) -> None:
     known = [evidence(*frame(seed, count=500, gap_px=gap_px)) for seed in range(8)]
     assert None not in known
-    assert estimated(known) is None
+    assert estimate_registration(known) is None
 
 
 def test_frames_with_few_points_show_together_what_each_does_not() -> None:
     frames = [evidence_of(seed, UNREGISTERED, count=80) for seed in range(8)]
-    assert [estimated([alone]) for alone in frames[:3]] == [None] * 3
-    found = estimated(frames)
+    assert [estimate_registration([alone]) for alone in frames[:3]] == [None] * 3
+    found = estimate_registration(frames)
     assert isinstance(found, ImageRegistration)
     assert found.zoom == pytest.approx(UNREGISTERED.zoom, abs=0.02)
 
@@ -66,7 +66,7 @@ def test_frames_with_few_points_show_together_what_each_does_not() -> None:
 @pytest.mark.parametrize("zoom", [0.72, 1.4])
 def test_frames_show_together_that_the_image_sees_much_less_or_more(zoom: float) -> None:
     there = ImageRegistration(zoom=zoom, right=6.0, down=-4.0)
-    found = estimated([evidence_of(seed, there) for seed in range(4)])
+    found = estimate_registration([evidence_of(seed, there) for seed in range(4)])
     assert isinstance(found, ImageRegistration)
     assert found.zoom == pytest.approx(zoom, abs=0.01)
     assert (found.right, found.down) == pytest.approx((6.0, -4.0), abs=0.5)
@@ -77,7 +77,7 @@ def test_images_of_other_scenes_are_not_moved(count: int, frames: int) -> None:
     pairs = [
         (frame(seed + 20, count=count)[0], frame(seed, count=count)[1]) for seed in range(frames)
     ]
-    assert estimated([evidence(*pair) for pair in pairs]) is None
+    assert estimate_registration([evidence(*pair) for pair in pairs]) is None
 
 
 def test_points_that_were_found_in_the_image_show_nothing() -> None:
@@ -110,12 +110,12 @@ def test_points_or_an_image_without_an_edge_leave_the_image(case: str) -> None:
     if case == "an image without an edge":
         rgb, depth = np.full((*SIZE, 3), 0.5, np.float32), points.depth
     known = evidence(rgb, SparsePoints(xy=xy, depth=depth, size=SIZE))
-    assert estimated([known] if known is not None else []) is None
+    assert estimate_registration([known] if known is not None else []) is None
 
 
 def test_the_colour_of_a_pixel_is_where_the_registration_says() -> None:
     y, x = np.mgrid[:41, :61].astype(np.float32)
     ramp = np.stack([x, y, x + y], axis=-1)
-    moved = ImageRegistration(zoom=0.5, right=4.0, down=-2.0).applied(ramp)
+    moved = ImageRegistration(zoom=0.5, right=4.0, down=-2.0).apply_to(ramp)
     assert moved[30, 40, 0] == pytest.approx(30 + 0.5 * (40 - 30) + 4)
     assert moved[30, 40, 1] == pytest.approx(20 + 0.5 * (30 - 20) - 2)

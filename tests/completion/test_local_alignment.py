@@ -6,7 +6,7 @@ import torch
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import BEYOND, aligned, from_space, to_space
-from pnpdepth_cli.completion.baselines import locally_aligned
+from pnpdepth_cli.completion.baselines import align_locally
 from pnpdepth_cli.completion.local_lines import RIDGE
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.points import SparsePoints
@@ -29,7 +29,7 @@ def test_a_prediction_that_is_a_line_away_everywhere_is_restored(space: str, cou
     prediction = from_space((to_space(gt, space) + 0.3) / 0.7, space)
     if count < 3:  # a factor is all that one and two points show
         prediction = gt / 3
-    dense = locally_aligned(prediction, random_points(gt, count), space=space)
+    dense = align_locally(prediction, random_points(gt, count), space=space)
     assert torch.allclose(dense, gt, rtol=1e-3)
 
 
@@ -42,7 +42,7 @@ def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve
     mean, std = at_points.mean(), at_points.std()
     inlier = inlier_weights(points, torch.from_numpy(np.log(y / at_points))).numpy()
     assert inlier.min() == 0 < inlier.max()
-    dense = locally_aligned(prediction, points)
+    dense = align_locally(prediction, points)
     for row, column in ((5, 5), (47, 0), (30, 15), (20, 60)):
         distance = np.hypot(*(points.xy.numpy() - (column, row)).T)
         near = np.argsort(distance)[:12]
@@ -63,7 +63,7 @@ def test_a_scale_that_drifts_over_the_image_is_followed(space: str, count: int) 
     gt = scene_depth()
     drift = torch.linspace(0.6, 1.5, SIZE[1])
     points = random_points(gt, count)
-    local = locally_aligned(gt * drift, points, space=space)
+    local = align_locally(gt * drift, points, space=space)
     everywhere = aligned(gt * drift, points, kind="affine", space=space)
     assert mean_log_error(local, gt) < 0.35 * mean_log_error(everywhere, gt)
 
@@ -73,6 +73,6 @@ def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:
     points = random_points(gt, 100)
     prediction = gt.clone()
     prediction[0, 0], prediction[0, 1] = 1e6, 1e-6
-    dense = locally_aligned(prediction, points, space="inverse")
+    dense = align_locally(prediction, points, space="inverse")
     assert float(dense.max()) <= float(points.depth.max()) * BEYOND * (1 + 1e-5)
     assert float(dense.min()) >= float(points.depth.min()) / BEYOND * (1 - 1e-5)

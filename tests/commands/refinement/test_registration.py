@@ -13,7 +13,7 @@ import torch
 from pnpdepth_cli import Refiner, load_network
 from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
-from pnpdepth_cli.completion.image_registration import estimated, evidence
+from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.depth import read_depth, write_depth
@@ -88,7 +88,7 @@ def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> Non
     assert inputs.image is not None
     all_points = evidence(inputs.image, inputs.points)
     assert all_points is not None
-    whole = estimated([all_points])
+    whole = estimate_registration([all_points])
     assert whole is not None
     assert record.points is not None
     assert record.points.used == 400
