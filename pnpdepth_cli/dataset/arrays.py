@@ -71,7 +71,7 @@ def read_levels(path: Path) -> NDArray[Any]:
     return values
 
 
-def masked(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[np.float32]:
+def apply_masks(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[np.float32]:
     """Returns the depth (H, W) with 0 where any of the masks is 0.
 
     Raises:
@@ -89,7 +89,7 @@ def masked(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[np.fl
 
 
 def check_same_view(what: str, own: tuple[int, ...], size: tuple[int, int]) -> None:
-    """Raises SizeError if what has the size `own` (H, W) has another aspect ratio than an image."""
+    """Raises SizeError unless the sizes `own` and `size` (H, W) have one aspect ratio."""
     if abs(own[1] * size[0] / (own[0] * size[1]) - 1) > _ASPECT_TOLERANCE:
         turned = abs(own[0] * size[0] / (own[1] * size[1]) - 1) <= _ASPECT_TOLERANCE
         raise SizeError(
@@ -99,11 +99,13 @@ def check_same_view(what: str, own: tuple[int, ...], size: tuple[int, int]) -> N
 
 
 def moved_note(own: tuple[int, ...], size: tuple[int, int]) -> str:
-    """Returns what a person should know of points of the size `own` (H, W) in an image (H, W)."""
+    """Returns a line for a person on points of a map (H, W) in an image of another size (H, W)."""
     return f"points of {own[1]}×{own[0]} are moved to the image of {size[1]}×{size[0]}"
 
 
-def moved_to(path: Path, depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+def move_depth(
+    path: Path, depth: NDArray[np.float32], size: tuple[int, int]
+) -> NDArray[np.float32]:
     """Returns the known depths (H, W) at the pixels of an image of the same view; the nearest wins.
 
     No depth is interpolated: in an image that is larger, `size` (H, W), most pixels stay unknown.
@@ -122,12 +124,12 @@ def moved_to(path: Path, depth: NDArray[np.float32], size: tuple[int, int]) -> N
 
 def shape_of(path: Path, name: str) -> tuple[int, ...]:
     """Returns the shape of an array of the file. Raises InputError if it has none."""
-    with _opened(path, name) as array:
+    with _open_array(path, name) as array:
         return tuple(array.shape)
 
 
 def _rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
-    """(H, W, 3) float32 in 0..1 of an array of bytes. Raises InputError for another."""
+    """An image (H, W, 3) float32 in 0..1 from an array of bytes. Raises InputError for another."""
     pixels = _read(source)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise FileFormatError(f"{source} is {pixels.dtype} of shape {pixels.shape}, not an image")
@@ -151,7 +153,7 @@ def depth_of(source: Hdf5Array | RawDepth) -> NDArray[np.float32]:
 
 
 def _read(source: Hdf5Array) -> NDArray[Any]:
-    with _opened(source.path, source.name) as array:
+    with _open_array(source.path, source.name) as array:
         if array.dtype.kind not in "fiu":
             raise FileFormatError(f"{source} holds {array.dtype} values, not numbers")
         one = array.shape if source.index is None else array.shape[1:]
@@ -165,7 +167,7 @@ def _read(source: Hdf5Array) -> NDArray[Any]:
 
 
 @contextmanager
-def _opened(path: Path, name: str) -> Iterator[Any]:
+def _open_array(path: Path, name: str) -> Iterator[Any]:
     """An array of an HDF5 file, which lies in the file itself."""
     try:
         import h5py

@@ -44,7 +44,7 @@ def read_colmap_points(
 ) -> SparseDepth:
     """Returns the points that COLMAP matched in an image, projected into it.
 
-    Into an image without matches, as of a model of known poses, all points are projected that no
+    An image of a model of known poses may have no matches. All points are projected into it that no
     nearer ones occlude.
 
     The camera's own lens distortion is applied to the points, so the photo stays as it was taken.
@@ -60,16 +60,19 @@ def read_colmap_points(
         SizeError: The photo does not show the camera's view.
         NoPointsError: No point is left.
     """
+    # The image in the model, whose camera must have the photo's view.
     model = read_model(path)
     name = name_in_model(model, image)
     camera = model.cameras[model.images[name].camera]
     assert camera.size is not None  # of every camera of a model
     check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
+    # Its points, without far values.
     points, notes = _points_in(model, name, unit_scale or 1.0)
     dropped = points.dropped
     unit = MODEL_UNITS if unit_scale is None else METRES
     far, lines = far_values(points.depth, unit)
     points = points.select(~far)
+    # What a person should know.
     turn, shift = model.images[name].rotation.T, model.images[name].translation
     reading = Reading(
         f"COLMAP model, image {name}, {camera.source}",
@@ -106,21 +109,24 @@ def read_colmap_points(
 def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points, list[str]]:
     """The points of an image that pass the filters, in its camera's size; and lines for a person.
 
-    They are those of its tracks, else all that are not occluded.
+    They are the points of its tracks. Without tracks they are all points that are not occluded.
     """
     image, points = model.images[name], model.points
     camera = model.cameras[image.camera]
     assert camera.size is not None
+    # The points of the image's tracks, else all.
     row = np.flatnonzero(np.isin(points.number, image.points))
     untracked = not len(row)
     if untracked:
         row = np.arange(len(points.number))
+    # Points of short tracks and with large reprojection errors go.
     total, drops = len(row), DropCounter()
     least = min(_LEAST_TRACK, len(model.images))
     if points.track.any():
         row = row[drops.keep(points.track[row] >= least, f"seen in fewer than {least} images")]
     why = f"with a reprojection error above {_MOST_REPROJECTION_PX:g} px"
     row = row[drops.keep(points.error[row] <= _MOST_REPROJECTION_PX, why)]
+    # The others are projected.
     seen = points.xyz[row] @ image.rotation.T + image.translation
     front = drops.keep(seen[:, 2] > 0, "behind the camera")
     if len(row) and not front.any():
@@ -130,11 +136,13 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
         )
     seen = seen[front]
     seen, xy = drops.keep_seen(seen, pixels_of(camera, seen), camera.size)
+    # Without tracks, nothing else tells which points the camera sees.
     notes = list[str]()
     if untracked:
         visible = drops.keep(~hidden_among(xy, seen[:, 2], camera.size), "hidden by foreground")
         seen, xy = seen[visible], xy[visible]
         notes = [f"sparse: {name} has no tracks; all {total:,} points of the model are projected"]
+    # What is left must be some.
     depth = seen[:, 2] * unit_scale
     if not len(depth):
         raise NoPointsError(

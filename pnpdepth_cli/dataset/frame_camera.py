@@ -33,7 +33,7 @@ def camera_of_frame(
 
     Args:
         files: The files of the frame.
-        options: How they are read.
+        options: Options of reading, such as the calibration.
         sparse: The sparse depth, with the camera of the whole image if it came with one.
         size: (H, W) of the whole image.
         needs_camera: Whether it must be known; only then it is taken from EXIF.

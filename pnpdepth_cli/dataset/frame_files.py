@@ -94,7 +94,7 @@ class Neighbour:
     """Another frame of the same sequence, whose points are moved into this one."""
 
     files: FrameFiles
-    motion: Pose | None  # from the other camera's frame to this one's. None: to be estimated.
+    motion: Pose | None  # from the other camera's coordinates to this one's. None: to be estimated.
     poses: str  # where the motion is from, for a person
     apart: int  # frames between the two, at least 1
 
@@ -119,7 +119,7 @@ class FrameFiles:
     gt_scale: float | None = None  # codes per metre of integer ground truth
     part: FramePart = WHOLE
     pose: Pose | None = None
-    """x_world = pose · (x, 1) for points in the camera's frame; of KITTI odometry camera 0's."""
+    """x_world = pose · (x, 1) for x in the camera's coordinates, in KITTI odometry camera 0's."""
     oxts: Path | None = None  # the packet of KITTI's inertial system that gives the pose
     neighbours: tuple[Neighbour, ...] = ()
     masks: tuple[Path, ...] = ()

@@ -38,7 +38,7 @@ class CameraRecord:
     lens: str
     distortion: list[float]
     pose: list[list[float]] | None
-    """(3, 4) from the camera's frame to the world's. None: unknown."""
+    """(3, 4) from the camera's coordinates to the world's. None: unknown."""
     source: str
 
     @classmethod

@@ -21,10 +21,11 @@ from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.motion import Keypoints, MotionEstimate, keypoints_of, motion_of_images
 
 _IN_MEMORY = 16
-"""Images whose keypoints are kept."""
+"""Number of images whose keypoints are kept."""
 _CONTRADICTION = 0.0075
-"""Of the image's width, by which poses put points elsewhere than the images show. On a KITTI drive
-the inertial system is off by 0.0006 to 0.0021, poses of another drive by 0.010 to 0.027."""
+"""Fraction of the image's width by which contradicting poses move points off what images show. On a
+KITTI drive the inertial system is off by 0.0006 to 0.0021, poses of another drive by 0.010 to
+0.027."""
 
 
 def read_neighbours(
@@ -35,14 +36,14 @@ def read_neighbours(
 ) -> tuple[SparsePoints, list[FileRecord], list[str]]:
     """Returns the points with those of the neighbours that agree with them.
 
-    A neighbour whose motion is neither known nor can be estimated is left out. Known motion to the
-    frame before, or after, is compared with that which the images show.
+    A neighbour is left out if its motion is unknown and cannot be estimated. A known motion to the
+    frame before, or after, is compared with the motion that the images show.
 
     Args:
-        files: Of the frame.
-        used: Its points without those that are held out; scans are registered to them.
-        camera: Of the frame.
-        points_of: Returns the points of a frame's files.
+        files: Files of the frame.
+        used: Points of the frame without the held-out ones; scans are registered to them.
+        camera: Camera of the frame.
+        points_of: Function of a frame's files that returns their points.
 
     Returns:
         The points, what a record keeps of each neighbour, and warnings.
@@ -61,6 +62,7 @@ def read_neighbours(
     own, scans, notes = _in_numpy(used), list[NeighbourScan](), list[str]()
     records = list[FileRecord]()
     for neighbour in files.neighbours:
+        # The neighbour's points, and its motion, from poses or from the images.
         points, source = (
             _in_numpy(points_of(neighbour.files)),
             neighbour.files.sparse or neighbour.files.gt,
@@ -68,13 +70,15 @@ def read_neighbours(
         assert source is not None
         known = neighbour.motion
         if known is None:
-            estimate = _estimated(files, neighbour.files, points, camera)
+            estimate = _estimate(files, neighbour.files, points, camera)
         else:
             estimate = MotionEstimate(motion=np.array(known), basis=neighbour.poses)
+        # Poses of the nearest neighbour are compared with the images.
         off: str | None = None
         if known is not None and not any(each.apart == 1 for each in scans):
             off = _off_images(files, neighbour, points, camera)
             notes += [off] if off else []
+        # A neighbour of known motion joins.
         if estimate.motion is None:
             notes.append(
                 f"warning: {_name_of(neighbour.files)} is left out of the accumulated points, as"
@@ -92,6 +96,7 @@ def read_neighbours(
                 contradicts_images=off is not None,
             )
         )
+    # At least one must join.
     if not scans:
         raise InputError(
             f"{_name_of(files)}: no motion to a neighbour can be estimated ({estimate.basis}); give"
@@ -100,7 +105,7 @@ def read_neighbours(
     return accumulated(own, scans, camera).tensors(), records, notes
 
 
-def _estimated(
+def _estimate(
     here: FrameFiles, there: FrameFiles, points: Points, camera: Camera
 ) -> MotionEstimate:
     assert here.image is not None
@@ -119,7 +124,7 @@ def _off_images(
     """A warning if the motion by the poses is not the one that the images of two frames show."""
     if files.image is None or neighbour.files.image is None or neighbour.apart != 1:
         return None
-    shown = _estimated(files, neighbour.files, points, camera)
+    shown = _estimate(files, neighbour.files, points, camera)
     if shown.motion is None:
         return None
     motions = (np.array(neighbour.motion), shown.motion)

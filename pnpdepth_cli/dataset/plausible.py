@@ -62,9 +62,9 @@ def scan_returns(
     """Returns the points (N, 3) of a scan that are returns, in metres; counts; lines for a person.
 
     Args:
-        path: Of the scan, or its topic.
-        xyz: (N, 3) in the scanner's frame, as they are stored.
-        scale: Numbers per metre that the user states, which count where metres are implausible.
+        path: Path or topic of the scan.
+        xyz: (N, 3) in the scanner's coordinates, as they are stored.
+        scale: Numbers per metre that the user states; used where metres are implausible.
 
     Raises:
         FileFormatError: Many coordinates are none of a scan.
@@ -84,7 +84,7 @@ def scan_returns(
     drop(~finite.any(axis=1), "without return, as they are not finite")
     range_m = np.linalg.norm(np.where(finite, xyz, 0).astype(np.float64), axis=1)
     drop(finite.all(axis=1) & (range_m < _AT_SENSOR_M), "without return, as they are at the sensor")
-    drop(_repeated(xyz, keep), "without return, as they are at one and the same place")
+    drop(_at_one_place(xyz, keep), "without return, as they are at one and the same place")
     plane = np.zeros(len(xyz), bool)
     plane[keep] = _far_plane(range_m[keep])[0]
     drop(plane, "without return, as they are at one range far beyond all others")
@@ -111,8 +111,8 @@ def scan_returns(
     return points, dropped, [*notes, *lines]
 
 
-def _repeated(xyz: NDArray[np.floating], keep: Mask) -> Mask:
-    """(N,) true for the points to keep at one place that more of them share than beams can."""
+def _at_one_place(xyz: NDArray[np.floating], keep: Mask) -> Mask:
+    """(N,) true for points at a place that more of the points to keep share than beams can."""
     result, rows = np.zeros(len(xyz), bool), np.asarray(xyz[keep], np.float64)
     if len(rows) >= _FEW:
         mixed = rows @ (1.0, np.pi, np.e**2)  # one number for each place
@@ -168,8 +168,10 @@ def plausible_map(
 
     Args:
         values: (H, W), 0 where unknown.
-        reading: How they were read.
-        what: Argument of `divisor_to_metres`, like `option` and `scale`.
+        reading: Format of the file, and the scale of its integers.
+        what: Name of the depths in lines for a person.
+        option: Option of the scale.
+        scale: Numbers per metre that the user states. None: nothing is stated.
 
     Raises:
         InputError: The depths are implausible in metres.
@@ -200,10 +202,10 @@ def divisor_to_metres(
 
     Args:
         depth: (N,) known depths, or ranges, as they were read.
-        reading: How; integers have been divided by its scale.
+        reading: Format of the file; integers have been divided by its scale.
         what: Name of the depths in lines for a person.
         option: Option of the scale.
-        scale: What the user states by it. None: nothing.
+        scale: Numbers per metre that the user states. None: nothing is stated.
         medians: The smallest and the largest that is plausible.
 
     Raises:
@@ -264,6 +266,7 @@ def check_pixels(path: Path, xy: NDArray[Any], size: tuple[int, int]) -> tuple[M
         SizeError: They are those of an image that was turned.
         NoPointsError: None lies in the image.
     """
+    # Coordinates that are relative to the image.
     (height, width), inside = size, np.asarray(in_frame(xy, size))
     outside = len(xy) - int(np.count_nonzero(inside))
     if len(xy) >= _FEW and bool((np.abs(xy) <= 1).all()) and min(size) > 2:
@@ -272,11 +275,13 @@ def check_pixels(path: Path, xy: NDArray[Any], size: tuple[int, int]) -> tuple[M
             f"{path}: the coordinates of all {len(xy):,} points are within {low}…1, so they are"
             f" relative to the image; multiply them by {width} and {height} to make them pixels"
         )
+    # Coordinates of an image that was turned.
     if outside > _SWAPPED * len(xy) and bool(in_frame(xy, (width, height)).all()):
         raise SizeError(
             f"{path}: {outside:,} of {len(xy):,} points are outside the {width}×{height} image,"
             f" but all are inside {height}×{width}: swap x and y, or turn the image by 90°"
         )
+    # Coordinates of a scan.
     below = int((xy < -0.5).any(axis=1).sum())
     if len(xy) >= _FEW and below > _BELOW_ZERO * len(xy):
         raise FileFormatError(
@@ -285,6 +290,7 @@ def check_pixels(path: Path, xy: NDArray[Any], size: tuple[int, int]) -> tuple[M
         )
     if not inside.any():
         raise NoPointsError(f"{path}: none of its {len(xy)} points lies in the image")
+    # Points that all keep within a corner are pixels of a smaller image.
     notes = [f"sparse: {outside:,} points outside the image"] if outside else []
     right, down = (xy.max(axis=0) + 1) / (width, height)
     corner = max(right, down) < _CORNER and min(right, down) > 0.9 * max(right, down)

@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.dataset.arrays import (
+    apply_masks,
     check_same_view,
     depth_of,
-    masked,
+    move_depth,
     moved_note,
-    moved_to,
     read_image,
     read_levels,
 )
@@ -74,7 +74,7 @@ def read_frame(
 
     Args:
         files: The files of the frame.
-        options: How they are read.
+        options: Options of reading, such as scales and the sampling of points.
         seed: Random seed of points that are sampled, and of those that are held out.
         holdout: Fraction of the points that is held out.
         needs_camera: Whether the camera must be known, if need be from EXIF.
@@ -110,7 +110,7 @@ def read_frame(
     # the sparse depth
     if files.sparse is None:
         scale = truth_reading and truth_reading.scale
-        sparse = _sampled(files, options, rgb, gt, scale, seed)
+        sparse = _sample_sparse(files, options, rgb, gt, scale, seed)
     else:
         sparse = _read_sparse(files, options, whole)
     given = sparse.points
@@ -130,7 +130,7 @@ def read_frame(
         size = whole or given.size
     # the camera, and with it the points of neighbouring frames
     camera, of_camera = camera_of_frame(files, options, sparse, size, needs_camera=needs_camera)
-    used, held_out = _split(given, holdout, seed)
+    used, held_out = _hold_out(given, holdout, seed)
     points, neighbours, lost = read_neighbours(
         files, used, camera, lambda other: _points_of(other, options, size, seed)
     )
@@ -169,7 +169,10 @@ def read_frame(
 
 
 def _is_one_view(files: FrameFiles, options: ReadOptions) -> bool:
-    """Whether user or files say so; a calibrated scan and SfM points are of the image's view."""
+    """Whether image and points are of one view, as a calibrated scan and SfM points are.
+
+    The user or the data set may say so, too.
+    """
     sparse = files.sparse
     calibrated = sparse is not None and (sparse.is_dir() or _is_scan(sparse, files, options))
     return calibrated or files.one_view or options.registration == "off"
@@ -180,7 +183,9 @@ def _is_scan(path: Path, files: FrameFiles, options: ReadOptions) -> bool:
     return (options.scan.over(files) if files.calib else options.scan).describes(path)
 
 
-def _split(points: SparsePoints, fraction: float, seed: int) -> tuple[SparsePoints, SparsePoints]:
+def _hold_out(
+    points: SparsePoints, fraction: float, seed: int
+) -> tuple[SparsePoints, SparsePoints]:
     """The points to use, and a random fraction of them, at least one unless it is 0, held out."""
     if not 0 <= fraction < 1:
         raise UsageError(f"--holdout must be a fraction, 0 <= F < 1, got {fraction}")
@@ -208,7 +213,7 @@ def _points_of(
     if files.gt is not None:
         truth, _, _ = _read_ground_truth(files, options, files.gt, size)
         gt = np.ascontiguousarray(crop(truth.values))
-    return _sampled(files, options, rgb, gt, None, seed).points
+    return _sample_sparse(files, options, rgb, gt, None, seed).points
 
 
 def _read_image(files: FrameFiles, source: ImageSource) -> tuple[ImageArray, str | None]:
@@ -240,9 +245,9 @@ def _read_ground_truth(
         if has_scan and options.depth_scale is not None:
             own = read_depth(source, scale=files.gt_scale)  # the option is that of the scan
             truth = truth if own.reading.assumed else own
-    values = masked(truth.values, files.masks)
+    values = apply_masks(truth.values, files.masks)
     if files.gt_other_size and size is not None and values.shape != size:
-        values = moved_to(file_of(source), values, size)
+        values = move_depth(file_of(source), values, size)
     values, notes = plausible_map(values, truth.reading, "gt", "gt_scale of a list", scale)
     described = describe_range(values, truth.reading, noun="pixels", option="gt_scale of a list")
     record = _file_record(source, truth.reading)
@@ -256,7 +261,7 @@ def _file_record(source: ImageSource | RawDepth, reading: Reading | None = None)
     return replace(record, read_as=reading.source, scale=reading.scale, assumed=reading.assumed)
 
 
-def _sampled(
+def _sample_sparse(
     files: FrameFiles,
     options: ReadOptions,
     rgb: ImageArray | None,
@@ -264,7 +269,7 @@ def _sampled(
     scale: float | None,
     seed: int,
 ) -> SparseDepth:
-    """Points sampled from the ground truth, whose file has so many integers per metre."""
+    """Points sampled from the ground truth, whose file has `scale` integers per metre."""
     if options.sample is None:
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
     if gt is None:
@@ -325,7 +330,10 @@ def _read_sparse(
 
 
 def _of_distances(sparse: SparseDepth, files: FrameFiles, options: ReadOptions) -> SparseDepth:
-    """The points with depth z, from distances to the camera; none where the lens shows nothing."""
+    """The points with depth z made of distances to the camera.
+
+    Points where the lens shows nothing go.
+    """
     scan = options.scan.over(files)
     if scan.calib is None:
         raise UsageError("--sparse-range needs the camera of the distances; give --calib")
@@ -378,16 +386,19 @@ def _read_points(
 ) -> SparseDepth:
     """The points of a depth map or a list, in the image."""
     scale = options.depth_scale or files.sparse_scale
+    # The points as they are stored, without far values.
     visible, reading = read_sparse(path, size=image_size, scale=scale)
     far, lines = far_values(visible.depth)
     visible = visible.select(~far)
     depth = visible.depth
     size = image_size or visible.size
     check_same_view(str(path), visible.size, size)
+    # What a person should know of them.
     notes = [f"sparse: {describe_range(depth, reading)}", *(f"sparse: {line}" for line in lines)]
     record = _file_record(path, reading)
     if visible.size != size:
         notes.append(f"sparse: {moved_note(visible.size, size)}")
+    # Points that the camera does not see go.
     keep_occluded = options.scan.keep_occluded
     if options.foreground is not None:
         behind = behind_foreground(visible, *options.foreground)
@@ -403,6 +414,7 @@ def _read_points(
             f"sparse: a projected LiDAR scan; dropped {count:,} points occluded from the camera by"
             " nearer ones; --preset paper keeps them"
         )
+    # The others must be pixels of the image, and plausible in metres.
     points = visible.tensors().resized(*size)
     inside, of_pixels = check_pixels(path, points.xy.numpy(), size)
     divisor, warnings = divisor_to_metres(depth, reading, "sparse", "--depth-scale", scale)

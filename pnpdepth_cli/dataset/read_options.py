@@ -30,7 +30,7 @@ class ScanOptions:
     )
     extrinsics: Path | None = option(
         None,
-        "Pose of the scanner in the camera's frame: matrix, quaternion or tf.",
+        "Pose of the scanner in the camera's coordinates: matrix, quaternion or tf.",
         metavar="FILE",
     )
     camera: int | None = option(

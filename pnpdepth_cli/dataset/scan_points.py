@@ -31,10 +31,10 @@ from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.projection import agreement_at, edge_ranks, near_jumps
 
 _MORE_IF_INVERTED = 3.0  # times as many points in the image with inverted extrinsics: a warning
-_NEXT_TO_NONE = 0.05  # of them; fewer points with the extrinsics themselves are an error
+_NEXT_TO_NONE = 0.05  # of the points with them inverted; with fewer, extrinsics are an error
 _THIN = 0.5  # largest variance of a scan's rays along its thin direction, of the next
 _AHEAD_DEG = 15.0  # angle to the camera's axis below which points are expected in the image
-_MOST_OUTSIDE = 1 / 3  # of these points; more outside the image give a warning
+_MOST_OUTSIDE = 1 / 3  # of the points ahead; more outside the image give a warning
 _OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
 _CLEARLY_BETTER = 0.03  # in `edge_agreement`, of a camera that replaces the one that is named
 _CAMERAS = 4  # of KITTI; more of a calibration are not tried
@@ -52,16 +52,16 @@ class SparseDepth:
     """The sparse depth of a frame, as it was read."""
 
     points: SparsePoints[Any]
-    """In the image, as arrays of either library."""
+    """The points in the image, as arrays of numpy or torch."""
     record: FileRecord
     notes: tuple[str, ...]
     reading: Reading
-    """Its scale is that of an integer file of the depth, per unit. None: it holds no integers."""
+    """How the file was read; its scale is integers per unit, None if the file holds none."""
     unit: str = METRES
     camera: Camera | None = None
     """The camera of the whole image, where it came with the points."""
     pose: NDArray[np.float64] | None = None
-    """(3, 4) from the camera's frame to the world's, in `unit`. None: unknown."""
+    """(3, 4) from the camera's coordinates to the world's, in `unit`. None: unknown."""
 
 
 def read_scan_points(
@@ -78,14 +78,16 @@ def read_scan_points(
         path: The scan.
         options: The calibration, and whether occluded points stay.
         size: (H, W) of the image; None for the calibration's.
-        image: Its file; tells whether it is rectified, where the calibration leaves that open.
-        scale: Numbers of the scan per metre, for one whose range is implausible in metres.
+        image: File of the image; its edges tell whether it is rectified, where the calibration
+            leaves that open.
+        scale: Numbers of the scan per metre; used where metres are implausible.
 
     Raises:
         InputError: A file cannot be read.
         SizeError: Calibration and image do not fit together.
         NoPointsError: No point is visible.
     """
+    # The calibration, with the pose of the scanner.
     named = options.calib
     if named is None:
         raise UsageError(
@@ -100,29 +102,33 @@ def read_scan_points(
             f"{named} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or"
             " give --extrinsics FILE"
         )
+    # It must be of the image.
     size = size or calibration.camera.size
     if size is None:
         raise SizeError(f"{named} does not give the image's size; give --image")
     warnings = check_size(named, calibration.camera, size, image)
+    # The returns of the scan.
     scan = read_scan(path)
     xyz, no_returns, mended = scan_returns(path, scan.points, scale)
     if calibration.rectified:
         frames = [] if image is None else [(read_rgb(image).values, xyz)]
-        calibration, note = chosen_camera(calibration, frames)
+        calibration, note = choose_camera(calibration, frames)
         warnings.append(note)
     camera, scanner = calibration.camera, calibration.scanner
     assert scanner is not None
     if options.extrinsics is not None and calibration.rectification is not SAME_FRAME:
         warnings.append(
-            f"extrinsics: in the frame of the unrectified camera 0; the rotation and offset that"
-            f" {named} rectifies with are applied"
+            f"extrinsics: in the coordinates of the unrectified camera 0; the rotation and offset"
+            f" that {named} rectifies with are applied"
         )
     if options.extrinsics is not None or not camera.source.startswith("KITTI"):  # one direction
         warnings += check_direction(xyz, camera, scanner, size)
+    # They are projected, and what seems wrong is warned of.
     points = project_velodyne(xyz, camera, scanner, size, keep_occluded=options.keep_occluded)
     warnings += _outside_warning(scanner.moved(xyz), camera, size)
     if image is not None and not calibration.rectified:
         warnings += _better_reading(points, calibration, _other_cameras(named, options), image)
+    # What a person should know, and what a record keeps.
     reading = Reading(f"{scan.source} of {len(xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
     if lost := describe_dropped(points.dropped):
@@ -145,21 +151,21 @@ def read_scan_points(
     )
 
 
-def chosen_camera(
+def choose_camera(
     raw: Calibration,
     frames: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
     topic: str = "",
 ) -> tuple[Calibration, str]:
     """Returns the camera of images that may be rectified, and a line that says which it is.
 
-    A topic image_rect* is of rectified images. Any other image is raw unless a rectified camera
-    puts the jumps of depth clearly better onto its edges, as in bags that hold rectified images as
+    A topic image_rect* is of rectified images. Any other image is raw, unless a rectified camera
+    puts the jumps of depth clearly better onto its edges: some bags hold rectified images as
     image_raw.
 
     Args:
         raw: The camera of raw images and the pose of the scanner, with the rectified cameras.
         frames: Images (H, W, 3) in 0..1, each with a scan (N, 3).
-        topic: Of the images, where it is known.
+        topic: Topic of the images, where it is known.
     """
     named = "image_rect" in topic
     cameras = {
@@ -212,8 +218,8 @@ def check_direction(
 ) -> list[str]:
     """Returns a warning if the inverse of the scanner's pose fits the image (H, W) better.
 
-    That is: it puts far more points into the image, or more points and the camera upright in the
-    scan, which is flatter than it is wide.
+    The inverse fits better if it puts far more points into the image. It also does if it puts more
+    points into it and the camera upright in the scan, which is flatter than it is wide.
 
     Raises:
         UsageError: The pose puts next to none of the points into the image.
@@ -263,10 +269,11 @@ def _other_cameras(named: Path, options: ScanOptions) -> dict[str, Calibration]:
 def _better_reading(
     points: Points, own: Calibration, others: Mapping[str, Calibration], image: Path
 ) -> list[str]:
-    """A warning if jumps of depth meet the image's edges clearly better in another reading.
+    """A warning if jumps of depth meet the image's edges clearly better by another calibration.
 
-    The jumps of the scan's points in the image are projected anew for each reading.
+    The jumps of the scan's points in the image are projected anew for each one.
     """
+    # The image's edges, and the jumps of depth in the scanner's coordinates.
     rgb, scanner = read_rgb(image).values, own.scanner
     assert scanner is not None
     if len(points) < _MANY_POINTS or rgb.shape[:2] != points.size:
@@ -283,6 +290,7 @@ def _better_reading(
             return -1.0
         return agreement_at(ranks, xy[inside], jumps[ahead][inside])
 
+    # How well they agree as they are, and by other axes, cameras and turns.
     found = agreement(seen, own.camera)
     readings = dict[str, tuple[float, float]]()  # how much better it must be, and its agreement
     for axis, name in ((1, "y"), (2, "z")):
@@ -297,6 +305,7 @@ def _better_reading(
         turn = Rotation.from_euler("xy", (down, right), degrees=True).as_matrix()
         text = f"with the extrinsics turned by {down}° about the camera's x and {right}° about y"
         readings[text] = _OTHER_TURN, agreement(seen @ turn.T, own.camera)
+    # The best must be better by more than chance.
     text = max(readings, key=lambda text: readings[text][1] - readings[text][0])
     needed, best = readings[text]
     if best - found < needed or best < _AGREES:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.dataset.arrays import depth_of, masked, read_image
+from pnpdepth_cli.dataset.arrays import apply_masks, depth_of, read_image
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import (
@@ -89,7 +89,7 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
         whole = DepthFile(values=depth_of(frame.gt), reading=reading)
     else:
         whole = _read(frame.gt, scale, request)
-    masked_gt = masked(whole.values, frame.masks)
+    masked_gt = apply_masks(whole.values, frame.masks)
     values, notes = plausible_map(masked_gt, whole.reading, "gt", "--gt-scale", scale)
     gt = np.ascontiguousarray(frame.part.apply(values))
     given = _given_points(pair, gt, required=request.rules.exclude_sparse)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.plausible import scan_returns
-from pnpdepth_cli.dataset.scan_points import chosen_camera
+from pnpdepth_cli.dataset.scan_points import choose_camera
 from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.bags import (
@@ -372,7 +372,7 @@ def _write_calibration(
         say(f"calibration: {source}")
     if calibration.rectified:
         pairs = () if sensors.is_map else _some_frames(request.output)
-        calibration, note = chosen_camera(calibration, pairs, image_topic)
+        calibration, note = choose_camera(calibration, pairs, image_topic)
         say(note)
     with atomic_path(request.output / "calib.txt") as temporary:
         temporary.write_text(_calibration_text(calibration))

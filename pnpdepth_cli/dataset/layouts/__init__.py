@@ -74,7 +74,7 @@ def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
 
     Args:
         root: The data set, or a folder with several of one layout.
-        name: Its layout; None to guess.
+        name: Name of the layout; None to guess.
 
     Raises:
         InputError: The folder matches no layout, or cannot be read.

@@ -36,7 +36,7 @@ from pnpdepth_cli.io.poses import LONGEST_GAP_S, read_trajectory
 _OF_ETH3D = "dslr_calibration_undistorted"
 _ASSOCIATIONS = "associations.txt"
 _LONGEST_POSE_GAP_S = 0.1
-"""Between poses, which motion capture takes at 100 Hz."""
+"""Longest gap between poses that are interpolated; motion capture takes them at 100 Hz."""
 
 Timed = tuple[float, Path]
 
@@ -46,10 +46,11 @@ def _is_tum(root: Path) -> bool:
     return (root / _ASSOCIATIONS).is_file() or all((root / name).is_file() for name in names)
 
 
-def _of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
+def _frames_of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
     """One frame for each image with a depth image within 0.02 s; each is used once."""
     poses = root / "groundtruth.txt"
     trajectory = read_trajectory(poses) if poses.is_file() else None
+    # A file of pairs, if there is one; else each image has the depth image closest in time.
     if (root / _ASSOCIATIONS).is_file():
         pairs = _timed_files(root / _ASSOCIATIONS, 2)
     else:
@@ -64,11 +65,13 @@ def _of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
                 partner_of[image] = depth
                 taken.add(depth)
         pairs = [[images[i], depths[partner_of[i]]] for i in sorted(partner_of)]
+        # Files without a partner are spare.
         for timed, used, other in ((images, partner_of, "depth"), (depths, taken, "image")):
             why = f"has no {other} within {LONGEST_GAP_S} s that is not another's"
             for number, (_, path) in enumerate(timed):
                 if number not in used:
                     yield Unmatched(path=path, why=why, spare=True)
+    # The frames, with poses where motion capture has them.
     for (time_s, image_path), (_, depth_path) in pairs:
         pose = None if trajectory is None else trajectory.at(time_s, _LONGEST_POSE_GAP_S)
         yield FrameFiles(
@@ -115,7 +118,7 @@ def _close_pairs(images: list[Timed], depths: list[Timed]) -> list[tuple[int, in
     return [(image, depth) for gap, image, depth in sorted(pairs) if gap <= LONGEST_GAP_S]
 
 
-TUM = Layout(matches=_is_tum, frames=_of_tum, needs=("rgb.txt", "depth.txt"))
+TUM = Layout(matches=_is_tum, frames=_frames_of_tum, needs=("rgb.txt", "depth.txt"))
 
 
 def _colmap_models(root: Path) -> list[Path]:

@@ -103,24 +103,25 @@ def row(
     """Returns the layout of a data set whose parts lie in folders, with files of one stem.
 
     Args:
-        parts: By field of `FrameFiles`, or "mask…" for its masks, "folder|other folder/*.png": the
-            names of its files in the first of these folders that exists in a place. `*`, or groups
-            of a regular expression, make the stem; `**` are paths in the folder and all folders in
-            it. Instead of images, a video of the folder's name may lie there (rgb.mp4), whose
-            frame, from 0, is the number at the end of a stem. A part that ends with ? may be
-            missing; every frame has the first.
-        name: From root, place and stem to the name of a frame.
+        parts: Patterns of files by field of `FrameFiles`, or "mask…" for its masks. A pattern is
+            "folder|other folder/*.png": the first of these folders that exists in a place, and the
+            names of the files in it. `*`, or groups of a regular expression, make the stem. `**`
+            are paths in the folder and all folders in it. Instead of images, a video of the
+            folder's name may lie there (rgb.mp4). Its frame, from 0, is the number at the end of a
+            stem. A part that ends with ? may be missing; every frame has the first.
+        name: Function of root, place and stem that gives the name of a frame.
         below: Patterns of where the places are, below the root, with | between them.
-        marks: Patterns of what else a place has. By the first, or the last part's folder, a place
-            is found.
-        places: Returns the places below a root, instead of `below` and `marks`.
-        folders: From the place to the folder, of parts that lie elsewhere.
-        needs: As in `Layout`, if not the folders of the parts and `marks`.
+        marks: Patterns of what else a place has. The first, or else the last part's folder, finds
+            a place.
+        places: Function of a root that gives the places, instead of `below` and `marks`.
+        folders: Functions of a place that give the folders of parts that lie elsewhere.
+        needs: Field `needs` of `Layout`, if not the folders of the parts and `marks`.
         gaps: Whether a file of the first part without a partner is spare, not broken.
         calib: File in a place, the calibration of frames without one of their own.
-        more: From a place to a function from a frame's files to its further fields.
+        more: Function of a place. It gives a function from a frame's files to its further fields.
         fields: Fields that all frames have.
     """
+    # The parts, and what finds a place.
     kinds = {field: _FilePart(text, (folders or {}).get(field)) for field, text in parts.items()}
     wanted = [kind for kind in kinds.values() if not kind.optional]
     probe = marks[0] if marks else wanted[-1].folders[0]
@@ -138,6 +139,7 @@ def row(
 
     def frames(root: Path) -> Iterator[FrameFiles | Unmatched]:
         for place in find_places(root):
+            # What all frames of the place share, and its videos.
             fields_of = more(place)
             shared = {"calib": place / calib} if calib and (place / calib).is_file() else {}
             videos = {field: path for field, kind in kinds.items() if (path := kind.video(place))}
@@ -146,12 +148,14 @@ def row(
                 if isinstance(found, Unmatched):
                     yield found
                     continue
+                # A frame of a video has the number at the end of the stem.
                 stem, files = found
                 number = re.search(r"\d+$", stem)
                 if videos and number is None:
                     why = f"has no number of a frame of {next(iter(videos.values()))} in its name"
                     yield Unmatched(path=next(iter(files.values())), why=why)
                     continue
+                # Further fields may rule the frame out.
                 extra = fields_of(files)
                 if isinstance(extra, Unmatched):
                     yield extra
@@ -162,6 +166,7 @@ def row(
                     masks = tuple(values.pop(key) for key in files if key.startswith("mask"))
                     yield FrameFiles(name=name(root, place, stem), masks=masks, **values)
 
+    # What the layout needs, for messages.
     missing = (*(kind.folders[0] for kind in wanted), *marks)
     return Layout(
         matches=find_places,

@@ -46,7 +46,7 @@ _VALUES: dict[str, Callable[[str], Any]] = {
     "group": str,
     "protocol": lambda text: find_protocol(text).part or WHOLE,
 }
-"""What a text becomes, by column; ValueError and our errors say what is wrong."""
+"""How a column's text is read, by column. ValueError and our errors say what is wrong with it."""
 
 
 def _frames(root: Path) -> list[FrameFiles | Unmatched]:
@@ -59,6 +59,7 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
         text = read_bytes(root).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{root} is not a text file; give CSV or JSON lines") from error
+    # The frame of each line.
     rows = _csv_rows if root.suffix.lower() == ".csv" else _json_rows
     frames: dict[int, FrameFiles] = {}
     broken = []
@@ -72,7 +73,8 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
         values["gt_other_size"] = values.pop("gt_size_ok", False)
         values["part"] = values.pop("protocol", WHOLE)
         frames[number] = FrameFiles(**{"name": "", "masks": masks, **files, **values})
-    named = _named(list(frames.values()))
+    # No two frames may share a name, on file systems that ignore capitals either.
+    named = _name_frames(list(frames.values()))
     first: dict[str, FrameFiles] = {}
     for number, frame in zip(frames, named, strict=True):
         if first.setdefault(frame.name.casefold(), frame) is not frame:
@@ -126,8 +128,8 @@ def _parts(folder: Path, where: str, row: dict[str, Any]) -> tuple[dict[str, Pat
     return files, values
 
 
-def _named(frames: list[FrameFiles]) -> list[FrameFiles]:
-    """All with names: by the stem, or by the path if stems are not unique."""
+def _name_frames(frames: list[FrameFiles]) -> list[FrameFiles]:
+    """The frames, all with names: the stem, or the path if stems are not unique."""
     paths = [frame.image or frame.sparse for frame in frames if not frame.name]
     files = [path for path in paths if isinstance(path, Path)]
     names = [path.stem for path in files]

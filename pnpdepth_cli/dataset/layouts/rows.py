@@ -28,7 +28,7 @@ from pnpdepth_cli.dataset.layouts.layout import Files, Layout, row
 from pnpdepth_cli.io.file_bytes import read_bytes
 
 
-def _joined(mark: str) -> Callable[[Path, Path, str], str]:
+def _prefix_with_place(mark: str) -> Callable[[Path, Path, str], str]:
     """A function that puts the place's name and a mark before the stem, if it is not the root."""
     return lambda root, place, stem: stem if place == root else f"{place.name}{mark}{stem}"
 
@@ -38,7 +38,7 @@ def _below(root: Path, place: Path, stem: str) -> str:
 
 
 def _of_void(place: Path) -> Callable[[Files], Mapping[str, Any] | None]:
-    """None for a frame that is not of the test split, where that is listed."""
+    """Gives {} for a frame of the test split, and None for another; {} where no split is listed."""
     split = place.parent.parent / "test_image.txt"
     if place.parent.name != "data" or not split.is_file():
         return lambda files: {}
@@ -56,7 +56,7 @@ ROWS: dict[str, Layout] = {
         {"image": r"(frame-[^.]+)\.color.IMAGE", "gt": r"(frame-[^.]+)\.depth.png"},
         below="|seq-*/",
         marks=("frame-*.color.*",),
-        name=_joined("_"),
+        name=_prefix_with_place("_"),
         calib="camera-intrinsics.txt",
         gt_scale=1000.0,
     ),
@@ -68,7 +68,7 @@ ROWS: dict[str, Layout] = {
             "gt": "highres_depth/*.png?",
         },
         below="|*/|*/*/",
-        name=_joined("/"),
+        name=_prefix_with_place("/"),
         sparse_scale=1000.0,
         gt_scale=1000.0,
         gt_other_size=True,
@@ -84,7 +84,7 @@ ROWS: dict[str, Layout] = {
         {"image": "images/dslr_images/*.JPG", "gt": "ground_truth_depth/dslr_images/*.JPG"},
         below="|*/|*/*/",
         marks=("ground_truth_depth",),
-        name=_joined("/"),
+        name=_prefix_with_place("/"),
         more=_raw_truth,
     ),
     "ibims": row(
@@ -106,7 +106,7 @@ ROWS: dict[str, Layout] = {
     "kitti-object": row(
         {"image": "image_2/*.IMAGE", "sparse": "velodyne/*.bin", "calib": "calib/*.txt"},
         below="|training/|testing/",
-        name=_joined("_"),
+        name=_prefix_with_place("_"),
         camera=2,
     ),
     "pairs": row(
@@ -123,7 +123,7 @@ ROWS: dict[str, Layout] = {
         {"image": "color/*.IMAGE", "gt": "depth/*.png"},
         below="|*/|*/*/",
         marks=("intrinsic",),
-        name=_joined("/"),
+        name=_prefix_with_place("/"),
         calib="intrinsic/intrinsic_color.txt",
         gt_scale=1000.0,
         gt_other_size=True,

@@ -13,7 +13,7 @@ from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import task_of
 from pnpdepth_cli.commands.refinement.refine_image import read_requested
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, sample_pattern
-from pnpdepth_cli.dataset.arrays import masked, moved_to
+from pnpdepth_cli.dataset.arrays import apply_masks, move_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles, file_of
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
@@ -322,12 +322,12 @@ def test_all_of_void_is_taken_without_a_list_of_the_test_split(tmp_path: Path) -
 def test_ground_truth_is_moved_and_never_interpolated(tmp_path: Path) -> None:
     depth = np.array([[1, 2], [3, 0]], np.float32)
     larger = [[0, 0, 0, 0], [0, 1, 0, 2], [0, 0, 0, 0], [0, 3, 0, 0]]
-    assert moved_to(tmp_path, depth, (4, 4)).tolist() == larger
-    assert moved_to(tmp_path, depth, (1, 1)).tolist() == [[1]]
+    assert move_depth(tmp_path, depth, (4, 4)).tolist() == larger
+    assert move_depth(tmp_path, depth, (1, 1)).tolist() == [[1]]
     with pytest.raises(SizeError, match="do not show the same view"):
-        moved_to(tmp_path, depth, (4, 9))
+        move_depth(tmp_path, depth, (4, 9))
     with pytest.raises(SizeError, match="one is turned by 90°, turn it back"):
-        moved_to(tmp_path, depth[:1], (4, 2))
+        move_depth(tmp_path, depth[:1], (4, 2))
 
 
 def test_a_manifest_names_masks_and_ground_truth_of_another_size(tmp_path: Path) -> None:
@@ -339,10 +339,10 @@ def test_a_manifest_names_masks_and_ground_truth_of_another_size(tmp_path: Path)
     assert inputs.gt is not None
     assert int((inputs.gt > 0).sum()) == HEIGHT * WIDTH // 2
     np.save(tmp_path / "mask.npy", np.arange(25).reshape(5, 5, 1) % 2)
-    kept = masked(np.ones((5, 5), np.float32), (tmp_path / "mask.npy",))
+    kept = apply_masks(np.ones((5, 5), np.float32), (tmp_path / "mask.npy",))
     assert kept.ravel().tolist() == [n % 2 for n in range(25)]
     with pytest.raises(SizeError, match=r"mask\.png is 32×24 but the ground truth is 5×5"):
-        masked(np.ones((5, 5), np.float32), (tmp_path / "mask.png",))
+        apply_masks(np.ones((5, 5), np.float32), (tmp_path / "mask.png",))
 
 
 def test_the_parent_of_data_sets_of_one_layout_has_their_frames(tmp_path: Path) -> None:
