@@ -25,7 +25,6 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord, Sampling
 from pnpdepth_cli.io.fingerprint import Fingerprint
 
-HUGE = 10**400
 CAMERA = Camera(
     intrinsics=np.array([[50.1, 0, 31.3], [0, 51, 22], [0, 0, 1]]),
     distortion=(0.1, 0.2, 0.0, 0.0),
@@ -149,9 +148,7 @@ def test_numbers_of_no_camera_are_refused(change: dict[str, Any]) -> None:
         {"points": {"farthest": 4.5}},
         {"size": [64, 1.5]},
         {"size": [64]},
-        {"improved_fraction": HUGE},
         {"errors": {"used": {"before": {"mae": 1.0}}}},
-        {"loss": [HUGE]},
         {"camera": {"intrinsics": [1, 2]}},
         {"inputs": {"sparse": {"path": "s.png", "unit_scale": "x"}}},
         {"inputs": {"sparse": {"path": "s.png", "image": 7}}},
