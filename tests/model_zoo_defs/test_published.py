@@ -1,0 +1,98 @@
+"""Layouts of published checkpoints, and what the networks compute with weights of a formula.
+
+The values were computed when each network agreed with one written from its published tensors alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from model_zoo_defs.fcrn import FCRN
+from model_zoo_defs.sfmlearner import DispNet
+from model_zoo_defs.sparse2dense import SparseToDense
+from pnpdepth_cli.models.registry import find_definition
+
+LAYOUTS = {
+    "eigen": "feb3263c6005e44b",
+    "fcrn": "4e9883663fa7356d",
+    "sparse2dense": "c6604bee0864b0a6",
+    "sparse2dense-kitti": "46b2121203d11cda",
+    "sfmlearner": "e374360515857b42",
+    "sparseconv": "aac5134b74f69962",
+    "adnn": "931c11a6002ac7f6",
+    "nconv": "ec540b7fa8d53202",
+    "pncnn": "f80ccbd3e95ffde6",
+}
+"""Digests of the names and shapes of all tensors."""
+NARROW: dict[str, Callable[[], nn.Module]] = {
+    "fcrn": lambda: FCRN(8),
+    "sparse2dense": lambda: SparseToDense(50, width=16),
+    "sparse2dense-kitti": lambda: SparseToDense(18, width=16),
+    "sfmlearner": lambda: DispNet(width=4),
+}
+COMPUTED = {
+    ("fcrn", 228, 304): [0.985, 0.0, 0.838, 2.244, 1.512, 3.467],
+    ("fcrn", 97, 130): [0.0, 1.017, 1.938, 0.0, 1.469, 0.076],
+    ("sparse2dense", 100, 130): [2.507, 2.262, 0.931, -1.293, -4.631, 0.754],
+    ("sparse2dense-kitti", 100, 130): [-0.525, -2.84, -1.909, -3.253, -3.432, -2.55],
+    ("sfmlearner", 130, 420): [4.143, 2.894, 3.598, 1.077, 1.767, 3.966],
+    ("sfmlearner", 65, 71): [3.701, 4.207, 3.684, 4.282, 3.782, 4.453],
+}
+"""Six values of the output by height and width of the image, in its standard deviations."""
+
+
+def layout(state: dict[str, Tensor]) -> str:
+    lines = sorted(f"{name} {tuple(tensor.shape)}" for name, tensor in state.items())
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+
+
+def uniform(shape: torch.Size, seed: int) -> Tensor:
+    """Numbers between 0 and 1 that look random and are the same everywhere."""
+    phase = torch.arange(shape.numel(), dtype=torch.float64) * 12.9898 + seed * 78.233
+    return (phase.sin() * 43758.5453).remainder(1).reshape(shape).float()
+
+
+def by_formula(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Weights with which activations neither vanish nor grow."""
+    filled = {}
+    for seed, (name, tensor) in enumerate(sorted(state.items())):
+        values = uniform(tensor.shape, seed) - 0.5
+        fan_in = tensor[0].numel() if tensor.ndim > 1 else 1
+        if name.endswith("num_batches_tracked"):
+            values = torch.tensor(7)
+        elif tensor.ndim > 1:
+            values *= (16 / fan_in) ** 0.5
+        elif name.endswith(("weight", "running_var")):
+            values += 1
+        filled[name] = values
+    return filled
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_network_has_the_published_names_and_shapes(name: str) -> None:
+    with torch.device("meta"):
+        network = find_definition(name).build()
+    assert layout(network.state_dict()) == LAYOUTS[name]
+
+
+@pytest.mark.parametrize(("name", "height", "width"), COMPUTED)
+def test_a_network_computes_what_its_published_tensors_say(
+    name: str, height: int, width: int
+) -> None:
+    network = NARROW[name]().eval()
+    network.load_state_dict(by_formula(network.state_dict()))
+    image = uniform(torch.Size((1, 3, height, width)), 1000)
+    points = uniform(torch.Size((1, 1, height, width)), 1001)
+    sparse = torch.where(points < 0.1, 1 + 40 * points, 0.0)
+    with torch.no_grad():
+        output = network(image, sparse) if "sparse" in name else network(image)
+    rows, columns = (
+        side * torch.arange(1, n) // n for side, n in zip(output.shape[2:], (3, 4), strict=True)
+    )
+    values = (output[0, 0][rows][:, columns] / output.std()).flatten()
+    assert values.tolist() == pytest.approx(COMPUTED[name, height, width], rel=2e-3, abs=2e-3)
