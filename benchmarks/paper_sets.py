@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
-from pnpdepth_cli.camera import Camera, Extrinsics
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import NYU_PART, FramePart
-from pnpdepth_cli.sensors import FORWARD_LEFT_UP, LIDARS, as_depth_image, simulate_lidar
+from pnpdepth_cli.sensors import LIDARS, as_depth_image, simulate_lidar
 
 T = TypeVar("T")
 
@@ -24,7 +24,6 @@ ROOM_LIMIT, STREET_LIMIT = 10.0, 80.0
 """Metres beyond which rendered ground truth counts as unknown: a Kinect's range, and KITTI's."""
 
 SCANNER = LIDARS["hdl-64e"]
-SCANNER_IN_CAMERA = np.array([0.0, -0.08, -0.27])  # metres; as KITTI's stands to its left cameras
 VIEWS = 4  # of one scene; frames are rendered a scene at a time
 
 
@@ -153,11 +152,10 @@ def within(depth: Depth, limit: float) -> Depth:
 
 
 def scan_of(gt: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
-    """(H, W) one turn of the 64-line scanner on KITTI's roof; lens: fx, fy, cx, cy in pixels."""
+    """(H, W) one turn of 64 scan lines from the camera's place; lens: fx, fy, cx, cy in pixels."""
     fx, fy, cx, cy = (float(value) for value in lens)
     camera = Camera(intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    pose = Extrinsics(FORWARD_LEFT_UP, SCANNER_IN_CAMERA)
-    return as_depth_image(simulate_lidar(gt, camera, pose, SCANNER, seed))
+    return as_depth_image(simulate_lidar(gt, camera, SCANNER, seed))
 
 
 def shared(root: Path, most: int) -> list[FrameSet]:

@@ -8,32 +8,21 @@ horizontal; its frame is x forward, y left, z up.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import Camera, Extrinsics
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import NoPointsError, UsageError
-from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import pixels_of
-from pnpdepth_cli.sensors.pixels import FARTHEST_M, DropCounter, Floats, Mask, Points, pixel_index
+from pnpdepth_cli.sensors.pixels import FARTHEST_M, DropCounter, Floats, Points, pixel_index
 
 FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """The rotation from a scanner's frame to that of a camera facing the same way."""
 
 _MOST_RAYS = 1 << 23
 """Points of one revolution, so that simulating them fits into memory; 128 beams give 460,000."""
-
-_SAME_SURFACE = 1.1
-"""Neighbouring pixels whose depths are within this ratio belong to one surface."""
-
-_FIRST_M = 0.01
-"""Metres ahead of the scanner at which its beams can first hit a surface."""
-
-_LONGEST_WALK = 2048
-"""Steps; beams that cross more pixels, close to the scanner, take longer steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,15 +143,12 @@ def ideal_lidar(beams: int, top_deg: float, bottom_deg: float) -> Lidar:
     return Lidar(name=f"{beams} beams", elevations_deg=elevations, azimuth_step_deg=0.2)
 
 
-def simulate_lidar(
-    depth: NDArray[np.floating], camera: Camera, scanner: Extrinsics, sensor: Lidar, seed: int
-) -> Points:
-    """Returns sparse depth of one revolution of the scanner, in the image of the dense depth.
+def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, seed: int) -> Points:
+    """Returns sparse depth of one revolution of a scanner at the camera's place, facing its way.
 
     Args:
         depth: (H, W) metres along the camera's axis, 0 = unknown.
         camera: The camera of the image.
-        scanner: The scanner's pose (`FORWARD_LEFT_UP` and zero: at the camera).
         sensor: What the scanner measures, with its noise.
         seed: Of all noise; the same seed gives the same points.
 
@@ -171,17 +157,20 @@ def simulate_lidar(
     """
     size = (depth.shape[0], depth.shape[1])
     rng = np.random.default_rng(seed)
-    beams = sensor.directions(rng) @ scanner.rotation.T
+    beams = sensor.directions(rng) @ FORWARD_LEFT_UP.T
+    beams = beams[beams[:, 2] > 1e-9]
     drops = DropCounter()
-    z = _depth_at_first_hit(np.asarray(depth, np.float64), camera, scanner.translation, beams)
-    met = drops.keep(np.isfinite(z), "meets nothing that the camera sees")
-    distance = (z[met] - scanner.translation[2]) / beams[met, 2]
+    # a beam from the camera's centre stays in one pixel
+    beams, xy = drops.keep_seen(beams, pixels_of(camera, beams), size)
+    z = np.asarray(depth, np.float64).ravel()[pixel_index(xy, size)]
+    met = drops.keep(z > 0, "meets nothing that the camera sees")
+    distance, beams = z[met] / beams[met, 2], beams[met]
     kept = drops.keep(distance <= sensor.max_range, "out of range")
-    distance, beams = distance[kept], beams[met][kept]
+    distance, beams = distance[kept], beams[kept]
     if sensor.range_noise > 0:
         distance = distance + rng.normal(0, sensor.range_noise, len(distance))
-    points = scanner.translation + beams * distance[:, None]
-    ahead = drops.keep((distance > 0) & (points[:, 2] > 0), "noise put it behind the camera")
+    points = beams * distance[:, None]
+    ahead = drops.keep(distance > 0, "noise put it behind the camera")
     points = points[ahead]
     near = np.abs(points).max(axis=1, initial=0) < FARTHEST_M
     if not near.all():
@@ -189,8 +178,8 @@ def simulate_lidar(
     points, xy = drops.keep_seen(points, pixels_of(camera, points), size)
     if not len(xy):
         raise NoPointsError(
-            f"no beam of {sensor.name} gives a point in the image ({drops}); check depth,"
-            " intrinsics and where the scanner stands"
+            f"no beam of {sensor.name} gives a point in the image ({drops}); check depth and"
+            " intrinsics"
         )
     return Points(
         xy=xy.astype(np.float32),
@@ -198,82 +187,3 @@ def simulate_lidar(
         size=size,
         dropped=drops.dropped,
     )
-
-
-def _depth_at_first_hit(depth: Floats, camera: Camera, start: Floats, directions: Floats) -> Floats:
-    """(M,) depth z at which each beam first hits the depth map; NaN where it does not.
-
-    In the camera's frame, `start` is the scanner's origin (3,) and `directions` are (M, 3) unit
-    vectors from there. A beam is followed outwards in steps of about a pixel. One that passes
-    behind an edge has no hit, because the camera does not see what is there.
-    """
-    hit = np.full(len(directions), np.nan)
-    known = depth[depth > 0]
-    if not known.size:
-        return hit
-    near, far = max(0.999 * known.min(), start[2] + _FIRST_M), 1.001 * known.max()
-    if far <= near:
-        return hit
-    # The others never get beyond `near`.
-    forward = np.flatnonzero(directions[:, 2] > 1e-9)
-    beams = directions[forward]
-    ends = [pixels_of(camera, _reached(start, beams, z)) for z in (near, far)]
-    depths_z = 1 / np.linspace(1 / near, 1 / far, _walk_length(ends, depth) + 1)
-    before_z, before_map = near, np.full(len(forward), np.inf)
-    been_inside = np.zeros(len(forward), bool)
-    walking = np.arange(len(forward))
-    for z in depths_z:
-        ahead, inside = _map_at(depth, camera, _reached(start, beams[walking], z))
-        met = (ahead > 0) & (z >= ahead)
-        same = before_map[walking] <= _SAME_SURFACE * ahead
-        straight_on = met & (before_z <= ahead)
-        slanted = met & ~straight_on & same
-        hit[forward[walking[straight_on]]] = ahead[straight_on]
-        gap_before = before_map[walking[slanted]] - before_z
-        fraction = gap_before / (gap_before + z - ahead[slanted])
-        hit[forward[walking[slanted]]] = before_z + fraction * (z - before_z)
-        before_map[walking] = np.where(ahead > 0, ahead, np.inf)
-        before_z = z
-        left = been_inside[walking] & ~inside  # a straight line never re-enters the image
-        been_inside[walking] |= inside
-        walking = walking[~(met | left)]
-    shown = np.flatnonzero(np.isfinite(hit))
-    points = _reached(start, directions[shown], hit[shown])
-    hit[shown] = np.where(_is_on_its_surface(points, depth, camera), hit[shown], np.nan)
-    return hit
-
-
-def _is_on_its_surface(points: Floats, depth: Floats, camera: Camera) -> Mask:
-    """(M,) whether a hit's own pixel shows its surface; one that grazed an edge may not."""
-    z = points[:, 2]
-    shown, _ = _map_at(depth, camera, points)
-    same: Mask = (z <= _SAME_SURFACE * shown) & (shown <= _SAME_SURFACE * z)
-    return same
-
-
-def _walk_length(ends: Sequence[Floats], depth: Floats) -> int:
-    """The number of steps in which no beam in the image moves by more than a pixel.
-
-    `ends` are the pixels (M, 2) at which the beams begin and end.
-    """
-    size = depth.shape[0], depth.shape[1]
-    seen = in_frame(ends[0], size) | in_frame(ends[1], size)
-    if not seen.any():
-        return 1
-    moved = np.hypot(*(ends[1] - ends[0])[seen].T)
-    return int(min(max(1, np.ceil(np.nanmax(moved, initial=0))), _LONGEST_WALK))
-
-
-def _reached(start: Floats, beams: Floats, z: float | Floats) -> Floats:
-    """The points (M, 3) at which beams from a point have the depth z."""
-    return np.asarray(start + beams * ((z - start[2]) / beams[:, 2])[:, None])
-
-
-def _map_at(depth: Floats, camera: Camera, points: Floats) -> tuple[Floats, Mask]:
-    """(M,) depth map at the pixels of points, 0 outside the image; and (M,) whether inside."""
-    xy = pixels_of(camera, points)
-    size = (depth.shape[0], depth.shape[1])
-    inside = in_frame(xy, size)
-    values = np.zeros(len(points))
-    values[inside] = depth.ravel()[pixel_index(xy[inside], size)]
-    return values, inside

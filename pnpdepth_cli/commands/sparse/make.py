@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import check_size, read_scan_points
@@ -26,7 +25,6 @@ from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
 from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors import (
-    FORWARD_LEFT_UP,
     LIDARS,
     Lidar,
     Points,
@@ -206,15 +204,9 @@ def simulate_scan(
     dense, notes = _dense(depth, **reading)
     calibration = read_calibration(calib)
     notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
-    scanner = Extrinsics(FORWARD_LEFT_UP, np.zeros(3))
-    points = simulate_lidar(dense, calibration.camera, scanner, sensor, seed)
+    points = simulate_lidar(dense, calibration.camera, sensor, seed)
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{sensor.name}, seed {seed}'))}")
-    settings = {
-        "sensor": plain(asdict(sensor)),
-        "rotation": scanner.rotation.tolist(),
-        "translation": scanner.translation.tolist(),
-        "seed": seed,
-    }
+    settings = {"sensor": plain(asdict(sensor)), "seed": seed}
     read_as = FileRecord(path=str(calib), read_as=calibration.camera.source)
     inputs: dict[str, Path | FileRecord | None] = {"depth": depth, "calibration": read_as}
     return target.write("simulate", points, settings, inputs=inputs, notes=notes)
