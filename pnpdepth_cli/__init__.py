@@ -35,6 +35,11 @@ if TYPE_CHECKING:
     from pnpdepth_cli.errors import UsageError as UsageError
     from pnpdepth_cli.frames.refined import Refined as Refined
     from pnpdepth_cli.frames.refiner import Refiner as Refiner
+    from pnpdepth_cli.models.definition import Fixed as Fixed
+    from pnpdepth_cli.models.definition import ModelDefinition as ModelDefinition
+    from pnpdepth_cli.models.definition import Multiple as Multiple
+    from pnpdepth_cli.models.definition import Near as Near
+    from pnpdepth_cli.models.definition import Normalisation as Normalisation
     from pnpdepth_cli.models.network import Network as Network
     from pnpdepth_cli.points import SparsePoints as SparsePoints
     from pnpdepth_cli.settings import Settings as Settings
@@ -47,6 +52,9 @@ _HOMES = {
     "Scores": "core.metrics",
     "Split": "core.split",
     "Network": "models.network",
+    **dict.fromkeys(
+        ("ModelDefinition", "Normalisation", "Fixed", "Multiple", "Near"), "models.definition"
+    ),
     "SparsePoints": "points",
     **dict.fromkeys(
         (

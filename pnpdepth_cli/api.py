@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from numpy.typing import ArrayLike
+from torch import nn
 
 from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.core.metrics import score as score_tensors
@@ -16,15 +18,17 @@ from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.measures import DELTA_THRESHOLDS
 from pnpdepth_cli.models import network as networks
+from pnpdepth_cli.models.definition import ModelDefinition, undescribed
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
 
 
 def load_network(
-    spec: str | Path = "compact",
+    spec: str | Path | nn.Module = "compact",
     checkpoint: str | Path | None = None,
     *,
+    definition: ModelDefinition | None = None,
     device: str = "cpu",
     precision: str = "fp32",
 ) -> Network:
@@ -32,8 +36,11 @@ def load_network(
 
     Args:
         spec: A name of `pnpdepth models`, an ONNX or torch.export file, a Hugging Face folder, or a
-            Python file (which is run), as `--model` of the command line.
+            Python file (which is run), as `--model` of the command line; or a module, which is put
+            into eval mode, its parameters without gradients.
         checkpoint: Weights. None takes those of the network's definition.
+        definition: What is known of a module. None: it takes an rgb image, and its layers and what
+            its output means are decided by the first frame.
         device: torch device, such as "cpu" or "cuda:1".
         precision: "fp32", "bf16" or "fp16" for convolutions and matrix products.
 
@@ -42,11 +49,20 @@ def load_network(
         CheckpointError: The weights cannot be read or do not fit.
         DeviceError: The device cannot be used.
     """
-    for name, value in (("spec", spec), ("checkpoint", checkpoint)):
-        if not isinstance(value, str | Path) and (name == "spec" or value is not None):
-            raise UsageError(f"{name} must be a name or a path, not {type(value).__name__}")
+    if not isinstance(checkpoint, str | Path | None):
+        raise UsageError(f"checkpoint must be a path, not {type(checkpoint).__name__}")
     path = None if checkpoint is None else Path(checkpoint)
-    return networks.load_network(str(spec), path, device, precision=precision)
+    what: str | ModelDefinition
+    if isinstance(spec, nn.Module):
+        known = definition or undescribed(name=type(spec).__name__, build=lambda: spec)
+        what = replace(known, build=lambda: spec, complete=path is None)
+    elif not isinstance(spec, str | Path):
+        raise UsageError(f"spec must be a name, a path or a module, not {type(spec).__name__}")
+    elif definition is not None:
+        raise UsageError("definition is for a module; a name or a file has its own")
+    else:
+        what = str(spec)
+    return networks.load_network(what, path, device, precision=precision)
 
 
 def refine(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 import pnpdepth_cli as pnp
 from pnpdepth_cli.choices import LOSSES
@@ -39,8 +40,9 @@ def frame() -> Frame:
 
 def test_the_public_names_are_these() -> None:
     assert sorted(pnp.__all__) == [
-        "CheckpointError", "DeviceError", "DivergedError", "InputError", "LayerError", "ModelError",
-        "Network", "NoPointsError", "PnpDepthError", "Refined", "Refiner",
+        "CheckpointError", "DeviceError", "DivergedError", "Fixed", "InputError", "LayerError",
+        "ModelDefinition", "ModelError", "Multiple", "Near", "Network", "NoPointsError",
+        "Normalisation", "PnpDepthError", "Refined", "Refiner",
         "Scores", "Settings", "SizeError", "SparsePoints", "Split", "UsageError", "__version__",
         "load_network", "refine", "score",
     ]  # fmt: skip
@@ -203,10 +205,38 @@ def test_rows_that_are_no_points_of_the_image_are_counted() -> None:
     assert frame_of_arrays(rgb, good).notes == ()
 
 
+def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -> None:
+    class Bright(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.encode, self.decode = nn.Conv2d(3, 4, 3, padding=1), nn.Conv2d(4, 1, 3, padding=1)
+
+        def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+            return self.decode(self.encode(rgb).tanh()).exp()
+
+    torch.manual_seed(0)
+    module, settings = Bright(), pnp.Settings(iterations=3, lr="3%")
+    definition = pnp.ModelDefinition(
+        name="bright",
+        input_kind="rgb",
+        size=pnp.Multiple(1),
+        build=Bright,
+        layers=("encode",),
+        output_scale="scale",
+    )
+    for known in (None, definition):
+        network = pnp.load_network(module, definition=known)
+        assert network.module is module
+        refined = pnp.refine(network, *frame, settings)
+        assert refined.losses[-1] < refined.losses[0]
+    with pytest.raises(pnp.UsageError):
+        pnp.load_network("compact", definition=definition)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (lambda: pnp.load_network(3), "spec must be a name or a path, not int"),  # type: ignore[arg-type]
+        (lambda: pnp.load_network(3), "spec must be a name, a path or a module, not int"),  # type: ignore[arg-type]
         (lambda: pnp.Refiner("compact"), "must be from load_network"),  # type: ignore[arg-type]
         (lambda: pnp.Refiner([]), "must be from load_network"),
         (lambda: pnp.Settings(iterations=-1), "iterations must be a whole number >= 0"),

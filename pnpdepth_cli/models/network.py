@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -209,7 +209,7 @@ def _read_nan_gradients_as_zero(tensor: Tensor) -> None:
 
 
 def load_network(
-    spec: str,
+    spec: str | ModelDefinition,
     checkpoint: Path | None,
     device: str = "cpu",
     *,
@@ -218,7 +218,7 @@ def load_network(
     """Returns a network, built, with its weights, on its device.
 
     Args:
-        spec: A name, file or folder; see `find_definition`.
+        spec: A name, file or folder, see `find_definition`; or a definition itself.
         checkpoint: The weights; None takes those of the definition.
         device: Name of a torch device.
         precision: "fp32", "bf16" or "fp16"; see `pnpdepth_cli.models.precision`.
@@ -231,7 +231,7 @@ def load_network(
     """
     torch_device = find_device(device)
     dtype = dtype_of(precision, torch_device)
-    definition = find_definition(spec)
+    definition = find_definition(spec) if isinstance(spec, str) else spec
     path = checkpoint or definition.checkpoint
     if isinstance(definition.build, nn.Module):
         raise ModelError(
@@ -239,7 +239,8 @@ def load_network(
             " made already; a class or a function that makes it is expected, as in lambda: net"
         )
     # `build` may import modules beside the model file.
-    with wrap_user_errors(f"build of network {definition.name!r}"), importing_beside(spec):
+    beside = importing_beside(spec) if isinstance(spec, str) else nullcontext()
+    with wrap_user_errors(f"build of network {definition.name!r}"), beside:
         module = definition.build()
     if not isinstance(module, nn.Module):
         raise ModelError(f"build of {definition.name!r} gives no torch module")
