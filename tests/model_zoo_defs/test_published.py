@@ -6,7 +6,9 @@ The values were computed when each network agreed with one written from its publ
 from __future__ import annotations
 
 import hashlib
+from argparse import Namespace
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,6 +17,7 @@ from torch import Tensor, nn
 from model_zoo_defs.fcrn import FCRN
 from model_zoo_defs.sfmlearner import DispNet
 from model_zoo_defs.sparse2dense import SparseToDense
+from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.registry import find_definition
 
 LAYOUTS = {
@@ -35,6 +38,11 @@ NARROW: dict[str, Callable[[], nn.Module]] = {
     "sparse2dense-kitti": lambda: SparseToDense(18, width=16),
     "sfmlearner": lambda: DispNet(width=4),
 }
+FILES: dict[str, Callable[[dict[str, Tensor]], dict[str, object]]] = {
+    "sparse2dense-kitti": lambda s: {"args": Namespace(arch="resnet18"), "epoch": 9, "model": s},
+    "sfmlearner": lambda s: {"epoch": 200, "state_dict": s},
+}
+"""What lies in the published file around the state."""
 COMPUTED = {
     ("fcrn", 228, 304): [0.985, 0.0, 0.838, 2.244, 1.512, 3.467],
     ("fcrn", 97, 130): [0.0, 1.017, 1.938, 0.0, 1.469, 0.076],
@@ -96,3 +104,17 @@ def test_a_network_computes_what_its_published_tensors_say(
     )
     values = (output[0, 0][rows][:, columns] / output.std()).flatten()
     assert values.tolist() == pytest.approx(COMPUTED[name, height, width], rel=2e-3, abs=2e-3)
+
+
+@pytest.mark.parametrize("counters", [True, False], ids=["now", "before PyTorch 0.4.1"])
+@pytest.mark.parametrize("name", FILES)
+def test_a_published_file_loads_whole(name: str, counters: bool, tmp_path: Path) -> None:
+    with torch.device("meta"):
+        unfilled = find_definition(name).build().state_dict()
+    state = by_formula(unfilled)
+    kept = {n: t for n, t in state.items() if counters or not n.endswith("num_batches_tracked")}
+    path = tmp_path / "model_best.pth.tar"
+    torch.save(FILES[name](kept), path, _use_new_zipfile_serialization=counters)
+    own = load_network(name, path).module.state_dict()
+    assert own.keys() == state.keys()
+    assert all(torch.equal(own[name], tensor) for name, tensor in kept.items())

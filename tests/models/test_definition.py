@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Multiple,
     Near,
-    Normalisation,
     graph_definition,
 )
 from pnpdepth_cli.settings import Settings
@@ -78,7 +76,6 @@ def test_inputs_are_given_with_the_axes_of_the_graph() -> None:
 
 # ------------------------------------------------------------------ fields that make no sense
 
-NAN, INF = math.nan, math.inf
 NO_SIZES = [0, -4, 1.5, "8", True, None]
 
 
@@ -104,16 +101,6 @@ def test_a_side_or_a_multiple_that_is_no_whole_number_above_zero_is_refused(valu
         refused(lambda longest: Multiple(8, longest), longest=value)
         refused(lambda height: Near(of=8, height=height), height=value)
         refused(lambda width: Near(of=8, width=width), width=value)
-
-
-@pytest.mark.parametrize("field", ["mean", "std"])
-@pytest.mark.parametrize(
-    "values", [(1, 1), (1, 1, 1, 1), 0.5, "rgb", (1, 1, NAN), (1, INF, 1), ("1", 1, 1)]
-)
-def test_a_normalisation_holds_three_numbers_each(field: str, values: Any) -> None:
-    refused(Normalisation, **{field: values})
-    refused(Normalisation, std=(1, 0, 1))
-    assert Normalisation(mean=(-1, 0, 1)).mean == (-1, 0, 1)
 
 
 @pytest.mark.parametrize(
