@@ -128,7 +128,7 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
     own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, values))
     own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, values))
     own |= {name: values.pop(name) for name in ("source", "output")}
-    sample = parse_sample(values.pop("sample"))
+    sample = None if (text := values.pop("sample")) is None else parse_sample(text)
     request = BatchRequest(refine=options.request_of(values, sample=sample), **own)
     request = unpacked(request, say)
     if not combination.texts:

@@ -92,9 +92,7 @@ def sample(
 
     values["scale"] = values.pop("depth_scale")
     target = make.SparseTarget(output=output, overwrite=overwrite)
-    pattern = parse_sample(count)
-    assert pattern is not None
-    print_sparse(make.sample_depth(depth, target, pattern, **values))
+    print_sparse(make.sample_depth(depth, target, parse_sample(count), **values))
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")

@@ -146,31 +146,14 @@ class RefineRequest:
         }
 
 
-def count_or_fraction(text: str) -> tuple[int | None, float | None]:
-    """Returns (points, fraction) of `500` or `5%`; the other is None. Raises UsageError."""
-    try:
-        if text.strip().endswith("%"):
-            return None, float(text.strip()[:-1]) / 100
-        return int(text), None
-    except ValueError:
-        raise UsageError(f"count {text!r} is neither a number such as 500 nor 5%") from None
-
-
-def sample_pattern(kind: str, text: str | None) -> SamplePattern:
-    """Returns the pattern of this kind, with `500` points or `5%`.
-
-    Raises:
-        UsageError: There is no such pattern, or the number is none.
-    """
+def parse_sample(text: str) -> SamplePattern:
+    """Returns the pattern of `500`, `5%` or `lines:16`. Raises UsageError for any other text."""
     from pnpdepth_cli.sensors import SamplePattern
 
-    count, fraction = (None, None) if text is None else count_or_fraction(text)
-    return SamplePattern(kind=kind, count=count, fraction=fraction)
-
-
-def parse_sample(text: str | None) -> SamplePattern | None:
-    """Returns the pattern of `500`, `5%` or `lines:16`; None for None. Raises UsageError."""
-    if text is None:
-        return None
-    kind, colon, count = text.rpartition(":")
-    return sample_pattern(kind if colon else "uniform", count)
+    kind, _, number = text.rpartition(":")
+    try:
+        fraction = float(number.strip()[:-1]) / 100 if number.strip().endswith("%") else None
+        count = int(number) if fraction is None else None
+    except ValueError:
+        raise UsageError(f"count {number!r} is neither a number such as 500 nor 5%") from None
+    return SamplePattern(kind=kind or "uniform", count=count, fraction=fraction)

@@ -12,7 +12,7 @@ import pytest
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import task_of
 from pnpdepth_cli.commands.refinement.refine_image import read_requested
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, sample_pattern
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.arrays import apply_masks, move_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles, file_of
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
@@ -263,7 +263,7 @@ def test_a_line_of_tum_that_means_nothing_is_named(
 
 def inputs_of(frame: FrameFiles, root: Path) -> Frame:
     """The frame as a batch reads it; points are sampled where it has none."""
-    pattern = None if frame.sparse is not None else sample_pattern("uniform", "20")
+    pattern = None if frame.sparse is not None else parse_sample("20")
     refine = RefineRequest.from_fields(sample=pattern)
     request = BatchRequest(source=root, output=root / "out", refine=refine)
     return read_requested(task_of(request, frame).request)
