@@ -43,6 +43,7 @@ def test_an_affine_output_is_read_exactly_in_every_space(space: str) -> None:
     x = output_for(d, space, 0.3, 0.05)
     alignment = align(x, points_of(d), (space,), "affine")
     assert (alignment.scale, alignment.shift) == pytest.approx((0.3, 0.05), rel=1e-4)
+    assert alignment.outliers == 0
     assert torch.allclose(alignment.depth(x), d, rtol=1e-4)
 
 

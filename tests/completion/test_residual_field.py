@@ -21,9 +21,15 @@ def test_grey_has_no_colour_and_white_is_the_lightest() -> None:
     assert bool((lightness[1:] > lightness[:-1]).all())
 
 
-def test_pure_red_is_where_it_is_in_tables_of_cielab() -> None:
-    lab: Tensor = cielab(torch.tensor([1.0, 0.0, 0.0])[:, None, None])[:, 0, 0]
-    assert torch.allclose(lab, torch.tensor([53.24, 80.09, 67.20]), atol=0.05)
+@pytest.mark.parametrize(
+    ("rgb", "expected"),
+    [((1.0, 0.0, 0.0), (53.24, 80.09, 67.20)), ((0.02, 0.02, 0.02), (1.40, 0, 0))],
+)
+def test_colours_are_where_they_are_in_tables_of_cielab(
+    rgb: tuple[float, ...], expected: tuple[float, ...]
+) -> None:
+    lab: Tensor = cielab(torch.tensor(rgb)[:, None, None])[:, 0, 0]
+    assert torch.allclose(lab, torch.tensor(expected), atol=0.05)
 
 
 @pytest.mark.parametrize("colour", [True, False])

@@ -106,18 +106,8 @@ def test_every_format_and_layout_gives_the_same_weights(
     assert notes == []
 
 
-@pytest.mark.parametrize("prefix", ["module.", "module.module."])
-def test_a_prefix_of_every_key_is_stripped_and_reported(prefix: str, tmp_path: Path) -> None:
-    torch.save({f"{prefix}{k}": v for k, v in weights().items()}, tmp_path / "w.pth")
-    state, notes = loaded(tmp_path / "w.pth")
-    assert equal(state, weights())
-    assert notes == ["checkpoint w.pth: prefix 'module.' of every key stripped"]
-
-
-@pytest.mark.parametrize(
-    "prefix", ["_orig_mod.", "model.", "module._orig_mod.", "model._orig_mod."]
-)
-def test_prefixes_of_compiled_and_of_lightning_modules_are_stripped(
+@pytest.mark.parametrize("prefix", ["module.", "module.module.", "_orig_mod.", "model._orig_mod."])
+def test_prefixes_of_parallel_compiled_and_lightning_modules_are_stripped(
     prefix: str, tmp_path: Path
 ) -> None:
     torch.save(
