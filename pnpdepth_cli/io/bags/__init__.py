@@ -169,7 +169,7 @@ def _errors_of_rosbags() -> tuple[type[Exception], ...]:
     own = (AnyReaderError, Reader1Error, Reader2Error, SerdeError)
     libraries = (sqlite3.Error, database.apsw.Error, mcap.zstd.ZstdError, struct.error)
     parts = (OSError, EOFError, RuntimeError)
-    content = (ValueError, LookupError, TypeError, AssertionError)  # rosbags asserts
+    content = (ValueError, LookupError, OverflowError, TypeError, AssertionError)
     return (*own, *libraries, *parts, *content)
 
 
