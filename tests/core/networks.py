@@ -511,7 +511,7 @@ class UNetTail(nn.Module):
 def wrapped_network() -> nn.Module:
     wrapped = nn.DataParallel(nn.Sequential(nn.Sequential(conv(3, 4), nn.ReLU(True)), UNetTail()))
     wrapped.device_ids = []  # on the CPU, also where there are GPUs
-    return wrapped
+    return wrapped.cpu()
 
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {

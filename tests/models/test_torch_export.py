@@ -93,8 +93,10 @@ definition = {function}(
     ],
 )
 def test_a_definition_names_a_graph_of_image_sparse_depth_and_intrinsics(
-    tmp_path: Path, suffix: str, module: str, function: str
+    tmp_path: Path, suffix: str, module: str, function: str, pytestconfig: pytest.Config
 ) -> None:
+    if suffix == ".onnx" and pytestconfig.getoption("--rounding"):
+        pytest.skip("torch's exporter would trace the other roundings")
     torch.manual_seed(0)
     net, rgb = WithPointsAndCamera().eval(), torch.rand(3, 20, 30)
     given = (rgb[None], torch.zeros(1, 1, 20, 30), torch.eye(3)[None])
