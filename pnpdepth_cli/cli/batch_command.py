@@ -121,7 +121,7 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
 
     The results of a combination of varied options lie in a folder of its own.
     """
-    from pnpdepth_cli.commands.batch.find_frames import unpacked
+    from pnpdepth_cli.commands.batch.find_frames import unpack
 
     values = dict(values)
     own = options.taken(BatchRequest, values)
@@ -130,7 +130,7 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
     own |= {name: values.pop(name) for name in ("source", "output")}
     sample = None if (text := values.pop("sample")) is None else parse_sample(text)
     request = BatchRequest(refine=options.request_of(values, sample=sample), **own)
-    request = unpacked(request, say)
+    request = unpack(request, say)
     if not combination.texts:
         return request
     return replace(

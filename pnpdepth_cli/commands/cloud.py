@@ -58,7 +58,7 @@ class CloudRequest:
     """Horizontal field of view of a camera without distortion, instead of `calib`."""
     poses: Path | None = None
     """Poses of the depth files, in their order. None: those of the records, if they have any. With
-    poses, the cloud is in the world's frame."""
+    poses, the cloud is in the world's coordinates."""
     depth_scale: float | None = None
     """Integer depth files hold metres × this."""
     max_depth: float = math.inf
@@ -77,12 +77,13 @@ def write_depth_cloud(
     """Writes the cloud and its record beside it, and returns the record.
 
     Args:
-        request: What is asked for.
+        request: Depth files, camera, poses and limits of the cloud.
         show: Receives the numbers of frames that are in the cloud, and of all.
 
     Raises:
         PnpDepthError: An input or output is at fault; then nothing is written.
     """
+    # The frames, with poses where views must agree.
     _check(request)
     frames = result_frames(request.depth)
     notes: list[str] = []
@@ -92,10 +93,12 @@ def write_depth_cloud(
             f"--min-views {request.min_views} needs as many frames with poses; give a folder of"
             " results, and --poses"
         )
+    # The cloud, part by part.
     coloured = all(request.image or frame.image for frame in frames)
     parts = _parts(request, frames, poses, coloured, notes, show)
     make_folder(request.output.parent)
-    points = write_cloud(request.output, _merged(request, parts, coloured))
+    points = write_cloud(request.output, _merge(request, parts, coloured))
+    # The record beside it.
     inputs = ("depth", "output", "image", "overwrite", "calib", "poses")
     settings = {name: value for name, value in asdict(request).items() if name not in inputs}
     record = {
@@ -161,7 +164,7 @@ def _parts(
     notes: list[str],
     show: Callable[[int, int], None],
 ) -> Iterator[PointCloud]:
-    """Yields the clouds of all depth maps, in the world's frame if there are poses."""
+    """Yields the clouds of all depth maps, in the world's coordinates if there are poses."""
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def view(index: int) -> View:
@@ -185,7 +188,7 @@ def _parts(
             yield part if pose is None else part.transformed(pose)
 
 
-def _merged(
+def _merge(
     request: CloudRequest, parts: Iterator[PointCloud], coloured: bool
 ) -> Iterator[PointCloud]:
     """The parts, or their points merged. Raises InputError if there is none."""

@@ -61,7 +61,7 @@ def error_table(
         errors: Errors of a frame, or their means.
         unit: Unit of the depths.
         keys: Keys of the measures, in this order; None for all.
-        bases: What the errors are on; None for `bases_of`.
+        bases: Names of what the errors are on; None for `bases_of`.
     """
     rows = []
     for basis in bases_of(errors) if bases is None else bases:
@@ -135,15 +135,18 @@ def _stages_table(record: FrameRecord) -> Table:
         dict[str, Scores](),
         "too few points to validate the result at some",
     )
+    # Scores on the ground truth, or at validation points.
     if stages := errors.get(GT):
         rows = {name: stages[name] for name in _STAGES if name in stages}
         keys, scored = ["rmse", "mae", "mre", "delta1"], _scored_on(stages[LINEAR])
     elif stages := errors.get(VALIDATION):
         rows = {name: stages[name] for name in _STAGES if name in stages}
         scored = f"at {stages[LINEAR]['points']:,} validation points, which the rows did not get"
+    # The result is no stage of its own where one expert has all the weight.
     if sum(weight > 0 for weight in record.weights.values()) == 1 and ALONE not in rows:
         rows.pop(AFTER, None)  # the network's own
     last = [name for name in rows if name != LINEAR][-1:]
+    # A row for each stage, the last in bold.
     of_names = {"name": names[0], "fusing": names[-1], "weights": weights_text(record.weights)}
     lines = []
     for name, scores in rows.items():

@@ -147,9 +147,9 @@ def interval(
     clusters have.
 
     Args:
-        statistic: From means (…, M) of each run to (…, M).
+        statistic: Function from means (…, M) of each run to (…, M).
         runs: (N, M) each, of the same frames and measures; NaN where a frame lacks a measure.
-        clusters: Of the frames.
+        clusters: Clusters of the frames.
     """
     from scipy.special import stdtrit
 
@@ -171,12 +171,12 @@ def interval(
     reach = stdtrit(np.maximum(count - 1, 1), (1 + LEVEL) / 2)  # quantile of Student's t
     below, above = (
         np.clip(end, reach, _WIDEST * reach)
-        for end in (_corrected(reach, skew), -_corrected(-reach, skew))
+        for end in (_correct_for_skewness(reach, skew), -_correct_for_skewness(-reach, skew))
     )
     return value - below * error, value + above * error
 
 
-def _corrected(t: Floats, skew: Floats) -> Floats:
+def _correct_for_skewness(t: Floats, skew: Floats) -> Floats:
     """The values that t has in samples of this skewness over √n (Hall 1992, equation 5)."""
     slight = np.abs(skew) < 1e-6
     skew = np.where(slight, 1.0, skew)
@@ -195,7 +195,7 @@ def swap_p_values(
     Args:
         first: (N, M), NaN where a frame lacks a measure.
         other: (N, M) of the same frames.
-        clusters: Of the frames.
+        clusters: Clusters of the frames.
         permutations: The most swaps that are tried.
         seed: Random seed of the swaps.
     """

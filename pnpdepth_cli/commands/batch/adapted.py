@@ -45,9 +45,9 @@ def with_adapted_weights(
 
     Args:
         request: The batch.
-        model: Its `model_identity`.
+        model: Identity of the network, as `model_identity` gives it.
         sequence: Name of the sequence.
-        frames: Its frames.
+        frames: Frames of the sequence.
         say: Receives what was decided.
         stopped: True ends the adaptation by KeyboardInterrupt. None uses only weights that exist.
 
@@ -94,6 +94,7 @@ def _learn(
     from pnpdepth_cli.frames.resolve import resolve_definition
     from pnpdepth_cli.models.network import load_network
 
+    # The frames of the sequence, until the run is stopped.
     def check() -> None:
         if stopped():
             raise KeyboardInterrupt
@@ -103,9 +104,11 @@ def _learn(
             check()
             yield task.name, read_requested(task.request)
 
+    # Too little to learn from.
     first = read_requested(tasks[0].request)
     if why := too_little(len(tasks), first):
         return why
+    # The network learns, and is written if it is better.
     choice = request.refine.network
     network = load_network(choice.model, choice.checkpoint, choice.device)
     network = resolve_definition(network, first.registered())

@@ -175,8 +175,8 @@ def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
     """Returns the workers asked for; None for this process alone.
 
     Args:
-        device: As the user names it: one device, several with commas, or "all".
-        options: Of the cluster.
+        device: Device as the user names it: one, several with commas, or "all".
+        options: Options of the cluster.
 
     Raises:
         UsageError: The devices cannot be spread over.

@@ -76,20 +76,20 @@ class Task:
         return self.outputs["record"]
 
 
-def unpacked(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
+def unpack(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     """Returns the request with the frames of its bag as source; any other request as it is.
 
     The frames are written to OUTPUT_frames, and stay there for the next run.
     """
     if not is_bag(request.source):
         return request
-    from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, write_frames, written_before
+    from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, has_frames, write_frames
 
     folder = request.output.with_name(f"{request.output.name}_frames")
     whole = request.limit is None or request.names is not None
     between = None if whole else (0, request.every * (request.limit or 1) - 1)
     frames = FramesRequest(bag=request.source, output=folder, between=between, overwrite=True)
-    if not written_before(frames):
+    if not has_frames(frames):
         record = write_frames(frames, say)
         say(f"bag: wrote {record['frames']:,} frames to {folder}")
     return replace(request, source=folder)
@@ -103,16 +103,19 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         UsageError: If none has sparse depth.
         OutputError: If the output is a file, or holds the frames.
     """
+    # The output must be a folder beside the frames.
     source, output, sequence = request.source, request.output, request.sequence
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
     if source.is_dir() and _is_inside(source, output):
         raise _holds_the_frames(output)
+    # The frames of the layout, without results that lie in the output.
     layout, listing = list_frames(source, request.layout)
     found, unmatched = _outside(output, listing.frames)
     frames, refused = _with_own_files(found, request.refine)
     lost = [*listing.broken, *listing.spare]
     unmatched += [each for each in lost if not _is_inside(each.path, output)]
+    # There must be some, with sparse depth.
     if not found:
         first = f" ({lost[0]})" if lost else ""
         raise InputError(
@@ -124,9 +127,11 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f"{source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
         )
+    # Neighbours, of all frames.
     if sequence.accumulate:
         poses = sequence.poses or _poses_beside(source, frames)
         frames = with_neighbours(frames, sequence.accumulate, poses)
+    # The part of the frames that this run refines.
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
     if frames and not chosen:
@@ -152,8 +157,10 @@ def _poses_beside(source: Path, frames: Sequence[FrameFiles]) -> Path | None:
 def task_of(request: FrameSelection, frame: FrameFiles) -> Task:
     """Returns the frame's task; options of the user go before what the data set states."""
     reading, refine = request.reading, request.refine
-    files = _chosen(request, frame)
-    neighbours = (replace(each, files=_chosen(request, each.files)) for each in frame.neighbours)
+    files = _files_to_read(request, frame)
+    neighbours = (
+        replace(each, files=_files_to_read(request, each.files)) for each in frame.neighbours
+    )
     files = replace(files, neighbours=tuple(neighbours))
     return Task(
         request=replace(refine, files=files, reading=reading),
@@ -162,7 +169,7 @@ def task_of(request: FrameSelection, frame: FrameFiles) -> Task:
     )
 
 
-def _chosen(request: FrameSelection, frame: FrameFiles) -> FrameFiles:
+def _files_to_read(request: FrameSelection, frame: FrameFiles) -> FrameFiles:
     """The files of a frame that are read for it, without its neighbours."""
     files = replace(frame, neighbours=())
     if request.protocol is not None:

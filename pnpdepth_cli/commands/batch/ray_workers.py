@@ -80,11 +80,11 @@ class Worker:
         self, frames: Sequence[FrameFiles], settings_worked: bool
     ) -> tuple[list[FrameRecord], list[str]]:
         """Returns the records of the frames, and notes, after their results are written."""
-        from pnpdepth_cli.commands.batch.running import opened_method, refine_tasks
+        from pnpdepth_cli.commands.batch.running import open_method, refine_tasks
 
         request = self._request
         if self._method is None:
-            opened = opened_method(request, self._references, self._notes.append)
+            opened = open_method(request, self._references, self._notes.append)
             self._method = self._open.enter_context(opened)
         tasks = (task_of(request, frame) for frame in frames)
         records = list(

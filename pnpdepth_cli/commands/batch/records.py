@@ -112,8 +112,8 @@ class Records:
 
         Args:
             task: The frame.
-            inputs: What identifies its files, by part.
-            write: Writes all but the record to the paths that it is given.
+            inputs: Fingerprints of its files, by part.
+            write: Function that writes all but the record to the paths that it is given.
         """
         planned = task.outputs
         make_folder(task.record.parent, below=self.output)
@@ -162,7 +162,7 @@ def settings_of(request: RefineRequest, model: dict[str, Any], *groups: str) -> 
     The files of the frame, its calibration among them, are compared by their content elsewhere.
 
     Args:
-        request: How the frame is refined.
+        request: Request of the frame.
         model: The `model_identity` of the request.
         *groups: Names of the request's groups. None: all of them.
     """

@@ -64,7 +64,7 @@ def run_batch(
     """Refines every frame that is to be done; one that fails has a record that says why.
 
     Args:
-        request: What to refine, and how.
+        request: Frames to refine, and the method.
         listener: Receives notes and the records of frames.
         stopped: Asked before each frame; True ends the batch.
 
@@ -105,7 +105,7 @@ class _Batch:
     """The frames of a batch, and what its output folder holds of them.
 
     Args:
-        request: As of `run_batch`.
+        request: Frames to refine, and the method.
         say: Receives what was assumed, and warnings of files that are in no frame.
     """
 
@@ -232,7 +232,7 @@ class _Batch:
                     settings_worked=worked, say=listener.say, stopped=stopped,
                 )  # fmt: skip
             else:
-                with running.opened_method(request, references, listener.say) as method:
+                with running.open_method(request, references, listener.say) as method:
                     begin()
                     yield from running.refine_tasks(
                         map(self._task, wanted), method, records,

@@ -36,7 +36,7 @@ from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
 
 Item = TypeVar("Item")
 REGISTERING = 16
-"""Frames that decide together how images are moved to the points."""
+"""Number of frames that decide together how images are moved to the points."""
 
 
 def read_task(task: Task, known: dict[str, Fingerprint] | None = None) -> Frame:
@@ -92,21 +92,23 @@ def registering(frames: Sequence[Item], first: int) -> list[Item]:
 
 
 @contextmanager
-def opened_method(
+def open_method(
     request: BatchRequest, references: References, say: Callable[[str], None]
 ) -> Iterator[Method]:
     """Yields the network, resolved on the frames that decide, open for any number of frames.
 
     Args:
         request: The batch.
-        references: Of `references_of`.
+        references: Frames that decide, from `references_of`.
         say: Receives what was decided.
     """
+    # The first frame that can be read.
     task = task_of(request, references.first)
     first = read_task(task)
     for note in first.notes:
         say(f"{task.name}: {note}")
 
+    # The method, resolved on it and on others, if need be.
     def readable(frames: Iterable[FrameFiles]) -> Iterator[Frame]:
         read = (_readable(task_of(request, frame)) for frame in frames)
         return (frame for frame in read if frame is not None)
@@ -115,6 +117,7 @@ def opened_method(
     method = load_method(task.request, first, others)
     for note in method.network.notes:
         say(note)
+    # The registration that all images share.
     if first.register == "auto":
         method.share_registration(readable(references.registering))
         for (height, width), registration in method.registrations.items():
@@ -123,6 +126,7 @@ def opened_method(
                     f"images of {width}×{height} are moved to the points by"
                     f" {registration}; --registration off leaves them"
                 )
+    # What refines, for a person.
     if method.is_default:
         names = " and ".join(member.network.definition.name for member in method.members)
         say(f"method: the default, with {names}")
@@ -184,7 +188,7 @@ def refine_tasks(
         UsageError: For an error of the settings before any frame was refined.
     """
 
-    def refined(reading: Iterable[FrameInMemory]) -> Iterator[FrameInMemory]:
+    def refine(reading: Iterable[FrameInMemory]) -> Iterator[FrameInMemory]:
         worked = settings_worked
         for frame in reading:
             if stopped():
@@ -196,12 +200,12 @@ def refine_tasks(
                 raise frame.result
             yield frame
 
-    def written(frame: FrameInMemory) -> FrameRecord:
+    def write(frame: FrameInMemory) -> FrameRecord:
         return _write(frame, method, records)
 
     with (
         closing(in_order(_read, tasks, THREADS)) as reading,
-        closing(in_order(written, refined(reading), THREADS)) as done,
+        closing(in_order(write, refine(reading), THREADS)) as done,
     ):
         yield from done
 

@@ -15,7 +15,7 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.poses import poses_of_frames, read_oxts_poses
 
 KnownPose = tuple[NDArray[np.float64], str]
-"""(3, 4) from the camera's frame to the world's in metres, and where it is from."""
+"""(3, 4) from the camera's coordinates to the world's in metres, and where it is from."""
 
 
 def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:

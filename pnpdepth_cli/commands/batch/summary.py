@@ -165,9 +165,9 @@ def write_summaries(
 
     Args:
         folder: The folder of the results.
-        summary: What is said of all frames together.
+        summary: Summary of all frames.
         lines: A file opened as TEXT, with a record in each line as JSON.
-        records: Gives the same records.
+        records: Function that gives the same records.
     """
     text = json.dumps(plain(asdict(summary)), indent=2, ensure_ascii=False, allow_nan=False)
     with atomic_path(folder / JSON) as path, path.open("w", **TEXT) as file:
@@ -176,7 +176,7 @@ def write_summaries(
         for number, line in enumerate(lines):
             file.write(f"{',' if number else ''}\n    {line.removesuffix(chr(10))}")
         file.write("\n  ]\n}\n")
-    measured = list(_measured(summary.errors, summary.columns))
+    measured = list(_error_columns(summary.errors, summary.columns))
     with atomic_path(folder / CSV) as path, path.open("w", **TEXT) as file:
         header = ["name", "status", "message", "points", "held_out_points", "improved_fraction"]
         header += [name for name, *_ in measured]
@@ -184,7 +184,7 @@ def write_summaries(
         write_csv(file, header, (list(_cells(record, measured)) for record in records()))
 
 
-def _measured(
+def _error_columns(
     errors: Mapping[str, Mapping[str, Scores]], keys: Sequence[str] | None
 ) -> Iterator[tuple[str, str, str, str]]:
     """The columns of errors: heading, basis, stage and key, those of ground truth first."""

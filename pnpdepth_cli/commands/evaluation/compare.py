@@ -214,8 +214,8 @@ def _gains(
 
     Args:
         values: (runs, frames, measures), NaN where a frame lacks a measure.
-        measures: Of the last axis.
-        clusters: Of the frames.
+        measures: Measures of the last axis.
+        clusters: Clusters of the frames.
     """
     keys = [measure.key for measure in measures]
     better = np.array([measure.sign for measure in measures], np.float64)
@@ -319,6 +319,7 @@ def read_run(text: str) -> Run:
         FileFormatError: For a file without scores.
         UsageError: For `:before` of an evaluation.
     """
+    # The file, and which side of the refinement.
     path, stage = Path(text), AFTER
     start, colon, end = text.rpartition(":")
     if colon and end in (BEFORE, AFTER) and not path.exists():
@@ -329,6 +330,7 @@ def read_run(text: str) -> Run:
         name = path.resolve().parent.name
     if record.get("command") == "eval" and stage == BEFORE:
         raise UsageError(f"{path} is of eval, which has no before; leave out :before")
+    # The frames with scores, and the measures that all of them have.
     entries, measures = record.get("frames"), record.get("measures", [])
     scoring, varied = record.get("scoring"), record.get("varied", {})
     try:

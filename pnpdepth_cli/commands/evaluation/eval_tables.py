@@ -88,6 +88,7 @@ def worst(evaluation: Evaluation) -> tuple[FrameRecord, ...]:
 
 def comparison_table(comparison: Comparison) -> Table:
     """Returns a row for each measure and run; all runs but the first have gain and p."""
+    # The first run has means only, the others gains too.
     first, *others = comparison.runs
     rows: list[list[Any]] = []
     for measure in comparison.measures:
@@ -106,6 +107,7 @@ def comparison_table(comparison: Comparison) -> Table:
                 _signed(found.high_percent),
                 "–" if p is None else f"{p:.4f}",
             ])  # fmt: skip
+    # What was tested, in the title.
     swaps = "all" if comparison.exact_p_values else f"{PERMUTATIONS:,} random"
     return Table(
         title=(

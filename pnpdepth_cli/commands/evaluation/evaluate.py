@@ -99,6 +99,7 @@ class Evaluation:
 
     def to_json(self) -> dict[str, Any]:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
+        # What was scored and how, the results, and the frames.
         request = self.request
         record = {
             "command": "eval",
@@ -136,8 +137,8 @@ def evaluate(
     Frames are read one after the other, so memory does not grow with their number.
 
     Args:
-        request: What to score, and how.
-        on_frame: Called with (done, of) after each frame.
+        request: Files to score, and the protocol.
+        on_frame: Callback with (done, of) after each frame.
 
     Raises:
         PnpDepthError: For what concerns all frames, or if none could be scored.

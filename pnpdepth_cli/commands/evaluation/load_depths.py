@@ -81,6 +81,7 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
         InputError: For a file that cannot be read.
         SizeError: Where sizes differ.
     """
+    # The ground truth, in the part of the frame that the protocol keeps.
     frame = pair.frame
     scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
     assert frame.gt is not None
@@ -92,6 +93,7 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
     masked_gt = apply_masks(whole.values, frame.masks)
     values, notes = plausible_map(masked_gt, whole.reading, "gt", "--gt-scale", scale)
     gt = np.ascontiguousarray(frame.part.apply(values))
+    # The pixels that are scored.
     given = _given_points(pair, gt, required=request.rules.exclude_sparse)
     scored = _scored_mask(gt, request.rules)
     if request.rules.exclude_sparse:
@@ -101,6 +103,7 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
                 " the prediction nor the data set names one"
             )
         scored &= ~given
+    # The prediction is fitted to those.
     loaded = LoadedFrame(
         depth=np.zeros_like(gt),
         gt=np.where(scored, gt, np.float32(0)),
@@ -234,10 +237,10 @@ def _to_size(pair: FramePair, depth: Depth, size: Size, resize: str | None) -> D
             pair, "prediction", pair.prediction, depth.shape, size,
             advice="; --resize nearest or bilinear scales predictions if both show the same view",
         )  # fmt: skip
-    return depth if depth.shape == size else _resized(depth, size, resize)
+    return depth if depth.shape == size else _resize(depth, size, resize)
 
 
-def _resized(depth: Depth, size: Size, method: str | None) -> Depth:
+def _resize(depth: Depth, size: Size, method: str | None) -> Depth:
     target = size[1], size[0]
     if method == "nearest":
         return cv2.resize(depth, target, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
@@ -259,9 +262,14 @@ def _different(
 def scaled(values: Depth, gt: Depth, kind: str, scale_by: str) -> tuple[Depth, Fit | None]:
     """Returns the prediction in metres, fitted to the ground truth of its image, and the fit.
 
-    By the median: Zhou et al. 2017, monodepth2; affine: least squares in depth, Marigold (Ke et al.
-    2024); affine-disparity: least squares in 1/m, MiDaS (Ranftl et al. 2020); log: the mean of the
-    logarithm, Eigen et al. 2014. A fitted value that is not above 0 becomes unknown (0).
+    The fits are
+
+    - median: ratio of the medians (Zhou et al. 2017, monodepth2),
+    - affine: least squares in depth (Ke et al. 2024, Marigold),
+    - affine-disparity: least squares in 1/m (Ranftl et al. 2020, MiDaS),
+    - log: mean of the logarithm (Eigen et al. 2014).
+
+    A fitted value that is not above 0 becomes unknown (0).
 
     Args:
         values: (H, W) predictions of the kind, 0 where unknown.

@@ -83,12 +83,13 @@ def pair_frames(
     Args:
         prediction: A depth file, or a folder of them.
         ground_truth: The same, or a data set of a known layout, or a manifest.
-        part: What is used of the frames of a data set; None for the layout's own.
+        part: Part of each frame of a data set that is used; None for the layout's own.
 
     Raises:
         UsageError: For a file and a folder.
         InputError: For a missing path, or folders without a common name.
     """
+    # Two files, two folders, or a folder and a data set.
     for path in filter(None, (prediction, ground_truth)):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
@@ -99,6 +100,7 @@ def pair_frames(
         )
     if layout is not None and prediction.is_file():
         raise UsageError(f"{ground_truth} is a data set but {prediction} one file; give a folder")
+    # The frames with ground truth, and the predictions by name.
     notes: list[str] = []
     if prediction.is_dir():
         predictions, notes = depth_files(prediction)
@@ -107,6 +109,7 @@ def pair_frames(
     else:
         name = frame_name(prediction.stem)
         frames, predictions = [FrameFiles(name=name, gt=ground_truth)], {name: prediction}
+    # At least one name must be common to both.
     names = {frame.name for frame in frames}
     if names.isdisjoint(predictions):
         raise InputError(
@@ -118,6 +121,7 @@ def pair_frames(
             f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
             f" and are not scored: {some_names(extra)}"
         )
+    # Each frame with its prediction.
     groups = groups_by_name([frame.name for frame in frames])
     return [
         _pair(frame, predictions.get(frame.name), group)

@@ -25,16 +25,17 @@ PREDICTION, TRUTH = "prediction", "gt"
 def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
     """Returns the scores of a frame's files, or why it has none.
 
-    Beside the measures, the scores have "pixels", those scored; "known", those with ground truth;
-    "predicted", those of them with a prediction in the file; "coverage", the fraction of these;
-    "given", the scored ones at which the network was given a point; "median_ratio" of prediction
-    and ground truth; and "factor" and "shift" of a prediction that was scaled.
+    Beside the measures, the scores have numbers of pixels: "pixels" are scored, "known" have ground
+    truth, "predicted" have a prediction in the file as well, and "given" are scored pixels at which
+    the network was given a point. "coverage" is predicted over known. "median_ratio" is that of
+    prediction over ground truth. A prediction that was scaled has "factor" and "shift".
     """
     record = FrameRecord(name=pair.name, group=pair.group, unit=pair.unit, inputs=_files_of(pair))
     try:
         frame = load_frame(pair, request)
     except PnpDepthError as error:
         return replace(record, status="failed", message=str(error))
+    # How the files were read.
     inputs = record.inputs | {
         side: replace(
             record.inputs[side],
@@ -45,6 +46,7 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
         for side, reading in frame.readings.items()
     }
     record = replace(record, inputs=inputs, notes=list(frame.notes))
+    # There must be something to score.
     if not (frame.gt > 0).any():
         return replace(
             record,

@@ -33,9 +33,9 @@ from pnpdepth_cli.io.rgb import sizes_of
 from pnpdepth_cli.sensors.point_cloud import PointCloud, cloud_from_depth
 
 _START_POINTS = 200_000
-"""Of all frames together: a scene that a splatting program begins with."""
+"""Number of points of all frames together that a splatting program begins with."""
 _LONGEST_NAME = 200
-"""Bytes of a name of a record that becomes a path."""
+"""Most bytes of a record's name that becomes a path."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +91,7 @@ class ExportFrame:
             save_png(self.image_in(folder), pixels)
 
     def start_points(self, frames: int) -> PointCloud:
-        """Returns its share, as one of so many, of points to begin with, in the world's frame."""
+        """Returns the frame's share of the points to begin with, in the world's coordinates."""
         assert self.pose is not None
         rgb = image_of_size(self.image, self.size)
         parts = list(cloud_from_depth(self.valid_depth(), self.camera, rgb=rgb))
@@ -168,16 +168,19 @@ def export_results(
     export: Export = EXPORTS[to]
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
+    # The results, all in one unit.
     frames = [_frame(result, export) for result in result_frames(results)]
     units = sorted({f"{f.result.unit} (unit-scale {f.unit_scale:g})" for f in frames})
     if len(units) > 1:
         raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
+    # Files of different names, none of which is there.
     written = [*export.files(output, frames), output / f"export_{to}.json"]
     if len(set(written)) < len(written):
         raise InputError(f"{results}: two frames have one image name; refine them again")
     for path in written:
         if path.exists() and not overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another folder")
+    # The record begins, and all files are written or none.
     make_folder(output)
     record: dict[str, Any] = {
         "command": "export",
@@ -198,6 +201,7 @@ def export_results(
 
 def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     record, image, (camera, pose) = result.record, result.image, result.camera_and_pose
+    # What the program needs must be in the record.
     if camera is None or image is None:
         lacks = "its image; run this in the folder where it was refined, or refine it again"
         if camera is None:
@@ -209,6 +213,7 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
             " `batch --layout colmap` does"
         )
     assert record is not None  # it has the camera
+    # The numbers and the name of the record must be usable.
     width, height = record.size or (0, 0)
     sparse, points = record.inputs.get("sparse"), record.points
     numbers = (points.farthest if points else 0.0, (sparse and sparse.unit_scale) or 1.0)
@@ -216,6 +221,7 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     name = (sparse and sparse.image) or (PurePosixPath(result.name).parent / own).as_posix()
     if not all(1e-9 < number < 1e9 for number in numbers) or not _is_fit(name):
         raise FileFormatError(f"{result.depth}: the record beside it is damaged; refine it again")
+    # The depth must be of the whole image.
     if isinstance(image, Path) and (height, width) not in sizes_of(image):
         raise SizeError(
             f"{result.depth} is not of the size of {image}; refine the whole image"

@@ -60,12 +60,14 @@ def _needs_model(folder: Path, frames: Sequence[ExportFrame]) -> bool:
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
+    # One scale for the inverse depth of all frames.
     scale = max(np.percentile(_inverse(frame)[0], _NEAREST_PERCENTILE) for frame in frames)
     if scale == 0:
         raise InputError("no frame has a pixel with known depth; refine them again")
     masked, clipped, pixels = 0, 0, 0
     if _needs_model(folder, frames):
         _write_model(_parameters(folder).parent, frames)
+    # Depth, mask and image of each frame.
     for frame in frames:
         inverse, valid = _inverse(frame)
         codes = np.rint(inverse / scale * _CODES)
@@ -75,6 +77,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         save_png(_depth_image(folder, frame), np.minimum(codes, _CODES - 1).astype(np.uint16))
         frame.copy_image(folder)
         done()
+    # What the program reads the codes with.
     make_folder(_parameters(folder).parent)
     parameters = {"scale": float(scale), "offset": 0.0}
     write_json(_parameters(folder), {frame.stem: parameters for frame in frames})

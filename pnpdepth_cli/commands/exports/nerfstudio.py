@@ -3,7 +3,7 @@
 Nerfstudio's data conventions: camera axes are x right, y up, z backwards; principal points count
 from the image's corner, so pixel centres are at .5; a depth is PNG code × 0.001 in the unit of the
 poses. Instant-NGP reads the same file; it takes that factor from `integer_depth_scale`. Splatting
-begins with the points of start.ply, in the frame and unit of the poses.
+begins with the points of start.ply, in the coordinates and unit of the poses.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
+    # The program takes lenses of one kind.
     lenses = sorted({frame.camera.lens for frame in frames})
     if len(lenses) > 1:
         raise InputError(
@@ -52,6 +53,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
             " takes one; undistort the images first"
         )
     factor = _factor(frames)
+    # Depth, points and image of each frame.
     clipped, entries, start = 0, [], []
     for frame in frames:
         entries.append(_entry(folder, frame, factor))
@@ -67,6 +69,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         frame.copy_image(folder)
         done()
     write_cloud(folder / _START, start)
+    # Cameras and poses.
     content = {
         "camera_model": _MODELS[lenses[0]],
         "enable_depth_loading": True,
@@ -75,6 +78,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         "frames": entries,
     }
     write_json(folder / "transforms.json", content)
+    # What a person should know.
     notes = []
     if clipped:
         limit = LARGEST_CODE / _CODES_PER_UNIT / factor
@@ -96,6 +100,7 @@ def _factor(frames: Sequence[ExportFrame]) -> float:
 
 def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
     """The frame's entry in transforms.json."""
+    # The coefficients of the lens, if the program has all of them.
     camera, pose = frame.camera, frame.pose
     assert pose is not None
     names = _COEFFICIENTS[camera.lens]
@@ -105,11 +110,13 @@ def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
             f"{frame.image} has a lens that Nerfstudio does not know ({camera.lens},"
             f" {len(camera.distortion)} coefficients); undistort the images first"
         )
+    # The pose, with Nerfstudio's axes: y up, z backwards.
     depth = _relative(_depth_image(folder, frame), folder)
     matrix = np.eye(4)
     matrix[:3] = pose
     matrix[:3, 3] *= factor
     matrix[:3, 1:3] *= -1
+    # Principal points count from the image's corner.
     intrinsics = camera.intrinsics
     return {
         "file_path": _relative(frame.image_in(folder), folder),

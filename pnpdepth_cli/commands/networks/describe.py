@@ -30,16 +30,16 @@ DEFAULT_SIZE = (240, 320)
 def list_models() -> list[dict[str, Any]]:
     """Returns every network that can be named, in the order of `registry.names`.
 
-    Of each, `ModelDefinition` has most values. family: the file or entry point that defines it.
+    Most values are those of `ModelDefinition`. `family` is the file or entry point that defines it.
     """
     listed: dict[str, dict[str, Any]] = {}
     for family, definitions in families().items():
         for definition in definitions.values():
-            listed.setdefault(definition.name, _listed(definition, family))
+            listed.setdefault(definition.name, _describe(definition, family))
     return list(listed.values())
 
 
-def _listed(definition: ModelDefinition, family: str) -> dict[str, Any]:
+def _describe(definition: ModelDefinition, family: str) -> dict[str, Any]:
     # On the meta device counting needs no memory.
     with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
@@ -79,10 +79,10 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
     must come back.
 
     Args:
-        model: See `pnpdepth_cli.models.registry.find_definition`.
-        checkpoint: Its weights; None takes those of the definition.
+        model: Name or file of the network, as `pnpdepth_cli.models.registry.find_definition` takes
+            it.
+        checkpoint: Weights of the network; None takes those of the definition.
         image: The rgb image to run it on; None runs it on a synthetic frame.
-        device: Name of a torch device.
 
     Returns:
         input, output: rows and columns. range: least and greatest value of the prediction as the
@@ -168,7 +168,7 @@ def list_layers(
     Args:
         choice: The network, its weights and device.
         every: Whether all submodules are listed, not only the layers of the definition.
-        on_layer: Called after each layer with the number of layers done and of all.
+        on_layer: Callback after each layer with the number of layers done and of all.
 
     Raises:
         UsageError: The definition lists no layers.

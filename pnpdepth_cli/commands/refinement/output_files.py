@@ -53,6 +53,7 @@ def plan_outputs(request: RefineRequest) -> dict[str, Path]:
     Raises:
         OutputError: One exists and may not be replaced, or is one of the inputs.
     """
+    # Where results go without -o.
     files, options = request.files, request.outputs
     sources = [files.image, files.sparse, files.gt, request.reading.scan.calib]
     inputs = [path for path in sources if isinstance(path, Path)]
@@ -60,6 +61,7 @@ def plan_outputs(request: RefineRequest) -> dict[str, Path]:
     suffix, formats = output.suffix.lower(), " ".join(DEPTH_SUFFIXES)
     if f".{options.format}" not in DEPTH_SUFFIXES:
         raise UsageError(f"format {options.format!r} is not one of {formats}")
+    # A depth file alone, or all files in a folder.
     if suffix in DEPTH_SUFFIXES:
         if request.hold_out.uncertainty:
             raise UsageError(
@@ -72,6 +74,7 @@ def plan_outputs(request: RefineRequest) -> dict[str, Path]:
         raise OutputError(f"{output} is a file; name a folder, or a depth file ({formats})")
     else:
         outputs = outputs_in(output, inputs[0].stem, request)
+    # No input is replaced, and no result unless it may be.
     resolved = {path.resolve() for path in inputs}
     for path in outputs.values():
         if path.resolve() in resolved:

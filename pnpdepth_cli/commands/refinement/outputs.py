@@ -44,7 +44,7 @@ _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
 
 LARGEST_VIEW = 200_000
-"""Points of a 3D view."""
+"""Most points of a 3D view."""
 
 _RAY_NODES = 64
 """Nodes of the grid of directions along the longer side: exact to 1e-4 of it for strong lenses."""
@@ -53,7 +53,8 @@ _RAY_NODES = 64
 def output_scale(inputs: Frame) -> float:
     """Returns the codes per metre of an integer depth file for this frame.
 
-    The sparse depth file's own, else 256 unless the points do not fit; known before refinement.
+    They are those of the sparse depth file. Without them they are 256, unless the points do not
+    fit. They are known before refinement.
     """
     if inputs.depth_scale is not None:
         return inputs.depth_scale
@@ -99,13 +100,15 @@ def write_outputs(
         outputs: The files by kind.
         inputs: The frame as it was read.
         frame: The refined frame.
-        made_by: What the depth before and the depth after are of, for the preview.
+        made_by: Names of what made the depth before and the depth after, for the preview.
 
     Returns:
         The fraction of pixels or points whose error fell, where that was drawn, and the figures.
     """
+    # The image as it was refined.
     image = replace(inputs, register=frame.registration).registered().image
     make_folder(outputs["depth"].parent)
+    # Depth, its standard deviation, and where it is valid.
     write_depth(outputs["depth"], frame.after, scale=output_scale(inputs))
     if frame.sigma is not None and "sigma" in outputs:
         _write_sigma(outputs["sigma"], frame.sigma)
@@ -113,6 +116,7 @@ def write_outputs(
         sigma_preview(frame.sigma, outputs["sigma_preview"], inputs.unit)
     if frame.valid is not None and "valid" in outputs:
         write_mask(outputs["valid"], frame.valid)
+    # Images for a person.
     improved, figures = None, {}
     if "preview" in outputs:
         figures["preview"] = preview(
@@ -170,6 +174,7 @@ def _write_view(path: Path, image: Image | None, inputs: Frame, frame: Refined) 
     uint16, 0 = unknown, else logarithmic over `range`.
     """
     assert inputs.camera is not None
+    # Depths without the points between surfaces, on a grid of few enough pixels.
     height, width = inputs.size
     stride = _stride((height, width))
     thinned = np.s_[stride // 2 :: stride, stride // 2 :: stride]
@@ -181,6 +186,7 @@ def _write_view(path: Path, image: Image | None, inputs: Frame, frame: Refined) 
         ]
         for name, depth in maps.items()
     }
+    # Their range, and the rays of the camera.
     known = np.concatenate([depth[depth > 0] for depth in depths.values()])
     near, far = (float(known.min()), float(known.max())) if len(known) else (1.0, 1.0)
     far = max(far, near * 1.001)

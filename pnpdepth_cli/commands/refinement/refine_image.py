@@ -40,8 +40,8 @@ def refine_image(
     """Refines one frame, writes its depth and companions, and returns what was done.
 
     Args:
-        request: What is asked for.
-        on_iteration: Called with (done, of, loss) after each update of z.
+        request: Files, network and settings of the refinement.
+        on_iteration: Callback with (done, of, loss) after each update of z.
 
     Raises:
         PnpDepthError: Any of its kinds; then nothing is written.
@@ -75,9 +75,9 @@ def load_method(
     """Returns the method that is asked for; this first frame decides what networks leave open.
 
     Args:
-        request: What is asked for.
+        request: Networks and settings of the refinement.
         first: The first frame.
-        more: Gives further frames, which decide as well; called only if a network needs it.
+        more: Function of further frames, which decide as well; called only if a network needs it.
 
     Raises:
         UsageError: The request combines what cannot be combined.

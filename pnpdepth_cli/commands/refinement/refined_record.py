@@ -40,10 +40,12 @@ def record_of(
     request: RefineRequest, method: Method, frame: Frame, refined: Refined
 ) -> FrameRecord:
     """Returns the record of a refined frame, without its outputs and times."""
+    # What the frame is called, and what the networks say.
     network, files = method.network, request.files
     first = files.image_file or files.sparse
     of_networks = [note for member in method.members for note in member.network.notes]
     own_used = len(frame.own) - len(refined.held_out)
+    # Status, files, method, settings, points and errors, in the order of the record.
     return FrameRecord(
         name=files.name or (first.stem if first else ""),
         group=files.group,
@@ -155,7 +157,7 @@ def _scores(depth: DepthMap, gt: DepthMap) -> Scores:
 
 
 def _at_points(points: SparsePoints, maps: dict[str, DepthMap]) -> Stages:
-    """The errors of depth maps (H, W) at points of their frame, where they are known there."""
+    """The errors of depth maps (H, W) at points of the same image, where both are known."""
     stages: Stages = {}
     for name, depth in maps.items():
         predicted = points.sample(torch.from_numpy(depth))

@@ -67,9 +67,9 @@ def check_batch_report(request: BatchRequest, folder: Path, files: Iterable[Path
     """Raises OutputError for a folder that the report cannot or may not be written to.
 
     Args:
-        request: Of the batch.
-        folder: Of the report.
-        files: Those that the batch reads.
+        request: Request of the batch.
+        folder: Folder of the report.
+        files: Files that the batch reads.
     """
     inside, output = folder.resolve(), request.output.resolve()
     if output.is_relative_to(inside):
@@ -92,10 +92,10 @@ def write_batch_report(
     """Writes the page, and links the images of all frames.
 
     Args:
-        request: Of the batch.
-        folder: Of the report.
+        request: Request of the batch.
+        folder: Folder of the report.
         summary: The batch's summary.
-        records: Gives the records of the frames, each time anew.
+        records: Function that gives the records of the frames, each time anew.
     """
     failed, first = [], None
     for record in records():
@@ -215,6 +215,7 @@ def _head(
         notes.append(f"warning: {unmatched:,} files are in no frame; summary.json has them")
     if first is not None and basis == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
+    # The columns and tables.
     columns = _columns(basis, unit)
     errors = summary.errors
     tables = [means_table(errors, unit, summary.columns)] if first is not None else []

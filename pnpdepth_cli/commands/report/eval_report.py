@@ -44,10 +44,10 @@ def write_eval_report(
     """Writes the report; the files are read once more for its images.
 
     Args:
-        folder: Where the page and its images are written.
+        folder: Folder of the page and its images.
         evaluation: The scores.
         keys: Measures of the report; None for all.
-        on_frame: Called with (done, of) after each frame.
+        on_frame: Callback with (done, of) after each frame.
 
     Raises:
         OutputError: If the report cannot be written; then the folder is as it was before.
@@ -112,7 +112,7 @@ def _entry(
         notes.append(f"{given:,} of them were given to the network as sparse depth.")
     notes += [f"Prediction: {pair.prediction}", f"Ground truth: {pair.frame.gt}"]
     try:
-        drawn = _drawn(pair, evaluation, images)
+        drawn = _draw(pair, evaluation, images)
     except InputError as error:  # the file has changed since it was scored
         notes.append(str(error))
         drawn = {"key": None}
@@ -125,7 +125,7 @@ def _entry(
     }
 
 
-def _drawn(pair: FramePair, evaluation: Evaluation, images: Path) -> dict[str, Any]:
+def _draw(pair: FramePair, evaluation: Evaluation, images: Path) -> dict[str, Any]:
     """Writes the images of a frame and returns the page's entry of them."""
     loaded = load_frame(pair, evaluation.request)
     gt, depth = loaded.gt, loaded.depth

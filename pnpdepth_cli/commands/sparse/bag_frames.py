@@ -63,13 +63,13 @@ _FOLDERS = ("rgb", "sparse")
 _COMPARED_FRAMES = 5
 _KINDS = {"images": True, "points": False}
 _DELAYS = 20
-"""Messages of each topic whose delay is measured."""
+"""Number of messages of each topic whose delay is measured."""
 
 _SLOWEST_S = 1.0
-"""Difference of delays from which it is that of two clocks."""
+"""A larger difference of delays is that of two clocks."""
 
 _LONGEST_GAP_S = 0.5
-"""Between two poses that one is interpolated from."""
+"""Longest time between two poses that one is interpolated from."""
 
 _SAME_K = 0.05
 """Relative difference of intrinsics of one camera, which a driver may have calibrated twice."""
@@ -102,7 +102,7 @@ class FramesRequest:
             raise UsageError(f"--tolerance must be >= 0, got {self.tolerance:g}")
 
     def identity(self) -> dict[str, Any]:
-        """Returns what the record of the same frames begins with."""
+        """Returns the beginning of the record, which is the same for the same frames."""
         paths = sorted(self.bag.iterdir()) if self.bag.is_dir() else [self.bag]
         return {
             "command": "frames",
@@ -127,6 +127,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         OutputError: The folder holds files that may not be replaced.
     """
     folder, wanted, tolerance = request.output, request.topics, request.tolerance
+    # A folder of its own, or of an earlier run.
     ours = (folder / RECORD).is_file()
     if ours and not request.overwrite:
         raise OutputError(f"{folder} holds the frames of a bag; --overwrite replaces them")
@@ -134,6 +135,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         raise OutputError(f"{folder} exists, and holds no frames of a bag; name another with -o")
     with open_bag(request.bag) as bag:
         check_topics(bag, wanted, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES, *TRANSFORMS))
+        # The topics, and what their clocks differ by.
         sensors = _sensors(bag, wanted, say)
         topics = sensors.images, sensors.points
         say(f"topics: images of {topics[0]}, points of {topics[1]}")
@@ -146,6 +148,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         offset = request.clock_offset
         if offset is None:
             offset = _clock_offset(bag, topics, say)
+        # Each image with the scan nearest in time.
         for image, scan in nearest_pairs(_stream(bag, *topics, offset), tolerance):
             if scan is None:
                 lost += 1
@@ -155,7 +158,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
             if number < first or (number - first) % request.every:
                 continue
             try:
-                values, counts = _measured(sensors, scan.message)
+                values, counts = _measurement(sensors, scan.message)
             except NoPointsError:
                 lost += 1
                 continue
@@ -163,11 +166,13 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
             frames = frames if times else (frame_of(image.message), frame_of(scan.message))
             _write_frame(request.output, sensors, image, values)
             times.append(image.time_s)
+        # Calibration and poses.
         if dropped:
             say(f"points: dropped {describe_dropped(dropped)}")
         if times:
             camera = _write_calibration(request, bag, sensors, frames, say)
             poses = _write_poses(request, bag, camera, times, say)
+    # What a person should know.
     if lost:
         say(f"warning: {lost:,} images have no scan with points within {tolerance:g} s")
     if not times:
@@ -176,6 +181,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
             f" {tolerance:g} s; {_first_times(request.bag, topics)}; if their clocks differ, give"
             " --clock-offset, else a larger --tolerance"
         )
+    # The record, which is complete now.
     record = request.identity() | {
         "image_topic": topics[0],
         "points_topic": topics[1],
@@ -189,7 +195,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
     return record
 
 
-def written_before(request: FramesRequest) -> bool:
+def has_frames(request: FramesRequest) -> bool:
     """Returns whether the folder holds the frames of this bag with these options."""
     path = request.output / RECORD
     if not path.is_file():
@@ -220,9 +226,9 @@ def _stream(
 
 
 def _clock_offset(bag: Bag, topics: tuple[str, str], say: Say) -> float:
-    """Seconds to add to the times of points: 0, or a large one by which two clocks differ.
+    """Seconds to add to the times of points: 0, or the difference of two clocks if it is large.
 
-    One clock times the log of both, so that their delays from stamp to log differ by the offset,
+    One clock times the log of both topics. So their delays from stamp to log differ by the offset,
     and by how long each message took, which is less than a second.
     """
     delays: dict[str, list[float]] = {topic: [] for topic in topics}
@@ -275,23 +281,27 @@ class _Sensors:
 def _sensors(bag: Bag, wanted: Sequence[str], say: Say) -> _Sensors:
     """The topics that are named, or the only ones; clouds rather than depth images.
 
-    Of several depth images, that in the frame of the images.
+    Of several depth images, those with the images' frame_id are taken.
     """
+    # Topics of images hold colours or depth, which the first message tells.
     topics = bag.topics(IMAGES)
     found = {name: next(bag.messages([name]), None) for name in topics}
     first = {name: message[2] for name, message in found.items() if message is not None}
     counts = {name: topics[name] for name in first}
     depths = {name: count for name, count in counts.items() if is_depth(first[name], name)}
     colours = {name: count for name, count in counts.items() if name not in depths}
+    # Points are clouds, unless depth images are named or alone.
     images, clouds = topic_of(bag, wanted, colours, "images"), bag.topics(CLOUDS)
     if not depths or (clouds and not set(wanted) & set(depths)):
         points = topic_of(bag, wanted, clouds, f"points ({CLOUDS[0]} or depth images)")
         return _Sensors(images=images, points=points, is_depth=False)
+    # Depth images with the colours' frame_id are preferred.
     frame = frame_of(first[images])
     registered = {name: count for name, count in depths.items() if frame_of(first[name]) == frame}
     usable = depths if set(wanted) & set(depths) else registered or depths
     points = topic_of(bag, wanted, usable, "depth images")
     same = _Sensors(images=images, points=points, is_depth=True)
+    # They may be of a camera of their own.
     infos = camera_info_topic(bag, images), camera_info_topic(bag, points)
     of_images, of_depth = (None if info is None else camera_of_bag(bag, info) for info in infos)
     if of_depth is None or infos[0] == infos[1]:
@@ -306,7 +316,7 @@ def _sensors(bag: Bag, wanted: Sequence[str], say: Say) -> _Sensors:
     return replace(same, depth_camera=of_depth[0].camera)
 
 
-def _measured(sensors: _Sensors, message: Any) -> tuple[NDArray[np.float32], dict[str, int]]:
+def _measurement(sensors: _Sensors, message: Any) -> tuple[NDArray[np.float32], dict[str, int]]:
     """A depth image (H, W) of the images' camera, or points (N, 3); and counts of what is none.
 
     Raises:
@@ -347,10 +357,11 @@ def _write_frame(
 def _write_calibration(
     request: FramesRequest, bag: Bag, sensors: _Sensors, frames: tuple[str, str], say: Say
 ) -> str:
-    """Writes calib.txt as far as there is a calibration; returns the name of the camera's frame.
+    """Writes calib.txt as far as there is a calibration; returns the frame_id of the camera.
 
-    `frames` are the names in the headers of an image and a scan.
+    `frames` are the frame_ids in the headers of an image and a scan.
     """
+    # The camera, from camera_info.
     image_topic = sensors.images
     topic = camera_info_topic(bag, image_topic)
     of_bag = None if topic is None else camera_of_bag(bag, topic)
@@ -359,6 +370,7 @@ def _write_calibration(
         say(f"warning: {bag.path} has no camera_info of {image_topic}; refine with --calib")
         return frames[0]
     calibration, source = of_bag[0], str(topic)
+    # The pose of the scanner, from static transforms.
     scanner = None if calibration.scanner else static_pose(bag, *names)
     if scanner is not None:
         source += f", and /tf_static from {names[0]} to {names[1]}"
@@ -370,6 +382,7 @@ def _write_calibration(
         )
     else:
         say(f"calibration: {source}")
+    # Whether the images are rectified.
     if calibration.rectified:
         pairs = () if sensors.is_map else _some_frames(request.output)
         calibration, note = choose_camera(calibration, pairs, image_topic)

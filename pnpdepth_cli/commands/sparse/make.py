@@ -81,19 +81,22 @@ class SparseTarget:
         """Writes the sparse depth, its record and the overlay, and returns the record.
 
         Args:
-            command: What made the points.
+            command: Name of the command that made the points.
             points: The sparse depth.
-            settings: How it was made; kept in a PNG or CSV too.
+            settings: Settings of the command; kept in a PNG or CSV too.
             inputs: Files by their part, or what a record keeps of them.
             notes: Lines for a person.
             rgb: (H, W, 3) in 0..1, the image of the overlay. None: there is none.
         """
+        # The points, as a map or a list.
         provenance = {"command": command, "version": __version__, **settings}
         make_folder(self.output.parent)
         image = as_depth_image(points)
         write_sparse(self.output, points.xy, points.depth, image, provenance=provenance)
+        # The points over the image.
         if rgb is not None:
             overlay(rgb, points.xy, points.depth, self.overlay)
+        # The record.
         record = {
             **provenance,
             "inputs": {name: _record(part).to_json() for name, part in inputs.items() if part},
@@ -133,7 +136,7 @@ def project_scan(
     """Writes the scan's points that the camera sees, and returns the record.
 
     Args:
-        scan: Its file.
+        scan: File of the scan.
         options: The calibration.
         target: Files to write.
         image: The camera's image, which gives the size and the ground of the overlay.
@@ -163,9 +166,9 @@ def sample_depth(
     Args:
         depth: The file of the map.
         target: Files to write.
-        pattern: Which pixels are sampled.
-        image: For `features`.
-        seed: Of the pattern.
+        pattern: Pattern of the pixels that are sampled.
+        image: Image whose features `features` samples.
+        seed: Random seed of the pattern.
         **reading: Options of `read_depth`.
     """
     target.check((depth, image))
@@ -197,7 +200,7 @@ def simulate_scan(
         target: Files to write.
         sensor: The scanner.
         calib: Calibration of the camera.
-        seed: Of all noise.
+        seed: Random seed of all noise.
         **reading: Options of `read_depth`.
     """
     target.check((depth, calib))

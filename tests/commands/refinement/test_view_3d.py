@@ -22,7 +22,7 @@ from pnpdepth_cli.sensors.point_cloud import kept_pixels
 from tests.commands.frames import frame_on_disk, run
 
 
-def unpacked(text: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
+def unpack(text: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), kind).reshape(shape)
 
 
@@ -47,7 +47,7 @@ def test_depths_are_those_of_the_cloud_to_a_ten_thousandth(
     width, height = view["size"]
     near, far = view["range"]
     for name, path in (("after", "out/img_depth.npy"), ("gt", "gt.png")):
-        codes = unpacked(view["depths"][name], "<u2", (height, width)).astype(float)
+        codes = unpack(view["depths"][name], "<u2", (height, width)).astype(float)
         depth = np.where(codes > 0, near * (far / near) ** ((codes - 1) / 65534), 0)
         expected = read_depth(tmp_path / path).values
         kept = kept_pixels(expected)
@@ -74,12 +74,12 @@ def test_a_depth_that_is_the_same_everywhere_has_a_range(tmp_path: Path) -> None
     run(frame, view_3d=True, scan=scan, iterations=0, align="none")
     view = json.loads((tmp_path / "out" / "img_view.json").read_text())
     assert view["range"] == pytest.approx([2, 2.002])
-    assert {*unpacked(view["depths"]["after"], "<u2", (46 * 62,))} == {1}
+    assert {*unpack(view["depths"]["after"], "<u2", (46 * 62,))} == {1}
 
 
 def test_colours_are_those_of_the_image(view: dict[str, Any], tmp_path: Path) -> None:
     width, height = view["size"]
-    colours = unpacked(view["colours"], "|u1", (height, width, 3))
+    colours = unpack(view["colours"], "|u1", (height, width, 3))
     assert (colours == np.rint(read_rgb(tmp_path / "img.png").values * 255)).all()
 
 

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rosbags")
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest, SequenceOptions
-from pnpdepth_cli.commands.batch.find_frames import find_frames, unpacked
+from pnpdepth_cli.commands.batch.find_frames import find_frames, unpack
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.sparse import bag_frames
 from pnpdepth_cli.errors import UsageError
@@ -94,5 +94,5 @@ def test_a_batch_of_a_bag_accumulates_with_its_poses(tmp_path: Path) -> None:
         refine=RefineRequest(),
         sequence=SequenceOptions(accumulate=1),
     )
-    (neighbour,) = find_frames(unpacked(request, lambda text: None)).frames[0].neighbours
+    (neighbour,) = find_frames(unpack(request, lambda text: None)).frames[0].neighbours
     assert neighbour.poses.startswith(str(tmp_path / "out_frames/poses.txt"))
