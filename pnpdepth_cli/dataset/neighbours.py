@@ -16,7 +16,7 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart
-from pnpdepth_cli.sensors import NeighbourScan, Points, accumulated
+from pnpdepth_cli.sensors import NeighbourScan, Points, accumulate
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.motion import Keypoints, MotionEstimate, keypoints_of, motion_of_images
 
@@ -102,7 +102,7 @@ def read_neighbours(
             f"{_name_of(files)}: no motion to a neighbour can be estimated ({estimate.basis}); give"
             " --poses, or leave out --accumulate"
         )
-    return accumulated(own, scans, camera).tensors(), records, notes
+    return accumulate(own, scans, camera).tensors(), records, notes
 
 
 def _estimate(

@@ -7,7 +7,7 @@ x right, y down, whole numbers at pixel centres. Nothing here reads a file.
 from __future__ import annotations
 
 from pnpdepth_cli.sensors.accumulation import NeighbourScan as NeighbourScan
-from pnpdepth_cli.sensors.accumulation import accumulated as accumulated
+from pnpdepth_cli.sensors.accumulation import accumulate as accumulate
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP as FORWARD_LEFT_UP
 from pnpdepth_cli.sensors.lidar import LIDARS as LIDARS
 from pnpdepth_cli.sensors.lidar import Lidar as Lidar

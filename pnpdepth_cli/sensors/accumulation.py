@@ -5,11 +5,11 @@ The motion is corrected until the surfaces of both scans coincide, by point-to-p
 weights of Geman and McClure. Distances are fractions of the depth, as errors of the sensor and of
 the pose are.
 
-A moved point is kept where the measured point of the frame nearest to it, or two of the nearest
-four, have about the same depth, and where no measured point close by contradicts it. So a point of
-something that has moved since is dropped, and one that is occluded in the frame or that the frame's
-own scanner has seen through. Scans nearer in time count more: a point is dropped where a point of
-the frame, or of a scan nearer in time, lies within as many pixels as frames are between.
+A moved point is compared with the measured points of the frame. It is kept where the nearest, or
+two of the nearest four, have about the same depth, and where none close by contradicts it. So three
+kinds of points are dropped: of something that has moved since, occluded in the frame, and seen
+through by the frame's own scanner. Scans nearer in time count more. A point is dropped where a
+point of the frame, or of a scan nearer in time, lies within as many pixels as frames are between.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _TOLERANCE = 0.05
 _CONTRADICTION = 0.1
 """Difference of log depth that contradicts; chosen, as `_CLOSE`, on frames 0, 2, 4, 6 of it."""
 _CLOSE = (0.55, 0.37)
-"""Mean spacings of the measured points, across and down, within which one contradicts. Down is
+"""Distance across and down within which a measured point contradicts, in mean spacings. Down it is
 less, as the next scan line of a LiDAR lies at another depth."""
 
 _COMPARED, _AGREEING = 4, 2  # measured points beside a moved one, of which so many agree
@@ -55,7 +55,7 @@ class NeighbourScan:
     """The points of another frame of the sequence."""
 
     points: Points  # in the other frame's image
-    motion: Floats  # (3, 4) from the other camera's frame to this one's, metres
+    motion: Floats  # (3, 4) from the other camera's coordinates to this one's, metres
     apart: int  # frames between the two, at least 1
 
 
@@ -64,7 +64,7 @@ class Surface:
     """N points of a scan with the planes through their neighbours."""
 
     points: Points
-    xyz: Floats  # (N, 3) metres in the camera's frame
+    xyz: Floats  # (N, 3) metres in the camera's coordinates
     normal: Floats  # (N, 3) unit vectors
     flat: Mask  # (N,) where the neighbours lie on a plane
     tree: cKDTree  # of the pixel coordinates
@@ -76,7 +76,7 @@ class Surface:
         return float(np.sqrt(height * width / len(self.points)))
 
 
-def accumulated(points: Points, neighbours: Sequence[NeighbourScan], camera: Camera) -> Points:
+def accumulate(points: Points, neighbours: Sequence[NeighbourScan], camera: Camera) -> Points:
     """Returns the frame's own points followed by those of its neighbours that agree with them."""
     surface, result = surface_of(points, camera), points
     for apart in sorted({scan.apart for scan in neighbours}):
@@ -84,14 +84,14 @@ def accumulated(points: Points, neighbours: Sequence[NeighbourScan], camera: Cam
         for scan in neighbours:
             if scan.apart == apart:
                 xyz = unproject(camera, scan.points.xy, scan.points.depth)
-                motion = registered(surface, xyz, scan.motion, camera)
+                motion = refine_motion(surface, xyz, scan.motion, camera)
                 moved.append(xyz @ motion[:, :3].T + motion[:, 3])
-        result = _added(result, np.concatenate(moved), surface, camera, apart)
+        result = _add(result, np.concatenate(moved), surface, camera, apart)
     return result
 
 
-def _added(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: int) -> Points:
-    """The points known so far, and of these (M, 3) those that agree with measured ones."""
+def _add(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: int) -> Points:
+    """The points known so far, joined by those of `xyz` (M, 3) that agree with measured ones."""
     from scipy.spatial import cKDTree
 
     drops = DropCounter()
@@ -140,10 +140,10 @@ def surface_of(points: Points, camera: Camera) -> Surface:
     return Surface(points=points, xyz=xyz, normal=axes[:, :, 0], flat=flat, tree=tree)
 
 
-def registered(surface: Surface, xyz: Floats, motion: Floats, camera: Camera) -> Floats:
+def refine_motion(surface: Surface, xyz: Floats, motion: Floats, camera: Camera) -> Floats:
     """Returns the motion (3, 4) that puts points (M, 3) on a surface; the given one if that fails.
 
-    Points are in the other camera's frame, the motion leads from there to the surface's.
+    Points are in the other camera's coordinates. The motion leads from there to the surface's.
     """
     from scipy.spatial.transform import Rotation
 

@@ -1,4 +1,4 @@
-"""From points of a camera's frame to its pixels and back, with lens distortion.
+"""From points in a camera's coordinates to its pixels and back, with lens distortion.
 
 A lens is a name of `choices.LENSES` and its coefficients. It maps the direction of a ray, x / z and
 y / z, to the point on the image plane z = 1 where it is seen, so all lenses here cover less than
@@ -37,7 +37,7 @@ _ROWS_PIXELS = 1 << 18
 
 
 def pixels_of(camera: Camera, points: NDArray[np.floating]) -> Floats:
-    """Returns the (N, 2) pixel coordinates of (N, 3) points of the camera's frame, z > 0.
+    """Returns the (N, 2) pixel coordinates of (N, 3) points in the camera's coordinates, z > 0.
 
     NaN for a direction beyond the one where the distortion turns back on itself.
     """
@@ -48,7 +48,7 @@ def pixels_of(camera: Camera, points: NDArray[np.floating]) -> Floats:
 
 
 def rays_of(camera: Camera, xy: NDArray[np.floating]) -> Floats:
-    """Returns the directions at (N, 2) pixels, (N, 2) x / z and y / z of the camera's frame.
+    """Returns the directions at (N, 2) pixels, (N, 2) x / z and y / z of the camera's coordinates.
 
     NaN where the lens shows nothing.
     """
@@ -82,7 +82,7 @@ def _rays_of_image(
 
 
 def unproject(camera: Camera, xy: NDArray[np.floating], depth: NDArray[np.floating]) -> Floats:
-    """Returns the (N, 3) points of the camera's frame at (N, 2) pixels of (N,) depth z."""
+    """Returns the (N, 3) points in the camera's coordinates at (N, 2) pixels of (N,) depth z."""
     rays = np.column_stack([rays_of(camera, xy), np.ones(len(xy))])
     return rays * np.asarray(depth, np.float64)[:, None]
 
@@ -94,7 +94,7 @@ def distort(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
     directions from outside the field of view inside it.
     """
     with np.errstate(all="ignore"):
-        shown = _shown(plane, lens, coefficients)
+        shown = _distorted(plane, lens, coefficients)
         shown[_square(plane) > largest_radius(lens, coefficients) ** 2] = np.nan
     return shown
 
@@ -131,10 +131,10 @@ def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coeffici
     """How far (N, 2) the directions are from those shown there, by central differences."""
     columns = []
     for axis in np.eye(2) * _NEWTON_STEP:
-        ahead, behind = (_shown(plane + sign * axis, lens, coefficients) for sign in (1, -1))
+        ahead, behind = (_distorted(plane + sign * axis, lens, coefficients) for sign in (1, -1))
         columns.append((ahead - behind) / (2 * _NEWTON_STEP))
     (a, c), (b, d) = columns[0].T, columns[1].T
-    x, y = (_shown(plane, lens, coefficients) - shown).T
+    x, y = (_distorted(plane, lens, coefficients) - shown).T
     return np.asarray(np.column_stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)[:, None])
 
 
@@ -148,12 +148,12 @@ def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats
     kept = range(len(coefficients)) if model.radial is None else model.radial
     radial_only = tuple(c if i in kept else 0.0 for i, c in enumerate(coefficients))
     with np.errstate(all="ignore"):
-        seen = _shown(np.column_stack([radius, 0 * radius]), lens, radial_only)
+        seen = _distorted(np.column_stack([radius, 0 * radius]), lens, radial_only)
     return radius, seen[:, 0]
 
 
-def _shown(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
-    """The points (N, 2) as the lens model has them, also beyond where it turns back."""
+def _distorted(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
+    """The points (N, 2) by the lens model, also beyond where it turns back."""
     return LENS_MODELS[lens].shown(plane, coefficients) if len(plane) else plane.copy()
 
 
@@ -165,7 +165,7 @@ class LensModel(NamedTuple):
     """A lens distortion."""
 
     shown: Callable[[Floats, Coefficients], Floats]
-    """From (N, 2) directions and the coefficients to (N, 2) points on the image plane."""
+    """Function from (N, 2) directions and the coefficients to (N, 2) points on the image plane."""
     by_angle: bool  # whether it is defined by the angle to the axis, not by the tangent of it
     radial: tuple[int, ...] | None = None  # which coefficients are radial. None: all.
 

@@ -19,7 +19,7 @@ from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.pixels import FARTHEST_M, DropCounter, Floats, Points, pixel_index
 
 FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""The rotation from a scanner's frame to that of a camera facing the same way."""
+"""The rotation from a scanner's coordinates to those of a camera facing the same way."""
 
 _MOST_RAYS = 1 << 23
 """Points of one revolution, so that simulating them fits into memory; 128 beams give 460,000."""
@@ -57,7 +57,7 @@ class Lidar:
                 raise UsageError(f"sensor {self.name!r}: {fault}")
 
     def directions(self, rng: np.random.Generator) -> Floats:
-        """Returns (M, 3) unit vectors of one revolution in the scanner's frame, beam by beam."""
+        """Returns (M, 3) unit vectors of one revolution in scanner coordinates, by beam."""
         elevation = np.radians(self.elevations_deg)[:, None]
         steps = round(360 / self.azimuth_step_deg)
         azimuth = np.radians(np.arange(steps) * self.azimuth_step_deg)[None, :]
@@ -130,7 +130,7 @@ def ideal_lidar(beams: int, top_deg: float, bottom_deg: float) -> Lidar:
     """Returns a scanner without noise and limit of range, with a VLP-16's azimuth step.
 
     Args:
-        beams: Their number, evenly spaced in elevation.
+        beams: Number of beams, evenly spaced in elevation.
         top_deg: Elevation of the uppermost beam.
         bottom_deg: Elevation of the lowest beam, below the uppermost.
 
@@ -149,8 +149,8 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     Args:
         depth: (H, W) metres along the camera's axis, 0 = unknown.
         camera: The camera of the image.
-        sensor: What the scanner measures, with its noise.
-        seed: Of all noise; the same seed gives the same points.
+        sensor: Beams, range and noise of the scanner.
+        seed: Random seed of all noise; the same seed gives the same points.
 
     Raises:
         NoPointsError: No beam hits anything that the camera sees.

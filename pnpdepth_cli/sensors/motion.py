@@ -41,7 +41,7 @@ class MotionEstimate(NamedTuple):
     """An estimated motion, or why it is refused."""
 
     motion: Floats | None
-    """(3, 4) from the other camera's frame to this one's, metres. None: refused."""
+    """(3, 4) from the other camera's coordinates to this one's, metres. None: refused."""
     basis: str  # what supports it, or why it is refused; for a person
 
 

@@ -47,7 +47,8 @@ class DropCounter:
     def keep_seen(self, xyz: Floats, xy: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
         """Keeps the points in an image (H, W) that are the nearest of their pixel; returns them.
 
-        They are given in the camera's frame and at pixels, NaN where the lens does not show them.
+        `xyz` are in the camera's coordinates. `xy` are pixels, NaN where the lens does not show
+        them.
         """
         inside = self.keep(in_frame(xy, size), "outside the image")
         xyz, xy = xyz[inside], xy[inside]

@@ -40,14 +40,14 @@ class PointCloud(NamedTuple):
     """N points with normals and colours."""
 
     xyz: NDArray[np.float32]
-    """(N, 3) in the unit of the depth, in the camera's or the world's frame."""
+    """(N, 3) in the unit of the depth, in the camera's or the world's coordinates."""
     normals: NDArray[np.float32]
     """(N, 3) unit vectors towards the camera; 0 where a point has no two neighbours."""
     rgb: NDArray[np.uint8] | None  # (N, 3) colours 0…255. None: without colours.
 
     def transformed(self, pose: Floats) -> PointCloud:
-        """Returns the cloud in the frame that a pose, (3, 4) or (4, 4), leads to."""
-        xyz, normals = _moved(self.xyz, pose[:3]), self.normals @ pose[:3, :3].T
+        """Returns the cloud in the coordinates that a pose, (3, 4) or (4, 4), leads to."""
+        xyz, normals = _apply(self.xyz, pose[:3]), self.normals @ pose[:3, :3].T
         return PointCloud(xyz.astype(np.float32), normals.astype(np.float32), self.rgb)
 
 
@@ -59,7 +59,7 @@ def cloud_from_depth(
     keep: Mask | None = None,
     edge: float = EDGE,
 ) -> Iterator[PointCloud]:
-    """Yields the points of a depth map in the camera's frame, some rows of pixels after others.
+    """Yields the points of a depth map in the camera's coordinates, some rows of pixels at a time.
 
     Args:
         depth: (H, W), 0 = unknown.
@@ -89,7 +89,7 @@ def cloud_from_depth(
 
 
 def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None, edge: float = EDGE) -> Mask:
-    """Returns (H, W) true for the pixels that become points; arguments as of `cloud_from_depth`."""
+    """Returns (H, W) true for the pixels of which `cloud_from_depth` makes points."""
     known: Mask = (depth > 0) & np.isfinite(depth)
     if keep is not None:
         known &= keep
@@ -124,7 +124,7 @@ def depth_normals(depth: NDArray[np.float32], camera: Camera) -> Floats:
 
 
 def _points(depth: NDArray[np.float32], known: Mask, rays: Floats) -> Floats:
-    """(H, W, 3) points in the camera's frame on rays (H, W, 2), 0 where depth is unknown."""
+    """(H, W, 3) points in the camera's coordinates on rays (H, W, 2), 0 where depth is unknown."""
     z = depth[known].astype(np.float64)
     points = np.zeros((*depth.shape, 3))
     points[known] = np.column_stack([rays[known] * z[:, None], z])
@@ -160,7 +160,7 @@ class VoxelGrid:
         self._sums = np.zeros((0, 10))  # xyz, rgb, normal, count
 
     def add(self, cloud: PointCloud) -> None:
-        """Adds the points of a cloud in the grid's frame."""
+        """Adds the points of a cloud in the grid's coordinates."""
         cells = np.floor(cloud.xyz / self._side).astype(np.int64)
         rgb = np.zeros(cloud.xyz.shape) if cloud.rgb is None else cloud.rgb
         ones = np.ones((len(cloud.xyz), 1))
@@ -189,7 +189,7 @@ class View:
 
     depth: NDArray[np.float32]  # (H, W), 0 = unknown
     camera: Camera
-    pose: Floats  # (3, 4) from the camera's frame to the world's
+    pose: Floats  # (3, 4) from the camera's coordinates to the world's
 
     @functools.cached_property
     def known(self) -> NDArray[np.intp]:
@@ -198,7 +198,7 @@ class View:
 
     @functools.cached_property
     def points(self) -> NDArray[np.float32]:
-        """(H·W, 3) point of each pixel in the camera's frame, 0 where unknown."""
+        """(H·W, 3) point of each pixel in the camera's coordinates, 0 where unknown."""
         known = kept_pixels(self.depth, edge=0)
         rays = rays_of_image(self.camera, (self.depth.shape[0], self.depth.shape[1]))
         return _points(self.depth, known, rays).reshape(-1, 3).astype(np.float32)
@@ -220,10 +220,10 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
     """
     rows, columns = np.divmod(here.known, here.depth.shape[1])
     xy, depth = np.column_stack([columns, rows]), here.depth.ravel()[here.known].astype(float)
-    world = _moved(here.points[here.known], here.pose)
+    world = _apply(here.points[here.known], here.pose)
     total, count = depth.copy(), np.ones(len(depth))
     for other in others:
-        index, back = _seen_back(world, here, other)
+        index, back = _project_back(world, here, other)
         away = np.linalg.norm(pixels_of(here.camera, back) - xy[index], axis=1)
         same = np.abs(back[:, 2] - depth[index]) <= _RETURN_DEPTH * depth[index]
         agrees = (away <= _RETURN_PX) & same
@@ -234,22 +234,22 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
     return result.reshape(here.depth.shape)
 
 
-def _seen_back(world: Floats, here: View, other: View) -> tuple[NDArray[np.intp], Floats]:
-    """The points that another view has a depth of, and its own points there in this one's frame."""
-    seen = _moved_back(world, other.pose)
+def _project_back(world: Floats, here: View, other: View) -> tuple[NDArray[np.intp], Floats]:
+    """Indices of the points that another view has a depth of, and its points there."""
+    seen = _apply_inverse(world, other.pose)
     index = np.flatnonzero(seen[:, 2] > 0)
     xy = pixels_of(other.camera, seen[index])
     size = (other.depth.shape[0], other.depth.shape[1])
     inside = in_frame(xy, size)
     index, points = index[inside], other.points[pixel_index(xy[inside], size)]
-    back = _moved_back(_moved(points, other.pose), here.pose)
+    back = _apply_inverse(_apply(points, other.pose), here.pose)
     usable = (points[:, 2] > 0) & (back[:, 2] > 0)
     return index[usable], back[usable]
 
 
-def _moved(points: NDArray[np.floating], pose: Floats) -> Floats:
+def _apply(points: NDArray[np.floating], pose: Floats) -> Floats:
     return np.asarray(points @ pose[:, :3].T + pose[:, 3])
 
 
-def _moved_back(points: Floats, pose: Floats) -> Floats:
+def _apply_inverse(points: Floats, pose: Floats) -> Floats:
     return np.asarray((points - pose[:, 3]) @ pose[:, :3])

@@ -68,7 +68,7 @@ def project_velodyne(
     """Returns the scan as sparse depth in an image, in the scan's order.
 
     Args:
-        points: (N, 3) or more columns, x y z in metres in the scanner's frame.
+        points: (N, 3) or more columns, x y z in metres in the scanner's coordinates.
         camera: The camera of the image.
         scanner: The scanner's pose.
         size: (H, W) of the image.
@@ -200,7 +200,7 @@ def _ranges(first: Indices, count: Indices) -> tuple[Indices, Indices]:
 def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:
     """(M, 2) pixel coordinates at which the beam to each point passes the depth `near` (M,).
 
-    The point's own where the beam starts beyond that depth.
+    They are the point's own where the beam starts beyond that depth.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         fraction = (near - scanner[2]) / (depth - scanner[2])
@@ -212,9 +212,10 @@ def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats
 def hidden_among(xy: Floats, depth: Floats, size: tuple[int, int]) -> Mask:
     """Returns (N,) true for points that are occluded from the camera by something nearer.
 
-    Foreground is looked for within twice the median distance from a point to the nearest other.
-    With points of other views of ICL-NUIM and 7-Scenes, and a quarter of them behind a wall, a
-    fifth or less of those behind others stay, and 1 (5,000 points) to 11 % (200) of the rest go.
+    Foreground is looked for within twice the median distance from a point to the nearest other. It
+    was measured with points of other views of ICL-NUIM and 7-Scenes, a quarter of them behind a
+    wall. A fifth or less of those behind others stay, and 1 % (5,000 points) to 11 % (200) of the
+    rest go.
 
     Args:
         xy: (N, 2) pixel coordinates inside the image, at most one point per pixel.
@@ -254,14 +255,14 @@ def occluded_in_map(points: Points) -> Mask | None:
 def behind_foreground(points: Points, window_px: int, metres: float) -> Mask:
     """Returns (N,) true for points that another point of their window shows to be behind others.
 
-    That is the filter of Conti et al. 2022 as the completion papers of 2023 to 2025 use it: the
-    nearest depth in the window of each point counts for all points in that window, and points
-    farther than it by more than `metres` are behind.
+    The filter is that of Conti et al. 2022, as the completion papers of 2023 to 2025 use it. The
+    nearest depth in the window of each point counts for all points in that window. Points farther
+    than it by more than `metres` are behind.
 
     Args:
-        points: On whole pixels.
+        points: Points on whole pixels.
         window_px: Side of the square window, odd.
-        metres: How much farther points may be.
+        metres: Distance by which points may be farther.
     """
     depth, window = as_depth_image(points), np.ones((window_px, window_px), np.uint8)
     known = depth > 0

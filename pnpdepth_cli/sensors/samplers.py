@@ -71,8 +71,8 @@ def sample_points(
 
     Args:
         depth: (H, W) metres, 0 = unknown.
-        pattern: Which pixels are sampled.
-        seed: Of the pattern.
+        pattern: Pattern of the pixels that are sampled.
+        seed: Random seed of the pattern.
         image: (H, W, 3) in 0..1 of the same view, for `features`.
 
     Raises:

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.sensors import NeighbourScan, Points, accumulated
-from pnpdepth_cli.sensors.accumulation import registered, surface_of
+from pnpdepth_cli.sensors import NeighbourScan, Points, accumulate
+from pnpdepth_cli.sensors.accumulation import refine_motion, surface_of
 from pnpdepth_cli.sensors.lens import unproject
 
 SIZE = (120, 160)
@@ -49,7 +49,7 @@ def from_ahead(metres: float) -> NDArray[np.float64]:
 
 def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
     own, ahead = room((0, 0, 0), None, 0), room((0, 0, 0.5), None, 1)
-    both = accumulated(own, [NeighbourScan(points=ahead, motion=from_ahead(0.5), apart=1)], CAMERA)
+    both = accumulate(own, [NeighbourScan(points=ahead, motion=from_ahead(0.5), apart=1)], CAMERA)
     assert both.xy[: len(own)].tobytes() == own.xy.tobytes()
     assert both.depth[: len(own)].tobytes() == own.depth.tobytes()
     moved = both.xy[len(own) :]
@@ -60,7 +60,7 @@ def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
 
 def test_points_of_a_moved_object_are_dropped() -> None:
     own, later = room((0, 0, 0), -1.0, 0), room((0, 0, 0), 1.0, 1)
-    both = accumulated(own, [NeighbourScan(points=later, motion=STILL, apart=1)], CAMERA)
+    both = accumulate(own, [NeighbourScan(points=later, motion=STILL, apart=1)], CAMERA)
     moved, depth = both.xy[len(own) :], both.depth[len(own) :]
     on_old_box = (np.abs((moved[:, 0] - 79.5) / 150 * 4 - 1) < 0.4) & (
         np.abs((moved[:, 1] - 59.5) / 150 * 4) < 0.4
@@ -74,7 +74,7 @@ def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
     own, one, two = (room((0, 0, 0), None, seed) for seed in range(3))
     near = NeighbourScan(points=one, motion=STILL, apart=1)
     far = NeighbourScan(points=two, motion=STILL, apart=2)
-    with_near, with_both = (accumulated(own, each, CAMERA) for each in ([near], [far, near]))
+    with_near, with_both = (accumulate(own, each, CAMERA) for each in ([near], [far, near]))
     kept = with_both.xy[: len(with_near)]
     assert kept.tobytes() == with_near.xy.tobytes()
     more = with_both.xy[len(with_near) :]
@@ -85,6 +85,6 @@ def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
 def test_an_inaccurate_motion_is_corrected_by_the_surfaces() -> None:
     own, ahead = room((0, 0, 0), -1.0, 0), room((0, 0, 0.5), -1.0, 1)
     xyz = unproject(CAMERA, ahead.xy, ahead.depth)
-    motion = registered(surface_of(own, CAMERA), xyz, from_ahead(0.6), CAMERA)
+    motion = refine_motion(surface_of(own, CAMERA), xyz, from_ahead(0.6), CAMERA)
     np.testing.assert_allclose(motion[:, :3], np.eye(3), atol=2e-3)
     assert abs(motion[2, 3] - 0.5) < 0.01
