@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_FRAME, Camera, Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
-from pnpdepth_cli.io.extrinsics import checked_pose, numbers_in, pose_of_matrix
+from pnpdepth_cli.io.extrinsics import check_pose, numbers_in, pose_of_matrix
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_text_size, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.json_file import read_json
@@ -78,11 +78,12 @@ class Calibration:
     camera: Camera
     scanner: Extrinsics | None = None  # None: the file does not state its pose
     rectification: Extrinsics = SAME_FRAME
-    """Pose, in the camera's frame, of the camera that poses of the scanner refer to: of KITTI's
-    unrectified camera 0 in a rectified one."""
+    """Pose, in the camera's coordinates, of the camera that poses of the scanner refer to, such as
+    KITTI's unrectified camera 0 in a rectified one."""
     rectified: Mapping[str, tuple[Camera, Extrinsics]] = field(default_factory=dict)
-    """Cameras of rectified images by what they are made of, where `camera` is of raw images, each
-    with the pose of `camera` in its frame."""
+    """Cameras of rectified images by their source, where `camera` is of raw images.
+
+    Each has the pose of `camera` in its coordinates."""
 
 
 def read_calibration(path: Path, camera: int | None = None) -> Calibration:
@@ -128,7 +129,7 @@ def read_rigid_motion(path: Path) -> Extrinsics:
     """Returns (rotation (3, 3), translation (3,) metres) of KITTI's raw files with R and T."""
     fields = _fields(path, _text(path))
     rotation = _matrix(path, fields, "R", (3, 3))
-    return checked_pose(path, "R", rotation, _matrix(path, fields, "T", (3,)))
+    return check_pose(path, "R", rotation, _matrix(path, fields, "T", (3,)))
 
 
 def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
@@ -195,10 +196,12 @@ def _kitti(path: Path, fields: Mapping[str, Any], camera: int | None) -> Calibra
     turn = "R_rect" if "R_rect" in fields else "R0_rect"
     velodyne = "Tr_velo_cam" if "Tr_velo_cam" in fields else "Tr_velo_to_cam"
     scanner = _matrix(path, fields, "Tr" if odometry else velodyne, (3, 4))
-    pose = checked_pose(path, "rotation of the scanner", scanner[:, :3], scanner[:, 3])
+    pose = check_pose(path, "rotation of the scanner", scanner[:, :3], scanner[:, 3])
     rectify = np.eye(3) if odometry else _matrix(path, fields, turn, (3, 3))
     projection = _matrix(path, fields, f"P{number}", (3, 4))
-    return _rectified(path, projection, rectify, pose, f"KITTI calibration, camera {number}")
+    return _rectified_calibration(
+        path, projection, rectify, pose, f"KITTI calibration, camera {number}"
+    )
 
 
 def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
@@ -220,7 +223,7 @@ def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
     numbers = [int(name[-2:]) for name in fields if re.fullmatch(r"P_rect_\d\d", name)]
     number = _camera(cameras, 0 if is_360 and camera is None else camera, numbers)
     # The development kit of the raw data rotates every camera by camera 0's rectification.
-    return _rectified(
+    return _rectified_calibration(
         cameras,
         _matrix(cameras, fields, f"P_rect_{number:02}", (3, 4)),
         _matrix(cameras, fields, "R_rect_00", (3, 3)),
@@ -241,7 +244,7 @@ def _bare_intrinsics(path: Path, text: str) -> dict[str, Any]:
     return {"K": text}
 
 
-def _rectified(
+def _rectified_calibration(
     path: Path,
     projection: Floats,
     rectify: Floats,
@@ -249,10 +252,10 @@ def _rectified(
     source: str,
     size: tuple[int, int] | None = None,
 ) -> Calibration:
-    """P · R_rect · [R t], with the camera's own offset in P's last column as a translation."""
-    intrinsics = _checked_intrinsics(path, projection[:, :3])
+    """The calibration P · R_rect · [R t]; the last column of P gives the camera's own offset."""
+    intrinsics = _check_intrinsics(path, projection[:, :3])
     offset = np.asarray(np.linalg.solve(intrinsics, projection[:, 3]), np.float64)
-    rectify_pose = checked_pose(path, "rectification", rectify, offset)
+    rectify_pose = check_pose(path, "rectification", rectify, offset)
     return Calibration(
         camera=Camera(intrinsics=intrinsics, size=size, source=source),
         scanner=None if scanner is None else rectify_pose @ scanner,
@@ -283,7 +286,7 @@ def _single(path: Path, fields: Mapping[str, Any], camera: int | None, source: s
     if camera is not None:
         raise UsageError(f"{path} describes one camera; leave out --camera {camera}")
     matrix = next((name for name in _MATRICES if name in fields), "K")
-    intrinsics = _checked_intrinsics(path, _matrix(path, fields, matrix, (3, 3)))
+    intrinsics = _check_intrinsics(path, _matrix(path, fields, matrix, (3, 3)))
     scanner = _pose(path, fields)
     lens, distortion = _lens(path, fields)
     size = _size(path, fields)
@@ -329,7 +332,7 @@ def _pose(path: Path, fields: Mapping[str, Any]) -> Extrinsics | None:
         missing = "t" if present == ["R"] else "R"
         raise FileFormatError(f"{path} has {present[0]} but no {missing}; give both")
     rotation = _matrix(path, fields, "R", (3, 3))
-    return checked_pose(path, "R", rotation, _matrix(path, fields, "t", (3,)))
+    return check_pose(path, "R", rotation, _matrix(path, fields, "t", (3,)))
 
 
 def _size(path: Path, fields: Mapping[str, Any]) -> tuple[int, int] | None:
@@ -409,7 +412,7 @@ def _camera(path: Path, wanted: int | None, present: list[int]) -> int:
     return number
 
 
-def _checked_intrinsics(path: Path, matrix: Floats) -> Floats:
+def _check_intrinsics(path: Path, matrix: Floats) -> Floats:
     bottom = np.array_equal(matrix[2], [0, 0, 1])
     if not (bottom and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[1, 0] == 0):
         raise FileFormatError(

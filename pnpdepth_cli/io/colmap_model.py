@@ -140,15 +140,18 @@ def read_model(path: Path) -> ColmapModel:
 @functools.lru_cache(maxsize=2)
 def _read(states: tuple[tuple[Path, int, int], ...]) -> ColmapModel:
     """The model in files of this size and time; kept for other images of a batch."""
+    # The readers, of binary files or of text.
     camera_file, image_file, point_file = (state[0] for state in states)
     if camera_file.suffix == ".bin":
         read_cameras, read_images, read_points = _binary_cameras, _binary_images, _binary_points
     else:
         read_cameras, read_images, read_points = _text_cameras, _text_images, _text_points
+    # The cameras.
     cameras = {
         number: _camera(camera_file, name, size, parameters)
         for number, name, size, parameters in read_cameras(camera_file)
     }
+    # The images, each of a name of its own and a camera that is there.
     images: dict[str, ColmapImage] = {}
     for name, camera, pose, points in read_images(image_file):
         if name in images:

@@ -97,7 +97,7 @@ def grey_of(rgb: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray(image @ weights, dtype=np.float32)
 
 
-def dimmed(grey: NDArray[np.float32]) -> Pixels:
+def dim(grey: NDArray[np.float32]) -> Pixels:
     """Returns an (H, W, 3) dark grey image, on which coloured points stand out."""
     levels = np.rint(20 + 115 * grey).astype(np.uint8)
     return np.repeat(levels[:, :, None], 3, axis=2)

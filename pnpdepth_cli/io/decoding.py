@@ -75,7 +75,7 @@ def check_exif(image: PIL.Image.Image) -> None:
 
 
 @contextmanager
-def opened_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
+def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
     """Yields the image of a file, not yet decoded; errors inside the block become ours.
 
     The checksums of a PNG and the size that the header claims are checked. The kind is "PNG",

@@ -187,7 +187,7 @@ def describe_range(
     An assumed scale adds the option that changes it and, where KITTI's scale gives near depths
     only, their range if they are millimetres. Unknown depth is 0 or not finite.
     """
-    known = _known(depth)
+    known = _known_values(depth)
     source, _, assumed = reading
     hint = f"; {option} to change" if assumed else ""
     if known.size == 0:
@@ -243,6 +243,6 @@ def metres(value: float) -> str:
     return f"{value:,.1f}" if value >= 0.95 else f"{value:.2g}"
 
 
-def _known(depth: NDArray[Any]) -> NDArray[np.float64]:
+def _known_values(depth: NDArray[Any]) -> NDArray[np.float64]:
     values = np.asarray(depth, dtype=np.float64)
     return values[np.isfinite(values) & (values > 0)]

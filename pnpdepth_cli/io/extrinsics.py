@@ -1,4 +1,4 @@
-"""The pose of a scanner in its camera's frame, as a matrix, a quaternion or a ROS transform.
+"""The pose of a scanner in its camera's coordinates, as a matrix, a quaternion or a ROS transform.
 
 x_camera = rotation · x_scanner + translation. A file holds one of
 
@@ -32,7 +32,7 @@ _FARTHEST_M = 1e6
 
 
 def read_extrinsics(path: Path) -> Extrinsics:
-    """Returns the pose of the scanner in the camera's frame.
+    """Returns the pose of the scanner in the camera's coordinates.
 
     Raises:
         FileFormatError: The file holds no pose.
@@ -77,7 +77,7 @@ def pose_of_matrix(path: Path, name: str, numbers: list[float]) -> Extrinsics:
     matrix = np.reshape(numbers, (-1, 4))
     if len(numbers) == 16 and not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise FileFormatError(f"{path}: the last row of {name} is not 0 0 0 1; correct it")
-    return checked_pose(path, name, matrix[:3, :3], matrix[:3, 3])
+    return check_pose(path, name, matrix[:3, :3], matrix[:3, 3])
 
 
 def pose_of_quaternion(path: Path, translation: list[float], xyzw: list[float]) -> Extrinsics:
@@ -88,10 +88,10 @@ def pose_of_quaternion(path: Path, translation: list[float], xyzw: list[float]) 
     if len(translation) != 3:
         raise FileFormatError(f"{path}: a translation has 3 numbers, not {len(translation)}")
     rotation = rotation_of(np.roll(xyzw, 1))
-    return checked_pose(path, "the quaternion", rotation, np.array(translation))
+    return check_pose(path, "the quaternion", rotation, np.array(translation))
 
 
-def checked_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> Extrinsics:
+def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> Extrinsics:
     """Returns the pose. Raises FileFormatError if it holds no rotation, or is of no sensor."""
     if not is_rotation(rotation):
         off = np.abs(rotation @ rotation.T - np.eye(3)).max()
@@ -142,7 +142,7 @@ def _pose_of_fields(path: Path, fields: Any) -> Extrinsics:
             )
             if len(numbers) == 9 and len(translation) == 3:
                 rotation = np.reshape(numbers, (3, 3))
-                return checked_pose(path, "rotation", rotation, np.array(translation))
+                return check_pose(path, "rotation", rotation, np.array(translation))
             return pose_of_quaternion(path, translation, numbers)
         name = next((n for n in fields if str(n).startswith(("T_", "matrix"))), None)
         if name is not None:

@@ -1,4 +1,4 @@
-"""A white figure with titled panels and a colour bar: the frame of every PNG for people."""
+"""A white figure with titled panels and a colour bar: the layout of every PNG for people."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.colours import DepthScale, Pixels, dimmed, signed_bar
+from pnpdepth_cli.io.colours import DepthScale, Pixels, dim, signed_bar
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -74,11 +74,11 @@ def draw_discs(
     factor: float,
     order: NDArray[np.intp],
 ) -> Pixels:
-    """Returns the dimmed grey image (H, W), enlarged by `factor`, with a disc at each of N points.
+    """Returns the dark grey image (H, W), enlarged by `factor`, with a disc at each of N points.
 
     Pixel coordinates (N, 2) are those of the image; `order` has the topmost point last.
     """
-    canvas = np.ascontiguousarray(resized(dimmed(grey), factor, smooth=True))
+    canvas = np.ascontiguousarray(resized(dim(grey), factor, smooth=True))
     spacing = math.sqrt(canvas.shape[0] * canvas.shape[1] / max(len(xy), 1))
     radius = min(max(0.24 * spacing, 1.4), 6.0)
     centres = (np.asarray(xy, dtype=np.float64) + 0.5) * factor - 0.5

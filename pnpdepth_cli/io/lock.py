@@ -21,11 +21,11 @@ LOCKS = ".batch*.lock"
 """Pattern of the names of all lock files."""
 _WHOLE = ".batch.lock"
 _TRIED_S = 0.2
-"""Another process that looks for running shards may hold a lock for a moment."""
+"""Longest wait for a lock; another process that looks for shards holds it for a moment."""
 
 
 @contextmanager
-def locked_folder(
+def lock_folder(
     folder: Path,
     shard: tuple[int, int] | None = None,
     when_alone: Callable[[], None] = lambda: None,
@@ -33,17 +33,17 @@ def locked_folder(
     """Holds the lock of a run or of a shard until the end of the block.
 
     Args:
-        shard: (i, n) for one of n that run at once; None for all frames.
-        when_alone: Called first in a run that is no shard.
+        shard: Number i of n that run at once, (i, n); None for all frames.
+        when_alone: Callback at the beginning of a run that is no shard.
 
     Raises:
         OutputError: Another run writes there, or the folder cannot be written to.
     """
     own = folder / (_WHOLE if shard is None else f".batch.{shard[0]}of{shard[1]}.lock")
-    with _held(own):
+    with _hold(own):
         for other in sorted(folder.glob(LOCKS)) if shard is None else [folder / _WHOLE]:
             if other != own and other.exists():
-                with _held(other):
+                with _hold(other):
                     pass
         if shard is None:
             when_alone()
@@ -53,12 +53,12 @@ def locked_folder(
 @contextmanager
 def in_turn(folder: Path) -> Iterator[None]:
     """No other shard is inside at the same time; each waits for the one before."""
-    with _held(folder / ".batch.summary.lock", timeout_s=-1):
+    with _hold(folder / ".batch.summary.lock", timeout_s=-1):
         yield
 
 
 @contextmanager
-def _held(path: Path, timeout_s: float | None = None) -> Iterator[None]:
+def _hold(path: Path, timeout_s: float | None = None) -> Iterator[None]:
     """Holds a lock; a negative timeout waits for ever. OutputError if another process does."""
     if not path.parent.is_dir():  # filelock would make it
         raise cannot_write(path.parent, FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)))

@@ -41,7 +41,7 @@ Floats = NDArray[np.float64]
 
 
 def read_poses(path: Path) -> Floats:
-    """Returns the poses (N, 3, 4) from each camera's frame to the world's, in file order.
+    """Returns the poses (N, 3, 4) from each camera's coordinates to the world's, in file order.
 
     Rows are 12 numbers, a 3×4 matrix (KITTI odometry), or 8 numbers, time, position and quaternion
     x y z w (TUM RGB-D benchmark); `#` begins a comment.
@@ -152,7 +152,7 @@ class Trajectory:
     """Poses of one body over time."""
 
     times_s: Floats  # (N,) seconds, ascending
-    poses: Floats  # (N, 3, 4) from the body's frame to the world's, metres
+    poses: Floats  # (N, 3, 4) from the body's coordinates to the world's, metres
 
     def at(self, time_s: float, longest_gap_s: float) -> Floats | None:
         """Returns the pose (3, 4) at a time, interpolated between the poses before and after.
@@ -196,7 +196,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) -> Floats:
-    """Returns the poses (N, 3, 4) of a camera of a drive, from its frame to one world's, metres.
+    """Returns the poses (N, 3, 4) of a drive's camera, from its coordinates to the world's, metres.
 
     The calibration is the folder with KITTI's raw calibrations.
     """
@@ -222,7 +222,7 @@ def _packet(path: Path) -> Floats:
 
 
 def _pose_of_packet(packet: Floats, scale: float) -> Floats:
-    """(4, 4) from the inertial system's frame to the world's."""
+    """(4, 4) from the inertial system's coordinates to the world's."""
     from scipy.spatial.transform import Rotation
 
     latitude, longitude, altitude = packet[:3]

@@ -77,7 +77,7 @@ def check_report_folder(
     Args:
         folder: The report's folder.
         inputs: Files and folders that are read.
-        made_of: What an earlier report in it was made of, as given to `write_report`.
+        made_of: Sources of an earlier report in it, as given to `write_report`.
         overwrite: Whether any other content may be replaced.
     """
     there = next((path for path in (folder, *folder.parents) if path.exists()), folder)
@@ -123,10 +123,10 @@ def write_report(
 
     Args:
         folder: The report's folder.
-        made_of: By which the report is known later.
-        head: What the page shows of all frames.
-        frames: From the folder for images to a mapping per frame, taken one by one, as report.js
-            shows it; its `key` is that of its images, or None.
+        made_of: Sources of the report, by which it is known later.
+        head: Facts, notes and tables of all frames.
+        frames: Function of the folder for images that gives a mapping per frame, one by one, as
+            report.js shows it. Its `key` is that of its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
     """
     remove_leftovers(folder)  # of a writer that was killed

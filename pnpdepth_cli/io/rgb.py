@@ -17,7 +17,7 @@ from pnpdepth_cli.io.decoding import (
     IMAGE_ERRORS,
     check_exif,
     decode_with_opencv,
-    opened_image,
+    open_image,
     orientation_of,
     raw_mode,
     silence,
@@ -75,7 +75,7 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
                 " bits"
             )
     note, white = None, 255.0
-    with opened_image(path, data, kind) as image:
+    with open_image(path, data, kind) as image:
         wide = ";16" in raw_mode(image)  # until the EXIF of a PNG is asked for, which decodes it
         if not wide:
             image.load()  # which applies the orientation of a TIFF

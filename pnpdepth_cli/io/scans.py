@@ -1,4 +1,4 @@
-"""LiDAR scans: points of x, y, z metres in the scanner's frame, from the formats they come in.
+"""LiDAR scans: x, y, z in metres in the scanner's coordinates, from the formats they come in.
 
 The readers of PCD and PLY are own: plyfile reads ASCII three times slower and allocates what a
 header claims, and pypcd4 takes 0.7 s to import and decompresses to the size that the file claims.
@@ -48,7 +48,7 @@ _MOST_COMPRESSED = 100
 """Times as many bytes as compressed ones; three bytes of LZF make at most 264."""
 
 _MOST_DIGITS = 18
-"""Of a count; Python refuses to convert thousands of them."""
+"""Most digits of a count; Python refuses to convert thousands of them."""
 
 Points = NDArray[np.float32]
 
@@ -57,7 +57,7 @@ Points = NDArray[np.float32]
 class ScanFile:
     """A LiDAR scan as read from a file."""
 
-    points: Points  # (N, 3) metres, x y z in the scanner's frame as stored, in file order
+    points: Points  # (N, 3) metres, x y z in the scanner's coordinates as stored, in file order
     source: str  # what was read, for a person
 
 
@@ -110,7 +110,7 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     # beams without return say nothing: more zeros in a row than a point has numbers
     zeros = np.convolve(numbers == 0, np.ones(max(_FIELD_COUNTS) + 1), "same")[: len(numbers)]
     counted = zeros <= max(_FIELD_COUNTS)
-    explained = {count: _explained(features, counted, count) for count in _FIELD_COUNTS}
+    explained = {count: _explained_variance(features, counted, count) for count in _FIELD_COUNTS}
     most = max(explained.values())
     if most < _LEAST_EXPLAINED:
         raise FileFormatError(
@@ -120,10 +120,12 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     return next(n for n, fraction in explained.items() if fraction >= _AS_MUCH * most)
 
 
-def _explained(features: NDArray[np.float64], counted: NDArray[np.bool_], count: int) -> float:
+def _explained_variance(
+    features: NDArray[np.float64], counted: NDArray[np.bool_], count: int
+) -> float:
     """Mean fraction of the variance of features (F, N) that N modulo `count` explains, 0…1.
 
-    Of the numbers that are counted, (N,) bool.
+    Only numbers that are `counted`, (N,) bool, have a part in it.
     """
     rows = features.shape[1] // count
     fields = features[:, : rows * count].reshape(len(features), rows, count)
@@ -177,7 +179,7 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
     if stored not in ("ascii", "binary", "binary_compressed"):
         raise FileFormatError(f"{path} is a PCD with {stored} data; save it as binary or ascii")
     if stored == "binary_compressed":
-        body = _decompressed_rows(path, columns, number, body)
+        body = _decompress_rows(path, columns, number, body)
     points = _xyz(path, "PCD", columns, number, body, None if stored == "ascii" else "<")
     source = f"{stored} PCD"
     if entries.get("VIEWPOINT", []) not in ([], ["0", "0", "0", "1", "0", "0", "0"]):
@@ -185,7 +187,7 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
     return points, source
 
 
-def _decompressed_rows(path: Path, columns: list[Column], number: int, body: bytes) -> bytes:
+def _decompress_rows(path: Path, columns: list[Column], number: int, body: bytes) -> bytes:
     """The rows of a compressed PCD: two sizes, then all numbers of each field, compressed."""
     sizes = [np.dtype(kind).itemsize * count for _, kind, count in columns if "?" not in kind]
     packed, claimed = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, 0)

@@ -144,6 +144,7 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
         raise FileFormatError(
             f"{path} is not a text file; give lines of x, y and depth in metres"
         ) from error
+    # The first line may be a header; "#" begins a comment.
     rows: list[list[float]] = []
     header: list[str] = []
     for number, line in enumerate(lines, start=1):
@@ -159,6 +160,7 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
             row = [float(word) for word in words]
         except ValueError:
             row = []
+        # Every row has as many numbers as the first.
         count = len(rows[0]) if rows else 3
         if len(row) < 3 or (rows and len(row) != count):
             raise FileFormatError(

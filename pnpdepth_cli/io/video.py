@@ -32,7 +32,7 @@ def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
     """
     size_of_regular_file(path)
     with _lock, silence():
-        bgr = _opened(path, path.stat().st_mtime_ns).frame(index)
+        bgr = _open(path, path.stat().st_mtime_ns).frame(index)
     return np.divide(bgr[:, :, ::-1], np.float32(255), dtype=np.float32)
 
 
@@ -75,5 +75,5 @@ class _Video:
 
 
 @functools.lru_cache(maxsize=1)
-def _opened(path: Path, mtime_ns: int) -> _Video:
+def _open(path: Path, mtime_ns: int) -> _Video:
     return _Video(path)

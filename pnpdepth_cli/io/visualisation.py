@@ -16,7 +16,7 @@ from pnpdepth_cli.io.colours import (
     DepthScale,
     Pixels,
     depth_scale,
-    dimmed,
+    dim,
     grey_of,
     paint_signed,
 )
@@ -59,7 +59,7 @@ def preview(
         after: (H, W) after refinement.
         path: The PNG.
         unit: Name in the legend.
-        made_by: What the depth before and the depth after are of.
+        made_by: Names of what made the depth before and the depth after.
 
     Raises:
         SizeError: Image and depth differ in size.
@@ -135,18 +135,18 @@ def error_map(
     """
     both = (prediction > 0) & (ground_truth > 0)
     error = prediction[both].astype(np.float64) - ground_truth[both]
-    return _painted(error, both, grey, "error")
+    return _paint(error, both, grey, "error")
 
 
-def _painted(
+def _paint(
     values: NDArray[np.float64],
     where: NDArray[np.bool_],
     grey: NDArray[np.float32] | None,
     colors: str,
 ) -> tuple[Pixels, float]:
-    """A map with the colours of signed values on the dark grey image, and that of full colour."""
+    """A map of signed values in colours on the dark grey image, and the value of full colour."""
     ground = np.full(where.shape, 0.3, np.float32) if grey is None else grey
-    pixels, strongest = dimmed(np.asarray(0.6 * ground, np.float32)), _strongest(values)
+    pixels, strongest = dim(np.asarray(0.6 * ground, np.float32)), _strongest(values)
     pixels[where] = paint_signed(values / strongest, 0.66 + 0.3 * ground[where], colors)
     return pixels, strongest
 
@@ -169,7 +169,7 @@ def _change_panel(before: Depth, after: Depth, grey: NDArray[np.float32], factor
     """The signed change in metres."""
     both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
     change = (after[both] - before[both]).astype(np.float64)
-    pixels, strongest = _painted(change, both, grey, "change")
+    pixels, strongest = _paint(change, both, grey, "change")
     remark = f"after - before: teal farther, purple nearer, full at {strongest:.3g}"
     return Panel(title="Change", pixels=resized(pixels, factor), remark=remark)
 
@@ -200,7 +200,7 @@ def improvement(
     if not known.any():
         raise InputError("the ground truth has no pixel with known depth; give another file")
     gain = _gain(before[known], after[known], gt[known])
-    pixels, strongest = _painted(gain, known, None if rgb is None else grey_of(rgb), "gain")
+    pixels, strongest = _paint(gain, known, None if rgb is None else grey_of(rgb), "gain")
     factor = magnification(gt.shape, columns=1, legend=False)
     panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
     unknown = "" if known.all() else "no ground truth"

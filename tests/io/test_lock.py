@@ -8,7 +8,7 @@ import pytest
 
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io import lock
-from pnpdepth_cli.io.lock import in_turn, locked_folder
+from pnpdepth_cli.io.lock import in_turn, lock_folder
 
 
 @pytest.fixture(autouse=True)
@@ -20,10 +20,10 @@ def test_one_run_at_a_time_and_after_it_another_also_after_an_error(tmp_path: Pa
     calls: list[int] = []
 
     def held(number: int) -> None:
-        with locked_folder(tmp_path, None, lambda: calls.append(number)):
+        with lock_folder(tmp_path, None, lambda: calls.append(number)):
             with (
                 pytest.raises(OutputError),
-                locked_folder(tmp_path, None, pytest.fail),
+                lock_folder(tmp_path, None, pytest.fail),
             ):
                 pass
             raise ZeroDivisionError
@@ -35,18 +35,18 @@ def test_one_run_at_a_time_and_after_it_another_also_after_an_error(tmp_path: Pa
 
 
 def test_shards_run_together_but_not_twice_nor_beside_a_whole_run(tmp_path: Path) -> None:
-    with locked_folder(tmp_path, (1, 3)), locked_folder(tmp_path, (3, 3), pytest.fail):
+    with lock_folder(tmp_path, (1, 3)), lock_folder(tmp_path, (3, 3), pytest.fail):
         for shard in ((1, 3), (3, 3), None):
-            with pytest.raises(OutputError), locked_folder(tmp_path, shard):
+            with pytest.raises(OutputError), lock_folder(tmp_path, shard):
                 pass
-        with locked_folder(tmp_path, (2, 3)):
+        with lock_folder(tmp_path, (2, 3)):
             pass
-    with locked_folder(tmp_path), pytest.raises(OutputError), locked_folder(tmp_path, (1, 2)):
+    with lock_folder(tmp_path), pytest.raises(OutputError), lock_folder(tmp_path, (1, 2)):
         pass
 
 
 def test_a_folder_that_is_not_there_cannot_be_locked(tmp_path: Path) -> None:
-    with pytest.raises(StorageError), locked_folder(tmp_path / "no"):
+    with pytest.raises(StorageError), lock_folder(tmp_path / "no"):
         pass
 
 

@@ -26,7 +26,7 @@ from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.lock import in_turn, locked_folder
+from pnpdepth_cli.io.lock import in_turn, lock_folder
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 Result = TypeVar("Result")
@@ -189,7 +189,7 @@ class _Batch:
                 self._say(f"removed {leftovers:,} half-written files of a run that was killed")
 
         make_folder(output)
-        stack.enter_context(locked_folder(output, self.request.shard, clean))
+        stack.enter_context(lock_folder(output, self.request.shard, clean))
 
     def to_do(self) -> list[tuple[FrameFiles, str]]:
         """Returns the frames that are to be done, and why, and says how many."""

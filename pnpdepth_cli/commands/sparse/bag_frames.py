@@ -28,8 +28,8 @@ from pnpdepth_cli.io.bags import (
     TRANSFORMS,
     Bag,
     check_topics,
+    choose_topic,
     open_bag,
-    topic_of,
 )
 from pnpdepth_cli.io.bags.messages import (
     Stamped,
@@ -291,15 +291,15 @@ def _sensors(bag: Bag, wanted: Sequence[str], say: Say) -> _Sensors:
     depths = {name: count for name, count in counts.items() if is_depth(first[name], name)}
     colours = {name: count for name, count in counts.items() if name not in depths}
     # Points are clouds, unless depth images are named or alone.
-    images, clouds = topic_of(bag, wanted, colours, "images"), bag.topics(CLOUDS)
+    images, clouds = choose_topic(bag, wanted, colours, "images"), bag.topics(CLOUDS)
     if not depths or (clouds and not set(wanted) & set(depths)):
-        points = topic_of(bag, wanted, clouds, f"points ({CLOUDS[0]} or depth images)")
+        points = choose_topic(bag, wanted, clouds, f"points ({CLOUDS[0]} or depth images)")
         return _Sensors(images=images, points=points, is_depth=False)
     # Depth images with the colours' frame_id are preferred.
     frame = frame_of(first[images])
     registered = {name: count for name, count in depths.items() if frame_of(first[name]) == frame}
     usable = depths if set(wanted) & set(depths) else registered or depths
-    points = topic_of(bag, wanted, usable, "depth images")
+    points = choose_topic(bag, wanted, usable, "depth images")
     same = _Sensors(images=images, points=points, is_depth=True)
     # They may be of a camera of their own.
     infos = camera_info_topic(bag, images), camera_info_topic(bag, points)

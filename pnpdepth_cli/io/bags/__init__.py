@@ -110,14 +110,14 @@ def message_types(*, ros1: bool) -> Any:
     return store
 
 
-def topic_of(bag: Bag, wanted: Sequence[str], topics: Mapping[str, int], what: str) -> str:
+def choose_topic(bag: Bag, wanted: Sequence[str], topics: Mapping[str, int], what: str) -> str:
     """Returns the one of these topics that is named, or else the only one.
 
     Args:
-        bag: They are of.
+        bag: Bag of the topics.
         wanted: Names of topics of any kind.
-        topics: Their numbers of messages, as of `Bag.topics`.
-        what: They hold, for a message.
+        topics: Numbers of messages by topic, from `Bag.topics`.
+        what: Name of what the topics hold, for a message.
 
     Raises:
         UsageError: There are several or none.
@@ -231,11 +231,11 @@ def bound_decompression() -> None:
 
     rosbag1: Any = importlib.import_module("rosbags.rosbag1.reader")
     mcap: Any = importlib.import_module("rosbags.rosbag2.storage_mcap")
-    rosbag1.decompressors.update(bz2=_bounded(bz2.open), lz4=_bounded(lz4.frame.open))
-    mcap.DECOMPRESSORS.update(lz4=_bounded(lz4.frame.open), zstd=_bounded(mcap.zstd.open))
+    rosbag1.decompressors.update(bz2=_bound(bz2.open), lz4=_bound(lz4.frame.open))
+    mcap.DECOMPRESSORS.update(lz4=_bound(lz4.frame.open), zstd=_bound(mcap.zstd.open))
 
 
-def _bounded(open_stream: Callable[..., Any]) -> Callable[..., bytes]:
+def _bound(open_stream: Callable[..., Any]) -> Callable[..., bytes]:
     """Returns a function of compressed bytes and, for MCAP, the size that the chunk claims."""
 
     def decompress(data: bytes, claimed: int | None = None) -> bytes:

@@ -138,6 +138,7 @@ def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
     Raises:
         FileFormatError: It has no x, y and z, or claims more than it holds.
     """
+    # The fields of x, y and z.
     fields = {str(field.name): field for field in message.fields}
     missing = [name for name in "xyz" if name not in fields]
     if missing:
@@ -145,10 +146,12 @@ def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
     unknown = [name for name in "xyz" if int(fields[name].datatype) not in _NUMBERS]
     if unknown:
         raise FileFormatError(f"{topic}: field {unknown[0]} of a cloud is of no known type")
+    # Where they lie in a point.
     order = ">" if message.is_bigendian else "<"
     formats = [order + _NUMBERS[int(fields[name].datatype)] for name in "xyz"]
     offsets = [int(fields[name].offset) for name in "xyz"]
     end = max(o + np.dtype(f).itemsize for o, f in zip(offsets, formats, strict=True))
+    # How many points the message holds.
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     row = int(message.row_step) if height > 1 else width * step
     data = np.frombuffer(message.data, np.uint8)
@@ -157,6 +160,7 @@ def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
             f"{topic}: a cloud of {width}×{height} points of {step} bytes has {data.size:,} bytes;"
             " the bag is damaged"
         )
+    # The coordinates, without the bytes between rows and fields.
     layout = np.dtype(
         {"names": list("xyz"), "formats": formats, "offsets": offsets, "itemsize": step}
     )
@@ -199,12 +203,12 @@ def nearest_pairs(
         while images and (
             (scans and scans[-1].time_s >= images[0].time_s) or len(images) > _MOST_WAITING
         ):
-            yield _paired(images.popleft(), scans, tolerance_s)
+            yield _pair(images.popleft(), scans, tolerance_s)
     for image in images:
-        yield _paired(image, scans, tolerance_s)
+        yield _pair(image, scans, tolerance_s)
 
 
-def _paired(
+def _pair(
     image: Stamped, scans: deque[Stamped], tolerance_s: float
 ) -> tuple[Stamped, Stamped | None]:
     while len(scans) > 1 and scans[1].time_s <= image.time_s:

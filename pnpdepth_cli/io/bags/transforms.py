@@ -66,13 +66,13 @@ def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
 
 
 def frame_of(message: Any) -> str:
-    """Returns the name of the frame in a message's header, without ROS 1's leading slash."""
+    """Returns the frame_id in a message's header, without ROS 1's leading slash."""
     return str(message.header.frame_id).lstrip("/")
 
 
 def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
-    """Returns the pose of the scanner's frame in the camera's, by /tf_static; None without one."""
-    return _chained(_static_links(bag), camera, scanner)
+    """Returns the scanner's pose in the camera's coordinates, by /tf_static; None without one."""
+    return _chain(_static_links(bag), camera, scanner)
 
 
 def poses_topics(bag: Bag, wanted: Sequence[str]) -> tuple[str, ...]:
@@ -86,9 +86,9 @@ def poses_topics(bag: Bag, wanted: Sequence[str]) -> tuple[str, ...]:
 def camera_trajectory(bag: Bag, topic: str, camera: str) -> Trajectory | None:
     """Returns the poses of the camera; None if nothing ties it to what the topic moves.
 
-    An odometry message names the frame that it moves, and /tf_static gives the camera in it. A pose
-    message names none, so its pose is the camera's own. Of transforms, the first above the camera
-    that changes is taken: that of odometry, without later corrections of the map.
+    An odometry message names the frame_id that it moves, and /tf_static gives the camera in it. A
+    pose message names none, so its pose is the camera's own. Of transforms, the first above the
+    camera that changes is taken. It is that of odometry, without later corrections of the map.
     """
     if topic in bag.topics(TRANSFORMS):
         return _of_transforms(bag, topic, camera)
@@ -98,7 +98,7 @@ def camera_trajectory(bag: Bag, topic: str, camera: str) -> Trajectory | None:
         pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
         times.append(seconds_of(message, logged_ns))
         poses.append(_pose_in(bag, pose.position, pose.orientation).square())
-    return _of_camera(times, poses, _chained(_static_links(bag), body, camera))
+    return _of_camera(times, poses, _chain(_static_links(bag), body, camera))
 
 
 def _of_transforms(bag: Bag, topic: str, camera: str) -> Trajectory | None:
@@ -116,11 +116,11 @@ def _of_transforms(bag: Bag, topic: str, camera: str) -> Trajectory | None:
     above = [
         link
         for link in moving
-        if _chained(links, link[1], camera) is not None and _chained(links, link[0], camera) is None
+        if _chain(links, link[1], camera) is not None and _chain(links, link[0], camera) is None
     ]
     if len(above) != 1:
         return None
-    return _of_camera(*series[above[0]], _chained(links, above[0][1], camera))
+    return _of_camera(*series[above[0]], _chain(links, above[0][1], camera))
 
 
 def _of_camera(
@@ -165,7 +165,7 @@ def _add_link(links: Links, link: tuple[str, str], pose: Extrinsics) -> None:
     links.setdefault(child, {})[parent] = pose.inverse()
 
 
-def _chained(links: Links, start: str, end: str) -> Extrinsics | None:
+def _chain(links: Links, start: str, end: str) -> Extrinsics | None:
     """The pose x_start = pose · x_end along the shortest chain of links; None if none."""
     poses = {start: SAME_FRAME}
     waiting = deque([start])

@@ -16,7 +16,7 @@ from pnpdepth_cli.io.decoding import (
     IMAGE_ERRORS,
     check_tags,
     decode_with_opencv,
-    opened_image,
+    open_image,
     raw_mode,
     silence,
 )
@@ -34,7 +34,7 @@ _COMPRESSION_LEVEL = 4  # of zlib: a third of the time of its default 6, files 4
 
 
 def _read_png(path: Path, data: bytes) -> DepthFile:
-    with opened_image(path, data, "PNG") as image:
+    with open_image(path, data, "PNG") as image:
         mode, palette = raw_mode(image), image.mode == "P"
         if not palette and ";16" not in mode:
             raise eight_bits(path, "PNG")
@@ -176,6 +176,7 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
     """
     import OpenEXR
 
+    # The size that the channels will have is checked before they are decoded.
     lists = [int.from_bytes(size, "little") for size in _CHANNEL_LIST.findall(data)]
     if sum(lists) > _MOST_CHANNEL_BYTES:
         raise FileFormatError(f"{path} lists tens of thousands of channels; export the depth alone")
@@ -192,8 +193,10 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
                 names = [str(part.name()) for part in file.parts]
     except (RuntimeError, ValueError, LookupError, OSError) as error:  # as the binding has it
         raise damaged(path, "EXR", f"cannot be read ({error})") from error
+    # All parts must have been decoded.
     if len(parts) != count:  # the binding leaves out a part that it cannot decode
         raise damaged(path, "EXR", "cannot be decoded")
+    # Names of several parts begin with the part's.
     if count == 1:
         channels = parts[0]
     else:
@@ -221,7 +224,7 @@ def _write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str])
 
 
 def _claimed_bytes(path: Path, header: dict[str, Any], file_bytes: int) -> int:
-    """How many bytes a part is decoded to. FileFormatError if it is not one that can be read."""
+    """Number of bytes that a part is decoded to. FileFormatError if it cannot be read."""
     claimed = 0
     if "deep" in str(header.get("type", "")):
         raise FileFormatError(f"{path} is a deep EXR; export it flattened")
