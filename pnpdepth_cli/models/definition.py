@@ -277,8 +277,8 @@ def graph_definition(
     """Returns the definition of a graph that was exported with its weights.
 
     Args:
-        shapes: Of its inputs, in their order; no whole number where a side is of any length.
-        file: It is from.
+        shapes: Shapes of its inputs, in their order; no whole number where a side is of any length.
+        file: File of the graph.
         stated: Fields that a definition file states of it.
         **known: Fields that are read in the file.
 
@@ -299,7 +299,7 @@ def graph_definition(
         )
     height, width = image[1:] if image[0] == channels else image[:2]
 
-    def fitted(tensor: Tensor, shape: Sequence[Any]) -> Tensor:
+    def fit(tensor: Tensor, shape: Sequence[Any]) -> Tensor:
         """The tensor without a batch axis, or with the channels last, where the graph has it so."""
         if tensor.ndim > len(shape):
             return tensor[0]
@@ -308,7 +308,7 @@ def graph_definition(
 
     def arguments(*given: Tensor | None) -> tuple[Tensor, ...]:
         tensors = (tensor for tensor in given if tensor is not None)
-        return tuple(fitted(*pair) for pair in zip(tensors, shapes, strict=True))
+        return tuple(fit(*pair) for pair in zip(tensors, shapes, strict=True))
 
     if "rgb" not in kind:
         known["normalisation"] = Normalisation()

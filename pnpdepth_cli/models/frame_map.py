@@ -1,4 +1,4 @@
-"""Between the image frame and the network's frame. Depth values of points are never touched."""
+"""Between pixels of the image and of the network. Depth values of points are never touched."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class FrameMap:
         return F.pad(torch.where(known > 1 - _ROUNDING, depth, 0.0), (0, right, 0, bottom))
 
     def points_to_network(self, points: SparsePoints) -> SparsePoints:
-        """The points inside the crop, with their pixel coordinates in the network's frame."""
+        """The points inside the crop, at pixel coordinates of the network."""
         resized = points.cropped(*self.crop).resized(*self.resized)
         return SparsePoints(xy=resized.xy, depth=resized.depth, size=self.network)
 
@@ -89,7 +89,7 @@ class FrameMap:
         return torch.from_numpy(resized.intrinsics)[None].float()
 
     def depth_to_image(self, depth: Tensor) -> Tensor:
-        """Depth (1, 1, h', w') over the network's frame → (H, W); 0 outside the crop."""
+        """Depth (1, 1, h', w') over the network's pixels → (H, W); 0 outside the crop."""
         if self.network != self.resized:
             depth = _resize(depth, self.network)[..., : self.resized[0], : self.resized[1]]
         top, left, height, width = self.crop

@@ -92,12 +92,14 @@ def hf_definition(folder: Path) -> ModelDefinition:
     """Returns the definition of a depth network in a Hugging Face folder.
 
     Args:
-        folder: Has config.json and model.safetensors, and preprocessor_config.json if it was saved.
+        folder: Folder with config.json and model.safetensors, and preprocessor_config.json if it
+            was saved.
 
     Raises:
         ModelError: A file is missing or wrong, or the type of network is not known.
         CheckpointError: Its weights are missing, or are pickles.
     """
+    # The type of network, which must be known.
     config = _json(folder / "config.json", "it says which network this is")
     kind = config.get("model_type")
     if not isinstance(kind, str) or kind not in _FAMILIES:
@@ -106,9 +108,11 @@ def hf_definition(folder: Path) -> ModelDefinition:
             f" {', '.join(_FAMILIES)}"
         )
     _check_settings(config, folder / "config.json")
+    # What its numbers are.
     family, assumed = _FAMILIES[kind], ""
     if config.get("depth_estimation_type") == "metric":
         family = replace(family, kind="depth", scale="metric")
+    # How images are prepared, as stated or as usual for the type.
     if (folder / "preprocessor_config.json").is_file():
         processing = _json(folder / "preprocessor_config.json", "it says how images are prepared")
     else:
@@ -119,6 +123,7 @@ def hf_definition(folder: Path) -> ModelDefinition:
             f"{folder.name} has no preprocessor_config.json; assumed, as usual for {kind}: size"
             f" {size}, {mean if family.size else 'rgb in 0…1'}"
         )
+    # The definition, whose network is built when it is needed.
     weights, prompted = _weights(folder), kind == "prompt_depth_anything"
     return ModelDefinition(
         name=folder.resolve().name,
@@ -270,10 +275,12 @@ def _build(folder: Path) -> nn.Module:
             f"{folder} is a Hugging Face folder, which needs the package {error.name!r}:"
             " pip install 'pnpdepth[hf]'"
         ) from None
+    # transformers says nothing of its own.
     logging: Any = transformers.utils.logging
     logging.set_verbosity_error()
     logging.disable_progress_bar()
     try:
+        # The network must not be larger than its weights, which are read last.
         config = transformers.AutoConfig.from_pretrained(str(folder), local_files_only=True)
         with _fewer_parameters_than_bytes(folder), torch.device("meta"):
             networks: Any = transformers.AutoModelForDepthEstimation
@@ -287,6 +294,7 @@ def _build(folder: Path) -> nn.Module:
         )
     except (OSError, ValueError, LookupError, TypeError, RuntimeError, ImportError) as error:
         raise ModelError(f"{folder}: transformers cannot load it: {describe(error)}") from None
+    # Every weight must have been there.
     missing = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
     if missing:
         raise CheckpointError(

@@ -57,11 +57,11 @@ def best_layer(
 ) -> str | None:
     """Returns the layer of the definition to cut at for so many points in a frame.
 
-    It is the last one whose influential field in the depth map is wide enough, which is the one of
-    least cost; if there is none, the one with the widest field.
+    It is the last one whose influential field in the depth map is wide enough, because that costs
+    least. If none is wide enough, it is the one with the widest field.
 
     Args:
-        network: Its definition's layers are measured.
+        network: Network whose definition's layers are measured.
         arguments: The network's arguments for the frame, real or synthetic.
         size: Rows and columns of the network's input.
         point_count: Sparse points in the frame, taken to be spread evenly.
@@ -132,7 +132,7 @@ def measure_layers(
         names: The layers, in the order of the result.
         arguments: The network's arguments for one frame, real or synthetic.
         size: Rows and columns of the network's input.
-        on_layer: Called after each layer with the number of layers done and of all.
+        on_layer: Callback after each layer with the number of layers done and of all.
     """
     measured = []
     with torch.no_grad(), FlopCounterMode(display=False) as whole:

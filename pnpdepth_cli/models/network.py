@@ -62,8 +62,8 @@ class Network:
         """Returns the image as the network takes it, (1, 3, h, w); None if it takes none.
 
         Args:
-            frame: Maps the image frame to the network's frame.
-            rgb: (1, 3, H, W) in 0…1 in the image frame; None if there is none.
+            frame: Map from pixels of the image to those of the network.
+            rgb: (1, 3, H, W) in 0…1, the whole image; None if there is none.
 
         Raises:
             UsageError: The network takes an rgb image and there is none.
@@ -89,10 +89,10 @@ class Network:
         """Returns the positional arguments of the network's forward.
 
         Args:
-            image: From `image_of`.
-            points: In the network's frame.
+            image: Image from `image_of`.
+            points: Points at pixel coordinates of the network.
             prior: (1, 1, h, w) metres, 0 = unknown, for a network that takes one; None without.
-            intrinsics: (1, 3, 3) in the network's frame. None: unknown.
+            intrinsics: (1, 3, 3) in pixels of the network. None: unknown.
 
         Raises:
             ModelError: The definition's `arguments` raises or does not return a tuple.
@@ -153,6 +153,7 @@ class Network:
             ModelError: It holds no prediction, or several tensors that `output` of the definition
                 does not choose from.
         """
+        # The definition's `output` picks the depth, or it is the only tensor.
         name = self.definition.name
         if self.definition.output is not None:
             with wrap_user_errors(f"output of network {name!r}"):
@@ -176,6 +177,7 @@ class Network:
                     " must pick the depth with `output`"
                 )
             chosen = tensors[0][1]
+        # One map, with or without axes of batch and channel.
         tensor = chosen.float()
         if tensor.ndim in (2, 3):
             tensor = tensor[:, None] if tensor.ndim == 3 else tensor[None, None]
@@ -184,6 +186,7 @@ class Network:
                 f"network {name!r} gives a tensor of shape {tuple(chosen.shape)}, where one depth"
                 " map (1, 1, h, w) is expected; pick it by the definition's output"
             )
+        # Where it is not finite, it is NaN, and no gradient comes from there.
         known = tensor.isfinite()
         if bool(known.all()):
             return tensor

@@ -48,7 +48,7 @@ def lower(module: nn.Module, dtype: torch.dtype, device: torch.device) -> None:
     forward = module.forward
 
     @functools.wraps(forward)
-    def lowered(*args: Any, **kwargs: Any) -> Any:
+    def forward_in_half(*args: Any, **kwargs: Any) -> Any:
         try:
             with torch.autocast(device.type, dtype=dtype):
                 return forward(*args, **kwargs)
@@ -60,4 +60,4 @@ def lower(module: nn.Module, dtype: torch.dtype, device: torch.device) -> None:
                 " precision fp32"
             ) from error
 
-    module.forward = lowered
+    module.forward = forward_in_half

@@ -46,8 +46,8 @@ def with_ends(steps: Sequence[Step], outputs: Sequence[str]) -> list[Step]:
 def run_steps(steps: Sequence[Step], values: dict[str, Any]) -> Iterator[Step]:
     """Adds the results to the values; yields each step before what ends there is removed."""
     for step in steps:
-        keywords = {name: _resolved(value, values) for name, value in step.keywords.items()}
-        result = step.run(*_resolved(step.arguments, values), **keywords)
+        keywords = {name: _resolve(value, values) for name, value in step.keywords.items()}
+        result = step.run(*_resolve(step.arguments, values), **keywords)
         if isinstance(step.outputs, str):
             values[step.outputs] = result
         else:
@@ -57,11 +57,11 @@ def run_steps(steps: Sequence[Step], values: dict[str, Any]) -> Iterator[Step]:
             values.pop(name, None)
 
 
-def _resolved(argument: Any, values: Mapping[str, Any]) -> Any:
+def _resolve(argument: Any, values: Mapping[str, Any]) -> Any:
     if isinstance(argument, Value):
         return values[argument.name]
     is_list = isinstance(argument, list | tuple)
-    return [_resolved(one, values) for one in argument] if is_list else argument
+    return [_resolve(one, values) for one in argument] if is_list else argument
 
 
 def _names_in(argument: Any) -> Iterator[str]:

@@ -101,14 +101,15 @@ def _observe(
 ) -> tuple[Tensor, Maps, list[Tensor]]:
     """One pass: the prediction, the maps of submodules that ran once, and copies of outputs.
 
-    reach_all: outputs that gradients do not reach are replaced by copies that they do reach, as a
-    cut there would.
+    With `reach_all`, outputs that gradients do not reach are replaced by copies that they do reach,
+    as a cut there would.
     """
     maps: Maps = {}
     ran: set[str] = set()
     ran_twice: set[str] = set()
     copies: list[Tensor] = []
 
+    # Copies of outputs that gradients do not reach.
     def with_gradient(path: tuple[str, ...], tensor: Tensor) -> Tensor:
         if tensor.requires_grad or not tensor.is_floating_point():
             return tensor
@@ -116,6 +117,7 @@ def _observe(
             copies.append(tensor.clone().detach().requires_grad_(True))
             return copies[-1].clone()  # in-place operations on the copy itself are forbidden
 
+    # Maps that gradients reach, of submodules that ran once.
     def keep(name: str, output: Any) -> Any:
         output = map_tensors(output, with_gradient) if reach_all else output
         (ran_twice if name in ran else ran).add(name)
@@ -123,6 +125,7 @@ def _observe(
             maps[name] = output
         return output
 
+    # The pass itself.
     hooks = [
         part.register_forward_hook(lambda m, inputs, output, name=name: keep(name, output))
         for name, part in module.named_modules()

@@ -119,7 +119,7 @@ class ExportedGraph(nn.Module):
             target, outputs = node["target"], node["outputs"]
             if target == _WITHOUT_GRADIENT:
                 enabled, body, *given = (argument["arg"] for argument in node["inputs"])
-                yield from self._inlined(body["as_graph"]["graph"], given, outputs, **enabled)
+                yield from self._inline(body["as_graph"]["graph"], given, outputs, **enabled)
             elif outputs:  # the others only check what the exporter saw
                 yield self._step(target, node["inputs"], outputs)
 
@@ -141,7 +141,7 @@ class ExportedGraph(nn.Module):
             name=target,
         )
 
-    def _inlined(
+    def _inline(
         self, body: Mapping[str, Any], given: list[Any], outputs: list[Any], *, as_bool: bool
     ) -> Iterator[Step]:
         """A graph in the graph, whose result has no gradient unless `as_bool` says so."""
@@ -229,10 +229,10 @@ def _function(target: str) -> Callable[..., Any]:
     arithmetic: Callable[..., Any] | None = getattr(place, found[1] or found[2] or found[3], None)
     if arithmetic is None:
         raise BrokenFileError(f"it calls {target[:80]!r}, which this version of torch lacks")
-    return arithmetic if found[1] == "getitem" else functools.partial(_computed, arithmetic)
+    return arithmetic if found[1] == "getitem" else functools.partial(_compute, arithmetic)
 
 
-def _computed(arithmetic: Callable[..., Any], *numbers: Any) -> Any:
+def _compute(arithmetic: Callable[..., Any], *numbers: Any) -> Any:
     """The result of arithmetic on numbers of 64 bits and tensors; not on lists and texts."""
     if not all(isinstance(each, int | float | Tensor) for each in numbers):
         raise ModelError("the exported program computes with what is no number")

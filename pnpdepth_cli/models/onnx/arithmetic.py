@@ -30,14 +30,14 @@ _UNARY = (
 """Named as in torch, but for capitals."""
 
 
-def _divided(a: Tensor, b: Tensor) -> Tensor:
+def _divide(a: Tensor, b: Tensor) -> Tensor:
     return a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")
 
 
 _BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Equal": torch.eq, "Greater": torch.gt,
     "Less": torch.lt, "GreaterOrEqual": torch.ge, "LessOrEqual": torch.le,
-    "And": torch.logical_and, "Or": torch.logical_or, "Xor": torch.logical_xor, "Div": _divided,
+    "And": torch.logical_and, "Or": torch.logical_or, "Xor": torch.logical_xor, "Div": _divide,
     "Pow": lambda base, exponent: torch.pow(base, exponent).to(base.dtype),
 }  # fmt: skip
 
@@ -57,13 +57,13 @@ def _binary(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
     return lambda _, i: function(i[0], i[1])
 
 
-def _folded(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
+def _fold(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
     return lambda _, inputs: functools.reduce(function, inputs)
 
 
 register({name: _unary(name) for name in _UNARY})
 register({name: _binary(function) for name, function in _BINARY.items()})
-register({name: _folded(function) for name, function in _FOLDED.items()})
+register({name: _fold(function) for name, function in _FOLDED.items()})
 register(
     {
         "Identity": lambda _, i: i[0].clone(),

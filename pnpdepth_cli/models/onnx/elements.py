@@ -104,11 +104,13 @@ def pad(node: Node, inputs: Inputs) -> Tensor:
         return F.pad(x, [n for pair in each for n in pair], value=value)
     for axis, (begin, end) in sides.items():
         if begin or end:
-            x = x.index_select(axis, _padded_indices(mode, x.shape[axis], begin, end).to(x.device))
+            x = x.index_select(
+                axis, _indices_of_padding(mode, x.shape[axis], begin, end).to(x.device)
+            )
     return x
 
 
-def _padded_indices(mode: str, size: int, begin: int, end: int) -> Tensor:
+def _indices_of_padding(mode: str, size: int, begin: int, end: int) -> Tensor:
     """The index of the input element for each element of the padded axis."""
     index = torch.arange(-begin, size + end)
     if mode == "edge":

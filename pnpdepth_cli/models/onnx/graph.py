@@ -48,8 +48,8 @@ class OnnxNode(nn.Module):
 
     Args:
         node: Operator and attributes.
-        inputs: For each input its constant, "" or any text for one that the call gives, or None for
-            one that is left out.
+        inputs: Constants of its inputs, "" or any text for one that the call gives, None for one
+            that is left out.
     """
 
     def __init__(self, node: Node, inputs: Sequence[Tensor | str | None]) -> None:
@@ -98,7 +98,7 @@ class OnnxGraph(nn.Module):
 
     Args:
         model: The onnx.ModelProto, without functions of its own, its nodes in order.
-        path: Its file, for messages.
+        path: File of the model, for messages.
 
     Raises:
         ModelError: An operator is not covered; the message names every one.
@@ -136,7 +136,7 @@ class OnnxGraph(nn.Module):
             module = OnnxNode(node, [None if isinstance(n, str) and not n else n for n in inputs])
             handed_in = tuple(n for n in inputs if isinstance(n, str) and n)
             if not handed_in:
-                constants.update(_folded(module, proto.output, limit, path))
+                constants.update(_fold(module, proto.output, limit, path))
                 continue
             on_shapes = node.op in _TO_SHAPES or all(n in shapes for n in handed_in)
             if on_shapes:
@@ -178,7 +178,7 @@ class OnnxGraph(nn.Module):
         return result if isinstance(result, tuple) else (result,)
 
 
-def _folded(
+def _fold(
     module: OnnxNode, outputs: Sequence[str], limit: SizeLimit, path: Path
 ) -> dict[str, Tensor]:
     """The outputs of a node that has only constant inputs."""

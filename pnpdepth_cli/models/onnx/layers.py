@@ -74,14 +74,14 @@ def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
         )
     ]
     y: Tensor = _TRANSPOSED[rank](x, weight, None, stride, 0, 0, node.get("group", 1), dilation)
-    crops = _transposed_pads(node, x, stride, full)
+    crops = _pads_of_transposed(node, x, stride, full)
     sides = [(-begin, e - end) for (begin, end), e in zip(crops, extra, strict=True)]
     if any(n for pair in sides for n in pair):
         y = F.pad(y, _sides(sides))
     return y if bias is None else y + bias.reshape(-1, *[1] * rank)
 
 
-def _transposed_pads(node: Node, x: Tensor, stride: Sequence[int], full: Sequence[int]) -> Pads:
+def _pads_of_transposed(node: Node, x: Tensor, stride: Sequence[int], full: Sequence[int]) -> Pads:
     auto, wanted = node.get("auto_pad", "NOTSET"), node.get("output_shape")
     if wanted is None:
         if not auto.startswith("SAME"):
@@ -92,7 +92,7 @@ def _transposed_pads(node: Node, x: Tensor, stride: Sequence[int], full: Sequenc
     return pads if auto == "SAME_UPPER" else [(end, begin) for begin, end in pads]
 
 
-def _pooled(node: Node, x: Tensor) -> tuple[list[int], list[int], list[int], Pads, Pads]:
+def _pooling(node: Node, x: Tensor) -> tuple[list[int], list[int], list[int], Pads, Pads]:
     """Kernel, stride, dilation, pads, and the pads with those that ceil_mode adds at the end."""
     rank = x.ndim - 2
     kernel = list(node.get("kernel_shape"))
@@ -116,7 +116,7 @@ def max_pool(node: Node, inputs: Inputs) -> Tensor:
     if node.outputs > 1:
         raise Unsupported("its second output, the indices")
     x = inputs[0]
-    kernel, stride, dilation, _, padded = _pooled(node, x)
+    kernel, stride, dilation, _, padded = _pooling(node, x)
     if any(n for pair in padded for n in pair):
         x = F.pad(x, _sides(padded), value=-math.inf)
     return _MAX_POOL[x.ndim - 2](x, kernel, stride, 0, dilation)
@@ -125,7 +125,7 @@ def max_pool(node: Node, inputs: Inputs) -> Tensor:
 @operator("AveragePool")
 def average_pool(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
-    kernel, stride, dilation, pads, padded = _pooled(node, x)
+    kernel, stride, dilation, pads, padded = _pooling(node, x)
     if x.ndim != 4 or any(d != 1 for d in dilation):
         raise Unsupported("other than two spatial axes, or dilations")
     if not any(n for pair in padded for n in pair):

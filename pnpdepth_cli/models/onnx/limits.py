@@ -44,10 +44,10 @@ def run_first(steps: Sequence[Step], values: dict[str, Any], stored: int, kind: 
     """Adds the results of the steps to the values, none of them far larger than image and weights.
 
     Args:
-        steps: Of a graph.
+        steps: Steps of a graph.
         values: The inputs, by name; what other values they have is stored, too.
         stored: Elements of the weights in the file.
-        kind: Of a step, in messages.
+        kind: Name of a step in messages.
 
     Raises:
         ModelError: A result is too large, or all at a time are.
@@ -88,7 +88,7 @@ def load_external(model: Any, folder: Path) -> None:
     external.load_external_data_for_model(model, str(folder))
 
 
-def inlined(model: Any, path: Path) -> Any:
+def inline(model: Any, path: Path) -> Any:
     """Returns the model without functions of its own.
 
     Raises:
@@ -99,12 +99,12 @@ def inlined(model: Any, path: Path) -> Any:
     functions = {(f.domain, f.name, getattr(f, "overload", "")): f for f in model.functions}
 
     @functools.cache
-    def written_out(key: tuple[str, str, str]) -> int:
+    def size_of_function(key: tuple[str, str, str]) -> int:
         return int(functions[key].ByteSize()) + size(functions[key])
 
     def size(graph: Any) -> int:
         calls = [(n.domain, n.op_type, getattr(n, "overload", "")) for n in nodes_in(graph.node)]
-        return sum(written_out(call) if call in functions else _NODE_BYTES for call in calls)
+        return sum(size_of_function(call) if call in functions else _NODE_BYTES for call in calls)
 
     try:
         claimed = size(model.graph)

@@ -26,7 +26,7 @@ from pnpdepth_cli.models.definition import (
     graph_definition,
 )
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
-from pnpdepth_cli.models.onnx.limits import inlined, load_external
+from pnpdepth_cli.models.onnx.limits import inline, load_external
 from pnpdepth_cli.models.onnx.quantised import Quantised, outputs_of, quantises, session_of
 
 MISMATCH = 1e-3
@@ -49,10 +49,10 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
     Raises:
         ModelError: The file cannot be read, or the network cannot be run.
     """
-    model = inlined(_read(file), file)
+    model = inline(_read(file), file)
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
-    is_part = _pruned(model, _chosen_output(model, output, file), file)
+    is_part = _prune(model, _choose_output(model, output, file), file)
     # From the file, onnxruntime reads weights that lie beside it.
     source = model.SerializeToString() if is_part else str(file)
     definition = graph_definition(
@@ -78,17 +78,19 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
     )
 
 
-def _pruned(model: Any, output: str, path: Path) -> bool:
-    """True if not all of the model was needed: in it stay that output and the nodes that it needs.
+def _prune(model: Any, output: str, path: Path) -> bool:
+    """Leaves in the model one output and the nodes that it needs. True if others were there.
 
     Each node comes after those it reads. The order is that of the file if possible; files converted
     to half precision are not in order. ModelError if a node reads a value that nothing gives, or
     nodes read each other in a circle.
     """
+    # What gives each value.
     graph = model.graph
     nodes, outputs = list(graph.node), [o for o in graph.output if o.name == output]
     known = {*(t.name for t in graph.initializer), *(i.name for i in graph.input)}
     producer = {name: n for n, proto in enumerate(nodes) for name in proto.output if name}
+    # The nodes that the output needs, from the output backwards.
     reads: dict[int, set[int]] = {}
     pending = [producer[output]] if output in producer else []
     while pending:
@@ -101,6 +103,7 @@ def _pruned(model: Any, output: str, path: Path) -> bool:
             raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
         reads[n] = {producer[name] for name in inputs}
         pending += reads[n]
+    # Their order is the file's, unless a node would come before what it reads.
     order = sorted(reads)
     if any(before >= n for n, befores in reads.items() for before in befores):
         try:
@@ -108,6 +111,7 @@ def _pruned(model: Any, output: str, path: Path) -> bool:
             order = [*graphlib.TopologicalSorter(by_number).static_order()]
         except graphlib.CycleError:
             raise ModelError(f"ONNX file {path}: its nodes read each other in a circle") from None
+    # They replace the graph's.
     pruned = len(order) < len(nodes) or len(outputs) < len(graph.output)
     kept = type(graph)()
     kept.node.extend(nodes[n] for n in order)
@@ -125,6 +129,7 @@ def _as_map(output: Any) -> Tensor:
 
 
 def _read(file: Path) -> Any:
+    # The file, and the packages that read it.
     if not file.is_file():
         raise ModelError(f"ONNX file {file} does not exist")
     size = file.stat().st_size
@@ -143,6 +148,7 @@ def _read(file: Path) -> Any:
         load_external(model, file.parent)
     except (DecodeError, onnx.checker.ValidationError, ValueError, TypeError, OSError) as error:
         raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
+    # A graph whose names are text, of an opset that is covered.
     if not model.graph.node:
         raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
     for node in (*model.graph.node, *(node for f in model.functions for node in f.node)):
@@ -166,7 +172,7 @@ def _shape(value: Any) -> list[int | str]:
     return [d.dim_value if d.dim_value > 0 else d.dim_param or "?" for d in dims]
 
 
-def _chosen_output(model: Any, wanted: str | None, file: Path) -> str:
+def _choose_output(model: Any, wanted: str | None, file: Path) -> str:
     outputs: dict[str, list[int | str]] = {o.name: _shape(o) for o in model.graph.output}
     if wanted is None and len(outputs) == 1:
         return next(iter(outputs))
@@ -195,7 +201,7 @@ class _FirstImageCheck:
     """Compares the network with onnxruntime on the first image.
 
     Args:
-        source: What onnxruntime reads: a file, or the content of one.
+        source: File that onnxruntime reads, or the content of one.
         file: The network's file, for messages.
     """
 

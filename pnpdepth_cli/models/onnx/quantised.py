@@ -29,7 +29,7 @@ class Quantised(nn.Module):
     """The network as a module with one layer, `output`, which lets no gradient through.
 
     Args:
-        source: What onnxruntime reads: a file, or the content of one.
+        source: File that onnxruntime reads, or the content of one.
         file: The network's file, for messages.
         model: The onnx.ModelProto.
         input_name: Name of the image in the graph.
@@ -68,8 +68,8 @@ def session_of(source: str | bytes, file: Path, most_bytes: int | None = None) -
 
     Args:
         source: A file, or the content of one.
-        file: For messages.
-        most_bytes: What the session may allocate; None is no limit.
+        file: File of the network, for messages.
+        most_bytes: Largest memory of the session; None is no limit.
     """
     import onnxruntime as ort
 

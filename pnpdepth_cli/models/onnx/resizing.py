@@ -31,7 +31,7 @@ def resize(node: Node, inputs: Inputs) -> Tensor:
         mode = {"bilinear": "linear"}.get(node.get("mode"), node.get("mode", "nearest"))
         more = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "simple"}
         factors = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
-        return _resized(x, replace(node, attributes={"mode": mode, **more}), factors, None)
+        return _resize(x, replace(node, attributes={"mode": mode, **more}), factors, None)
     axes = [a % x.ndim for a in node.get("axes", range(x.ndim))]
     if sizes is not None and sizes.numel():
         wanted = dict(zip(axes, whole_numbers(sizes), strict=True))
@@ -42,14 +42,14 @@ def resize(node: Node, inputs: Inputs) -> Tensor:
             wanted = {a: math.floor(ratio * x.shape[a] + 0.5) for a in axes}
             by_axis = dict.fromkeys(axes, ratio)
         out = [wanted.get(a, x.shape[a]) for a in range(x.ndim)]
-        return _resized(x, node, [by_axis.get(a, 1.0) for a in range(x.ndim)], out)
+        return _resize(x, node, [by_axis.get(a, 1.0) for a in range(x.ndim)], out)
     if scales is None:
         raise Unsupported("neither scales nor sizes")
     by_axis = dict(zip(axes, scales.tolist(), strict=True))
-    return _resized(x, node, [by_axis.get(a, 1.0) for a in range(x.ndim)], None)
+    return _resize(x, node, [by_axis.get(a, 1.0) for a in range(x.ndim)], None)
 
 
-def _resized(x: Tensor, node: Node, factors: list[float], sizes: list[int] | None) -> Tensor:
+def _resize(x: Tensor, node: Node, factors: list[float], sizes: list[int] | None) -> Tensor:
     sizes = sizes or [math.floor(n * s) for n, s in zip(x.shape, factors, strict=True)]
     fast = _by_torch(x, node, factors, sizes)
     if fast is not None:

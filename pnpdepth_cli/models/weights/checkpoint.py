@@ -70,9 +70,9 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     matter in training only.
 
     Args:
-        network: Built by `definition`; its weights are replaced.
-        definition: Its `read_checkpoint` renames the tensors of a published file.
-        path: See `read_checkpoint`.
+        network: Network built by `definition`; its weights are replaced.
+        definition: Definition whose `read_checkpoint` renames the tensors of a published file.
+        path: File or folder, as `read_checkpoint` takes it.
 
     Raises:
         CheckpointError: A tensor is missing, unexpected, of another shape, or not finite.
@@ -81,7 +81,7 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
     stored, prefix_notes = _without_prefixes(stored, path, own)
     notes = [*notes, *prefix_notes]
-    state = _fitted(definition, own, stored, path)
+    state = _fit_state(definition, own, stored, path)
     # A sum shows a value that is not finite, without a copy of the tensor.
     broken = [
         name
@@ -102,13 +102,14 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     return notes
 
 
-def _fitted(
+def _fit_state(
     definition: ModelDefinition,
     own: Mapping[str, Tensor],
     stored: Mapping[str, Tensor],
     path: Path,
 ) -> Mapping[str, Tensor]:
     """The state dict that replaces the network's own. CheckpointError if it does not fit."""
+    # The definition renames tensors of a published file.
     state = stored
     if definition.read_checkpoint is not None:
         try:
@@ -120,6 +121,7 @@ def _fitted(
             ) from None
         if not isinstance(state, Mapping) or not _only_tensors(state):
             raise ModelError(f"read_checkpoint of {definition.name!r} gives no named tensors")
+    # What does not fit.
     problems = {
         "missing": [n for n in own if n not in state and not n.endswith(_COUNTER)],
         "complex": [n for n in own if n in state and state[n].is_complex() > own[n].is_complex()],
@@ -172,6 +174,7 @@ def _short(word: str) -> str:
 
 def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     """The named tensors of a file or folder, and notes about it."""
+    # A folder, or a file that is there itself.
     path, key = file_and_part(path)
     if path.is_dir():
         return _read_folder(path)
@@ -187,6 +190,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
             " fetches that"
         )
     check_network_file(path, "checkpoint", CheckpointError)
+    # Its reader gives named tensors, or what a torch file holds.
     kind, read = _READERS.get(path.suffix, ("torch file", read_torch_file))
     try:
         content = read(path)
@@ -198,6 +202,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], list[str]]:
         if key:
             raise CheckpointError(f"checkpoint {path} is a {kind}, which has no {key!r} to choose")
         return content, []
+    # The state dict in that.
     content, names = content
     state, notes = _state_in(content, path, key)
     if names:
@@ -230,7 +235,7 @@ def _state_in(content: Any, path: Path, key: str) -> tuple[dict[str, Tensor], li
     """The state dict in what a torch file holds, and a note where there are several.
 
     Args:
-        key: Of the one to read. Empty: a usual one.
+        key: Name of the state dict to read. Empty: a usual one.
     """
     if not key and is_module(content):
         return module_state(content), []

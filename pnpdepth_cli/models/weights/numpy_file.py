@@ -81,7 +81,7 @@ def _read_pickled_dict(path: Path) -> dict[str, Tensor]:
     made: dict[int, Tensor] = {}
     for name, value in _entries(objects[0]):
         if id(value) not in made:
-            made[id(value)] = _unpickled(value, name, left)
+            made[id(value)] = _unpickle(value, name, left)
             left -= made[id(value)].nbytes
         tensors[name] = made[id(value)]
         _check_entries(tensors)
@@ -113,7 +113,7 @@ def _entries(
             yield f"{prefix}{key}", value
 
 
-def _unpickled(value: Any, name: str, most: int) -> Tensor:
+def _unpickle(value: Any, name: str, most: int) -> Tensor:
     """The tensor of a pickled array of at most so many bytes."""
     _, shape, dtype, fortran, data = _state_of_array(value)
     if not isinstance(shape, tuple):

@@ -81,9 +81,9 @@ def read_pickle(
     A broken pickle raises BrokenFileError or what its parts raise.
 
     Args:
-        file: Stands at the first opcode, afterwards behind the last. In memory or mapped: its
-            `read` allocates no more than there is.
-        load_storage: Returns the flat tensor for a persistent id
+        file: File that stands at the first opcode, afterwards behind the last. It is in memory or
+            mapped: its `read` allocates no more than there is.
+        load_storage: Function that returns the flat tensor for a persistent id
             ("storage", type, key, location, elements, ...); None refuses one.
     """
     machine = _Machine(load_storage)
@@ -110,8 +110,9 @@ class _Machine:
             raise BrokenFileError(f"its pickle takes more than {MAX_STEPS:,} steps")
 
     def step(self, opcode: str, argument: Any) -> None:
-        """Does what the opcode says, except for a call; see `_called`."""
+        """Does what the opcode says. Instead of a call, see `_call`."""
         stack = self.stack
+        # One case for each opcode that pickles of weights have.
         match opcode:
             case "BINPUT" | "LONG_BINPUT":
                 self._memo[argument] = stack[-1]
@@ -145,10 +146,10 @@ class _Machine:
             case "STACK_GLOBAL":
                 stack.append(self._name(stack.pop(-2), stack.pop()))
             case "REDUCE" | "NEWOBJ":
-                stack.append(self._called(stack.pop(-2), stack.pop()))
+                stack.append(self._call(stack.pop(-2), stack.pop()))
             case "NEWOBJ_EX":  # the last are arguments by name
                 stack[-1:] = []
-                stack.append(self._called(stack.pop(-2), stack.pop()))
+                stack.append(self._call(stack.pop(-2), stack.pop()))
             case "BUILD":
                 state = stack.pop()
                 if isinstance(stack[-1], StandIn):
@@ -206,10 +207,11 @@ class _Machine:
             raise BrokenFileError("its pickle refers to something outside it")
         return self._load_storage(pid)
 
-    def _called(self, function: Any, arguments: Any) -> Any:
-        """What stands for a call's result; only tensors and plain containers are made."""
+    def _call(self, function: Any, arguments: Any) -> Any:
+        """The result of a call if it is a tensor or a plain container, else what stands for it."""
         if not isinstance(arguments, tuple) or not isinstance(function, Name):
             raise BrokenFileError("its pickle calls something other than a function")
+        # Plain containers and tensors are made; nothing is run.
         first = arguments[0] if arguments else None
         match function.path:
             case "collections.OrderedDict" | "collections.defaultdict" | "builtins.dict":
@@ -222,20 +224,21 @@ class _Machine:
             case "torch.Size" | "torch.device":
                 return first or ()
             case "copyreg._reconstructor" if isinstance(first, Name):
-                return self._called(first, ())
+                return self._call(first, ())
             case "torch._utils._rebuild_tensor" | "torch._utils._rebuild_tensor_v2":
                 return view_of(*arguments[:4])
             case "torch._utils._rebuild_tensor_v3":  # of a dtype that storages do not name
                 storage, *view = arguments[:4]
                 return view_of(storage.view(_DTYPES[arguments[6].path]), *view)
             case "torch._tensor._rebuild_from_type_v2":  # it has attributes of its own
-                return self._called(first, arguments[2])
+                return self._call(first, arguments[2])
             case (
                 "torch._utils._rebuild_parameter"
                 | "torch._utils._rebuild_parameter_with_state"
                 | "torch.nn.parameter.Parameter"
             ):
                 return first
+        # Anything else is remembered by its name.
         self.stood_for.setdefault(function.path)
         return StandIn(function.path, arguments)
 

@@ -36,6 +36,7 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
 
     The files of values lie beside PREFIX.index. A broken file raises whatever its parts do.
     """
+    # The table of variables, after its header.
     table = dict(_table(index.read_bytes()))
     header = _message(table.pop(b"", b""))
     if _last(header, 2) != 0:
@@ -49,6 +50,7 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
             raise BrokenFileError("a variable is in slices")
         if _last(fields, 1) == _TEXT:
             continue
+        # The file of its values, read once.
         shard = _last(fields, 3)
         if shard not in shards:
             path = index.with_name(f"{index.stem}.data-{shard:05d}-of-{_last(header, 1):05d}")
@@ -57,6 +59,7 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
             check_network_file(path, "its file", BrokenFileError)
             shards[shard] = path.read_bytes()
             left += len(shards[shard])
+        # Variables claim no more than the files have.
         size = _last(fields, 5)
         check_claim(f"{name} has {size:,} bytes", size, left, error=BrokenFileError)
         left -= size

@@ -112,10 +112,12 @@ def refuse_inflated(archive: zipfile.ZipFile, path: Path) -> None:
 
 
 def _read_row_of_pickles(file: mmap) -> tuple[Any, list[str]]:
-    """magic, protocol, system, content, keys of the storages; then each storage's length and bytes.
+    """The content of a torch file of before PyTorch 1.6, and the names in its pickle.
 
-    The content comes before the storages, which are filled afterwards.
+    Such a file has pickles of a magic number, the protocol, the system, the content, and the keys
+    of the storages. Each storage's length and bytes follow, so that storages are filled at the end.
     """
+    # It begins with the magic number.
     try:
         begins, _ = read_pickle(file)
     except CONTENT_ERRORS:  # of another kind of file
@@ -124,6 +126,7 @@ def _read_row_of_pickles(file: mmap) -> tuple[Any, list[str]]:
         raise BrokenFileError("it begins as no torch file does")
     for _ in ("protocol", "system"):
         read_pickle(file)
+    # The content, with storages of the size that it states.
     promised = 0
 
     def room_for(key: str, count: int) -> bytearray:
@@ -136,6 +139,7 @@ def _read_row_of_pickles(file: mmap) -> tuple[Any, list[str]]:
 
     storages = _Storages(room_for)
     content, named = read_pickle(file, storages.load)
+    # The bytes of each storage.
     keys, _ = read_pickle(file)
     plain = isinstance(keys, list) and all(isinstance(key, str | int) for key in keys)
     if not plain or {*map(str, keys)} != storages.contents.keys():
