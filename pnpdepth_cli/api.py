@@ -78,17 +78,18 @@ def refine(
     """Returns the refined depth of one frame.
 
     Args:
-        network: From `load_network`.
-        image: As of `Refiner.refine`.
-        sparse: As of `Refiner.refine`.
-        settings: As of `Refiner`, like `uncertainty` and `registration`.
-        unit: As of `Refiner.refine`.
+        network: Network from `load_network`.
+        image: Image as `Refiner.refine` takes it; None for a network that takes sparse depth only.
+        sparse: Depth map, rows of x, y and depth, or SparsePoints, as `Refiner.refine` takes them.
+        settings: Settings as `Refiner` takes them; what they leave open, the network decides.
+        unit: Unit of the depth of an array, "m" or "mm".
         uncertainty: Whether the standard deviation of the depth is estimated too.
-        registration: Whether the image is moved into the frame of the points.
+        registration: Whether the image is moved to the points: "auto", "off", or (zoom, right,
+            down).
 
     Raises:
         InputError: Image or points cannot be used.
-        DivergedError: As of `Refiner.refine`.
+        DivergedError: The loss became non-finite; `last_good` is the Refined before that.
     """
     with Refiner(network, settings, uncertainty=uncertainty, registration=registration) as refiner:
         return refiner.refine(image, sparse, unit=unit)
@@ -107,8 +108,8 @@ def score(
         depth: Predicted depth, any shape, metres.
         ground_truth: Ground truth of the same shape. Zero, negative and non-finite values are
             unknown, in both.
-        unit: Of the ground truth, "m" or "mm"; needed where it is of integers.
-        thresholds: Of δ1, δ2 and δ3.
+        unit: Unit of the ground truth, "m" or "mm"; needed where it is of integers.
+        thresholds: Thresholds of δ1, δ2 and δ3.
 
     Raises:
         SizeError: The shapes differ.

@@ -73,10 +73,10 @@ def check_claim(
     Every reader calls this with what a file claims, before memory is taken for it.
 
     Args:
-        claim: What claims how much, as in "a.png has 9 pixels": the beginning of the message.
+        claim: Beginning of the message, such as "a.png has 9 pixels".
         size: Bytes, pixels, values or entries claimed.
         most: Largest size allowed.
-        error: Makes the error of a message.
+        error: Type of the error, or function that makes it of a message.
         way_out: End of the message.
     """
     if not 0 <= size <= most:

@@ -1,4 +1,4 @@
-"""A camera, and the pose of a scanner in its frame."""
+"""A camera, and the pose of a scanner in its coordinates."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ class Camera:
 
 
 class Extrinsics(NamedTuple):
-    """The pose of a scanner in a camera's frame: x_camera = rotation · x_scanner + translation."""
+    """The pose of a scanner beside a camera: x_camera = rotation · x_scanner + translation."""
 
     rotation: Floats  # (3, 3)
-    translation: Floats  # (3,) metres, the scanner's origin in the camera's frame
+    translation: Floats  # (3,) metres, the scanner's origin in the camera's coordinates
 
     def moved(self, points: NDArray[np.floating]) -> Floats:
-        """Returns (N, 3) points of the scanner's frame in the camera's frame, metres."""
+        """Returns (N, 3) points of the scanner in the camera's coordinates, metres."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
     def __matmul__(self, other: Extrinsics) -> Extrinsics:
-        """Returns the pose in this frame of what has a pose in this one's scanner's frame."""
+        """Returns the pose beside this camera of what has the other pose beside the scanner."""
         turn, shift = self
         return Extrinsics(turn @ other.rotation, turn @ other.translation + shift)
 
     def inverse(self) -> Extrinsics:
-        """Returns the pose of the camera in the scanner's frame."""
+        """Returns the pose of the camera in the scanner's coordinates."""
         return Extrinsics(self.rotation.T, -self.rotation.T @ self.translation)
 
     def square(self) -> Floats:
@@ -65,5 +65,5 @@ class Extrinsics(NamedTuple):
         return matrix
 
 
-SAME_FRAME = Extrinsics(np.eye(3), np.zeros(3))
-"""The pose of a frame in itself."""
+SAME_PLACE = Extrinsics(np.eye(3), np.zeros(3))
+"""The pose of a sensor in its own coordinates."""

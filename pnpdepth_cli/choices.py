@@ -31,7 +31,7 @@ class OpenList(Mapping[str, Any]):
         path: Path of the folder or the module relative to `package`, such as "commands/exports".
         attribute: Name of the object in each module.
         group: Last part of the entry point group.
-        noun: What one entry is called in messages.
+        noun: Name of one entry in messages.
         names: All names in the module's table, in the order of their listing.
         first: Names listed before the others, which follow in alphabetical order.
         package: The package that `path` belongs to.

@@ -52,7 +52,7 @@ class FileRecord:
     poses: str | None = None
     """Where the motion to a neighbouring frame is from."""
     motion: list[list[float]] | None = None
-    """(3, 4) from the camera's frame of the neighbour to that of the frame."""
+    """(3, 4) from the camera's coordinates at the neighbour to those at the frame."""
     contradicts_images: bool = False
     """Whether the images show another motion."""
 

@@ -323,13 +323,13 @@ def boundary_f1(predicted: Image, truth: Image) -> float:
 def boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
     """Returns the F1 of the boundaries as MoGe's code prints it.
 
-    Pairs are of a pixel and all others within the radius; F1 is of all pairs together, and its mean
+    Pairs are of a pixel and all others within the radius. F1 is of all pairs together, and its mean
     over the ratios is weighted by the ratio − 1. Pixels nearer than the radius to the border are
     neighbours alone.
 
     Args:
-        predicted: As of `boundary_f1`.
-        truth: As of `boundary_f1`.
+        predicted: (H, W) metres, 0 where unknown.
+        truth: (H, W) metres, 0 where unknown.
         radius: Pixels, 1 to 3 in MoGe's tables.
     """
     span = range(-radius, radius + 1)
@@ -418,7 +418,7 @@ def within_sigma(predicted: Image, truth: Image, sigma: Image, factor: int) -> f
         predicted: (H, W) metres, 0 where unknown.
         truth: (H, W) metres, 0 where unknown.
         sigma: (H, W) standard deviation of the prediction in metres, 0 where unknown.
-        factor: How many standard deviations.
+        factor: Number of standard deviations.
 
     Returns:
         NaN if no pixel has all three.
@@ -434,9 +434,9 @@ def sparsification_error(predicted: Image, truth: Image, sigma: Image) -> float:
     its error is the difference from removing those of the largest error (Ilg et al., ECCV 2018).
 
     Args:
-        predicted: As of `within_sigma`.
-        truth: As of `within_sigma`.
-        sigma: As of `within_sigma`.
+        predicted: (H, W) metres, 0 where unknown.
+        truth: (H, W) metres, 0 where unknown.
+        sigma: (H, W) standard deviation of the prediction in metres, 0 where unknown.
     """
     import numpy as np
 

@@ -124,9 +124,9 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
     from pnpdepth_cli.commands.batch.find_frames import unpack
 
     values = dict(values)
-    own = options.taken(BatchRequest, values)
-    own["cluster"] = ClusterOptions(**options.taken(ClusterOptions, values))
-    own["sequence"] = SequenceOptions(**options.taken(SequenceOptions, values))
+    own = options.take_options(BatchRequest, values)
+    own["cluster"] = ClusterOptions(**options.take_options(ClusterOptions, values))
+    own["sequence"] = SequenceOptions(**options.take_options(SequenceOptions, values))
     own |= {name: values.pop(name) for name in ("source", "output")}
     sample = None if (text := values.pop("sample")) is None else parse_sample(text)
     request = BatchRequest(refine=options.request_of(values, sample=sample), **own)

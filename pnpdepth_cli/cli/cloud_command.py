@@ -62,8 +62,8 @@ def cloud(**values: Any) -> None:
     pnpdepth cloud out/ --calib calib.txt --poses poses.txt --min-views 2 -o drive.ply
     pnpdepth cloud depth.exr --image img.png --fov 60 -o img.ply
 
-    The cloud is in the camera's frame (x right, y down, z forward), with poses in the world's.
-    Pixels that NAME_valid.png beside NAME_depth excludes are left out.
+    The cloud is in the camera's coordinates (x right, y down, z forward), with poses in the
+    world's. Pixels that NAME_valid.png beside NAME_depth excludes are left out.
     """
     from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
 

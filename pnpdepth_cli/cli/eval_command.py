@@ -76,6 +76,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     from pnpdepth_cli.commands.report import eval_report as report_eval
     from pnpdepth_cli.measures import OF_SIGMA, chosen_measures
 
+    # All that can be wrong is found before anything is scored.
     files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
     files.check((prediction, ground_truth))
     keys = values.pop("columns")
@@ -83,6 +84,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
         report_eval.check_eval_report(html, [prediction, ground_truth], overwrite=files.overwrite)
     request = EvalRequest(prediction=prediction, ground_truth=ground_truth, **values)
     chosen_measures((*request.measures, *OF_SIGMA), keys)
+    # The scores, as tables and as JSON.
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
     print_notes([f"protocol {request.describe()}", *evaluation.notes])

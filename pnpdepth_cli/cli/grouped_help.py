@@ -29,9 +29,9 @@ class GroupedCommand(click.Command):
     """A command whose help lists its options in groups.
 
     Args:
-        groups: By the title of their group, in the order of the help, long names of options and
-            dataclasses of a request, which stand for those of their options that are named nowhere
-            else. What the command does not have is skipped.
+        groups: Members of each group by its title, in the order of the help. A member is the long
+            name of an option, or a dataclass of a request, which stands for those of its options
+            that are named nowhere else. What the command does not have is skipped.
         common: Long names of the options that `--help` shows; None shows all, and there is no
             `--help-all`.
     """

@@ -17,7 +17,7 @@ import click
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.cli.streams import INTERRUPTED, printable, say, shortened
+from pnpdepth_cli.cli.streams import INTERRUPTED, printable, say, shorten
 from pnpdepth_cli.errors import DeviceError, InputError, OutputError, PnpDepthError
 
 _EXIT_CODES = """\b
@@ -158,7 +158,7 @@ def _end(message: object, code: int) -> int:
             sys.stdout.flush()
     except OSError:  # it is full
         sys.stdout = None
-    say(f"pnpdepth: {shortened(printable(message))}")
+    say(f"pnpdepth: {shorten(printable(message))}")
     return code
 
 

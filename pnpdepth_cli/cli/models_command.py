@@ -39,6 +39,7 @@ def list_command(as_json: bool) -> None:
     """List the networks that --model takes by name, with their inputs, outputs and defaults."""
     from pnpdepth_cli.commands.networks.describe import list_models
 
+    # As JSON, or as a table with a row for each network.
     listed = list_models()
     if as_json:
         print_json(listed)

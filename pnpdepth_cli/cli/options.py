@@ -154,7 +154,7 @@ def table_files(*, csv: str, latex: str) -> Callable[[Any], Any]:
     return decorate
 
 
-def taken(group: type, values: dict[str, Any]) -> dict[str, Any]:
+def take_options(group: type, values: dict[str, Any]) -> dict[str, Any]:
     """Returns the options of this group by name; they are removed from `values`."""
     names = [each.name for each in options_of(group)]
     return {name: values.pop(name) for name in names if name in values}
@@ -164,10 +164,10 @@ def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
     """Returns the request that these options of a command make.
 
     Args:
-        values: Of the options of `refinement`, by their names.
+        values: Values of the options of `refinement`, by their names.
         **others: Other fields of the request.
     """
-    scan_options = ScanOptions(**taken(ScanOptions, values))
+    scan_options = ScanOptions(**take_options(ScanOptions, values))
     if isinstance(values.get("model"), tuple):  # of the commands that take several
         first, *more = values["model"]
         others |= {"model": first, "more_models": tuple(more)}

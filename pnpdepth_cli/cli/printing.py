@@ -122,6 +122,7 @@ def print_notes(notes: Sequence[str]) -> None:
 def print_refinement(record: FrameRecord) -> None:
     """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
     assert record.method is not None
+    # Notes and tables of errors.
     is_default, errors = record.method.kind == "default", record.errors
     print_notes(record.notes)
     print_table(refinement_table(record), err=True)
@@ -136,6 +137,7 @@ def print_refinement(record: FrameRecord) -> None:
         where = "held-out points" if HELD_OUT in errors else "points used"
         where = "pixels with ground truth" if GT in errors else where
         console.print(f"improved: {record.improved_fraction:.1%} of the {where}")
+    # Updates, times and files.
     settings = record.settings
     updates = (
         f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
@@ -147,10 +149,10 @@ def print_refinement(record: FrameRecord) -> None:
         + f" · peak {record.peak_memory_mb['process']:,.0f} MB",
         soft_wrap=True,
     )
-    _print_written(console, "wrote", record.outputs.values())
+    _print_paths(console, "wrote", record.outputs.values())
 
 
-def _print_written(console: Console, start: str, paths: Iterable[str]) -> None:
+def _print_paths(console: Console, start: str, paths: Iterable[str]) -> None:
     console.print(f"{start} {escape('  '.join(paths))}", soft_wrap=True)
 
 
@@ -162,6 +164,7 @@ def print_batch(summary: BatchSummary) -> None:
     print_notes(summary.notes)
     if has_baselines(errors):
         print_table(baselines_table(errors, summary.unit), err=True)
+    # Counts of frames.
     parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
     parts += [
         f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
@@ -173,6 +176,7 @@ def print_batch(summary: BatchSummary) -> None:
         parts.append(f"{worse} worse than linear interpolation")
     console = _Console(stderr=True, highlight=False)
     console.print(", ".join(parts))
+    # Warnings of several frames, each once, weights and files.
     for each in summary.warnings:
         more = "" if each.frames <= len(each.first) else ", …"
         names = f"{', '.join(each.first)}{more}"
@@ -195,4 +199,4 @@ def print_sparse(record: Mapping[str, Any]) -> None:
         " pixels:"
     )
     written = [path for path in record["outputs"].values() if path]
-    _print_written(_Console(stderr=True, highlight=False), start, written)
+    _print_paths(_Console(stderr=True, highlight=False), start, written)

@@ -26,6 +26,7 @@ def progress_bar(title: str, unit: str, *, stays: bool = False) -> Iterator[Call
     Not on a terminal, it prints a line per minute. The time counts from the first call of `show`.
     A bar that stays is drawn from the beginning, and left at the end.
     """
+    # The bar begins with the first call of `show`.
     bar: tqdm[Any] | None = None
     began = printed_at = 0.0
 

@@ -48,7 +48,7 @@ def project(
     from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 
     target = SparseTarget(output=output, overwrite=overwrite)
-    of_scan = ScanOptions(**options.taken(ScanOptions, values))
+    of_scan = ScanOptions(**options.take_options(ScanOptions, values))
     print_sparse(project_scan(scan, of_scan, target, image, scale=depth_scale))
 
 

@@ -32,7 +32,7 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2))
 
 
-def shortened(text: str) -> str:
+def shorten(text: str) -> str:
     """Returns the text, without its middle where it is longer than 2,000 characters."""
     half = _LONGEST // 2
     return text if len(text) <= _LONGEST else f"{text[:half]} … {text[-half:]}"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.camera import SAME_FRAME, Camera, Extrinsics
+from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.dataset.plausible import scan_returns
 from pnpdepth_cli.dataset.read_options import METRES, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
@@ -116,7 +116,7 @@ def read_scan_points(
         warnings.append(note)
     camera, scanner = calibration.camera, calibration.scanner
     assert scanner is not None
-    if options.extrinsics is not None and calibration.rectification is not SAME_FRAME:
+    if options.extrinsics is not None and calibration.rectification is not SAME_PLACE:
         warnings.append(
             f"extrinsics: in the coordinates of the unrectified camera 0; the rotation and offset"
             f" that {named} rectifies with are applied"

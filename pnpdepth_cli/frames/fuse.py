@@ -333,7 +333,7 @@ def _expert(
         network: The network that predicts, open.
         split: The frame and its validation points.
         name: Name of the expert.
-        known: Its prediction from all points, where that was computed already.
+        known: Prediction from all points, where it was computed already.
         prior: The expert whose depth is the network's prior.
         user: The user's network whose depth it is, or has as a prior.
         updates: Whether z is updated with all points, which takes as long as all else.

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import SAME_FRAME, Camera, Extrinsics
+from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.extrinsics import check_pose, numbers_in, pose_of_matrix
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_text_size, one_line, read_bytes
@@ -77,7 +77,7 @@ class Calibration:
 
     camera: Camera
     scanner: Extrinsics | None = None  # None: the file does not state its pose
-    rectification: Extrinsics = SAME_FRAME
+    rectification: Extrinsics = SAME_PLACE
     """Pose, in the camera's coordinates, of the camera that poses of the scanner refer to, such as
     KITTI's unrectified camera 0 in a rectified one."""
     rectified: Mapping[str, tuple[Camera, Extrinsics]] = field(default_factory=dict)
@@ -178,7 +178,7 @@ def _rectified_cameras(
         offset = np.linalg.solve(intrinsics, p.reshape(3, 4)[:, 3])
     plain = Camera(intrinsics=intrinsics, size=raw.size, source=raw.source)
     turned = not np.allclose(turn, np.eye(3), atol=1e-9)
-    cameras = {"P": (plain, SAME_FRAME)}
+    cameras = {"P": (plain, SAME_PLACE)}
     if turned:
         cameras = {"P and R": (plain, Extrinsics(turn, np.zeros(3)))} | cameras
     if np.abs(offset).max() > 1e-9:

@@ -3,7 +3,7 @@
 The paper's four are there by data sheet, and as the paper has them.
 
 A rotating LiDAR fires all its beams at every azimuth step. Elevations are degrees above the
-horizontal; its frame is x forward, y left, z up.
+horizontal; its coordinates are x forward, y left, z up.
 """
 
 from __future__ import annotations

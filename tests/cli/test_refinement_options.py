@@ -9,7 +9,7 @@ import click
 import pytest
 
 from pnpdepth_cli.cli.batch_command import batch
-from pnpdepth_cli.cli.options import taken
+from pnpdepth_cli.cli.options import take_options
 from pnpdepth_cli.cli.refine_command import refine
 from pnpdepth_cli.commands.refinement.refine_request import OutputOptions, RefineRequest
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
@@ -51,9 +51,9 @@ def test_options_reach_the_settings(command: click.Command) -> None:
     arguments += ["--sparse", "s"] if command is refine else ["--format", "exr"]
     params = dict(command.make_context("command", arguments).params)
     assert params["normalise"] == "bytes"
-    assert taken(ScanOptions, params)["extrinsics"] == Path("pose.txt")
-    assert taken(ReadOptions, params)["unit_scale"] == 2
-    assert taken(OutputOptions, params).get("format", "exr") == "exr"
+    assert take_options(ScanOptions, params)["extrinsics"] == Path("pose.txt")
+    assert take_options(ReadOptions, params)["unit_scale"] == 2
+    assert take_options(OutputOptions, params).get("format", "exr") == "exr"
 
 
 def test_every_field_belongs_to_one_group_and_its_option_is_one_of_batch() -> None:

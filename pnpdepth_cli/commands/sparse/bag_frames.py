@@ -312,7 +312,9 @@ def _sensors(bag: Bag, wanted: Sequence[str], say: Say) -> _Sensors:
         own, other = of_images[0].camera, of_depth[0].camera
         if own.size == other.size and np.allclose(own.intrinsics, other.intrinsics, rtol=_SAME_K):
             return same
-        say(f"{points} is of another camera than {images}, but in its frame: no offset is known")
+        say(
+            f"{points} is of another camera than {images}, but has its frame_id: no offset is known"
+        )
     return replace(same, depth_camera=of_depth[0].camera)
 
 

@@ -106,6 +106,7 @@ def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
         raise InputError(f"{root}: no such folder; check the path")
     if (layout := _match(root, name)) is not None:
         return [root], layout
+    # The folders in it may be data sets of one layout.
     inside = sorted(root.iterdir()) if root.is_dir() else []
     folders = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
     found = {path: each for path in folders if (each := _match(path, name)) is not None}
@@ -117,6 +118,7 @@ def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
         )
     if found:
         return list(found), layouts[0]
+    # Why there is none.
     if root.suffix.lower() == ".r3d":
         raise InputError(
             f"{root}: the depth in it is compressed with LZFSE, which is not read; export 'EXR +"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import SAME_FRAME, Extrinsics
+from pnpdepth_cli.camera import SAME_PLACE, Extrinsics
 from pnpdepth_cli.io.bags import CAMERAS, COMPRESSED, ODOMETRY, POSES, TRANSFORMS, Bag
 from pnpdepth_cli.io.bags.messages import seconds_of
 from pnpdepth_cli.io.calibration import Calibration, camera_in_yaml
@@ -42,7 +42,7 @@ def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
 
 
 def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
-    """Returns the camera of the first message of a camera_info topic, and its frame's name."""
+    """Returns the camera of the first message of a camera_info topic, and its frame_id."""
     for _, _, message in bag.messages([topic]):
         k, d, r, p = (
             np.asarray(getattr(message, name, getattr(message, name.upper(), ())), np.float64)
@@ -167,7 +167,7 @@ def _add_link(links: Links, link: tuple[str, str], pose: Extrinsics) -> None:
 
 def _chain(links: Links, start: str, end: str) -> Extrinsics | None:
     """The pose x_start = pose · x_end along the shortest chain of links; None if none."""
-    poses = {start: SAME_FRAME}
+    poses = {start: SAME_PLACE}
     waiting = deque([start])
     while waiting and end not in poses:
         frame = waiting.popleft()
