@@ -104,7 +104,7 @@ def set_max_pixels(max_pixels: int | None) -> None:
     _chosen = max_pixels
 
 
-def chosen_max_pixels() -> int | None:
+def max_pixels_given() -> int | None:
     """What `set_max_pixels` was given; None for the default."""
     return _chosen
 

@@ -45,7 +45,7 @@ class Extrinsics(NamedTuple):
     rotation: Floats  # (3, 3)
     translation: Floats  # (3,) metres, the scanner's origin in the camera's coordinates
 
-    def moved(self, points: NDArray[np.floating]) -> Floats:
+    def apply(self, points: NDArray[np.floating]) -> Floats:
         """Returns (N, 3) points of the scanner in the camera's coordinates, metres."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
 

@@ -317,7 +317,7 @@ def boundary_f1(predicted: Image, truth: Image) -> float:
         recall = sum(both / max(true, 1) for both, _, true in of_sides) / 4
         precision = sum(both / max(own, 1) for both, own, _ in of_sides) / 4
         scores.append(2 * recall * precision / (recall + precision) if recall + precision else 0.0)
-    return _weighted(scores, _RATIOS)
+    return _weigh(scores, _RATIOS)
 
 
 def boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
@@ -341,10 +341,10 @@ def boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
     for of_disc in zip(*(of_ratio for _, of_ratio in counts), strict=True):
         both, own, true = (sum(column) for column in zip(*of_disc, strict=True))
         scores.append(2 * both / (own + true) if own + true else 0.0)
-    return _weighted(scores, [ratio - 1 for ratio in _RATIOS])
+    return _weigh(scores, [ratio - 1 for ratio in _RATIOS])
 
 
-def _weighted(scores: Sequence[float], weights: Sequence[float]) -> float:
+def _weigh(scores: Sequence[float], weights: Sequence[float]) -> float:
     total = sum(weight * score for weight, score in zip(weights, scores, strict=True))
     return total / sum(weights)
 
@@ -485,7 +485,7 @@ def parse_keys(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(text.split(",")))
 
 
-def chosen_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> tuple[Measure, ...]:
+def choose_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> tuple[Measure, ...]:
     """Returns the measures with these keys, in their order; all for None.
 
     Raises:

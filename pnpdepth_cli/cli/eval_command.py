@@ -74,7 +74,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     from pnpdepth_cli.commands.evaluation import eval_tables as tables
     from pnpdepth_cli.commands.evaluation.evaluate import evaluate as run_evaluation
     from pnpdepth_cli.commands.report import eval_report as report_eval
-    from pnpdepth_cli.measures import OF_SIGMA, chosen_measures
+    from pnpdepth_cli.measures import OF_SIGMA, choose_measures
 
     # All that can be wrong is found before anything is scored.
     files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
@@ -83,7 +83,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     if html is not None:
         report_eval.check_eval_report(html, [prediction, ground_truth], overwrite=files.overwrite)
     request = EvalRequest(prediction=prediction, ground_truth=ground_truth, **values)
-    chosen_measures((*request.measures, *OF_SIGMA), keys)
+    choose_measures((*request.measures, *OF_SIGMA), keys)
     # The scores, as tables and as JSON.
     with progress_bar("eval", "frame") as show:
         evaluation = run_evaluation(request, on_frame=show)
@@ -100,7 +100,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
         with progress_bar("report", "frame") as show:
             report_eval.write_eval_report(html, evaluation, keys, on_frame=show)
         say(f"wrote {html / 'index.html'}")
-    if reasons := evaluation.unscored():
+    if reasons := evaluation.describe_unscored():
         out, of = len(evaluation.frames) - len(evaluation.scored), len(evaluation.frames)
         raise FramesFailedError(
             f"{out:,} of {of:,} frames were not scored ({reasons}); the means are over the others"

@@ -185,7 +185,7 @@ def _parts(
         image = request.image or frame.image
         rgb = image_of_size(image, depth.shape) if coloured and image is not None else None
         for part in cloud_from_depth(depth, here.camera, rgb=rgb):
-            yield part if pose is None else part.transformed(pose)
+            yield part if pose is None else part.transform(pose)
 
 
 def _merge(

@@ -98,7 +98,7 @@ def refinement_table(record: FrameRecord) -> Table:
     assert record.model is not None
     title = f"{record.model.name} cut at {record.settings['layer']}"
     if GT in record.errors:
-        title += f"; {_scored_on(record.errors[GT][AFTER])}"
+        title += f"; {_describe_pixels(record.errors[GT][AFTER])}"
     return error_table(title, record.errors, record.unit)
 
 
@@ -108,7 +108,7 @@ def held_out_table(record: FrameRecord) -> Table:
     return error_table(title, record.errors, record.unit, bases=[HELD_OUT])
 
 
-def made_by(record: FrameRecord) -> tuple[str, str]:
+def names_of_depths(record: FrameRecord) -> tuple[str, str]:
     """Returns what the depth before and the depth after of a record are of, in a few words."""
     assert record.method is not None
     assert record.model is not None
@@ -138,7 +138,7 @@ def _stages_table(record: FrameRecord) -> Table:
     # Scores on the ground truth, or at validation points.
     if stages := errors.get(GT):
         rows = {name: stages[name] for name in _STAGES if name in stages}
-        keys, scored = ["rmse", "mae", "mre", "delta1"], _scored_on(stages[LINEAR])
+        keys, scored = ["rmse", "mae", "mre", "delta1"], _describe_pixels(stages[LINEAR])
     elif stages := errors.get(VALIDATION):
         rows = {name: stages[name] for name in _STAGES if name in stages}
         scored = f"at {stages[LINEAR]['points']:,} validation points, which the rows did not get"
@@ -224,7 +224,7 @@ def change(key: str, before: float | None, after: float | None) -> Cell:
     return Cell(text, "good" if gain > 0 else "bad" if gain < 0 else "dim")
 
 
-def _scored_on(scores: Scores) -> str:
+def _describe_pixels(scores: Scores) -> str:
     return (
         f"scored on {scores['pixels']:,} pixels of ground truth"
         f" ({scores['coverage']:.1%} of those known)"

@@ -122,7 +122,9 @@ def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -
     return min(fits, key=_bic)
 
 
-def aligned(prediction: Tensor, points: SparsePoints, *, kind: str, space: str = "depth") -> Tensor:
+def align_prediction(
+    prediction: Tensor, points: SparsePoints, *, kind: str, space: str = "depth"
+) -> Tensor:
     """Returns the prediction aligned with the points, (H, W) float32 metres, 0 = unknown.
 
     Args:

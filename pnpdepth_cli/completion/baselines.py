@@ -14,7 +14,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.alignment import align, aligned, to_space, where_predicted
+from pnpdepth_cli.completion.alignment import align, align_prediction, to_space, where_predicted
 from pnpdepth_cli.completion.interpolation import (
     distinct,
     inverse_distance,
@@ -65,7 +65,7 @@ class Baseline:
 
 
 def _align_by(title: str, kind: str, space: str) -> Baseline:
-    return Baseline(title=title, of_prediction=partial(aligned, kind=kind, space=space))
+    return Baseline(title=title, of_prediction=partial(align_prediction, kind=kind, space=space))
 
 
 def align_locally(

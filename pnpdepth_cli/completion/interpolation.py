@@ -190,7 +190,7 @@ def remember(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.lru_cache(maxsize)
-        def known(*keys: bytes | int) -> Any:
+        def call_once(*keys: bytes | int) -> Any:
             return function(
                 *(k if isinstance(k, int) else np.frombuffer(k).reshape(-1, 2) for k in keys)
             )
@@ -199,7 +199,7 @@ def remember(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]
         def call(*args: Any) -> Any:
             if sum(len(arg) for arg in args if not isinstance(arg, int)) > _MOST_REMEMBERED:
                 return function(*args)
-            return known(*(arg if isinstance(arg, int) else arg.tobytes() for arg in args))
+            return call_once(*(arg if isinstance(arg, int) else arg.tobytes() for arg in args))
 
         return call
 

@@ -125,7 +125,7 @@ def read_scan_points(
         warnings += check_direction(xyz, camera, scanner, size)
     # They are projected, and what seems wrong is warned of.
     points = project_velodyne(xyz, camera, scanner, size, keep_occluded=options.keep_occluded)
-    warnings += _outside_warning(scanner.moved(xyz), camera, size)
+    warnings += _outside_warning(scanner.apply(xyz), camera, size)
     if image is not None and not calibration.rectified:
         warnings += _better_reading(points, calibration, _other_cameras(named, options), image)
     # What a person should know, and what a record keeps.
@@ -227,7 +227,7 @@ def check_direction(
     poses = (scanner, scanner.inverse())
     inside, inverted = (
         int(np.count_nonzero(in_frame(pixels_of(camera, xyz[xyz[:, 2] > 0]), size)))
-        for xyz in (pose.moved(scan) for pose in poses)
+        for xyz in (pose.apply(scan) for pose in poses)
     )
     upright, upright_inverted = (_is_upright(scan, pose.rotation) for pose in poses)
     far_more = inverted >= _MORE_IF_INVERTED * max(inside, 1) and upright is not True
@@ -280,7 +280,7 @@ def _better_reading(
         return []
     ranks, jumps = edge_ranks(rgb), near_jumps(points)
     seen = unproject(own.camera, points.xy, points.depth)
-    xyz = scanner.inverse().moved(seen)
+    xyz = scanner.inverse().apply(seen)
 
     def agreement(moved: NDArray[np.float64], camera: Camera) -> float:
         ahead = moved[:, 2] > 0
@@ -296,10 +296,10 @@ def _better_reading(
     for axis, name in ((1, "y"), (2, "z")):
         flipped = xyz * np.where(np.arange(3) == axis, -1, 1)
         text = f"with {name} of the scan negated, as of left-handed ones (CARLA, Unity)"
-        readings[text] = _OTHER_READING, agreement(scanner.moved(flipped), own.camera)
+        readings[text] = _OTHER_READING, agreement(scanner.apply(flipped), own.camera)
     for option, other in others.items():
         if other.scanner is not None:
-            of_other = agreement(other.scanner.moved(xyz), other.camera)
+            of_other = agreement(other.scanner.apply(xyz), other.camera)
             readings[f"with {option}"] = _OTHER_READING, of_other
     for down, right in itertools.product(_TURNS_DEG, _TURNS_DEG):
         turn = Rotation.from_euler("xy", (down, right), degrees=True).as_matrix()

@@ -124,9 +124,9 @@ def learn(
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam(theta.values(), LR, eps=EPSILON)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
-    visited = _shuffled(len(training), generator)
+    visited = _shuffle(len(training), generator)
     for first in range(0, STEPS, STEPS_A_VISIT):
-        with training[next(visited)].opened(generator) as loss_of:
+        with training[next(visited)].open_lesson(generator) as loss_of:
             for step in range(first, min(first + STEPS_A_VISIT, STEPS)):
                 optimiser.zero_grad()
                 with torch.enable_grad():
@@ -176,7 +176,7 @@ class _Lesson:
         return cls(frame=prepared, points=points)
 
     @contextmanager
-    def opened(self, generator: torch.Generator) -> Iterator[Callable[[Weights], Tensor]]:
+    def open_lesson(self, generator: torch.Generator) -> Iterator[Callable[[Weights], Tensor]]:
         """Gives a function: the loss at hidden points for weights, others at every call.
 
         The points are divided into two halves, and each half is hidden once before they are
@@ -215,12 +215,12 @@ def _losses_of(lessons: Sequence[_Lesson], theta: Weights, seed: int) -> NDArray
     """The loss at hidden points of each frame; with a seed the same points are hidden."""
     losses = list[float]()
     for lesson in lessons:
-        with lesson.opened(torch.Generator().manual_seed(seed)) as loss_of, torch.no_grad():
+        with lesson.open_lesson(torch.Generator().manual_seed(seed)) as loss_of, torch.no_grad():
             losses.append(float(loss_of(theta)))
     return np.array(losses)
 
 
-def _shuffled(count: int, generator: torch.Generator) -> Iterator[int]:
+def _shuffle(count: int, generator: torch.Generator) -> Iterator[int]:
     """0 … count − 1 without end, shuffled anew when all were there."""
     while True:
         yield from torch.randperm(count, generator=generator).tolist()

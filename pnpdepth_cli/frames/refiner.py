@@ -112,7 +112,7 @@ class Refiner:
         """
         frame = frame_of_arrays(image, sparse, self._register, unit)
         with self._lock:
-            method = self._opened(frame)
+            method = self._method_for(frame)
             refined = method.refine(frame)
         refined = replace(refined, notes=(*method.network.notes, *frame.notes, *refined.notes))
         if refined.diverged is not None:
@@ -130,14 +130,16 @@ class Refiner:
         read = [frame_of_arrays(*pair, self._register, None) for pair in frames]
         if read:
             with self._lock:
-                self._opened(read[0]).share_registration(read)
+                self._method_for(read[0]).share_registration(read)
 
-    def _opened(self, first: Frame) -> Method:
+    def _method_for(self, first: Frame) -> Method:
         """The method, which this frame decides if it is the first."""
         if self._method is None:
             networks = list(self._networks)
             if self._adapt:
-                networks[0] = self._adapted(resolve_definition(networks[0], first.registered()))
+                networks[0] = self._adapt_network(
+                    resolve_definition(networks[0], first.registered())
+                )
             method = Method(
                 networks,
                 self._asked,
@@ -148,7 +150,7 @@ class Refiner:
             self._method = self._stack.enter_context(method)
         return self._method
 
-    def _adapted(self, network: Network) -> Network:
+    def _adapt_network(self, network: Network) -> Network:
         """The network with the weights that it learnt, if they are better, and a note on them."""
         why, own = too_little(len(self._adapt), self._adapt[0]), "the network's own weights: "
         if why is None:

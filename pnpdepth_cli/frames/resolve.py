@@ -75,7 +75,7 @@ def resolve_definition(
             network, note = _with_best_input_range(network, [frame, *more_frames()])
             notes.append(note)
         if definition.verify is not None:
-            notes += network.verified(prepare(network, frame).arguments)
+            notes += network.verify(prepare(network, frame).arguments)
     return replace(network, notes=tuple(notes))
 
 

@@ -254,7 +254,7 @@ def file_and_part(path: Path) -> tuple[Path, str]:
     return (path.with_name(name), part) if name and not path.exists() else (path, "")
 
 
-def undescribed(**known: Any) -> ModelDefinition:
+def assume_definition(**known: Any) -> ModelDefinition:
     """Returns a definition for a network that brings no description of its numbers.
 
     It is of rgb, and sides of images are padded to multiples of `ASSUMED_MULTIPLE`, unless other
@@ -318,4 +318,4 @@ def graph_definition(
         check_claim(claim, height * width, budget().max_pixels, error=ModelError, way_out=limit)
         known["size"] = Fixed(height, width)
     known |= {"name": file.stem, "complete": True, "checkpoint": file, "arguments": arguments}
-    return undescribed(**known | dict(stated))
+    return assume_definition(**known | dict(stated))

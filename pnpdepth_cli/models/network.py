@@ -125,7 +125,7 @@ class Network:
             intrinsics=frame.intrinsics_to_network(synthetic_camera(frame.image)),
         )
 
-    def verified(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
+    def verify(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
         """Returns the notes of the definition's `verify` on the network's arguments for a frame.
 
         Raises:

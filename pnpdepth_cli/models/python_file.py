@@ -16,7 +16,7 @@ from typing import Any
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
-from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, undescribed
+from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, assume_definition
 
 
 def python_definition(file: Path, attribute: str | None = None) -> ModelDefinition:
@@ -89,7 +89,7 @@ def _names_in_constructor(network: type) -> set[str]:
 
 def _assumed_definition(build: Callable[..., Any], attribute: str, file: Path) -> ModelDefinition:
     """A definition around a class or function that returns a network; the rest is assumed."""
-    return undescribed(
+    return assume_definition(
         name=f"{file.stem}.{attribute}",
         summary=f"{attribute} of {file.name}",
         build=build,

@@ -45,7 +45,7 @@ class PointCloud(NamedTuple):
     """(N, 3) unit vectors towards the camera; 0 where a point has no two neighbours."""
     rgb: NDArray[np.uint8] | None  # (N, 3) colours 0…255. None: without colours.
 
-    def transformed(self, pose: Floats) -> PointCloud:
+    def transform(self, pose: Floats) -> PointCloud:
         """Returns the cloud in the coordinates that a pose, (3, 4) or (4, 4), leads to."""
         xyz, normals = _apply(self.xyz, pose[:3]), self.normals @ pose[:3, :3].T
         return PointCloud(xyz.astype(np.float32), normals.astype(np.float32), self.rgb)

@@ -79,7 +79,7 @@ def project_velodyne(
     """
     xyz = np.asarray(points)[:, :3]
     drops = DropCounter()
-    seen = scanner.moved(xyz)
+    seen = scanner.apply(xyz)
     seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
     seen, xy = drops.keep_seen(seen, pixels_of(camera, seen), size)
     if not keep_occluded:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.choices import SPACES
-from pnpdepth_cli.completion.alignment import BEYOND, aligned, from_space, to_space
+from pnpdepth_cli.completion.alignment import BEYOND, align_prediction, from_space, to_space
 from pnpdepth_cli.completion.baselines import align_locally
 from pnpdepth_cli.completion.local_lines import RIDGE
 from pnpdepth_cli.completion.outliers import inlier_weights
@@ -37,7 +37,7 @@ def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve
     gt = scene_depth()
     points = spoiled(random_points(gt, 40), 0.1)
     prediction = gt * torch.linspace(0.6, 1.5, SIZE[1])
-    x = aligned(prediction, points, kind="auto", space="depth").double()
+    x = align_prediction(prediction, points, kind="auto", space="depth").double()
     at_points, y = points.sample(x).numpy(), points.depth.double().numpy()
     mean, std = at_points.mean(), at_points.std()
     inlier = inlier_weights(points, torch.from_numpy(np.log(y / at_points))).numpy()
@@ -64,7 +64,7 @@ def test_a_scale_that_drifts_over_the_image_is_followed(space: str, count: int) 
     drift = torch.linspace(0.6, 1.5, SIZE[1])
     points = random_points(gt, count)
     local = align_locally(gt * drift, points, space=space)
-    everywhere = aligned(gt * drift, points, kind="affine", space=space)
+    everywhere = align_prediction(gt * drift, points, kind="affine", space=space)
     assert mean_log_error(local, gt) < 0.35 * mean_log_error(everywhere, gt)
 
 

@@ -171,7 +171,7 @@ def test_kitti_360_maps_camera_0_to_the_scanner_and_has_one_rectification(tmp_pa
         for path in (tmp_path, tmp_path / "perspective.txt"):
             calibration = read_calibration(path, camera or None)
             assert calibration.scanner is not None
-            seen = calibration.scanner.moved(point[None])
+            seen = calibration.scanner.apply(point[None])
             pixel = pixels_of(calibration.camera, seen)[0]
             np.testing.assert_allclose([*pixel, seen[0, 2]], expected)
             assert calibration.camera.size == (376, 1408)

@@ -122,7 +122,7 @@ def test_a_definition_names_a_graph_of_image_sparse_depth_and_intrinsics(
         right = net(arguments[0], sparse, intrinsics)
         torch.testing.assert_close(network.raw_of(network.module(*arguments)), right)
     if suffix == ".onnx":
-        assert "agrees with onnxruntime" in network.verified(arguments)[0]
+        assert "agrees with onnxruntime" in network.verify(arguments)[0]
     with pytest.raises(UsageError):
         prepare(network, frame)
     with pytest.raises(ModelError):

@@ -42,7 +42,7 @@ def board_before_wall(left_m: float) -> tuple[NDArray[np.float64], NDArray[np.bo
 def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None:
     scan, hidden = board_before_wall(left_m)
     scanner = Extrinsics(FORWARD_LEFT_UP, np.array([-left_m, 0.0, 0.0]))
-    tree = cKDTree(pixels_of(CAMERA, scanner.moved(scan)))
+    tree = cKDTree(pixels_of(CAMERA, scanner.apply(scan)))
     everything, kept = (
         tree.query(project_velodyne(scan, CAMERA, scanner, SIZE, keep_occluded=keep).xy)[1]
         for keep in (True, False)

@@ -79,7 +79,7 @@ def test_unknown_and_excluded_pixels_have_no_point() -> None:
 def test_a_pose_moves_points_and_turns_normals() -> None:
     cloud = whole(np.full((HEIGHT, WIDTH), 3, np.float32), CAMERA)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    moved = cloud.transformed(np.column_stack([turn, [1.0, 2, 3]]))
+    moved = cloud.transform(np.column_stack([turn, [1.0, 2, 3]]))
     assert moved.xyz == pytest.approx(cloud.xyz @ turn.T + [1, 2, 3], abs=1e-5)
     assert moved.normals == pytest.approx(np.tile([-1.0, 0, 0], (len(cloud.xyz), 1)), abs=1e-5)
 

@@ -49,6 +49,6 @@ def test_a_lens_model_does_not_fold_points_from_outside_into_the_image() -> None
     # 1 - 0.4 r² turns back at r = 0.91: a point at r = 1.58 would land on the axis
     eye = Camera(intrinsics=K, distortion=(-0.4, 0.0, 0.0, 0.0))
     folded = np.array([[10.0, 15.8, 0.0]])
-    assert np.isnan(pixels_of(eye, HERE.moved(folded))).all()
+    assert np.isnan(pixels_of(eye, HERE.apply(folded))).all()
     inside = np.array([[10.0, 5.0, 0.0], *folded])
     assert len(project_velodyne(inside, eye, HERE, SIZE, keep_occluded=True)) == 1

@@ -12,7 +12,7 @@ from pnpdepth_cli.choices import LAYOUTS, PROTOCOLS
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.measures import MEASURES, chosen_measures, parse_keys
+from pnpdepth_cli.measures import MEASURES, choose_measures, parse_keys
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.settings import option
 
@@ -152,7 +152,7 @@ class BatchRequest(FrameSelection):
             raise UsageError("--adapt does not go with --shard; weights are learnt in one process")
         if self.html_3d and self.html is None:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
-        chosen_measures(MEASURES, self.columns)
+        choose_measures(MEASURES, self.columns)
 
 
 class RayWorkers(NamedTuple):

@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.budget import chosen_max_pixels, set_max_pixels
+from pnpdepth_cli.budget import max_pixels_given, set_max_pixels
 from pnpdepth_cli.commands.batch.batch_request import LOCAL, BatchRequest, RayWorkers
 from pnpdepth_cli.commands.batch.find_frames import task_of
 from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
@@ -134,11 +134,11 @@ def refine_on_workers(
     """
     locks = [path.absolute() for path in request.output.glob(LOCKS)]
     shared = [request.source, *locks]
-    with connected(workers) as (ray, count, resources):
+    with connect_workers(workers) as (ray, count, resources):
         say(f"Ray workers: starting {count:,}, each with {workers.each}")
         options = {"scheduling_strategy": "SPREAD", "max_restarts": _RESTARTS, **resources}
         actor, model = ray.remote(Worker).options(**options), records.model
-        job = request, references, model, software(), shared, Path.cwd(), chosen_max_pixels()
+        job = request, references, model, software(), shared, Path.cwd(), max_pixels_given()
         threads = resources["num_cpus"]
         actors = [actor.remote(*job, threads) for _ in range(count)]
         try:
@@ -232,7 +232,7 @@ def reason_of(error: Exception) -> str:
 
 
 @contextmanager
-def connected(workers: RayWorkers) -> Iterator[tuple[ModuleType, int, dict[str, Any]]]:
+def connect_workers(workers: RayWorkers) -> Iterator[tuple[ModuleType, int, dict[str, Any]]]:
     """Yields Ray, connected, the number of workers to start, and the resources of each.
 
     Raises:
@@ -248,7 +248,7 @@ def connected(workers: RayWorkers) -> Iterator[tuple[ModuleType, int, dict[str, 
     if ours:
         _connect(ray, workers)
     try:
-        yield ray, *_planned(ray, workers)
+        yield ray, *_plan(ray, workers)
     finally:
         if ours:
             ray.shutdown()
@@ -276,7 +276,7 @@ def _connect(ray: ModuleType, workers: RayWorkers) -> None:
         ) from None
 
 
-def _planned(ray: ModuleType, workers: RayWorkers) -> tuple[int, dict[str, Any]]:
+def _plan(ray: ModuleType, workers: RayWorkers) -> tuple[int, dict[str, Any]]:
     """The number of workers that the devices of the cluster allow, and the resources of each."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     kind, resources = ("GPU" if workers.device == "cuda" else "CPU"), {"num_cpus": 1}

@@ -82,7 +82,7 @@ def run_batch(
         to_do = [frame for frame, _ in batch.to_do()]
         began = 0
         if to_do:
-            with closing(batch.refined(to_do, listener, stopped)) as records:
+            with closing(batch.refine(to_do, listener, stopped)) as records:
                 for record in records:
                     listener.frame(record)
                     began += 1
@@ -207,7 +207,7 @@ class _Batch:
             self._say(f"{frames}, all of them done already")
         return to_do
 
-    def refined(
+    def refine(
         self, to_do: list[FrameFiles], listener: Listener, stopped: Callable[[], bool]
     ) -> Generator[FrameRecord, None, None]:
         """Refines frames in this process or on Ray workers; yields the record of each."""

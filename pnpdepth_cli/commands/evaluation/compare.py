@@ -28,7 +28,7 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.json_file import plain, read_json
-from pnpdepth_cli.measures import MEASURES, FrameMeans, Measure, chosen_measures
+from pnpdepth_cli.measures import MEASURES, FrameMeans, Measure, choose_measures
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.stages import AFTER, BEFORE, GT
 
@@ -200,7 +200,7 @@ def _shared_measures(runs: Sequence[Run], columns: Sequence[str] | None) -> tupl
     shared = set.intersection(*({measure.key for measure in run.measures} for run in runs))
     measures = tuple(measure for measure in runs[0].measures if measure.key in shared)
     main = tuple(measure for measure in measures if measure.main)
-    return main if columns is None and main else chosen_measures(measures, columns)
+    return main if columns is None and main else choose_measures(measures, columns)
 
 
 def _means(keys: Sequence[str], values: NDArray[np.float64]) -> dict[str, float | None]:

@@ -13,7 +13,7 @@ from pnpdepth_cli.commands.evaluation.scoring import PREDICTION, TRUTH, scores_o
 from pnpdepth_cli.commands.tables import Cell, Style, Table
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.json_file import plain
-from pnpdepth_cli.measures import COVERAGE, chosen_measures
+from pnpdepth_cli.measures import COVERAGE, choose_measures
 
 _FRAMES_SHOWN = 12
 _FRAME_COLUMNS = 6
@@ -37,7 +37,7 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
         title += f"; 95 % interval over {evaluation.clusters.describe()}"
     rows = []
     mean = evaluation.mean | {COVERAGE.key: evaluation.coverage}
-    for measure in (*chosen_measures(evaluation.measures, keys), COVERAGE):
+    for measure in (*choose_measures(evaluation.measures, keys), COVERAGE):
         row = [measure.heading, measure.text(mean[measure.key])]
         if intervals is not None:
             row.append(" … ".join(measure.text(end) for end in intervals.get(measure.key, ())))
@@ -48,7 +48,7 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
 
 def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
-    measures = chosen_measures(evaluation.measures, keys)
+    measures = choose_measures(evaluation.measures, keys)
     counts = ("pixels", "known", COVERAGE.key, "given", "median_ratio", "factor", "shift")
     rows = []
     for frame in evaluation.frames:
@@ -102,10 +102,9 @@ def comparison_table(comparison: Comparison) -> Table:
                 measure.heading,
                 run.name,
                 measure.text(run.mean[measure.key]),
-                Cell(_signed(found.percent), style if p is not None and p < ALPHA else "dim"),
-                _signed(found.low_percent),
-                _signed(found.high_percent),
-                "–" if p is None else f"{p:.4f}",
+                Cell(_format_signed(found.percent), style if p is not None and p < ALPHA else
+                "dim"), _format_signed(found.low_percent), _format_signed(found.high_percent), "–"
+                if p is None else f"{p:.4f}",
             ])  # fmt: skip
     # What was tested, in the title.
     swaps = "all" if comparison.exact_p_values else f"{PERMUTATIONS:,} random"
@@ -113,7 +112,7 @@ def comparison_table(comparison: Comparison) -> Table:
         title=(
             f"{len(comparison.frames):,} shared frames; gains in per cent of the error of"
             f" {first.name}, positive is better; intervals (95 %) and p-values, from {swaps}"
-            f" swaps, {_tested(comparison)}"
+            f" swaps, {_describe_tests(comparison)}"
         ),
         columns=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
         rows=rows,
@@ -140,14 +139,14 @@ def methods_table(comparison: Comparison) -> Table:
     return Table(
         title=(
             f"means over {len(comparison.frames):,} frames, the best in bold; *, **, ***:"
-            f" differs from {runs[0].name} with p < 0.05, 0.01, 0.001 {_tested(comparison)}"
+            f" differs from {runs[0].name} with p < 0.05, 0.01, 0.001 {_describe_tests(comparison)}"
         ),
         columns=["", *measures],
         rows=rows,
     )
 
 
-def _tested(comparison: Comparison) -> str:
+def _describe_tests(comparison: Comparison) -> str:
     others, measures = len(comparison.runs) - 1, len(comparison.measures)
     tests = f"{measures} measures" + (f" of {others} runs" if others > 1 else "")
     tested = f"over {comparison.clusters.describe()}, p adjusted for {tests} (Holm)"
@@ -158,5 +157,5 @@ def _without_sparse(excluded: bool) -> str:
     return "; without the pixels of sparse points" if excluded else ""
 
 
-def _signed(value: float | None) -> str:
+def _format_signed(value: float | None) -> str:
     return "–" if value is None else f"{value:+.2f}"

@@ -90,7 +90,7 @@ class Evaluation:
         )
         return "; ".join([self.request.describe(), *readings])
 
-    def unscored(self) -> str:
+    def describe_unscored(self) -> str:
         """Returns why frames are in no mean; empty if all are."""
         missing = sum(map(is_missing, self.frames))
         faulty = len(self.frames) - len(self.scored) - missing
@@ -180,7 +180,7 @@ def evaluate(
         notes=(
             *notes,
             *_reading_notes(rows),
-            *_unscored(rows),
+            *_notes_on_unscored(rows),
             *_ground_truth(rows),
             *_empty_pixels(scored, request),
             *_scales(scored, request),
@@ -223,7 +223,7 @@ def _reading_notes(rows: Sequence[FrameRecord]) -> list[str]:
     return lines
 
 
-def _unscored(rows: Sequence[FrameRecord]) -> Iterator[str]:
+def _notes_on_unscored(rows: Sequence[FrameRecord]) -> Iterator[str]:
     """Frames that are in no mean."""
     if missing := [row.name for row in rows if is_missing(row)]:
         yield f"warning: {len(missing):,} frames have no prediction: {some_names(missing)}"

@@ -1,6 +1,6 @@
 """Reads the depths of one frame, checks their sizes, and masks what the protocol does not score.
 
-Predictions of relative networks are scaled to the ground truth of each image (`scaled`).
+Predictions of relative networks are scaled to the ground truth of each image (`scale_prediction`).
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _with_prediction(frame: LoadedFrame, pair: FramePair, request: EvalRequest) 
     rules, size = request.rules, frame.gt.shape
     image = _read(pair.prediction, request.pred_scale, request)
     values = _to_size(pair, image.values, size, request.resize)
-    depth, fit = scaled(values, frame.gt, request.prediction_kind, request.scale_by)
+    depth, fit = scale_prediction(values, frame.gt, request.prediction_kind, request.scale_by)
     if rules.clip:
         clipped = np.clip(depth, rules.min_depth, rules.max_depth)
         depth = np.where(depth > 0, clipped, 0).astype(np.float32)
@@ -259,7 +259,9 @@ def _different(
     )
 
 
-def scaled(values: Depth, gt: Depth, kind: str, scale_by: str) -> tuple[Depth, Fit | None]:
+def scale_prediction(
+    values: Depth, gt: Depth, kind: str, scale_by: str
+) -> tuple[Depth, Fit | None]:
     """Returns the prediction in metres, fitted to the ground truth of its image, and the fit.
 
     The fits are

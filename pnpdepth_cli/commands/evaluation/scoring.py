@@ -115,6 +115,6 @@ def _scores_of(
     return values | of_sigma | counts, None
 
 
-def filled(depth: Depth) -> Depth:
+def fill_missing(depth: Depth) -> Depth:
     """Returns the depth with what the development kit fills in, without its −1."""
     return np.maximum(fill_background(depth), np.float32(0))

@@ -98,7 +98,7 @@ class ExportFrame:
         step = max(1, sum(len(part.xyz) for part in parts) * frames // _START_POINTS)
         columns: Any = zip(*parts, strict=True)
         cloud = PointCloud(*(np.concatenate(column)[::step] for column in columns))
-        return cloud.transformed(self.pose)
+        return cloud.transform(self.pose)
 
 
 def unit_of_model(frames: Sequence[ExportFrame]) -> str:

@@ -102,7 +102,7 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
             network, _synthetic(_own_size(network)) if image is None else _read(image)
         )
         arguments = prepared.arguments
-        notes = [*network.notes, *network.verified(arguments)]
+        notes = [*network.notes, *network.verify(arguments)]
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
         known = raw[raw.isfinite()]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from pnpdepth_cli.commands.error_tables import made_by
+from pnpdepth_cli.commands.error_tables import names_of_depths
 from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs, stale_outputs
 from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
@@ -118,7 +118,7 @@ def write_refined(
         stale = stale_outputs(record_path.parent, record_path.stem, outputs)
     with all_or_none(outputs.values()):
         with watch("write"):
-            improved, figures = write_outputs(outputs, inputs, frame, made_by(record))
+            improved, figures = write_outputs(outputs, inputs, frame, names_of_depths(record))
         record = replace(
             record,
             improved_fraction=improved,

@@ -13,7 +13,7 @@ from pnpdepth_cli.commands.evaluation.eval_tables import means_table
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
 from pnpdepth_cli.commands.evaluation.load_depths import image_of, load_frame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.commands.evaluation.scoring import filled, scores_of
+from pnpdepth_cli.commands.evaluation.scoring import fill_missing, scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, PnpDepthError
@@ -26,7 +26,7 @@ from pnpdepth_cli.io.report import (
     write_report,
 )
 from pnpdepth_cli.io.visualisation import error_map
-from pnpdepth_cli.measures import COVERAGE, Measure, chosen_measures
+from pnpdepth_cli.measures import COVERAGE, Measure, choose_measures
 
 
 def check_eval_report(folder: Path, inputs: list[Path], *, overwrite: bool) -> None:
@@ -66,7 +66,7 @@ def write_eval_report(
 
 
 def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[Measure]:
-    measures = chosen_measures(evaluation.measures, keys)
+    measures = choose_measures(evaluation.measures, keys)
     chosen = measures if keys is None else [replace(each, main=True) for each in measures]
     return [*chosen, replace(COVERAGE, main=True)]
 
@@ -86,7 +86,7 @@ def _head(evaluation: Evaluation, keys: Sequence[str] | None, columns: list[Meas
         ],
         notes=evaluation.notes,
         tables=[means_table(evaluation, keys)],
-        without_title=f"Not scored: {evaluation.unscored()}",
+        without_title=f"Not scored: {evaluation.describe_unscored()}",
         without=without,
         columns=columns,
         sort_by=columns[0].key,
@@ -130,7 +130,7 @@ def _draw(pair: FramePair, evaluation: Evaluation, images: Path) -> dict[str, An
     loaded = load_frame(pair, evaluation.request)
     gt, depth = loaded.gt, loaded.depth
     if evaluation.request.is_devkit:
-        depth = filled(depth)
+        depth = fill_missing(depth)
     try:
         image = image_of(pair, gt.shape)
     except PnpDepthError:

@@ -144,7 +144,7 @@ def row(
             shared = {"calib": place / calib} if calib and (place / calib).is_file() else {}
             videos = {field: path for field, kind in kinds.items() if (path := kind.video(place))}
             others = {field: kind for field, kind in kinds.items() if field not in videos}
-            for found in _joined(place, others, gaps):
+            for found in _join_parts(place, others, gaps):
                 if isinstance(found, Unmatched):
                     yield found
                     continue
@@ -175,7 +175,7 @@ def row(
     )
 
 
-def _joined(
+def _join_parts(
     place: Path, kinds: Mapping[str, _FilePart], gaps: bool
 ) -> Iterator[tuple[str, Files] | Unmatched]:
     """The stem and files of each frame, and the files that lack a partner."""

@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.batch.batch_request import (
 )
 from pnpdepth_cli.commands.batch.ray_workers import (
     check_node,
-    connected,
+    connect_workers,
     reason_of,
     refine_on_actors,
     software,
@@ -162,7 +162,7 @@ def test_the_death_of_a_worker_is_one_line_of_what_ray_says() -> None:
 def connect(address: str) -> None:
     workers = ray_workers_of("cpu", ClusterOptions(ray=address))
     assert workers is not None
-    with connected(workers):
+    with connect_workers(workers):
         raise AssertionError("there is no cluster")
 
 

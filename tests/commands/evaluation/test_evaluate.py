@@ -15,7 +15,7 @@ import pytest
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.eval_tables import worst
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
-from pnpdepth_cli.commands.evaluation.scoring import filled, is_missing, scores_of
+from pnpdepth_cli.commands.evaluation.scoring import fill_missing, is_missing, scores_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, Sampling
@@ -55,12 +55,12 @@ def test_each_image_counts_alike(two: Path) -> None:
 
 
 def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path) -> None:
-    assert scored(two).unscored() == ""
+    assert scored(two).describe_unscored() == ""
     depth_file(two / "gt" / "c.npy", [[1, 1]])
     result = scored(two)
     assert [frame.name for frame in result.frames if is_missing(frame)] == ["c"]
     assert (result.mean["rmse"], result.coverage) == (2, 3 / 6)
-    assert result.unscored() == "1 without prediction"
+    assert result.describe_unscored() == "1 without prediction"
 
 
 FAULTS = [
@@ -80,7 +80,7 @@ def test_a_failed_frame_is_reported_and_the_others_are_scored(
     assert result.mean["rmse"] == 3
     assert message in (result.frames[0].message or "")
     assert any(note.startswith("warning: frame a was not scored") for note in result.notes)
-    assert result.unscored() == "1 with a faulty file"
+    assert result.describe_unscored() == "1 with a faulty file"
 
 
 def test_of_two_single_files_the_error_is_theirs(two: Path) -> None:
@@ -358,8 +358,8 @@ def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) 
     for folder, codes in (("out", [[65535, 512]]), ("gt", [[256, 512]])):
         (tmp_path / folder).mkdir()
         cv2.imwrite(str(tmp_path / folder / "a.png"), np.array(codes, np.uint16))
-    assert filled(np.array([[0, 0.5, 0]], np.float32)).tolist() == [[0.5, 0.5, 0.5]]
-    assert filled(np.zeros((1, 2), np.float32)).tolist() == [[0, 0]]
+    assert fill_missing(np.array([[0, 0.5, 0]], np.float32)).tolist() == [[0.5, 0.5, 0.5]]
+    assert fill_missing(np.zeros((1, 2), np.float32)).tolist() == [[0, 0]]
     devkit = scored(tmp_path, protocol="kitti-devkit")
     assert devkit.mean["mae"] == pytest.approx((65535 / 256 - 1) / 2)
     assert scored(tmp_path).pixels == 1

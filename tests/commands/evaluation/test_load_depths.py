@@ -9,7 +9,7 @@ import pytest
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
-from pnpdepth_cli.commands.evaluation.load_depths import scaled
+from pnpdepth_cli.commands.evaluation.load_depths import scale_prediction
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import write_depth
 
@@ -22,7 +22,7 @@ WHERE = RNG.random(GT.shape) < 0.7
 def test_without_scaling_disparity_becomes_depth_and_nothing_else() -> None:
     disparity = (1 / GT).astype(np.float32)
     disparity[0, 0] = 0
-    depth, fit = scaled(disparity, GT, "disparity", "none")
+    depth, fit = scale_prediction(disparity, GT, "disparity", "none")
     assert fit is None
     assert depth[0, 0] == 0
     assert depth[1:] == pytest.approx(GT[1:], rel=1e-6)
@@ -34,7 +34,7 @@ def test_median_is_that_of_monodepth2_and_empty_predictions_stay_empty() -> None
     both = WHERE & (predicted > 0)
     # evaluate_depth.py: ratio = np.median(gt_depth) / np.median(pred_depth), both masked
     ratio = np.median(GT[both]) / np.median(predicted[both])
-    depth, fit = scaled(predicted, np.where(WHERE, GT, 0), "depth", "median")
+    depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), "depth", "median")
     assert fit is not None
     assert fit.factor == pytest.approx(ratio, rel=1e-6)
     assert depth == pytest.approx(predicted * ratio, rel=1e-6)
@@ -51,7 +51,7 @@ def test_affine_is_the_least_squares_fit_of_marigold_and_midas(scale_by: str) ->
     a = np.stack([predicted[both], np.ones(both.sum())], axis=1).astype(np.float64)
     (s, t), *_ = np.linalg.lstsq(a, target[both].astype(np.float64), rcond=None)
     kind = "depth" if in_depth else "disparity"
-    depth, fit = scaled(predicted, np.where(WHERE, GT, 0), kind, scale_by)
+    depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), kind, scale_by)
     assert fit is not None
     assert (fit.factor, fit.shift) == pytest.approx((s, t), rel=1e-5)
     assert not depth[:3].any()
@@ -61,15 +61,15 @@ def test_affine_is_the_least_squares_fit_of_marigold_and_midas(scale_by: str) ->
 
 def test_log_leaves_no_mean_error_of_the_logarithm() -> None:
     predicted = (GT * RNG.lognormal(1, 0.2, GT.shape)).astype(np.float32)
-    depth, _ = scaled(predicted, np.where(WHERE, GT, 0), "depth", "log")
+    depth, _ = scale_prediction(predicted, np.where(WHERE, GT, 0), "depth", "log")
     assert np.mean(np.log(depth[WHERE]) - np.log(GT[WHERE])) == pytest.approx(0, abs=1e-6)
 
 
 def test_a_constant_prediction_and_too_few_pixels_are_refused() -> None:
     with pytest.raises(InputError, match="constant"):
-        scaled(np.ones_like(GT), GT, "depth", "affine")
+        scale_prediction(np.ones_like(GT), GT, "depth", "affine")
     with pytest.raises(InputError, match="needs 2 pixels"):
-        scaled(GT, np.zeros_like(GT), "depth", "median")
+        scale_prediction(GT, np.zeros_like(GT), "depth", "median")
 
 
 def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:

@@ -171,7 +171,7 @@ def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(
     row, column = np.nonzero(theirs)
     xy = np.column_stack([column, row]).astype(np.float64)
     points = unproject(calibration.camera, xy, theirs[row, column] / 256)
-    points = calibration.scanner.inverse().moved(points)
+    points = calibration.scanner.inverse().apply(points)
     scan = tmp_path / "scan.bin"
     np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(scan)
     project_scan(

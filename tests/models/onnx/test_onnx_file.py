@@ -73,9 +73,9 @@ def test_fixed_and_free_input_sizes_agree_with_onnxruntime(
     tmp_path: Path, shape: tuple[object, ...]
 ) -> None:
     network = load_network(str(write_network(tmp_path / "net.onnx", shape=shape)), None)
-    (note,) = network.verified((image(1, 3, 32, 48),))
+    (note,) = network.verify((image(1, 3, 32, 48),))
     assert "agrees with onnxruntime" in note
-    assert network.verified((image(1, 3, 32, 48),)) == (note,)
+    assert network.verify((image(1, 3, 32, 48),)) == (note,)
 
 
 def test_an_incorrect_conversion_is_refused(
@@ -85,7 +85,7 @@ def test_an_incorrect_conversion_is_refused(
     monkeypatch.setitem(OPERATORS, "Resize", lambda node, options: right(node, options).flip(3))
     network = load_network(str(write_network(tmp_path / "net.onnx")), None)
     with pytest.raises(ModelError):
-        network.verified((image(1, 3, 32, 48),))
+        network.verify((image(1, 3, 32, 48),))
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_several_outputs_are_listed_and_one_can_be_named(tmp_path: Path) -> None
     for name in ("depth", "g"):
         network = load_network(f"{path}:{name}", None)
         assert network.module.output_names == (name,)
-        assert "agrees with onnxruntime" in network.verified((image(1, 3, 32, 48),))[0]
+        assert "agrees with onnxruntime" in network.verify((image(1, 3, 32, 48),))[0]
 
 
 def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
                     z = split.front(x)
                     assert torch.equal(split.rear(z), whole), name
                     assert torch.equal(split.rear(z), whole), name
-    assert network.verified((image(1, 3, 32, 48),))
+    assert network.verify((image(1, 3, 32, 48),))
 
 
 # ------------------------------------------------------------------ half precision, quantised
@@ -229,7 +229,7 @@ def test_a_network_in_half_precision_is_run_though_its_nodes_are_not_in_order(
     onnx.save(half, tmp_path / "half.onnx")
     network = load_network(str(tmp_path / "half.onnx"), None)
     x = image(1, 3, 32, 48)
-    assert "agrees with onnxruntime" in network.verified((x,))[0]
+    assert "agrees with onnxruntime" in network.verify((x,))[0]
     expected = load_network(str(tmp_path / "net.onnx"), None).module(x)
     assert torch.allclose(network.module(x), expected, atol=1e-2)
 
