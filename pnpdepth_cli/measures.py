@@ -38,7 +38,7 @@ class Pixels:
     truth: Tensor
     """Metres."""
     thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
-    """Of δ1 to δ3."""
+    """Thresholds of δ1 to δ3."""
 
     @cached_property
     def error(self) -> Tensor:
@@ -75,7 +75,7 @@ class Formula:
     terms: tuple[Term, ...]
     """What is summed; the first term counts the pixels."""
     of_sums: Callable[..., Tensor]
-    """From the sum of each term, of any shape, to the measure."""
+    """Function from the sum of each term, of any shape, to the measure."""
 
 
 def pixel_count(pixels: Pixels) -> Tensor:
@@ -113,7 +113,7 @@ class Measure:
     """A measure: its name, how it is shown, and its formula."""
 
     key: str
-    """Its name in files and on the command line."""
+    """Name in files and on the command line."""
     title: str
     unit: str = ""
     """Unit in files."""
@@ -128,8 +128,10 @@ class Measure:
     main: bool = False
     """True if short tables have it."""
     formula: Formula | Callable[..., float] | None = field(default=None, compare=False, repr=False)
-    """Of the scored pixels; or of the images (H, W) of predicted and true depth in metres, 0 where
-    unknown or not scored, to NaN where there is no value. None for a measure read from a file."""
+    """Formula of sums over scored pixels, or function of images. None: the measure is from a file.
+
+    The function takes predicted and true depth (H, W) in metres, 0 where unknown or not scored. It
+    gives NaN where there is no value."""
 
     @property
     def table_unit(self) -> str:

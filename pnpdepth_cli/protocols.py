@@ -100,7 +100,7 @@ def _block_means(image: NDArray[Any], side: int) -> NDArray[Any]:
 WHOLE = FramePart()
 NYU_PART = FramePart(halved=True, crop=(228, 304))
 ODOMETRY_PART = FramePart(crop=(228, 912), anchor="bottom")
-"""Of the seed paper (Wang et al. 2019, section on data sets), and of many after it."""
+"""Parts of the seed paper (Wang et al. 2019, section on data sets), and of many after it."""
 
 
 class ForegroundFilter(NamedTuple):

@@ -3,7 +3,7 @@
 BEFORE, AFTER, LINEAR = "before", "after", "linear"
 """The user's network, aligned with the points; the result; linear interpolation of all points."""
 UPDATED, PROPAGATED, ALONE = "updated", "propagated", "alone"
-"""Of the default method: the user's network after the updates of z, and after the propagation of
+"""Stages of the default method: the user's network after the updates of z, and after propagation of
 the residual; the network that takes a prior, without one."""
 
 GT, HELD_OUT, VALIDATION, USED = "ground_truth", "held_out", "validation", "used"

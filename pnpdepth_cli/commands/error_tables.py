@@ -24,7 +24,7 @@ from pnpdepth_cli.stages import (
 )
 
 Errors = Mapping[str, Mapping[str, Scores]]
-"""By basis, then by stage, as of `FrameRecord.errors`."""
+"""Scores by basis, then by stage, as `FrameRecord.errors` has them."""
 
 _STAGES = {
     BEFORE: "{name}, aligned with the points",

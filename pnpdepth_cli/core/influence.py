@@ -26,7 +26,7 @@ class InfluentialField:
     """The sizes of both patches, (height, width)."""
 
     in_z: tuple[int, int] | None
-    """Of the patch of z, in elements; None if z has no two spatial axes."""
+    """Size of the patch of z, in elements; None if z has no two spatial axes."""
     in_output: tuple[int, int]  # of the patch of the output, in pixels
 
 

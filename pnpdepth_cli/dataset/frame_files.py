@@ -57,7 +57,7 @@ class VideoFrame:
 
     path: Path
     index: int
-    """From 0."""
+    """Number of the frame, from 0."""
 
     def __str__(self) -> str:
         return f"{self.path}[{self.index}]"

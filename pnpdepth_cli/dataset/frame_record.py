@@ -103,7 +103,7 @@ class PointsRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchState:
-    """By what a batch knows that a frame is done."""
+    """State by which a batch knows that a frame is done."""
 
     settings: str
     """SHA-256 of the settings that decide the result."""
@@ -152,7 +152,7 @@ class FrameRecord:
     loss: list[float | None] = field(default_factory=list)
     """Loss at the points before the first update and after each."""
     errors: dict[str, dict[str, Scores]] = field(default_factory=dict)
-    """By basis (`BASES`), then by stage: before, after, linear, and those of the method."""
+    """Errors by basis (`BASES`), then by stage: before, after, linear, and those of the method."""
     improved_fraction: float | None = None
     """Fraction of the pixels with ground truth, else of the points, whose error fell."""
     notes: list[str] = field(default_factory=list)
@@ -162,7 +162,7 @@ class FrameRecord:
     seconds: dict[str, float] = field(default_factory=dict)
     """Seconds by what they were spent on."""
     peak_memory_mb: dict[str, float] = field(default_factory=dict)
-    """In 10^6 bytes: of the process, and of the GPU if one is used."""
+    """Largest memory in 10^6 bytes of the process, and of the GPU if one is used."""
     versions: dict[str, str] = field(default_factory=dict)
     """Versions of the program, Python and the numerical libraries."""
 

@@ -38,15 +38,15 @@ STEPS = 100
 LR = 4e-4
 """α at the first update; it falls to 0 as a cosine does."""
 EPSILON = 1e-12
-"""Of Adam. Smaller than the common 1e-8, which would suppress the small gradients."""
+"""ε of Adam. It is smaller than the common 1e-8, which would suppress the small gradients."""
 STEPS_A_VISIT = 4
 """Updates on a frame before the next is taken: every point is hidden twice."""
 LEAST_FRAMES = 8
-"""Of a sequence; fewer teach too little."""
+"""Least number of frames of a sequence; fewer teach too little."""
 SIGNIFICANT = 0.05
-"""Of the one-sided paired t test over the frames for validation."""
+"""Level of the one-sided paired t test over the frames for validation."""
 MIN_POINTS_FOR_OUTLIERS = 50
-"""Of fewer points, one inconsistent with the others may be all that is seen of an object."""
+"""Of fewer points none is an outlier: each may be all that is seen of an object."""
 
 _LOSS = "log"
 

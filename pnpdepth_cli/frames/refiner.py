@@ -40,9 +40,9 @@ class Refiner:
             where there is an image. Without, `network` alone is refined.
         registration: Whether images are moved to their points: "auto", if their depth edges show
         that they are not registered; "off"; or by (zoom, right, down), pixels.
-        adapt: Frames of the same sequence, (image, sparse) each, whose points the weights of
-            `network`, which must take points, learn from before the first frame is refined. The
-            learnt weights are used while the refiner is open, if hidden points show that they are
+        adapt: Frames of the same sequence, (image, sparse) each. Before the first frame is refined,
+            the weights of `network`, which must take points, learn from them. The new weights are
+            used while the refiner is open, if points hidden from its input show that they are
             better.
 
     Raises:

@@ -184,8 +184,8 @@ def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[N
 def choose_input_range(errors: Mapping[str, float]) -> tuple[str, str | None]:
     """Returns the input range of a network that states none, and a rival where that is unsure.
 
-    0…1 is kept unless another range fits far better: which range fits a single frame best is
-    mostly chance.
+    The range 0…1 stays unless another one fits far better. Which of them fits a single frame best
+    is mostly chance.
 
     Args:
         errors: Relative error after alignment by the names of `NORMALISATIONS`.

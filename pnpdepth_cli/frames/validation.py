@@ -20,7 +20,7 @@ FOLDS = 5
 MIN_POINTS = 5
 """With fewer points none is for validation."""
 MOST_VALIDATION_POINTS = 1000
-"""Of more validation points, so many at random are predicted."""
+"""Most validation points that are predicted; of more, so many at random."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +40,8 @@ class ValidationSplit(ValidationPoints):
     def propagation(self) -> str:
         """How the residual at the points is propagated, a name in `choices.PROPAGATIONS`.
 
-        Of scan lines by "local": on even KITTI frames its MAE is 1.9 % and its RMSE 1.7 % below
-        those of "gp", which is 0 to 28 % below it with points at random pixels.
+        It is "local" for scan lines: on even KITTI frames its MAE is 1.9 % and its RMSE 1.7 % below
+        those of "gp". With points at random pixels, "gp" is 0 to 28 % below "local".
         """
         return "local" if self.has_scan_lines else "gp"
 

@@ -66,7 +66,7 @@ _FIELD = re.compile(r"^\s*([A-Za-z_]\w*)(?:\s*:|\s+(?=[-+.\d]))(.*)$")
 """A name and its value; KITTI's tracking set has names without a colon."""
 
 _LARGEST = 1e9
-"""Of the numbers of a calibration, in pixels or metres; beyond it, products overflow."""
+"""Largest number of a calibration, in pixels or metres; beyond it, products overflow."""
 
 Floats = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from pnpdepth_cli.io.json_file import read_json
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 
 LONGEST_GAP_S = 0.02
-"""Between a frame and its pose, as in the tools of the TUM RGB-D benchmark."""
+"""Longest gap between a frame and its pose, as in the tools of the TUM RGB-D benchmark."""
 POSES_FILE = "poses.txt"
 """What `pnpdepth frames` writes: TUM rows, one for each frame in the order of their names."""
 PACKETS = "oxts/data"
@@ -62,7 +62,7 @@ def poses_of_frames(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
     frames, the number in a name is the number of its row from 0.
 
     Raises:
-        FileFormatError: As of `read_poses`.
+        FileFormatError: A row has other numbers, or its rotation is none.
         InputError: The rows do not fit the frames.
     """
     if path.suffix.lower() == ".json":

@@ -56,7 +56,7 @@ class Head:
     without_title: str = ""
     without: Sequence[tuple[str, str]] = ()
     columns: Sequence[Measure] = ()
-    """Of the values of a frame; the main ones are in the list of frames."""
+    """Measures of a frame's values; the main ones are in the list of frames."""
     signed: Sequence[str] = ()
     """Keys of the columns whose values below 0 are better and above 0 worse."""
     sort_by: str = ""

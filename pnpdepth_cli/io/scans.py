@@ -32,7 +32,7 @@ _AS_MUCH = 0.85
 """Fraction of the variance that the best count explains: what its divisors do not reach."""
 
 _LEAST_EXPLAINED = 0.03
-"""Of the variance; numbers in any order have less."""
+"""Least explained fraction of the variance; numbers in any order have less."""
 
 _PCD_TYPES = {k + n: k.lower() + n for k in "IUF" for n in "1248" if k + n not in ("F1", "F2")}
 """NumPy types by TYPE and SIZE of a PCD."""

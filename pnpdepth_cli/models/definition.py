@@ -123,7 +123,7 @@ Chosen with FastDepth on rendered rooms; Adam with steps of 3 % left a quarter m
 """
 
 ASSUMED_MULTIPLE = 32
-"""Of the sides of images, for a network that does not say what sizes it takes."""
+"""Multiple of the sides of images, for a network that does not say what sizes it takes."""
 
 DENSE_SPACING = 10.0
 """Mean spacing of the points in pixels below which they are dense, as those of a LiDAR are."""
@@ -160,7 +160,7 @@ class ModelDefinition:
 
     `pnpdepth layers` lists all. Without any, the shapes of the feature maps suggest them."""
     defaults: Settings = Settings()
-    """Its settings of refinement where no option sets them."""
+    """Settings of refinement where no option sets them."""
     checkpoint: Path | None = None
     """The weights that come with the definition; None if the user names them."""
     complete: bool = False

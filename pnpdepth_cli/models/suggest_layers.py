@@ -72,7 +72,7 @@ def _area(output: Tensor) -> int:
 
 
 def _gradients(prediction: Tensor, tensors: list[Tensor]) -> tuple[Tensor | None, ...]:
-    """Of the prediction's sum; None for a tensor that it does not depend on."""
+    """Gradients of the prediction's sum; None for a tensor that it does not depend on."""
     if not tensors or not prediction.requires_grad:
         return (None,) * len(tensors)
     with torch.enable_grad(), wrap_user_errors("the gradient of the network"):
@@ -80,7 +80,7 @@ def _gradients(prediction: Tensor, tensors: list[Tensor]) -> tuple[Tensor | None
 
 
 def _last_of_each_resolution(areas: Mapping[str, int]) -> list[str]:
-    """From the first of the coarsest maps on, the last map before each finer one."""
+    """The last map before each finer one, from the first of the coarsest maps on."""
     chosen: list[str] = []
     names = list(areas)
     first = names.index(min(names, key=areas.__getitem__)) if names else 0

@@ -58,7 +58,7 @@ def rays_of(camera: Camera, xy: NDArray[np.floating]) -> Floats:
 
 
 def rays_of_image(camera: Camera, size: tuple[int, int]) -> Floats:
-    """Returns the directions at the pixels of an image, (H, W, 2) as of `rays_of`; read only.
+    """Returns the directions at the pixels of an image, (H, W, 2) x / z and y / z; read only.
 
     Those of the last camera are kept, as the frames of a sequence mostly have one.
     """
@@ -203,4 +203,4 @@ LENS_MODELS = {
     "radial-tangential": LensModel(_radial_tangential, False, (0, 1, 4, 5, 6, 7)),
     "fisheye": LensModel(_fisheye, True),
 }
-"""By name, as in `choices.LENSES`."""
+"""Lens models by name, as in `choices.LENSES`."""

@@ -35,7 +35,7 @@ class Lidar:
     max_range: float = np.inf  # metres from the scanner
     range_noise: float = 0.0  # metres
     angle_noise_deg: float = 0.0
-    """Of the direction of each measurement, in elevation and in azimuth."""
+    """Standard deviation of each measurement's direction, in elevation and in azimuth."""
 
     def __post_init__(self) -> None:
         angles, step = np.array(self.elevations_deg, np.float64), self.azimuth_step_deg

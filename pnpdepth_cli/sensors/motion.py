@@ -21,7 +21,7 @@ from pnpdepth_cli.sensors.pixels import Floats, Mask, Points
 MIN_INLIERS = 30
 """Matches that agree with the motion; fewer support no estimate."""
 MIN_FRACTION = 0.25
-"""Of the matches, that agree with the motion."""
+"""Least fraction of the matches that agrees with the motion."""
 
 _KEYPOINTS = 3000
 _RATIO = 0.8  # Lowe's, of the distances to the nearest and the next descriptor

@@ -26,7 +26,7 @@ floors down to a grazing angle of about 5 degrees."""
 
 _NEIGHBOURS = 8
 _WIDEST_DEG = 60.0
-"""Between the axes of two cameras that see the same surfaces."""
+"""Widest angle between the axes of two cameras that see the same surfaces."""
 
 _RETURN_PX = 2.0
 _RETURN_DEPTH = 0.03

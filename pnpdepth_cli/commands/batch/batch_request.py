@@ -159,7 +159,7 @@ class RayWorkers(NamedTuple):
     """The workers that a command asks for."""
 
     address: str
-    """Of the cluster, or LOCAL."""
+    """Address of the cluster, or LOCAL."""
     device: str
     """Kind of device that every worker computes on: cpu or cuda."""
     indices: tuple[int, ...]

@@ -44,7 +44,7 @@ class BatchFrames:
     frames: Sequence[FrameFiles]
     """All frames of the source whose results have files of their own."""
     chosen: Sequence[FrameFiles]
-    """Those of the names, the limit and the shard."""
+    """Frames of these that the names, the limit and the shard choose."""
     refused: Sequence[tuple[FrameFiles, str]]
     """Frames whose results would have no files of their own, and why."""
     unmatched: tuple[Unmatched, ...]

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _CONNECT_S = 5.0
 _FRAMES_OF_A_CALL = 8
-"""So many are read and written beside the network; fewer where that leaves workers idle."""
+"""Frames that are read and written beside the network; fewer where that leaves workers idle."""
 _NO_WORKER_S = 300.0
 """How long a cluster may take to start a worker, such as on a machine that it starts first."""
 _RETRIES = 2
@@ -130,7 +130,8 @@ def refine_on_workers(
 ) -> Iterator[FrameRecord]:
     """Refines and writes the frames on Ray workers; yields the records as they are done.
 
-    Arguments and errors are as of `refine_tasks`, with ClusterError if the cluster cannot be used.
+    Arguments and errors are those of `refine_tasks`, with ClusterError if the cluster cannot be
+    used.
     """
     locks = [path.absolute() for path in request.output.glob(LOCKS)]
     shared = [request.source, *locks]

@@ -42,7 +42,7 @@ class Run(NamedTuple):
     """The scored frames of one saved run, by name."""
 
     name: str
-    """That of the folder, or of the file without its ending."""
+    """Name of the folder, or of the file without its ending."""
     path: str
     stage: str
     """The depth that is compared: before or after refinement."""
@@ -74,7 +74,7 @@ class Gain:
     """How much better a run is than the first by one measure; positive per cents are better."""
 
     percent: float | None
-    """Of the first run's mean. None, as below, for a value that there is not."""
+    """Gain in per cent of the first run's mean. None, as below, for a value that there is not."""
     low_percent: float | None
     """Lower end of the 95 % interval of `percent`."""
     high_percent: float | None
@@ -98,7 +98,7 @@ class ComparedRun:
     varied: dict[str, str]
     coverage: float
     gains: dict[str, Gain]
-    """By measure; empty for the first run."""
+    """Gains by measure; empty for the first run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,7 +251,7 @@ def _check_rules(first: Run, other: Run) -> None:
 
 
 def _names(runs: Sequence[Run]) -> list[str]:
-    """Their own names, or else those of the innermost folders that tell the runs apart."""
+    """The runs' own names, else those of the innermost folders that tell the runs apart."""
     paths = ((run.name, *Path(run.path).parts[-2::-1]) for run in runs)
     for names in zip_longest(*paths):
         if None not in names and len({*names}) == len(runs):

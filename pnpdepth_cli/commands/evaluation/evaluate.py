@@ -53,9 +53,9 @@ class Evaluation:
     frames: tuple[FrameRecord, ...]
     """The scores of each."""
     measures: tuple[Measure, ...]
-    """Those of the request, and those of the standard deviation where a frame has one."""
+    """Measures of the request, and of the standard deviation where a frame has one."""
     mean: dict[str, float | None]
-    """Of each measure; None where no frame has it."""
+    """Mean of each measure; None where no frame has it."""
     interval: dict[str, tuple[float, float]] | None
     """The ends of the 95 % interval of each mean; None with too few independent frames."""
     clusters: Clusters

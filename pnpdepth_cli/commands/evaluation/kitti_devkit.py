@@ -97,7 +97,7 @@ DEVKIT_MEASURES = (
     _row("abs relative", lambda p: p.mean(p.error / p.gt)),
     _row("squared relative", lambda p: p.mean(p.error * p.error / (p.gt * p.gt))),
 )
-"""In the kit's order and with its six decimals. Its squared relative is (p − g)²/g²."""
+"""Measures in the kit's order, with its six decimals. Its squared relative is (p − g)²/g²."""
 
 
 def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:

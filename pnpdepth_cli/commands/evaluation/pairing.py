@@ -47,7 +47,7 @@ class FramePair:
     """The files of one frame to score; parts that it does not have are None."""
 
     name: str
-    """By which runs are compared."""
+    """Name by which runs are compared."""
     prediction: Path | None
     frame: FrameFiles
     """The ground truth's frame; it has `gt`."""

@@ -15,7 +15,7 @@ from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.measures import Measure
 
 _CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
-"""By the suffix of a plot, what is not written to it, so that the same runs give the same bytes."""
+"""Metadata that a plot lacks, by its suffix, so that the same runs give the same bytes."""
 _SIDE_INCHES = 3.2
 
 

@@ -45,12 +45,12 @@ class ExportFrame:
     result: ResultFrame
     image: ImageSource
     image_name: str
-    """Its path below the folder of the images, as COLMAP names it, with slashes."""
+    """Path of the image below the folder of images, as COLMAP names it, with slashes."""
     size: tuple[int, int]
     """(H, W)."""
     camera: Camera
     pose: Pose | None
-    """In the unit of the result. None: unknown."""
+    """Pose in the unit of the result. None: unknown."""
     unit_scale: float
     """Units of the depth per unit of the COLMAP model; 1 without a model."""
     farthest: float

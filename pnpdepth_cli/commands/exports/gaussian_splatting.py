@@ -34,7 +34,7 @@ from pnpdepth_cli.io.json_file import write_json
 _CODES = 2**16
 _OURS = b"# Of pnpdepth export: the refined images, points of their depth\n"
 _NEAREST_PERCENTILE = 99.9
-"""Of the inverse depth of an image; nearer pixels are clipped, so that few do not set the scale."""
+"""Percentile of an image's inverse depth, so that few near pixels do not set the scale."""
 
 
 def _depth_image(folder: Path, frame: ExportFrame) -> Path:

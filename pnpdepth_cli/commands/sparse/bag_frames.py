@@ -85,7 +85,7 @@ class FramesRequest:
     output: Path
     """The folder for rgb/, sparse/, calib.txt, poses.txt and frames.json."""
     topics: tuple[str, ...] = ()
-    """Of images, of points (PointCloud2) and of poses; else the only one of its kind."""
+    """Topics of images, of points (PointCloud2) and of poses; else the only one of its kind."""
     tolerance: float = 0.05
     """Largest time between an image and its scan, seconds."""
     clock_offset: float | None = None

@@ -41,7 +41,7 @@ class SparseTarget:
     """Where sparse depth is written, with a JSON beside it that says what it was made from."""
 
     output: Path
-    """Its suffix is one of `SPARSE_SUFFIXES`."""
+    """File of the sparse depth; the suffix is one of `SPARSE_SUFFIXES`."""
     overwrite: bool = False
 
     @property

@@ -30,7 +30,7 @@ _SUFFIXES = {
 """What a pattern of file names may end with, for any of these."""
 
 Files = dict[str, Path]
-"""Of one frame, by field of `FrameFiles`."""
+"""Files of one frame, by field of `FrameFiles`."""
 Fields = Mapping[str, Any] | Unmatched | None
 """More fields of a frame, why it is none, or None for one that is not wanted."""
 

@@ -39,7 +39,7 @@ _ARCHIVE_ERRORS = (
 )
 """What zipfile raises on damaged archives."""
 _MOST_AXES = 32
-"""Of an array of NumPy 1."""
+"""Most axes of an array of NumPy 1."""
 _LOCK = threading.Lock()
 """NumPy evaluates a header as Python, and threads of CPython 3.11 that do so at once may fail."""
 
@@ -98,7 +98,7 @@ NPY = DepthFormat(
 
 
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Those that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
+"""Compressions that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
 
 
 def parse_npz(path: Path, data: bytes) -> tuple[str, NDArray[Any]]:

@@ -46,7 +46,7 @@ class DepthFile:
     values: NDArray[Any]
     """(H, W). As stored, floats in metres or integer codes, of any shape that `is_image` allows."""
     reading: Reading
-    """As stored, its scale is the one that the file itself states."""
+    """How the file was read; of stored values, the scale is the one that the file itself states."""
     is_image: bool = True  # false for NPY and NPZ, whose arrays may also be lists of points
 
     @property
@@ -61,11 +61,11 @@ class DepthFormat:
 
     name: str  # as messages call it, such as "PNG"
     suffixes: tuple[str, ...]
-    """Of its files, in lower case; "." and the name in `choices.FORMATS` is one of them."""
+    """Suffixes of its files in lower case; "." and the name in `choices.FORMATS` is one of them."""
     magic: tuple[bytes, ...]
     """What the content begins with; files are recognised by content, never by suffix."""
     read: Callable[[Path, bytes], DepthFile]
-    """From path (for messages) and content. Raises FileFormatError."""
+    """Reader of path (for messages) and content. Raises FileFormatError."""
     write: Callable[[Path, NDArray[Any], Mapping[str, str]], None]
     """(H, W) float32 metres or uint16 codes, 0 where unknown, into an existing empty file, with
     texts by key where the format has room for them."""

@@ -28,7 +28,7 @@ from pnpdepth_cli.models.weights.torch_file import is_module, module_state, read
 
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
 _PREFIXES = ("module.", "_orig_mod.", "model.")
-"""Of torch's DataParallel, torch.compile, and modules that hold the network, as Lightning's."""
+"""Prefixes of torch's DataParallel, of torch.compile, and of modules that hold the network."""
 
 _WRAPPED = re.compile(f"^(?:{'|'.join(map(re.escape, _PREFIXES))})+")
 _INDEX = ".index"  # of a TensorFlow checkpoint
@@ -38,7 +38,7 @@ _READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     ".npz": ("numpy file", read_numpy_file),
     _INDEX: ("TensorFlow checkpoint", read_tensor_bundle),
 }
-"""By suffix; any other file is one of torch."""
+"""Kind and reader by suffix; any other file is one of torch."""
 
 WEIGHT_SUFFIXES = (*_READERS, ".pth", ".pt", ".bin", ".ckpt", ".tar")
 
