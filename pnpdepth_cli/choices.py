@@ -22,10 +22,13 @@ from pnpdepth_cli.errors import UsageError
 class OpenList(Mapping[str, Any]):
     """The entries of an open list by name; listing the names imports none of them.
 
-    An entry of this package is the object `attribute` of the module `path/<name>.py`, or the module
-    itself without one ("-" in a name is "_" in the file; names that start with "_" and subpackages
-    are none). With `names` it is `TABLE[name]` of the module `path.py`. An entry of another package
-    is its entry point `<name>` in the group `pnpdepth.<group>`; the package's own entries win.
+    An entry of this package is the object `attribute` of the module `path/<name>.py`. Without
+    `attribute` it is the module itself. A "-" in a name is "_" in the file. Names that start with
+    "_", and subpackages, are no entries. With `names` an entry is `TABLE[name]` of the module
+    `path.py`.
+
+    An entry of another package is its entry point `<name>` in the group `pnpdepth.<group>`. The
+    package's own entries win.
 
     Args:
         path: Path of the folder or the module relative to `package`, such as "commands/exports".

@@ -50,12 +50,14 @@ def compare(
     pnpdepth compare out/summary.json:before out/summary.json
     pnpdepth compare study/*/ --columns mae --plot mae.png
 
-    A RUN is the output of `pnpdepth eval --json`, or the folder or summary.json of a batch;
-    FILE:before takes the depth before refinement. Gains
-    are in per cent of the first run and positive if the other run is better. p is the p-value of a
-    paired permutation test over groups of frames (manifest column group, sequence or folder), in a
-    single sequence over blocks as long as its errors are correlated, adjusted for the number of
-    measures and runs (Holm); it is exact for few groups, else with random permutations.
+    A RUN is the output of `pnpdepth eval --json`, or the folder or summary.json of a batch.
+    FILE:before takes the depth before refinement. Gains are in per cent of the first run, and
+    positive if the other run is better.
+
+    p is the p-value of a paired permutation test over groups of frames: manifest column group,
+    sequence or folder. In a single sequence the groups are blocks as long as its errors are
+    correlated. p is adjusted for the number of measures and runs (Holm). It is exact for few
+    groups, else computed with random permutations.
     """
     from pnpdepth_cli.cli.printing import TableFiles, print_notes, print_table
     from pnpdepth_cli.commands.evaluation.compare import compare as compare_runs

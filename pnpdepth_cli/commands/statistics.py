@@ -87,10 +87,10 @@ def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
 def block_length(series: Floats) -> int:
     """Returns the length of blocks whose means are nearly independent; 1 if frames already are.
 
-    Blocks of length L of a first-order autoregression with lag-1 correlation ρ understate the
-    variance of the mean by the fraction 2ρ/(1 − ρ²)/L for large L, which is kept at BLOCK_BIAS.
-    ρ is the median over the columns without NaN, corrected for its bias (Kendall 1954); a
-    correlation below its standard error counts as none.
+    Take blocks of length L of a first-order autoregression with lag-1 correlation ρ. For large L
+    they understate the variance of the mean by the fraction 2ρ/(1 − ρ²)/L. L keeps that fraction at
+    BLOCK_BIAS. ρ is the median over the columns without NaN, corrected for its bias (Kendall 1954).
+    A correlation below its standard error counts as none.
 
     Args:
         series: (N, M) in order of time.

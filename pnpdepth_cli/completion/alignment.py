@@ -7,10 +7,10 @@ shift. The fit is made in the network's own space: with x its output at a point 
     inverse:  1/d   = scale·x + shift
     log:      log d = scale·x + shift
 
-`scale` keeps the shift at 0 (in log space, where a factor of depth is an addend, it keeps the scale
-at 1). `median` is the same by the median of the points' own ratios. The fit is robust to outliers:
-of lines through many pairs of points, the one with the smallest median residual wins (LMedS,
-Rousseeuw 1984), and starts reweighted least squares with Tukey's biweight.
+`scale` keeps the shift at 0. In log space, where a factor of depth is an addend, it keeps the scale
+at 1. `median` is the same by the median of the points' own ratios. The fit is robust to outliers.
+Of lines through many pairs of points, the one with the smallest median residual is the start
+(LMedS, Rousseeuw 1984) of reweighted least squares with Tukey's biweight.
 """
 
 from __future__ import annotations

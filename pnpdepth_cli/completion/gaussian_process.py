@@ -5,16 +5,17 @@ The residual r in log depth is a random field observed at the points,
     r(p) = β₀ + β₁·u(p) + f(p) + noise,   cov f(p), f(q) = exp(−|φ(p) − φ(q)|),
 
 β₀ and β₁ normal with variances 100 and 1, u the predicted log depth. φ holds the position in the
-image, u, and the colour in CIELAB, each divided by a length scale: pixels that are near, look alike
-and are predicted alike have about the same residual, and an edge of the image or of the prediction
-stops it. The mean of r anywhere, given the points, is
+image, u, and the colour in CIELAB, each divided by a length scale. So pixels that are near, look
+alike and are predicted alike have about the same residual. An edge of the image or of the
+prediction stops it. The mean of r anywhere, given the points, is
 
     mean = k·α,   α = (K + N)⁻¹ r,
 
 K of all covariances among the points, k of those with p, N diagonal of the noise (Rasmussen and
 Williams, "Gaussian Processes for Machine Learning", 2006, sections 2.2 and 2.7; universal kriging
-in Cressie, "Statistics for Spatial Data", 1993, section 3.4). Of a few length scales, those with
-the smallest leave-one-out error are taken, which costs no more than solving once (ibid., eq. 5.12).
+in Cressie, "Statistics for Spatial Data", 1993, section 3.4). A few length scales are compared, and
+those with the smallest leave-one-out error are taken. The error costs no more than solving once
+(ibid., eq. 5.12).
 
 With many points, each image block is predicted from its nearest points, all blocks at once. Two
 layers of blocks, half a block apart, are blended so that no seam is seen.

@@ -2,10 +2,10 @@
 
     min over a, b of  Σ_i w_i·(y_i − a·x_i − b)² + ridge·a²,   w_i = 1 / distance_i³
 
-y is a residual at the points and x the prediction there. Moving least squares (Lancaster and
-Salkauskas 1981) of the depth against the prediction, as in locally weighted alignment of monocular
-depth (Xu et al. 2022), but with weights that go through the points instead of a bandwidth: that was
-far better on rendered frames from 20 points to LiDAR.
+y is a residual at the points and x the prediction there. These are moving least squares (Lancaster
+and Salkauskas 1981) of the depth against the prediction, as in locally weighted alignment of
+monocular depth (Xu et al. 2022). Instead of a bandwidth, the weights make the lines go through the
+points, which was far better on rendered frames from 20 points to LiDAR.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 """Weights that learn from the points of a sequence, without ground truth: `--adapt`.
 
 A network that is given the points as an input fits them already. So it is asked for points that it
-is not given: half of a frame's points m ⊂ D_s are hidden from the input, and the loss L is taken at
-these, while Adam updates the weights θ:
+is not given. Half of a frame's points, m ⊂ D_s, are hidden from the input. The loss L is taken at
+these, and Adam updates the weights θ:
 
     θ_{k+1} = θ_k − α·Adam(∂L(f_θ(x, D_s ∖ m_k), m_k) / ∂θ_k)
 
-A part of the frames is for validation: only where their loss at hidden points fell beyond chance,
-the learnt weights serve. The image encoder that a definition names does not learn.
+A part of the frames is for validation. The new weights are used only if the loss at hidden points
+of these frames fell beyond chance. The image encoder that a definition names does not learn.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LEAST_FRAMES = 8
 SIGNIFICANT = 0.05
 """Level of the one-sided paired t test over the frames for validation."""
 MIN_POINTS_FOR_OUTLIERS = 50
-"""Of fewer points none is an outlier: each may be all that is seen of an object."""
+"""Fewer points have no outliers: each may be all that is seen of an object."""
 
 _LOSS = "log"
 

@@ -170,9 +170,11 @@ class ModelDefinition:
     """Name of a submodule whose output depends on the image alone. It runs once for several sets of
     points of one image."""
     coarse: Callable[[Any], AbstractContextManager[list[Any]]] | None = None
-    """Called with the network; while it is open, forward returns a smaller depth of the same field
-    of view, sooner. The first forward, and each without gradients, also adds its full depth to the
-    list. The default method takes the gradient of its updates of z there."""
+    """Function of the network that returns a context.
+
+    Inside it, forward returns a smaller depth of the same field of view, sooner. The first forward,
+    and each without gradients, also adds its full depth to the list. The default method takes the
+    gradient of its updates of z there."""
     takes_prior: bool = False
     """True if forward takes one more argument, which may be left out: a dense prior (1, 1, H, W) in
     metres with 0 = unknown, such as another network's depth aligned with the points."""
@@ -180,17 +182,18 @@ class ModelDefinition:
     """True if forward takes one more argument, the camera matrix (1, 3, 3) in pixels of its image,
     whole numbers at pixel centres."""
     weighs_points: bool = False
-    """True if the network itself finds outliers among its points. It is then given those, too, that
-    are left out elsewhere as outliers."""
+    """True if the network itself finds outliers among its points, so none is removed before."""
     static_graph: bool = False
     """True if the network runs the same submodules in the same order for all images of one size,
     even where values of tensors reach Python code. Then the cut is learned only once."""
     read_checkpoint: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] | None = None
     """Renames or reshapes the tensors of a published checkpoint into the network's state dict."""
     arguments: Callable[..., tuple[Tensor, ...]] | None = None
-    """Returns the positional arguments of forward, for rgb (1, 3, H, W), normalised, and sparse
-    depth (1, 1, H, W) in metres with 0 = unknown, each None if `input_kind` lacks it; and for the
-    intrinsics if it takes them. By default they are passed in this order."""
+    """Returns the positional arguments of forward.
+
+    It gets rgb (1, 3, H, W), normalised, sparse depth (1, 1, H, W) in metres with 0 = unknown, each
+    None if `input_kind` lacks it, and the intrinsics if the network takes them. By default they are
+    passed in this order."""
     output: Callable[[Any], Tensor] | None = None
     """Returns the prediction, (1, 1, h, w) or (1, h, w), from what forward returns. By default that
     is the tensor itself, or the only tensor in it."""

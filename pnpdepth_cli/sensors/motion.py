@@ -1,7 +1,7 @@
 """The motion of a camera between two frames, estimated where no pose is known.
 
-With images: SIFT keypoints of both (Lowe, "Distinctive image features from scale-invariant
-keypoints", 2004) are matched, those of the other frame get depth from its sparse points, and the
+SIFT keypoints of both images are matched (Lowe, "Distinctive image features from scale-invariant
+keypoints", 2004). Those of the other frame get depth from its sparse points. The
 perspective-n-point problem is solved in RANSAC (Fischler and Bolles, 1981). The frame's own depth
 takes no part in it. An estimate that few matches support is refused.
 """

@@ -1,12 +1,13 @@
 """`gaussian-splatting`: inverse depth and depth_params.json for depth-regularised 3DGS.
 
 The code of Kerbl et al. 2023 takes the inverse depth, in the unit of the COLMAP model, as
-png / 2^16 · scale + offset: NAME.png of 16 bits in the folder of its option -d, scale and offset of
-each image in sparse/0/depth_params.json. It ignores images whose scale is below 0.2 or above 5
-times the median, so all images have one scale here. It takes 0 for infinitely far and reads no
-masks, so every pixel has a depth: one that is not valid its own, one that is unknown that of the
-nearest known pixel. Unless a model is there,
-sparse/0/ gets one of the refined images with points of their depth.
+png / 2^16 · scale + offset. NAME.png has 16 bits and lies in the folder of its option -d. Scale and
+offset of each image are in sparse/0/depth_params.json. The code ignores images whose scale is below
+0.2 or above 5 times the median, so all images have one scale here.
+
+The code takes 0 for infinitely far and reads no masks, so every pixel has a depth. A pixel that is
+not valid keeps its own. An unknown one has that of the nearest known pixel. Unless a model is
+there, sparse/0/ gets one of the refined images with points of their depth.
 """
 
 from __future__ import annotations

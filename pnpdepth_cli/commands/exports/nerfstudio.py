@@ -1,9 +1,9 @@
 """`nerfstudio`: transforms.json with poses, intrinsics and depth as 16-bit PNG in millimetres.
 
-Nerfstudio's data conventions: camera axes are x right, y up, z backwards; principal points count
-from the image's corner, so pixel centres are at .5; a depth is PNG code × 0.001 in the unit of the
-poses. Instant-NGP reads the same file; it takes that factor from `integer_depth_scale`. Splatting
-begins with the points of start.ply, in the coordinates and unit of the poses.
+The data conventions are Nerfstudio's. Camera axes are x right, y up, z backwards. Principal points
+count from the image's corner, so pixel centres are at .5. A depth is PNG code × 0.001 in the unit
+of the poses. Instant-NGP reads the same file; it takes that factor from `integer_depth_scale`.
+Splatting begins with the points of start.ply, in the coordinates and unit of the poses.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Watching a pass of a network operation by operation, for `Split`.
 
-Two modes of torch, active in this thread and this pass only: a dispatch mode sees every tensor
-operation; a torch function mode sees `Tensor.numpy` and the like, by which values reach Python
-without an operation. The latter is off within torch's fused transformer layers, which would
-otherwise take other kernels, and so other bits, than in later passes.
+Two modes of torch are active in this thread and this pass only. A dispatch mode sees every tensor
+operation. A torch function mode sees `Tensor.numpy` and the like, by which values reach Python
+without an operation. It is off within torch's fused transformer layers, which would otherwise take
+other kernels, and so other bits, than in later passes.
 """
 
 from __future__ import annotations

@@ -3,8 +3,9 @@
 Messages are decoded as the released ROS message types define them. The definitions in the bag
 itself are not used, because rosbags makes Python code of them.
 
-rosbags decompresses whatever a chunk holds and runs what SQLite stores: a chunk of a few kilobytes
-can hold gigabytes, and a schema can hold views and generated columns, computed when they are read.
+rosbags decompresses whatever a chunk holds, and a chunk of a few kilobytes can hold gigabytes. It
+runs what SQLite stores, and a schema can hold views and generated columns, which are computed when
+they are read. Both are bounded here.
 """
 
 from __future__ import annotations
