@@ -156,6 +156,7 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
         NoPointsError: No beam hits anything that the camera sees.
     """
     size = (depth.shape[0], depth.shape[1])
+    # The beams that look ahead, and what each meets.
     rng = np.random.default_rng(seed)
     beams = sensor.directions(rng) @ FORWARD_LEFT_UP.T
     beams = beams[beams[:, 2] > 1e-9]
@@ -169,6 +170,7 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     distance, beams = distance[kept], beams[kept]
     if sensor.range_noise > 0:
         distance = distance + rng.normal(0, sensor.range_noise, len(distance))
+    # The points, as noise moves them, of which the image shows the nearest of each pixel.
     points = beams * distance[:, None]
     ahead = drops.keep(distance > 0, "noise put it behind the camera")
     points = points[ahead]
