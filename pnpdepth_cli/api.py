@@ -18,7 +18,7 @@ from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.refiner import Refiner
 from pnpdepth_cli.measures import DELTA_THRESHOLDS
 from pnpdepth_cli.models import network as networks
-from pnpdepth_cli.models.definition import ModelDefinition, undescribed
+from pnpdepth_cli.models.definition import ModelDefinition, assume_definition
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -54,7 +54,7 @@ def load_network(
     path = None if checkpoint is None else Path(checkpoint)
     what: str | ModelDefinition
     if isinstance(spec, nn.Module):
-        known = definition or undescribed(name=type(spec).__name__, build=lambda: spec)
+        known = definition or assume_definition(name=type(spec).__name__, build=lambda: spec)
         what = replace(known, build=lambda: spec, complete=path is None)
     elif not isinstance(spec, str | Path):
         raise UsageError(f"spec must be a name, a path or a module, not {type(spec).__name__}")
