@@ -39,8 +39,8 @@ def load_network(
             Python file (which is run), as `--model` of the command line; or a module, which is put
             into eval mode, its parameters without gradients.
         checkpoint: Weights. None takes those of the network's definition.
-        definition: What is known of a module. None: it takes an rgb image, and its layers and what
-            its output means are decided by the first frame.
+        definition: Definition of a module. None: the module takes an rgb image, and its layers and
+            what its output means are decided by the first frame.
         device: torch device, such as "cpu" or "cuda:1".
         precision: "fp32", "bf16" or "fp16" for convolutions and matrix products.
 
