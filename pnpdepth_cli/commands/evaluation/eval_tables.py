@@ -102,9 +102,10 @@ def comparison_table(comparison: Comparison) -> Table:
                 measure.heading,
                 run.name,
                 measure.text(run.mean[measure.key]),
-                Cell(_format_signed(found.percent), style if p is not None and p < ALPHA else
-                "dim"), _format_signed(found.low_percent), _format_signed(found.high_percent), "–"
-                if p is None else f"{p:.4f}",
+                Cell(_gain_text(found.percent), style if p is not None and p < ALPHA else "dim"),
+                _gain_text(found.low_percent),
+                _gain_text(found.high_percent),
+                "–" if p is None else f"{p:.4f}",
             ])  # fmt: skip
     # What was tested, in the title.
     swaps = "all" if comparison.exact_p_values else f"{PERMUTATIONS:,} random"
@@ -157,5 +158,5 @@ def _without_sparse(excluded: bool) -> str:
     return "; without the pixels of sparse points" if excluded else ""
 
 
-def _format_signed(value: float | None) -> str:
+def _gain_text(value: float | None) -> str:
     return "–" if value is None else f"{value:+.2f}"

@@ -110,7 +110,7 @@ class _Machine:
             raise BrokenFileError(f"its pickle takes more than {MAX_STEPS:,} steps")
 
     def step(self, opcode: str, argument: Any) -> None:
-        """Does what the opcode says. Instead of a call, see `_call`."""
+        """Does what the opcode says; calls are left to `_call`."""
         stack = self.stack
         # One case for each opcode that pickles of weights have.
         match opcode:
