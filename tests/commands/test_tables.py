@@ -14,7 +14,7 @@ from pnpdepth_cli.commands.error_tables import (
     change,
     format_error,
     held_out_table,
-    made_by,
+    names_of_depths,
     refinement_table,
 )
 from pnpdepth_cli.commands.evaluation.compare import ComparedRun, Comparison, Gain
@@ -196,4 +196,4 @@ def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part(
     weights: dict[str, float], after: str
 ) -> None:
     record = record_of("net", "compact", weights=weights)
-    assert made_by(record) == ("net, aligned with the points", after)
+    assert names_of_depths(record) == ("net, aligned with the points", after)
