@@ -13,7 +13,7 @@ from PIL import Image
 
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.colours import UNKNOWN, DepthScale, depth_scale
-from pnpdepth_cli.io.figure import MARGIN, magnification
+from pnpdepth_cli.io.figure import MARGIN, magnification, resized
 from pnpdepth_cli.io.visualisation import (
     error_map,
     improvement,
@@ -184,3 +184,9 @@ def test_points_are_coloured_discs_where_they_lie(
     assert colours[20, 30].tolist() == ORANGE
     assert len(set(colours[12, 17].tolist())) == 1
     assert ("held-out" in content.footer) == held_out
+
+
+def test_a_reduced_image_has_means_and_an_enlarged_one_squares() -> None:
+    pixels = np.array([[0, 2], [4, 6]], np.float32)
+    assert resized(pixels, 0.5).tolist() == [[3]]
+    assert resized(pixels, 2).tolist() == pixels.repeat(2, 0).repeat(2, 1).tolist()
