@@ -158,3 +158,22 @@ def test_numbers_of_no_camera_are_refused(change: dict[str, Any]) -> None:
 def test_what_is_no_record_is_refused_with_the_name_of_its_file(entry: object) -> None:
     with pytest.raises(FileFormatError, match=r"a\.json"):
         FrameRecord.from_json(entry, Path("a.json"))
+
+
+@pytest.mark.parametrize(
+    ("own", "linear", "basis", "worse"),
+    [
+        (2.0, 1.0, "ground_truth", True),
+        (1.0, 1.0, "ground_truth", False),
+        (1.0, 2.0, "validation", False),
+        (2.0, 1.0, "held_out", True),
+        (2.0, 1.0, "used", None),
+        (2.0, None, "ground_truth", None),
+        (None, 1.0, "ground_truth", None),
+    ],
+)
+def test_a_result_is_worse_than_linear_by_what_measures_it_best(
+    own: float | None, linear: float | None, basis: str, worse: bool | None
+) -> None:
+    errors = {"before": {}, "after": {"mae": own}, "linear": {"mae": linear}}
+    assert FrameRecord(errors={basis: errors}).worse_than_linear is worse
