@@ -62,7 +62,7 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     assert record["settings"]["loss"] == "charbonnier"
     assert record["settings"]["update"] == "rmsprop"
     assert record["settings"]["propagate"] == "median"
-    assert record["baselines"]["farthest"]["validation_mae"] > 0
+    assert record["errors"]["validation"]["farthest"]["mae"] > 0
     assert record["loss"][-1] < record["loss"][0]
     files_of = [f"my_package/{name}.py" for name in ("charbonnier", "rmsprop")]
     by_file = ["--loss", files_of[0], "--update", files_of[1], "--lr", "1%"]
