@@ -121,7 +121,8 @@ def errors_of(refined: Refined, frame: Frame, *, with_baselines: bool = False) -
         frame: The frame with its ground truth and its points, also those held out.
         with_baselines: Whether the other baselines of the points are stages as well.
     """
-    baselines = dict(_baselines(refined, frame.points)) if with_baselines else {}
+    is_compared = with_baselines and frame.gt is not None
+    baselines = dict(_baselines(refined, frame.points)) if is_compared else {}
     maps = {BEFORE: refined.before, AFTER: refined.after}
     beside: dict[str, DepthMap] = {}
     if frame.gt is not None or len(refined.held_out):
@@ -186,9 +187,11 @@ def _at_validation_points(refined: Refined, *, with_baselines: bool) -> Stages:
 
 
 def _baselines(refined: Refined, given: SparsePoints) -> Iterator[tuple[str, DepthMap]]:
-    """The depth of every baseline of all given points, of those that do not fail on the frame."""
+    """The depth of the other baselines of all given points that do not fail on the frame."""
     before = torch.from_numpy(refined.before)
     for name, baseline in BASELINES.items():
+        if name == LINEAR:  # is compared with in any case
+            continue
         try:
             yield name, baseline.depth(given, before).numpy()
         except ModelError:  # such as a line through points that are all equally far
