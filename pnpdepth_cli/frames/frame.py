@@ -43,7 +43,7 @@ class Frame:
     unit: str = METRES  # of all depths: "m", or "model units" of a COLMAP model without scale
     register: Register = None  # how `rgb` is to be moved to the points
     one_view: bool = False
-    """Whether image and points are stated to be of one view, so that the image is not doubted."""
+    """Whether image and points are stated to be of one view, so that this is not checked."""
     outliers: SparsePoints | None = None
     """Outliers, which are not in `points`; for networks that weigh their points."""
     prior: Tensor | None = None
