@@ -44,27 +44,23 @@ if TYPE_CHECKING:
     from pnpdepth_cli.points import SparsePoints as SparsePoints
     from pnpdepth_cli.settings import Settings as Settings
 
-_HOMES = {
-    **dict.fromkeys(("load_network", "refine", "score"), "api"),
-    "Refiner": "frames.refiner",
-    "Refined": "frames.refined",
-    "Settings": "settings",
-    "Scores": "core.metrics",
-    "Split": "core.split",
-    "Network": "models.network",
-    **dict.fromkeys(
-        ("ModelDefinition", "Normalisation", "Fixed", "Multiple", "Near"), "models.definition"
-    ),
-    "SparsePoints": "points",
-    **dict.fromkeys(
-        (
-            *("PnpDepthError", "UsageError", "InputError", "SizeError", "NoPointsError"),
-            *("ModelError", "LayerError", "CheckpointError", "DivergedError", "DeviceError"),
-        ),
-        "errors",
+_NAMES = {
+    "api": ("load_network", "refine", "score"),
+    "frames.refiner": ("Refiner",),
+    "frames.refined": ("Refined",),
+    "settings": ("Settings",),
+    "core.metrics": ("Scores",),
+    "core.split": ("Split",),
+    "models.network": ("Network",),
+    "models.definition": ("ModelDefinition", "Normalisation", "Fixed", "Multiple", "Near"),
+    "points": ("SparsePoints",),
+    "errors": (
+        *("PnpDepthError", "UsageError", "InputError", "SizeError", "NoPointsError"),
+        *("ModelError", "LayerError", "CheckpointError", "DivergedError", "DeviceError"),
     ),
 }
-"""The module of each public name."""
+"""The public names of each module."""
+_HOMES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = ["__version__", *_HOMES]
 

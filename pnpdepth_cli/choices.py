@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import functools
-import importlib
+import importlib.util
 import pkgutil
 from collections.abc import Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
@@ -22,40 +22,36 @@ from pnpdepth_cli.errors import UsageError
 class OpenList(Mapping[str, Any]):
     """The entries of an open list by name; listing the names imports none of them.
 
-    An entry of this package is the object `attribute` of the module `path/<name>.py`. Without
-    `attribute` it is the module itself. A "-" in a name is "_" in the file. Names that start with
-    "_", and subpackages, are no entries. With `names` an entry is `TABLE[name]` of the module
-    `path.py`.
+    With `names`, an entry is `TABLE[name]` of the module. Without, the module is a package, and an
+    entry is a file of it, or the object `attribute` in the file. A "-" in a name is "_" in the
+    file. Files that start with "_", and subpackages, are no entries.
 
     An entry of another package is its entry point `<name>` in the group `pnpdepth.<group>`. The
     package's own entries win.
 
     Args:
-        path: Path of the folder or the module relative to `package`, such as "commands/exports".
-        attribute: Name of the object in each module.
+        module: Name of the module or package, such as "pnpdepth_cli.core.losses".
         group: Last part of the entry point group.
         noun: Name of one entry in messages.
         names: All names in the module's table, in the order of their listing.
         first: Names listed before the others, which follow in alphabetical order.
-        package: The package that `path` belongs to.
+        attribute: Name of the object in each file of the package.
         in_file: Name of the object in a user's Python file, whose path is then a name too.
     """
 
     def __init__(
         self,
-        path: str,
-        attribute: str | None = None,
+        module: str,
         *,
         group: str,
         noun: str,
         names: tuple[str, ...] = (),
         first: tuple[str, ...] = (),
-        package: str = "pnpdepth_cli",
+        attribute: str | None = None,
         in_file: str | None = None,
     ) -> None:
-        self._in_file = in_file
         self.group, self.noun = group, noun
-        self._path, self._attribute, self._package = path, attribute, package
+        self._module, self._attribute, self._in_file = module, attribute, in_file
         self._names, self._first = names, names or first
 
     def __getitem__(self, name: str) -> Any:
@@ -87,15 +83,14 @@ class OpenList(Mapping[str, Any]):
 
     @functools.cached_property
     def _modules(self) -> dict[str, str]:
-        package = ".".join((self._package, *filter(None, self._path.split("/"))))
         if self._names:
-            return dict.fromkeys(self._names, package)
-        roots = importlib.import_module(self._package).__path__
-        modules = pkgutil.iter_modules([str(Path(root, self._path)) for root in roots])
+            return dict.fromkeys(self._names, self._module)
+        package = importlib.util.find_spec(self._module)
+        assert package is not None
         return {
-            module.name.replace("_", "-"): f"{package}.{module.name}"
-            for module in modules
-            if not module.name.startswith("_") and not module.ispkg
+            file.name.replace("_", "-"): f"{self._module}.{file.name}"
+            for file in pkgutil.iter_modules(package.submodule_search_locations)
+            if not file.name.startswith("_") and not file.ispkg
         }
 
     @functools.cached_property
@@ -118,7 +113,7 @@ def _from_file(path: str, attribute: str, noun: str) -> Any:
 
 
 LOSSES = OpenList(
-    "core/losses",
+    "pnpdepth_cli.core.losses",
     in_file="loss",
     group="losses",
     noun="loss",
@@ -127,7 +122,7 @@ LOSSES = OpenList(
 """L: (N,) predicted and (N,) measured depth to a scalar."""
 
 UPDATES = OpenList(
-    "core/update_rules",
+    "pnpdepth_cli.core.update_rules",
     in_file="update_rule",
     group="updates",
     noun="update rule",
@@ -136,7 +131,7 @@ UPDATES = OpenList(
 """U: each entry creates a rule that turns gradients into directions of z."""
 
 PROPAGATIONS = OpenList(
-    "completion/propagation",
+    "pnpdepth_cli.completion.propagation",
     group="propagations",
     noun="propagation",
     names=("gp", "local", "diffusion"),
@@ -144,7 +139,7 @@ PROPAGATIONS = OpenList(
 """How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
 
 BASELINES = OpenList(
-    "completion/baselines",
+    "pnpdepth_cli.completion.baselines",
     group="baselines",
     noun="baseline",
     names=(
@@ -155,19 +150,18 @@ BASELINES = OpenList(
 """Dense depth without refinement: `pnpdepth_cli.completion.baselines`."""
 
 NETWORKS = OpenList(
-    "",
+    "model_zoo_defs",
     group="models",
     noun="network",
     first=(
         *("compact", "eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense"),
         *("latefusion", "nconv", "pncnn"),
     ),
-    package="model_zoo_defs",
 )
 """The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
 
 FORMATS = OpenList(
-    "io/formats",
+    "pnpdepth_cli.io.formats",
     group="formats",
     noun="depth format",
     names=("png", "exr", "npy", "npz", "pfm", "tiff"),
@@ -175,7 +169,7 @@ FORMATS = OpenList(
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
 LAYOUTS = OpenList(
-    "dataset/layouts",
+    "pnpdepth_cli.dataset.layouts",
     group="layouts",
     noun="layout",
     names=(
@@ -187,15 +181,17 @@ LAYOUTS = OpenList(
 """Data set layouts, in the order in which they are guessed (`dataset.layouts.Layout`)."""
 
 EXPORTS = OpenList(
-    "commands/exports",
-    "EXPORT",
+    "pnpdepth_cli.commands.exports",
+    attribute="EXPORT",
     group="exports",
     noun="export",
     first=("colmap", "nerfstudio", "gaussian-splatting"),
 )
 """Files for reconstruction programs: `pnpdepth_cli.commands.exports.Export`."""
 
-MEASURES = OpenList("measures", group="measures", noun="measure", names=tuple(measures.TABLE))
+MEASURES = OpenList(
+    "pnpdepth_cli.measures", group="measures", noun="measure", names=tuple(measures.TABLE)
+)
 """Measures that `eval` computes only on request: `pnpdepth_cli.measures.Measure`."""
 
 # The method

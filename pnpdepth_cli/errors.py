@@ -1,21 +1,5 @@
 """Every error a user can cause, as one tree; each class carries its exit code.
 
-    PnpDepthError                1  our own bug, when raised as itself
-    ├── UsageError               2  an option or argument makes no sense
-    │   └── OutputError          2  the output path cannot be used
-    │       └── StorageError     2  nothing more can be written: full, gone or read-only
-    ├── InputError               3  a file with image or depth data is invalid
-    │   ├── FileFormatError      3  a file is not of the expected format
-    │   ├── SizeError            3  image, sparse depth and ground truth differ in size
-    │   └── NoPointsError        3  there is no sparse depth to work with
-    ├── ModelError               4  the network or its definition is invalid
-    │   ├── LayerError           4  the network cannot be cut at the layer
-    │   └── CheckpointError      4  the weights cannot be used
-    ├── DivergedError            5  refinement produced non-finite numbers
-    ├── DeviceError              6  the device is absent or out of memory
-    │   └── ClusterError         6  the Ray cluster cannot be used
-    └── FramesFailedError        7  a batch finished, but some of its frames failed
-
 A message names the object, the fact and the remedy, on one line.
 """
 

@@ -21,11 +21,11 @@ _KEY = "option"
 
 @dataclass(frozen=True, kw_only=True)
 class Option:
-    """What the command line says of a field."""
+    """A field that the user can set, and what the command line says of it."""
 
     help: str
-    flag: str | None = None
-    """None: the field's name with dashes."""
+    flag: str = ""
+    """Spelling on the command line. By default the field's name with dashes, such as `--lr`."""
     choices: Collection[str] | None = None
     metavar: str | None = None
     least: int | None = None
@@ -35,22 +35,11 @@ class Option:
     value_if_bare: str | None = None
     """Value of the option where none follows. None: one has to."""
     show_default: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class OptionField:
-    """A field with its option."""
-
-    name: str
-    type: str
+    name: str = ""
+    """Name of the field."""
+    type: str = ""
     """Type of the value as it is written, without "| None"; of several, the last."""
-    default: Any
-    option: Option
-
-    @property
-    def flag(self) -> str:
-        """Spelling on the command line, such as `--lr`."""
-        return self.option.flag or f"--{self.name.replace('_', '-')}"
+    default: Any = None
 
 
 def option(default: Any, help: str, **details: Any) -> Any:
@@ -64,15 +53,17 @@ def option(default: Any, help: str, **details: Any) -> Any:
     return field(default=default, metadata={_KEY: Option(help=help, **details)})
 
 
-def options_of(group: type) -> Iterator[OptionField]:
+def options_of(group: type) -> Iterator[Option]:
     """Yields the fields of a dataclass that were made by `option`, in their order."""
-    for declared in fields(group):
-        if _KEY in declared.metadata:
-            yield OptionField(
-                name=declared.name,
-                type=str(declared.type).removesuffix(" | None").rpartition(" | ")[2],
-                default=declared.default,
-                option=declared.metadata[_KEY],
+    for each in fields(group):
+        if _KEY in each.metadata:
+            declared = each.metadata[_KEY]
+            yield replace(
+                declared,
+                flag=declared.flag or f"--{each.name.replace('_', '-')}",
+                name=each.name,
+                type=str(each.type).removesuffix(" | None").rpartition(" | ")[2],
+                default=each.default,
             )
 
 
@@ -102,16 +93,11 @@ class Settings:
     )
     iterations: int | None = option(None, "Number of updates; 0 is no refinement.", metavar="K")
     lr: float | str | None = option(
-        None,
-        "Step size: absolute, or % of the std of z.",
-        metavar="NUMBER|P%",
-        parse=str,
+        None, "Step size: absolute, or % of the std of z.", metavar="NUMBER|P%"
     )
     loss: str | None = option(None, "Loss at the sparse points.", choices=choices.LOSSES)
     update: str | None = option(
-        None,
-        "Update rule; another than the network's resets --lr.",
-        choices=choices.UPDATES,
+        None, "Update rule; another than the network's resets --lr.", choices=choices.UPDATES
     )
     schedule: str | None = None
     """Step size over the updates, "constant" or "linear" to 0. It has no option."""
@@ -213,9 +199,7 @@ def _is_step(value: object) -> bool:
 
 
 _NAMES: Mapping[str, Collection[str]] = {"schedule": choices.SCHEDULES} | {
-    each.name: each.option.choices
-    for each in options_of(Settings)
-    if each.option.choices is not None
+    each.name: each.choices for each in options_of(Settings) if each.choices is not None
 }
 _CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
     "layer": (lambda value: isinstance(value, str), "the name of a layer, or a fraction as text"),

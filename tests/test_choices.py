@@ -31,7 +31,13 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OpenList:
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    return OpenList("io", "__name__", group="test_table", noun="entry", first=("json-file",))
+    return OpenList(
+        "pnpdepth_cli.io",
+        attribute="__name__",
+        group="test_table",
+        noun="entry",
+        first=("json-file",),
+    )
 
 
 def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_there(
@@ -74,7 +80,7 @@ def test_every_name_of_a_closed_list_is_implemented() -> None:
 
 
 def test_a_table_of_modules_leaves_out_subpackages() -> None:
-    table = OpenList("", None, group="test_none", noun="package")
+    table = OpenList("pnpdepth_cli", group="test_none", noun="package")
     assert table["points"].__name__ == "pnpdepth_cli.points"
     assert "core" not in table
 

@@ -61,7 +61,11 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 )
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST|BAG")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
-@options.sample
+@click.option(
+    "--sample",
+    metavar="[PATTERN:]N|P%",
+    help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
+)
 @options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions)
 @click.option(
     "--vary",
@@ -123,12 +127,12 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
     """
     from pnpdepth_cli.commands.batch.find_frames import unpack
 
-    values = dict(values)
     own = options.take_options(BatchRequest, values)
     own["cluster"] = ClusterOptions(**options.take_options(ClusterOptions, values))
     own["sequence"] = SequenceOptions(**options.take_options(SequenceOptions, values))
     own |= {name: values.pop(name) for name in ("source", "output")}
-    sample = None if (text := values.pop("sample")) is None else parse_sample(text)
+    text = values.pop("sample")
+    sample = None if text is None else parse_sample(text)
     request = BatchRequest(refine=options.request_of(values, sample=sample), **own)
     request = unpack(request, say)
     if not combination.texts:

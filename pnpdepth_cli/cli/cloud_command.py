@@ -46,12 +46,7 @@ from pnpdepth_cli.cli.progress import progress_bar
     show_default=True,
     help="Keep pixels on which N views agree; their depth is the mean.",
 )
-@click.option(
-    "--voxel",
-    type=float,
-    metavar="M",
-    help="Merge the points in cubes of this side.",
-)
+@click.option("--voxel", type=float, metavar="M", help="Merge the points in cubes of this side.")
 @click.option("-o", "--output", type=options.FILE, required=True, help="PLY file.")
 @options.overwrite
 def cloud(**values: Any) -> None:

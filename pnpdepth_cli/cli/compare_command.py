@@ -38,10 +38,7 @@ columns = click.option(
     " plot.",
 )
 def compare(
-    runs: tuple[str, ...],
-    columns: tuple[str, ...] | None,
-    plot: Path | None,
-    **table_files: Any,
+    runs: tuple[str, ...], columns: tuple[str, ...] | None, plot: Path | None, **table_files: Any
 ) -> None:
     """Compare RUNs with the first of them, on the frames that all of them scored.
 

@@ -26,19 +26,12 @@ _OUTPUT = ("--csv", "--latex", "--columns", "--html", "--overwrite", "--json")
         {"--protocol", "--max-depth", "--scale-by", "--gt-scale", "--pred-scale", "--resize"}
         | {*_OUTPUT}
     ),
-    groups={
-        "Protocol": ("--protocol", ScoringRules),
-        "Input": (EvalRequest,),
-        "Output": _OUTPUT,
-    },
+    groups={"Protocol": ("--protocol", ScoringRules), "Input": (EvalRequest,), "Output": _OUTPUT},
 )
 @click.argument("prediction", type=options.FILE, metavar="PRED")
 @click.argument("ground_truth", type=options.FILE, metavar="GT")
 @options.options_of_groups(EvalRequest)
-@options.table_files(
-    csv="Write a row per frame.",
-    latex="Write a tabular of the means.",
-)
+@options.table_files(csv="Write a row per frame.", latex="Write a tabular of the means.")
 @columns
 @click.option(
     "--html",

@@ -13,16 +13,9 @@ import click
 
 from pnpdepth_cli.settings import options_of
 
-OTHER = "Other"
-"""Title of the options that no group lists."""
-
-COMMON = frozenset(
-    {
-        *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--preset", "--layer"),
-        *("--holdout", "--uncertainty", "--output", "--overwrite", "--json"),
-    }
-)
-"""The options of a refinement that `--help` shows."""
+_NAME_COLUMN = 22
+_HELP = ("--help", "--help-all")
+_SHOW_ALL = "pnpdepth.help_all"
 
 
 class GroupedCommand(click.Command):
@@ -32,63 +25,48 @@ class GroupedCommand(click.Command):
         groups: Members of each group by its title, in the order of the help. A member is the long
             name of an option, or a dataclass of a request, which stands for those of its options
             that are named nowhere else. What the command does not have is skipped.
-        common: Long names of the options that `--help` shows; None shows all, and there is no
-            `--help-all`.
+        common: Long names of the options that `--help` shows.
     """
 
     def __init__(
         self,
         *args: Any,
         groups: Mapping[str, tuple[str | type, ...]],
-        common: frozenset[str] | None = None,
+        common: frozenset[str],
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
         self.common = common
-        self.groups: dict[str, tuple[str, ...]] = {}
-        grouped = {member for of in groups.values() for member in of if isinstance(member, str)}
+        self.groups: dict[str, list[str]] = {}
+        named = {member for of in groups.values() for member in of if isinstance(member, str)}
         for title, members in groups.items():
-            flags: list[str] = []
+            flags = self.groups[title] = []
             for member in members:
                 if isinstance(member, str):
                     flags.append(member)
-                    continue
-                names = [field.flag.partition("/")[0] for field in options_of(member)]
-                flags += [name for name in names if name not in grouped]
-                grouped |= {*names}
-            self.groups[title] = tuple(flags)
-        if common is not None:
-            self.params.append(_help_all())
+                else:
+                    flags += [each.flag for each in options_of(member) if each.flag not in named]
+                    named |= {*flags}
+        self.params.append(_help_all())
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes one section per group."""
-        shows_all = self.common is None or ctx.meta.get(_SHOW_ALL, False)
+        shown = None if ctx.meta.get(_SHOW_ALL) else {*self.common, *_HELP}
         options = {long_name(o): o for o in self.get_params(ctx) if isinstance(o, click.Option)}
-        for title, names in {**self.groups, OTHER: self.ungrouped(ctx), "Help": _HELP}.items():
-            shown = [
+        for title, names in {**self.groups, "Help": _HELP}.items():
+            records = (
                 options[name].get_help_record(ctx)
                 for name in names
-                if name in options and (shows_all or name in {*(self.common or ()), *_HELP})
-            ]
-            if rows := [row for row in shown if row is not None]:
+                if name in options and (shown is None or name in shown)
+            )
+            if rows := [row for row in records if row is not None]:
                 with formatter.section(title):
                     formatter.write_dl(rows, col_max=_NAME_COLUMN)
-
-    def ungrouped(self, ctx: click.Context) -> tuple[str, ...]:
-        """Returns the options that no group lists, without those for help."""
-        listed = {*_HELP, *(name for names in self.groups.values() for name in names)}
-        options = (o for o in self.get_params(ctx) if isinstance(o, click.Option) and not o.hidden)
-        return tuple(name for name in map(long_name, options) if name not in listed)
 
 
 def long_name(option: click.Option) -> str:
     """Returns the first of the option's names that starts with two dashes."""
-    return next((name for name in option.opts if name.startswith("--")), option.opts[0])
-
-
-_NAME_COLUMN = 22
-_HELP = ("--help", "--help-all")
-_SHOW_ALL = "pnpdepth.help_all"
+    return next(name for name in option.opts if name.startswith("--"))
 
 
 def _help_all() -> click.Option:

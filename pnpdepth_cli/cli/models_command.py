@@ -39,7 +39,6 @@ def list_command(as_json: bool) -> None:
     """List the networks that --model takes by name, with their inputs, outputs and defaults."""
     from pnpdepth_cli.commands.networks.describe import list_models
 
-    # As JSON, or as a table with a row for each network.
     listed = list_models()
     if as_json:
         print_json(listed)
@@ -47,23 +46,19 @@ def list_command(as_json: bool) -> None:
     from pnpdepth_cli.cli.printing import print_table
     from pnpdepth_cli.commands.tables import Table
 
-    print_table(Table(
-        title="networks",
-        columns=("name", "takes", "size", "gives", "params", "weights", "defaults"),
-        rows=[
-            (
-                model["name"],
-                model["input_kind"],
-                model["size"],
-                model["output_kind"],
-                f"{model['parameters']:,}",
-                "shipped" if model["checkpoint"] else "yours",
-                f"layer {model['layer']}, K {model['iterations']}, lr {model['lr']},"
-                f" {model['loss']}, {model['update']}",
-            )
-            for model in listed
-        ],
-    ))  # fmt: skip
+    columns = ("name", "takes", "size", "gives", "params", "weights", "defaults")
+    keys = ("name", "input_kind", "size", "output_kind")
+    defaults = "layer {layer}, K {iterations}, lr {lr}, {loss}, {update}"
+    rows = [
+        (
+            *(each[key] for key in keys),
+            f"{each['parameters']:,}",
+            "shipped" if each["checkpoint"] else "yours",
+            defaults.format(**each),
+        )
+        for each in listed
+    ]
+    print_table(Table(title="networks", columns=columns, rows=rows))
 
 
 @models.command(short_help="Load a network, run it and cut it at its layers.")
@@ -78,14 +73,12 @@ def check(network: str, image: Path | None, checkpoint: Path | None, as_json: bo
     """
     from pnpdepth_cli.commands.networks.describe import check_model
 
-    _print(check_model(network, checkpoint, image), as_json)
+    show = print_json if as_json else _print
+    show(check_model(network, checkpoint, image))
 
 
-def _print(record: Mapping[str, Any], as_json: bool) -> None:
-    """Prints the record to stdout; as text, its `notes` go to stderr."""
-    if as_json:
-        print_json(record)
-        return
+def _print(record: Mapping[str, Any]) -> None:
+    """Prints the record to stdout, but its `notes` to stderr."""
     for key, value in record.items():
         if key == "notes":
             for note in value:
@@ -94,10 +87,8 @@ def _print(record: Mapping[str, Any], as_json: bool) -> None:
             click.echo(f"{key}:")
             for name, text in value.items():
                 click.echo(f"  {name}: {text}")
-        elif isinstance(value, list):
-            click.echo(f"{key}: {' '.join(map(str, value))}")
         else:
-            click.echo(f"{key}: {value}")
+            click.echo(f"{key}: {' '.join(map(str, value)) if isinstance(value, list) else value}")
 
 
 @click.command(short_help="List the layers a network can be cut at.")
@@ -117,23 +108,17 @@ def layers(every: bool, as_json: bool, **values: Any) -> None:
 
     choice = NetworkChoice(**values)
     with progress_bar("layers", "layer") as show:
-        rows = list_layers(
-            choice,
-            every=every,
-            on_layer=show,
-        )
+        rows = [asdict(row) for row in list_layers(choice, every=every, on_layer=show)]
     if as_json:
-        print_json([asdict(row) for row in rows])
+        print_json(rows)
         return
     from pnpdepth_cli.cli.printing import print_table
     from pnpdepth_cli.commands.tables import Table
 
-    fields = ("field\nin z", "field\nin depth")
-    print_table(Table(
-        title=f"layers of {choice.model}",
-        columns=("layer", "z", "stride", "params", "cost\nbehind", "time\nbehind", *fields),
-        rows=[_cells(asdict(row)) for row in rows],
-    ))  # fmt: skip
+    costs, fields = ("cost\nbehind", "time\nbehind"), ("field\nin z", "field\nin depth")
+    columns = ("layer", "z", "stride", "params", *costs, *fields)
+    title = f"layers of {choice.model}"
+    print_table(Table(title=title, columns=columns, rows=[_cells(row) for row in rows]))
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,16 +47,13 @@ class TableFiles:
             UsageError: Two outputs go to one file or to stdout.
             OutputError: A file is an input, or exists and is not to be replaced.
         """
-        named = {"--csv": self.csv, "--latex": self.latex}
-        if sum(str(path) == "-" for path in named.values()) + self.as_json > 1:
+        named = [path for path in (self.csv, self.latex) if path is not None]
+        files = [path for path in named if str(path) != "-"]
+        if len(named) - len(files) + self.as_json > 1:
             raise UsageError("only one of --json, --csv - and --latex - can go to stdout")
-        options: dict[Path, str] = {}
-        for option, path in named.items():
-            if path is None or str(path) == "-":
-                continue
-            first = options.setdefault(path.resolve(), option)
-            if first != option:
-                raise UsageError(f"{first} and {option} are the same file {path}; name two files")
+        if len({path.resolve() for path in files}) < len(files):
+            raise UsageError(f"--csv and --latex are the same file {files[0]}; name two files")
+        for path in files:
             if path.resolve() in {source.resolve() for source in inputs}:
                 raise OutputError(f"{path} is one of the inputs; name another output")
             if path.exists() and not self.overwrite:
@@ -66,16 +63,14 @@ class TableFiles:
 
     def write(self, *, csv: Table, latex: Table) -> bool:
         """Writes the files that were named. Returns whether a text went to stdout."""
-        targets = (
-            (self.csv, csv.csv),
-            (self.latex, latex.latex),
-        )
-        for path, text in targets:
+        to_stdout = False
+        for path, text in ((self.csv, csv.csv), (self.latex, latex.latex)):
             if str(path) == "-":
+                to_stdout = True
                 click.echo(text().encode("utf-8", "backslashreplace"), nl=False)
             elif path is not None:
                 write_text(path, text())
-        return any(str(path) == "-" for path, _ in targets)
+        return to_stdout
 
 
 class _Console(Console):
@@ -86,17 +81,12 @@ class _Console(Console):
 def print_table(table: Table, *, err: bool = False) -> None:
     """Prints a table on stdout or stderr, as wide as needed unless that is a terminal."""
     console = _Console(stderr=err, highlight=False)
-    shown = RichTable(
-        title=escape(printable(table.title)),
-        title_justify="left",
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-    )
-    for number, column in enumerate(table.headings):
-        first = number == 0
-        shown.add_column(
-            escape(column), overflow="fold", justify="left" if first else "right", no_wrap=first
-        )
+    title = escape(printable(table.title))
+    shown = RichTable(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    first, *others = map(escape, table.headings)
+    shown.add_column(first, overflow="fold", no_wrap=True)
+    for heading in others:
+        shown.add_column(heading, overflow="fold", justify="right")
     for row in table.texts:
         shown.add_row(*map(_markup, row))
     if not console.is_terminal:
@@ -138,22 +128,14 @@ def print_refinement(record: FrameRecord) -> None:
         where = "pixels with ground truth" if GT in errors else where
         console.print(f"improved: {record.improved_fraction:.1%} of the {where}")
     # Updates, times and files.
-    settings = record.settings
-    updates = (
-        f"{settings['iterations']} updates ({settings['update']}, {settings['loss']}, step"
-        f" {settings['step']:.3g}) · "
-    )
-    console.print(
-        ("" if is_default else updates)
-        + ", ".join(f"{stage} {spent:.2f} s" for stage, spent in record.seconds.items())
-        + f" · peak {record.peak_memory_mb['process']:,.0f} MB",
-        soft_wrap=True,
-    )
-    _print_paths(console, "wrote", record.outputs.values())
-
-
-def _print_paths(console: Console, start: str, paths: Iterable[str]) -> None:
-    console.print(f"{start} {escape('  '.join(paths))}", soft_wrap=True)
+    parts = [", ".join(f"{stage} {spent:.2f} s" for stage, spent in record.seconds.items())]
+    parts.append(f"peak {record.peak_memory_mb['process']:,.0f} MB")
+    if not is_default:
+        settings = record.settings
+        how = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
+        parts.insert(0, f"{settings['iterations']} updates ({how})")
+    console.print(" · ".join(parts), soft_wrap=True)
+    console.print(f"wrote {escape('  '.join(record.outputs.values()))}", soft_wrap=True)
 
 
 def print_batch(summary: BatchSummary) -> None:
@@ -166,37 +148,31 @@ def print_batch(summary: BatchSummary) -> None:
         print_table(baselines_table(errors, summary.unit), err=True)
     # Counts of frames.
     parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
-    parts += [
-        f"{counts[kind]:,} {kind}" for kind in ("diverged", "failed", "pending") if counts[kind]
-    ]
-    if counts["with_warnings"]:
-        parts.append(f"{counts['with_warnings']:,} with warnings")
+    for kind in ("diverged", "failed", "pending", "with_warnings"):
+        if counts[kind]:
+            parts.append(f"{counts[kind]:,} {kind.replace('_', ' ')}")
     if counts["compared"]:
         worse = f"{counts['worse']:,} of {counts['compared']:,}"
         parts.append(f"{worse} worse than linear interpolation")
-    console = _Console(stderr=True, highlight=False)
-    console.print(", ".join(parts))
+    lines = [", ".join(parts)]
     # Warnings of several frames, each once, weights and files.
     for each in summary.warnings:
-        more = "" if each.frames <= len(each.first) else ", …"
-        names = f"{', '.join(each.first)}{more}"
+        names = ", ".join([*each.first, *["…"] * (each.frames > len(each.first))])
         count = "1 frame" if each.frames == 1 else f"{each.frames:,} frames"
-        note = each.note.removeprefix("warning: ")
-        console.print(escape(f"warning in {count} ({names}): {note}"), soft_wrap=True)
+        lines.append(f"warning in {count} ({names}): {each.note.removeprefix('warning: ')}")
     if summary.weights:
-        mean_weights = mean_weights_text(summary.weights)
-        console.print(escape(f"mean weights in the result: {mean_weights}"), soft_wrap=True)
-    output = summary.output
-    console.print("wrote " + escape(f"{output}/summary.json  {output}/summary.csv"), soft_wrap=True)
+        lines.append(f"mean weights in the result: {mean_weights_text(summary.weights)}")
+    lines.append(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")
+    console = _Console(stderr=True, highlight=False)
+    for line in lines:
+        console.print(escape(line), soft_wrap=True)
 
 
 def print_sparse(record: Mapping[str, Any]) -> None:
     """Prints the end of `pnpdepth project`, `sample` and `simulate`: notes, points, files."""
     print_notes(record["notes"])
     points, (width, height) = record["points"], record["size"]
-    start = (
-        f"wrote {points['count']:,} points, {points['fraction_of_pixels']:.2%} of {width}×{height}"
-        " pixels:"
-    )
-    written = [path for path in record["outputs"].values() if path]
-    _print_paths(_Console(stderr=True, highlight=False), start, written)
+    share = f"{points['fraction_of_pixels']:.2%} of {width}×{height} pixels"
+    paths = "  ".join(path for path in record["outputs"].values() if path)
+    line = f"wrote {points['count']:,} points, {share}: {escape(paths)}"
+    _Console(stderr=True, highlight=False).print(line, soft_wrap=True)

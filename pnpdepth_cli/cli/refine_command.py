@@ -9,11 +9,7 @@ import click
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.cli.streams import print_json
-from pnpdepth_cli.commands.refinement.refine_request import (
-    HoldOut,
-    NetworkChoice,
-    OutputOptions,
-)
+from pnpdepth_cli.commands.refinement.refine_request import HoldOut, NetworkChoice, OutputOptions
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Settings
 
@@ -21,15 +17,16 @@ from pnpdepth_cli.settings import Settings
 @click.command(
     short_help="Refine the depth of one image.",
     cls=grouped_help.GroupedCommand,
-    common=grouped_help.COMMON,
+    common=frozenset(
+        {
+            *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--preset", "--layer"),
+            *("--holdout", "--uncertainty", "--output", "--overwrite", "--json"),
+        }
+    ),
     groups={
         "Input": (
-            "--sparse",
-            "--sparse-mask",
-            "--min-confidence",
-            "--gt",
-            ScanOptions,
-            ReadOptions,
+            *("--sparse", "--sparse-mask", "--min-confidence", "--gt"),
+            *(ScanOptions, ReadOptions),
         ),
         "Network": (NetworkChoice,),
         "Method": (Settings, HoldOut),

@@ -16,7 +16,7 @@ from pnpdepth_cli.dataset.read_options import ScanOptions
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
 @click.argument("scan", type=options.FILE)
-@options.scan
+@options.options_of_groups(ScanOptions)
 @click.option(
     "--image",
     type=options.FILE,
@@ -27,12 +27,7 @@ from pnpdepth_cli.dataset.read_options import ScanOptions
 @options.sparse_output
 @options.overwrite
 def project(
-    scan: Path,
-    image: Path,
-    depth_scale: float | None,
-    output: Path,
-    overwrite: bool,
-    **values: Any,
+    scan: Path, image: Path, depth_scale: float | None, output: Path, overwrite: bool, **values: Any
 ) -> None:
     """Project a LiDAR SCAN (KITTI's BIN, NPY, PCD or PLY) to a sparse depth map.
 
@@ -65,13 +60,7 @@ def project(
 @options.depth_scale
 @options.sparse_output
 @options.overwrite
-def sample(
-    depth: Path,
-    count: str,
-    output: Path,
-    overwrite: bool,
-    **values: Any,
-) -> None:
+def sample(depth: Path, count: str, output: Path, overwrite: bool, **values: Any) -> None:
     """Sample sparse depth from the dense DEPTH.
 
     \b
@@ -98,9 +87,7 @@ def sample(
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
 @click.argument("depth", type=options.FILE)
 @click.option(
-    "--sensor",
-    type=click.Choice(SENSORS),
-    help="LiDAR by its data sheet, or as the paper has it.",
+    "--sensor", type=click.Choice(SENSORS), help="LiDAR by its data sheet, or as the paper has it."
 )
 @click.option(
     "--beams",
