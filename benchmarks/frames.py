@@ -1,4 +1,4 @@
-"""Real frames for measuring: folders in the layout of the data's own README, or rendered ones."""
+"""Real frames for measuring: folders in the layout of the data's own README."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -86,29 +85,6 @@ MORE_SETS: dict[str, Callable[[Path], Iterator[EvalFrame]]] = {
     "realsense": rgbd("realsense_unregistered", 1000),
 }
 """Sets on which nothing was chosen."""
-
-
-def rendered(folder: Path) -> list[EvalFrame]:
-    """The frames of shards that this project rendered."""
-    from model_zoo_defs.training.learning.dataset import Frames
-
-    shards = Frames(folder)
-    frames = (shards[number] for number in range(len(shards)))
-    return [EvalFrame(str(n), f[0].astype(np.float32) / 255, f[1]) for n, f in enumerate(frames)]
-
-
-def as_fastdepth_sees_it(frame: EvalFrame) -> EvalFrame:
-    """The frame at 224×224, cropped as the network's own evaluation does."""
-    if frame.gt.shape == (224, 224):
-        return frame
-
-    def cut(image: np.ndarray, how: int) -> np.ndarray:
-        height, width = image.shape[0] * 250 // 480, image.shape[1] * 250 // 480
-        image = cv2.resize(image, (width, height), interpolation=how)
-        top, left = (height - 228) // 2, (width - 304) // 2
-        return cv2.resize(image[top : top + 228, left : left + 304], (224, 224), interpolation=how)
-
-    return EvalFrame(frame.name, cut(frame.rgb, cv2.INTER_AREA), cut(frame.gt, cv2.INTER_NEAREST))
 
 
 def sampled(gt: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

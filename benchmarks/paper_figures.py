@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 from pnpdepth_cli.protocols import ODOMETRY_PART, WHOLE, FramePart
-from pnpdepth_cli.settings import PAPER
-
-SETTING = PAPER
-"""Section "Implementation Details": for all experiments."""
 
 MEASURES = ("rmse", "mae", "mre", "delta1", "delta2", "delta3")
 FINE_THRESHOLDS = (1.01, 1.01**2, 1.01**3)
@@ -111,8 +106,3 @@ def _row(text: str) -> PaperRow:
 
 _LINES = [line for line in _TABLES.split("\n") if line]
 ROWS = tuple(_row(a + b) for a, b in zip(_LINES[::2], _LINES[1::2], strict=True))
-
-
-def networks_of(row: PaperRow, names: Iterable[str]) -> list[str]:
-    """Those of the networks that belong in a row, in their order."""
-    return [name for name in names if row.takes(name)]

@@ -160,12 +160,8 @@ def _steps(rows: Sequence[Result]) -> str:
 
 
 def remarks(rows: Sequence[Result]) -> list[str]:
-    """For how many MAE falls, and where not; alignments, pixels not scored, divergence."""
-    notes = [
-        f"MAE falls for {_count(rows, state, 'before')} at {STATES[state]}" for state in STATES
-    ]
-    below = _count(rows, "tuned", "linear")
-    notes.append(f"at our setting, MAE is below that of the points interpolated for {below}")
+    """Alignments, pixels that are not scored, and divergence."""
+    notes = []
     for row in rows:
         if row["aligned"]:
             kinds = ", ".join(f"{kind} in {count}" for kind, count in row["aligned"].items())
@@ -173,10 +169,6 @@ def remarks(rows: Sequence[Result]) -> list[str]:
                 f"`{row['network']}` does not give metres: its output is aligned with the same"
                 f" points, once for before and after alike ({kinds} frames)"
             )
-        for state, title in STATES.items():
-            gain = row["settings"][state]["gains"]["mae"]
-            if gain <= 0:
-                notes.append(f"`{row['network']}`: {title} does not improve MAE ({gain:+.2f} %)")
         if row["coverage"] < 0.9995:
             notes.append(
                 f"`{row['network']}`: {100 * (1 - row['coverage']):.2f} % of the pixels with known"
@@ -185,12 +177,6 @@ def remarks(rows: Sequence[Result]) -> list[str]:
         if row["diverged"]:
             notes.append(f"`{row['network']}`: {row['diverged']} refinements diverged")
     return notes
-
-
-def _count(rows: Sequence[Result], state: str, other: str) -> str:
-    """How many of the networks have a lower MAE in one state than in the other."""
-    lower = sum(row["scores"][state]["mae"] < row["scores"][other]["mae"] for row in rows)
-    return f"{lower} of {len(rows)} networks"
 
 
 def plot(tables: Sequence[Table], path: Path) -> None:

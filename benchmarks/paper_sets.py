@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +16,6 @@ from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import NYU_PART, FramePart
 from pnpdepth_cli.sensors import LIDARS, as_depth_image, simulate_lidar
-
-T = TypeVar("T")
 
 ROOM_LIMIT, STREET_LIMIT = 10.0, 80.0
 """Metres beyond which rendered ground truth counts as unknown: a Kinect's range, and KITTI's."""
@@ -179,8 +176,8 @@ def shared(root: Path, most: int) -> list[FrameSet]:
     return sets
 
 
-def _evenly(every: Sequence[T], most: int | None) -> list[T]:
-    count = min(most or len(every), len(every))
+def _evenly(every: Sequence[TableFrame], most: int) -> list[TableFrame]:
+    count = min(most, len(every))
     return [every[index] for index in np.linspace(0, len(every) - 1, count).astype(int)]
 
 

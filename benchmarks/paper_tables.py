@@ -1,6 +1,6 @@
 """The paper's tables I and II for the seven networks: `python -m benchmarks.paper_tables`.
 
-    python -m benchmarks.paper_tables --shared ../shared/data --json t.json --plot t.png
+    python -m benchmarks.paper_tables --shared ../shared/data --plot t.png
 
 The tiny editions that come with the program, on rooms and streets rendered from seeds that nothing
 else uses (into --cache, once; needs pnpdepth[train]), and with --shared on the real frames at hand.
@@ -18,7 +18,6 @@ fits the points, once for before and after alike.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -33,18 +32,16 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.frames import Depth, frame_inputs, refined
-from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, SETTING, PaperRow, networks_of
+from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, PaperRow
 from benchmarks.paper_report import heading, markdown, plot
 from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, TableFrame, rendered, shared
-from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.errors import PnpDepthError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import names
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
 
 KINDS = {"rgb": "rgb", "sparse": "sd", "rgb+sparse": "rgb + sd"}  # as the paper writes them
 ROOM_FRAMES = 96  # of streets, which are three times as wide, a quarter
@@ -57,7 +54,7 @@ class Entry:
 
     row: PaperRow
     network: Network
-    settings: dict[str, tuple[str, Settings]]
+    settings: dict[str, tuple[str, ClosedSettings]]
 
     @property
     def name(self) -> str:
@@ -71,7 +68,7 @@ def entry_of(row: PaperRow, network: Network) -> Entry:
     # One factor, as in the evaluation of networks that know depth up to one; "auto" might take two.
     align = "scale" if definition.output_scale == "scale" else definition.default_alignment
     tuned = resolve_settings(definition, Settings(align=align))
-    paper = replace(SETTING, align=align)
+    paper = replace(PAPER.closed(), align=align)
     settings = {"paper": (row.layer, paper), "tuned": (resolve_layer(definition, None), tuned)}
     return Entry(row=row, network=network, settings=settings)
 
@@ -152,10 +149,8 @@ def result_of(entry: Entry, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
         settings[state] |= {"gains": gains(states["before"], states[state])}
         won = [f["scores"][state]["mae"] < f["scores"]["before"]["mae"] for f in frames]
         settings[state] |= {"frames_with_lower_mae": float(np.mean(won))}
-    checkpoint = entry.network.checkpoint
     return {
         "network": entry.name,
-        "checkpoint": None if checkpoint is None else checkpoint.name,
         "paper_row": entry.row.name,
         "kind": KINDS[entry.network.definition.input_kind],
         "fine": entry.row.fine,
@@ -205,7 +200,7 @@ def entries_of(only: Sequence[str]) -> tuple[list[Entry], list[str]]:
     entries, notes = [], []
     loaded: dict[str, Network] = {}
     for row in ROWS:
-        wanted = networks_of(row, only or tiny)
+        wanted = [name for name in only or tiny if row.takes(name)]
         if not wanted and not only:
             notes.append(row.missing)
         for name in wanted:
@@ -224,7 +219,7 @@ def sets_of(args: argparse.Namespace, entries: Sequence[Entry]) -> Iterable[Fram
         yield from shared(args.shared, args.frames or SHARED_FRAMES)
 
 
-def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+def parsed() -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
@@ -234,41 +229,32 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--cache", type=Path, default=Path("out/paper_tables"))
     parser.add_argument("--shared", type=Path, help="also these real frames (../shared/data)")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="that render")
-    parser.add_argument("--json", type=Path, help="write everything into this file")
     parser.add_argument("--plot", type=Path, help="draw the gains into this image")
-    chosen = parser.parse_args(arguments)
+    chosen = parser.parse_args()
     if chosen.frames is not None and chosen.frames < 1:
         parser.error("--frames: give 1 or more")
     return chosen
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The tables on stdout; returns the exit code."""
-    args, began = parsed(arguments), time.monotonic()
-    try:
-        entries, notes = entries_of(args.only)
-        tables = []
-        for frame_set in sets_of(args, entries):
-            table = table_of(frame_set, entries)
-            if table["rows"]:
-                print(markdown(table), flush=True)
-            else:
-                notes += [f"{heading(table)}: no row"]
-                notes += table["notes"] or ["none of the networks belongs in it"]
-            tables.append(table)
-        for note in notes:
-            print(f"- {note}")
-        if args.json:
-            with atomic_path(args.json) as temporary:
-                temporary.write_text(json.dumps({"tables": tables, "notes": notes}, indent=1))
-        if args.plot:
-            plot(tables, args.plot)
-    except PnpDepthError as error:
-        print(f"error: {printable(error)}", file=sys.stderr)
-        return error.exit_code
+def main() -> None:
+    """Prints the tables."""
+    args, began = parsed(), time.monotonic()
+    entries, notes = entries_of(args.only)
+    tables = []
+    for frame_set in sets_of(args, entries):
+        table = table_of(frame_set, entries)
+        if table["rows"]:
+            print(markdown(table), flush=True)
+        else:
+            notes += [f"{heading(table)}: no row"]
+            notes += table["notes"] or ["none of the networks belongs in it"]
+        tables.append(table)
+    for note in notes:
+        print(f"- {note}")
+    if args.plot:
+        plot(tables, args.plot)
     print(f"{time.monotonic() - began:.0f} s", file=sys.stderr)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

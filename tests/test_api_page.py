@@ -19,14 +19,15 @@ PAGE = Path(__file__).parent.parent / "docs" / "python-api.md"
 BEGIN = "<!-- signatures, written by `python -m tests.test_api_page` -->\n"
 END = "<!-- end of the signatures -->\n"
 FOR_THE_PROGRAM = {
-    "Refiner": set(),
     "Scores": {"to_json"},
     "Settings": {"fixed_by", "with_preset", "given", "opened", "over", "closed"},
     "SparsePoints": {"cropped", "joined", "select", "tensors"},
     "Split": {"static_graph", "in_half"},
     "Network": {
-        *("image_of", "arguments_of", "synthetic_arguments", "verified", "depth_of", "raw_of"),
+        *("image_of", "arguments_of", "synthetic_arguments", "verify", "verified", "depth_of"),
+        "raw_of",
     },
+    "ModelDefinition": {"default_layer", "default_alignment", "call_arguments"},
 }
 """Methods that a user does not need."""
 WIDTH = 74
@@ -69,8 +70,10 @@ def function_lines(node: ast.FunctionDef) -> Iterator[str]:
     yield from description(ast.get_docstring(node))
 
 
-def field_lines(node: ast.AnnAssign, after: ast.stmt | None) -> Iterator[str]:
-    """A field of a dataclass with its type, its default and its description."""
+def field_lines(
+    node: ast.AnnAssign, after: ast.stmt | None, *, of_record: bool = False
+) -> Iterator[str]:
+    """A field of a dataclass with its type, its description, and its default if it is no record."""
     described, default = None, node.value
     if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
         described = str(after.value.value)
@@ -78,27 +81,26 @@ def field_lines(node: ast.AnnAssign, after: ast.stmt | None) -> Iterator[str]:
         if len(default.args) > 1:  # option(default, help)
             described = str(ast.literal_eval(default.args[1]))
         default = default.args[0] if default.args else None
-    value = "" if default is None else f" = {ast.unparse(default)}"
+    value = "" if default is None or of_record else f" = {ast.unparse(default)}"
     yield f"{ast.unparse(node.target)}: {ast.unparse(node.annotation)}{value}"
     yield from description(described)
 
 
-def class_lines(node: ast.ClassDef) -> Iterator[str]:
-    """A class, and its fields, properties and methods that a user needs."""
-    functions = [each for each in node.body if isinstance(each, ast.FunctionDef)]
-    private = {each.name for each in functions if each.name.startswith("_")}
-    hidden = private | FOR_THE_PROGRAM.get(node.name, set())
-    made_by = [each for each in functions if each.name == "__init__"]
-    yield from (
-        call_lines(f"class {node.name}", made_by[0], "") if made_by else (f"class {node.name}",)
-    )
+def class_lines(node: ast.ClassDef, *, of_record: bool = False) -> Iterator[str]:
+    """A class with its fields, and with its methods that a user needs if it is no record."""
+    functions = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
+    hidden = {*functions} if of_record else FOR_THE_PROGRAM.get(node.name, set())
+    if "__init__" in functions:
+        yield from call_lines(f"class {node.name}", functions["__init__"], "")
+    else:
+        yield f"class {node.name}"
     yield from description(ast.get_docstring(node))
     for each, after in zip(node.body, [*node.body[1:], None], strict=True):
         lines: Iterator[str] = iter(())
         if isinstance(each, ast.AnnAssign):
-            lines = field_lines(each, after)
+            lines = field_lines(each, after, of_record=of_record)
         elif isinstance(each, ast.FunctionDef) and each.name not in hidden:
-            lines = function_lines(each)
+            lines = iter(()) if each.name.startswith("_") else function_lines(each)
         yield from (f"    {line}" for line in lines)
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
+import traceback
 from pathlib import Path
 
 import pytest
+import torch
 
-from pnpdepth_cli.cli.main import COMMANDS
+from pnpdepth_cli.cli.main import COMMANDS, run
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
@@ -148,3 +151,29 @@ def test_help_imports_neither_torch_nor_numpy_nor_rich() -> None:
 )
 def test_an_import_is_light(module: str, heavy: str) -> None:
     imports_nothing_of(heavy, f"import {module}")
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda f: f.stem)
+def test_a_benchmark_is_importable(file: Path) -> None:
+    importlib.import_module(f"benchmarks.{file.stem}")
+
+
+def test_few_functions_lie_between_the_command_and_equation_3(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stacks, backward = [], torch.Tensor.backward
+
+    def watched(tensor: torch.Tensor) -> None:
+        stacks.append(traceback.extract_stack())
+        backward(tensor)
+
+    monkeypatch.setattr(torch.Tensor, "backward", watched)
+    sample = ROOT / "samples" / "indoor"
+    files = [str(sample / "rgb.png"), "--sparse", str(sample / "sparse.png")]
+    method = ["--model", "fcrn-tiny", "--iterations", "1", "-o", str(tmp_path / "depth.npy")]
+    assert run(["refine", *files, *method]) == 0
+    own = [each for each in stacks[0] if PACKAGE in Path(each.filename).parents]
+    own = [each for each in own if PACKAGE / "core" / "split" not in Path(each.filename).parents]
+    names = [each.name for each in own if Path(each.filename).parent.name != "cli"]
+    assert names[0] == "refine_image"
+    assert len(names) <= 5, names

@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import inspect
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -17,42 +16,22 @@ from pnpdepth_cli import file_record
 from pnpdepth_cli.dataset import frame_record
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io import fingerprint
+from tests.test_api_page import class_lines
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGE, SCHEMA = DOCS / "record.md", DOCS / "record.schema.json"
 BEGIN = "<!-- fields, written by `python -m tests.test_record_page` -->\n"
 
 
-def classes() -> Iterator[ast.ClassDef]:
+def fields() -> str:
     """The dataclasses of a record, the frame's first."""
     found = {}
     for module in (frame_record, file_record, fingerprint):
         tree = ast.parse(inspect.getsource(module))
         found |= {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    yield found.pop("FrameRecord")
-    yield from found.values()
-
-
-def rows_of(node: ast.ClassDef) -> Iterator[str]:
-    """A row for each field, with its docstring."""
-    for field, after in zip(node.body, [*node.body[1:], None], strict=True):
-        if not isinstance(field, ast.AnnAssign):
-            continue
-        text = ""
-        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-            text = " ".join(str(after.value.value).split())
-        kind = ast.unparse(field.annotation).replace("|", "\\|")
-        yield f"| `{ast.unparse(field.target)}` | `{kind}` | {text} |"
-
-
-def fields() -> str:
-    """A table for each type."""
-    lines = [BEGIN]
-    for node in classes():
-        about = " ".join(str(ast.get_docstring(node)).split("\n\n")[0].split())
-        lines += [f"## {node.name}\n", f"{about}\n", "| field | type | meaning |", "|---|---|---|"]
-        lines += [*rows_of(node), ""]
-    return "\n".join(lines)
+    ordered = [found.pop("FrameRecord"), *found.values()]
+    blocks = ("\n".join(class_lines(node, of_record=True)) for node in ordered)
+    return "\n".join((BEGIN, *(f"```python\n{block}\n```\n" for block in blocks)))
 
 
 def schema() -> str:
