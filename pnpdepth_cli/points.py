@@ -24,6 +24,9 @@ else:
 
     A = TypeVar("A")
 
+METRES, MODEL_UNITS = "m", "model units"
+"""Units of depth: metres, and those of a COLMAP model whose scale is not known."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SparsePoints(Generic[A]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,27 @@ from pnpdepth_cli.dataset.frame_files import (
     ImageSource,
     RawDepth,
     VideoFrame,
+    file_of,
 )
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
+from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.rgb import read_rgb, sizes_of
 from pnpdepth_cli.io.video import read_video_frame
 
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
+
+
+def record_of(source: ImageSource | RawDepth, reading: Reading | None = None) -> FileRecord:
+    """Returns what a record keeps of a file, and of how it was read."""
+    record = FileRecord(path=str(source), sha256=fingerprint(file_of(source)).sha256)
+    if reading is None:
+        return record
+    return replace(record, read_as=reading.source, scale=reading.scale, assumed=reading.assumed)
 
 
 def read_image(source: ImageSource) -> NDArray[np.float32]:

@@ -9,8 +9,7 @@ import numpy as np
 
 from pnpdepth_cli.dataset.arrays import check_same_view, moved_note
 from pnpdepth_cli.dataset.plausible import far_values
-from pnpdepth_cli.dataset.read_options import METRES, MODEL_UNITS
-from pnpdepth_cli.dataset.scan_points import SparseDepth
+from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.colmap_model import (
@@ -24,6 +23,7 @@ from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.formats.depth_format import SATURATED_CODE
+from pnpdepth_cli.points import METRES, MODEL_UNITS
 from pnpdepth_cli.sensors import Points
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.pixels import DropCounter, describe_dropped
@@ -90,6 +90,7 @@ def read_colmap_points(
         notes.append("unit: depth is in model units; --unit-scale M gives metres per unit")
     return SparseDepth(
         points=points.resized(*size),
+        calibrated=True,
         camera=replace(camera.resized(*size), source=f"COLMAP model {path}"),
         pose=np.column_stack([turn, -turn @ shift * (unit_scale or 1.0)]),
         unit=unit,

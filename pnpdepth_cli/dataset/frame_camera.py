@@ -11,12 +11,13 @@ import numpy as np
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_options import ReadOptions
-from pnpdepth_cli.dataset.scan_points import SparseDepth, check_size
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.dataset.sparse_depth import SparseDepth
+from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.rgb import read_focal_length
 
 _MAX_FOV_DEG = 170.0
+_OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
 
 
 def camera_of_frame(
@@ -69,6 +70,35 @@ def camera_of_file(
     camera = read_calibration(path, number).camera
     notes = check_size(path, camera, size, image)
     return replace(camera, source=f"{path}: {camera.source}"), notes
+
+
+def check_size(
+    path: Path, camera: Camera, size: tuple[int, int], image: Path | None = None
+) -> list[str]:
+    """Returns warnings if an image (H, W) seems to be of another camera than a calibration.
+
+    Raises:
+        SizeError: They cannot belong together.
+    """
+    name = f"{image} is" if image else "the image is"
+    if camera.size is not None and camera.size != size:
+        height, width = camera.size
+        raise SizeError(
+            f"{name} {size[1]}×{size[0]} but {path} is for images of {width}×{height}; give the"
+            " image at that size"
+        )
+    x, y = camera.intrinsics[:2, 2]
+    if not (0 <= x < size[1] and 0 <= y < size[0]):
+        raise SizeError(
+            f"{name} {size[1]}×{size[0]}, which does not contain the principal point"
+            f" ({x:.1f}, {y:.1f}) of {path}; one of them is of another camera or size"
+        )
+    if max(abs(x / size[1] - 0.5), abs(y / size[0] - 0.5)) > _OFF_CENTRE:
+        return [
+            f"warning: the principal point ({x:.1f}, {y:.1f}) of {path} is far from the centre of"
+            f" a {size[1]}×{size[0]} image; does the calibration belong to this image?"
+        ]
+    return []
 
 
 def camera_of_fov(fov_deg: float, size: tuple[int, int]) -> Camera:

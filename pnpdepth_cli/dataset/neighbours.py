@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.dataset.arrays import read_image
+from pnpdepth_cli.dataset.arrays import read_image, record_of
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ImageSource, Neighbour, file_of
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.file_record import FileRecord
@@ -32,7 +33,7 @@ def read_neighbours(
     files: FrameFiles,
     used: SparsePoints,
     camera: Camera | None,
-    points_of: Callable[[FrameFiles], SparsePoints],
+    points_of: Callable[[FrameFiles], Points],
 ) -> tuple[SparsePoints, list[FileRecord], list[str]]:
     """Returns the points with those of the neighbours that agree with them.
 
@@ -59,47 +60,42 @@ def read_neighbours(
             f"{_name_of(files)}: moving points to other frames needs the camera; give --calib, or a"
             " column calib in a list"
         )
-    own, scans, notes = _in_numpy(used), list[NeighbourScan](), list[str]()
-    records = list[FileRecord]()
-    for neighbour in files.neighbours:
+    own = Points(xy=used.xy.numpy(), depth=used.depth.numpy(), size=used.size)
+    scans, records, notes = list[NeighbourScan](), list[FileRecord](), list[str]()
+    for each in files.neighbours:
         # The neighbour's points, and its motion, from poses or from the images.
-        points, source = (
-            _in_numpy(points_of(neighbour.files)),
-            neighbour.files.sparse or neighbour.files.gt,
-        )
+        points, source = points_of(each.files), each.files.sparse or each.files.gt
         assert source is not None
-        known = neighbour.motion
-        if known is None:
-            estimate = _estimate(files, neighbour.files, points, camera)
+        if each.motion is None:
+            motion, basis = _estimate(files, each.files, points, camera)
+            poses = f"{each.poses}: {basis}"
         else:
-            estimate = MotionEstimate(motion=np.array(known), basis=neighbour.poses)
+            motion, basis, poses = np.array(each.motion), each.poses, each.poses
         # Poses of the nearest neighbour are compared with the images.
         off: str | None = None
-        if known is not None and not any(each.apart == 1 for each in scans):
-            off = _off_images(files, neighbour, points, camera)
+        if each.motion is not None and each.apart == 1 and all(scan.apart > 1 for scan in scans):
+            off = _off_images(files, each, points, camera)
             notes += [off] if off else []
         # A neighbour of known motion joins.
-        if estimate.motion is None:
+        if motion is None:
             notes.append(
-                f"warning: {_name_of(neighbour.files)} is left out of the accumulated points, as"
-                f" its motion is unknown: {estimate.basis}"
+                f"warning: {_name_of(each.files)} is left out of the accumulated points, as its"
+                f" motion is unknown: {basis}"
             )
         else:
-            apart = neighbour.apart
-            scans.append(NeighbourScan(points=points, motion=estimate.motion, apart=apart))
+            scans.append(NeighbourScan(points=points, motion=motion, apart=each.apart))
         records.append(
-            FileRecord(
-                path=str(source),
-                sha256=fingerprint(file_of(source)).sha256,
-                poses=neighbour.poses + (f": {estimate.basis}" if known is None else ""),
-                motion=None if estimate.motion is None else estimate.motion.tolist(),
+            replace(
+                record_of(source),
+                poses=poses,
+                motion=None if motion is None else motion.tolist(),
                 contradicts_images=off is not None,
             )
         )
     # At least one must join.
     if not scans:
         raise InputError(
-            f"{_name_of(files)}: no motion to a neighbour can be estimated ({estimate.basis}); give"
+            f"{_name_of(files)}: no motion to a neighbour can be estimated ({basis}); give"
             " --poses, or leave out --accumulate"
         )
     return accumulate(own, scans, camera).tensors(), records, notes
@@ -108,21 +104,21 @@ def read_neighbours(
 def _estimate(
     here: FrameFiles, there: FrameFiles, points: Points, camera: Camera
 ) -> MotionEstimate:
-    assert here.image is not None
-    assert there.image is not None
-    return motion_of_images(
-        _keypoints(here.image, here.part, fingerprint(file_of(here.image)).sha256),
-        _keypoints(there.image, there.part, fingerprint(file_of(there.image)).sha256),
-        points,
-        camera,
-    )
+    """The motion that two images show; `points` are those of `there`."""
+    return motion_of_images(_keypoints_of(here), _keypoints_of(there), points, camera)
+
+
+def _keypoints_of(files: FrameFiles) -> Keypoints:
+    assert files.image is not None
+    digest = fingerprint(file_of(files.image)).sha256
+    return _keypoints(files.image, files.part, digest)
 
 
 def _off_images(
     files: FrameFiles, neighbour: Neighbour, points: Points, camera: Camera
 ) -> str | None:
     """A warning if the motion by the poses is not the one that the images of two frames show."""
-    if files.image is None or neighbour.files.image is None or neighbour.apart != 1:
+    if files.image is None or neighbour.files.image is None:
         return None
     shown = _estimate(files, neighbour.files, points, camera)
     if shown.motion is None:
@@ -155,7 +151,3 @@ def _keypoints(image: ImageSource, part: FramePart, digest: str) -> Keypoints:
 
 def _name_of(files: FrameFiles) -> str:
     return str(files.sparse or files.image or files.gt)
-
-
-def _in_numpy(points: SparsePoints) -> Points:
-    return Points(xy=points.xy.numpy(), depth=points.depth.numpy(), size=points.size)

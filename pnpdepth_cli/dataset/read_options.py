@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from pnpdepth_cli.dataset.frame_files import FrameFiles
     from pnpdepth_cli.sensors import SamplePattern
 
-METRES, MODEL_UNITS = "m", "model units"
-
 
 @dataclass(frozen=True, kw_only=True)
 class ScanOptions:
@@ -69,9 +67,15 @@ class ScanOptions:
         return False
 
     def over(self, files: FrameFiles) -> ScanOptions:
-        """Returns these options, with the calibration that the data set names where none is."""
-        camera = files.camera if self.camera is None else self.camera
-        return replace(self, calib=self.calib or files.calib, camera=camera)
+        """Returns these options, with the calibration and camera that the data set names.
+
+        The user's own go before.
+        """
+        if (calib := self.calib or files.calib) is None:
+            return self
+        return replace(
+            self, calib=calib, camera=files.camera if self.camera is None else self.camera
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,17 +5,18 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
+from pnpdepth_cli.dataset.frame_camera import check_size
 from pnpdepth_cli.dataset.plausible import scan_returns
-from pnpdepth_cli.dataset.read_options import METRES, ScanOptions
+from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
@@ -25,7 +26,7 @@ from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.json_file import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors import Points, describe_dropped, edge_agreement, project_velodyne
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.projection import agreement_at, edge_ranks, near_jumps
@@ -35,7 +36,6 @@ _NEXT_TO_NONE = 0.05  # of the points with them inverted; with fewer, extrinsics
 _THIN = 0.5  # largest variance of a scan's rays along its thin direction, of the next
 _AHEAD_DEG = 15.0  # angle to the camera's axis below which points are expected in the image
 _MOST_OUTSIDE = 1 / 3  # of the points ahead; more outside the image give a warning
-_OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
 _CLEARLY_BETTER = 0.03  # in `edge_agreement`, of a camera that replaces the one that is named
 _CAMERAS = 4  # of KITTI; more of a calibration are not tried
 _TURNS_DEG = (-4, -2, -1, 0, 1, 2, 4)
@@ -45,23 +45,6 @@ _OTHER_READING, _OTHER_TURN = 0.06, 0.1
 _AGREES = 0.08  # edge agreement that is not by chance
 _MANY_POINTS = 1000  # fewer tell too little
 _FEW_INSIDE = 0.5  # of the most points in the image; a camera with fewer is ruled out
-
-
-@dataclass(frozen=True, kw_only=True)
-class SparseDepth:
-    """The sparse depth of a frame, as it was read."""
-
-    points: SparsePoints[Any]
-    """The points in the image, as arrays of numpy or torch."""
-    record: FileRecord
-    notes: tuple[str, ...]
-    reading: Reading
-    """How the file was read; its scale is integers per unit, None if the file holds none."""
-    unit: str = METRES
-    camera: Camera | None = None
-    """The camera of the whole image, where it came with the points."""
-    pose: NDArray[np.float64] | None = None
-    """(3, 4) from the camera's coordinates to the world's, in `unit`. None: unknown."""
 
 
 def read_scan_points(
@@ -135,6 +118,7 @@ def read_scan_points(
         notes.append(f"sparse: dropped {lost}")
     return SparseDepth(
         points=points,
+        calibrated=True,
         camera=replace(camera, source=f"calibration of {path.name}"),
         record=FileRecord(
             path=str(path),
@@ -323,32 +307,3 @@ def _is_upright(scan: NDArray[np.floating], rotation: NDArray[np.float64]) -> bo
     if variances[0] > _THIN * variances[1]:
         return None
     return bool(np.argmax(np.abs(rotation @ axes[:, 0])) == 1)
-
-
-def check_size(
-    path: Path, camera: Camera, size: tuple[int, int], image: Path | None = None
-) -> list[str]:
-    """Returns warnings if an image (H, W) seems to be of another camera than a calibration.
-
-    Raises:
-        SizeError: They cannot belong together.
-    """
-    name = f"{image} is" if image else "the image is"
-    if camera.size is not None and camera.size != size:
-        height, width = camera.size
-        raise SizeError(
-            f"{name} {size[1]}×{size[0]} but {path} is for images of {width}×{height}; give the"
-            " image at that size"
-        )
-    x, y = camera.intrinsics[:2, 2]
-    if not (0 <= x < size[1] and 0 <= y < size[0]):
-        raise SizeError(
-            f"{name} {size[1]}×{size[0]}, which does not contain the principal point"
-            f" ({x:.1f}, {y:.1f}) of {path}; one of them is of another camera or size"
-        )
-    if max(abs(x / size[1] - 0.5), abs(y / size[0] - 0.5)) > _OFF_CENTRE:
-        return [
-            f"warning: the principal point ({x:.1f}, {y:.1f}) of {path} is far from the centre of"
-            f" a {size[1]}×{size[0]} image; does the calibration belong to this image?"
-        ]
-    return []

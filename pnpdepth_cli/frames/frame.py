@@ -21,10 +21,9 @@ from pnpdepth_cli.completion.image_registration import (
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.models.definition import DENSE_SPACING
-from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.points import METRES, SparsePoints
 from pnpdepth_cli.settings import Settings
 
-METRES = "m"
 DepthMap = NDArray[np.float32]
 Registration = str | tuple[float, float, float]
 """What the user says of the registration: "auto", "off", or zoom, right and down in pixels."""

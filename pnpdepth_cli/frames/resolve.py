@@ -10,7 +10,7 @@ import torch
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
-from pnpdepth_cli.frames.frame import METRES, Frame
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import Member
 from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.models.definition import (
@@ -21,6 +21,7 @@ from pnpdepth_cli.models.definition import (
 )
 from pnpdepth_cli.models.measure_layers import default_layer
 from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.points import METRES
 from pnpdepth_cli.settings import ClosedSettings, Settings
 
 NORMALISATIONS = {

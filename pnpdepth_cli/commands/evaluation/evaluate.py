@@ -31,13 +31,13 @@ from pnpdepth_cli.commands.statistics import (
 )
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.json_file import plain
 from pnpdepth_cli.measures import OF_SIGMA, FrameMeans, Measure
+from pnpdepth_cli.points import METRES
 
 _LISTED = 3
 _OPTIONS = {PREDICTION: "--pred-scale", TRUTH: "--gt-scale"}

@@ -19,11 +19,11 @@ from pnpdepth_cli.dataset.frame_files import (
 )
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
-from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.json_file import read_json
+from pnpdepth_cli.points import METRES
 from pnpdepth_cli.protocols import WHOLE, FramePart
 from pnpdepth_cli.sensors import SamplePattern
 

@@ -25,11 +25,11 @@ from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import image_of_size, read_image
 from pnpdepth_cli.dataset.frame_files import ImageSource, file_of
 from pnpdepth_cli.dataset.frame_record import Pose
-from pnpdepth_cli.dataset.read_options import MODEL_UNITS
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
 from pnpdepth_cli.io.json_file import write_json
 from pnpdepth_cli.io.rgb import sizes_of
+from pnpdepth_cli.points import MODEL_UNITS
 from pnpdepth_cli.sensors.point_cloud import PointCloud, cloud_from_depth
 
 _START_POINTS = 200_000

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
+from pnpdepth_cli.dataset.frame_camera import check_size
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_options import ScanOptions
-from pnpdepth_cli.dataset.scan_points import check_size, read_scan_points
+from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import make_folder
