@@ -12,7 +12,7 @@ from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.compare_command import columns
 from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.cli.streams import print_json, say
-from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest, ScoringRules
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.errors import FramesFailedError
 
 _OUTPUT = ("--csv", "--latex", "--columns", "--html", "--overwrite", "--json")
@@ -26,7 +26,11 @@ _OUTPUT = ("--csv", "--latex", "--columns", "--html", "--overwrite", "--json")
         {"--protocol", "--max-depth", "--scale-by", "--gt-scale", "--pred-scale", "--resize"}
         | {*_OUTPUT}
     ),
-    groups={"Protocol": ("--protocol", ScoringRules), "Input": (EvalRequest,), "Output": _OUTPUT},
+    groups={
+        "Protocol": (EvalRequest,),
+        "Input": ("--pred-scale", "--gt-scale"),
+        "Output": _OUTPUT,
+    },
 )
 @click.argument("prediction", type=options.FILE, metavar="PRED")
 @click.argument("ground_truth", type=options.FILE, metavar="GT")

@@ -8,7 +8,6 @@ coverage of the intervals here is in docs/notes/statistics.md.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -68,12 +67,11 @@ def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
         groups: The sequence of each of N frames.
         series: (N, M) what is averaged, in the order of the frames.
     """
-    names, frames = list(dict.fromkeys(groups)), len(groups)
-    if 1 < len(names) < frames:
-        number = {name: index for index, name in enumerate(names)}
-        ids = np.array([number[group] for group in groups])
-        return Clusters(ids=ids, unit="groups of frames")
-    length = block_length(series) if len(names) == 1 else 1
+    number = {name: index for index, name in enumerate(dict.fromkeys(groups))}
+    frames = len(groups)
+    if 1 < len(number) < frames:
+        return Clusters(ids=np.array([number[own] for own in groups]), unit="groups of frames")
+    length = block_length(series) if len(number) == 1 else 1
     if length == 1:
         return Clusters(ids=np.arange(frames), unit="frames")
     blocks = max(1, min(MAX_BLOCKS, frames // length))
@@ -99,11 +97,11 @@ def block_length(series: Floats) -> int:
     if frames < MIN_CLUSTERS:
         return 1
     centred = series - series.mean(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with np.errstate(divide="ignore", invalid="ignore"):
         lag_one = (centred[1:] * centred[:-1]).sum(axis=0) / (centred**2).sum(axis=0)
-        correlation = float(np.nanmedian(lag_one))
-    if math.isnan(correlation) or correlation <= 1 / math.sqrt(frames):
+    known = lag_one[np.isfinite(lag_one)]
+    correlation = float(np.median(known)) if len(known) else 0.0
+    if correlation <= 1 / math.sqrt(frames):
         return 1
     correlation = min(correlation + (1 + 3 * correlation) / frames, 0.99)
     return min(frames, math.ceil(2 * correlation / (1 - correlation**2) / BLOCK_BIAS))
@@ -191,31 +189,24 @@ def swap_p_values(
     The p-value is the fraction of swaps of the two runs, cluster by cluster, after which the means
     differ at least as much as observed (Good 2005, chapter 3). All 2^G swaps are tried if they are
     at most `permutations`; else so many random ones, with the observed one counted in.
+    scipy.stats.permutation_test takes 15 times as long for 2,000 clusters.
 
     Args:
         first: (N, M), NaN where a frame lacks a measure.
-        other: (N, M) of the same frames.
+        other: (N, M) of the same frames, NaN in the same places.
         clusters: Clusters of the frames.
         permutations: The most swaps that are tried.
         seed: Random seed of the swaps.
     """
-    a, b = (_cluster_sums(values, clusters) for values in (first, other))
-    count = len(a)
-
-    def difference(swapped: Floats) -> Floats:
-        """(B, M) the differences of means with the clusters swapped where (B, G) is 1."""
-        moved = np.tensordot(swapped, b - a, axes=1)
-        return np.abs(_mean(b.sum(axis=0) - moved) - _mean(a.sum(axis=0) + moved))
-
-    exact = count < 60 and 2**count <= permutations
-    if count < 2:
-        return np.full(a.shape[-1], math.nan), exact
-    observed = difference(np.zeros((1, count)))[0]
-    # rounding must not make an equal difference look smaller than the observed one
-    least = observed * (1 - 1e-9)
+    # a swap changes the sign of what its cluster adds to the difference of the means
+    sums, known = _cluster_sums(other - first, clusters).transpose(1, 0, 2)
+    count = len(sums)
+    exact = count <= math.log2(permutations)
     tried = 2**count if exact else permutations
+    # rounding must not make an equal difference look smaller than the observed one
+    least = np.abs(sums.sum(axis=0)) * (1 - 1e-9)
     generator = np.random.default_rng(seed)
-    as_much = np.zeros(len(observed))
+    as_much = np.zeros(len(least))
     at_once = max(1, _CELLS // count)
     for start in range(0, tried, at_once):
         numbers = np.arange(start, min(tried, start + at_once))
@@ -223,9 +214,10 @@ def swap_p_values(
             swapped = numbers[:, None] >> np.arange(count) & 1
         else:
             swapped = generator.integers(0, 2, (len(numbers), count))
-        as_much += (difference(swapped.astype(np.float64)) >= least).sum(axis=0)
+        as_much += (np.abs((1.0 - 2 * swapped) @ sums) >= least).sum(axis=0)
     p_values = as_much / tried if exact else (as_much + 1) / (tried + 1)
-    return np.where(np.isfinite(observed), p_values, math.nan), exact
+    has_values = (known.sum(axis=0) > 0) & (count > 1)
+    return np.where(has_values, p_values, math.nan), exact
 
 
 def holm(p_values: Floats) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import zip_longest
 from pathlib import Path
@@ -46,7 +46,7 @@ class Run(NamedTuple):
     path: str
     stage: str
     """The depth that is compared: before or after refinement."""
-    measures: Sequence[Measure]
+    measures: list[Measure]
     scoring: dict[str, Any]
     frames: dict[str, FrameRecord]
     varied: dict[str, str]
@@ -141,37 +141,37 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     if len(paths) < 2:
         raise UsageError("two runs at least are needed to compare")
     runs = [read_run(path) for path in paths]
+    first = runs[0]
     for run in runs[1:]:
-        _check_rules(runs[0], run)
+        _check_rules(first, run)
     # the frames and the measures that all runs have
-    names = tuple(name for name in runs[0].frames if all(name in run.frames for run in runs))
+    names = tuple(name for name in first.frames if all(name in run.frames for run in runs))
     if not names:
-        first, other = (some_names(run.frames) or "none" for run in (runs[0], runs[-1]))
-        raise InputError(f"the runs have no scored frame in common: {first}; and {other}")
+        own, other = (some_names(run.frames) or "none" for run in (first, runs[-1]))
+        raise InputError(f"the runs have no scored frame in common: {own}; and {other}")
     measures = _shared_measures(runs, columns)
     keys = [measure.key for measure in measures]
-    values = np.array(
-        [[[run.scores(name).get(key) for key in keys] for name in names] for run in runs],
-        np.float64,
-    )
+    scores = [[[*map(run.scores(name).get, keys)] for name in names] for run in runs]
+    values = np.array(scores, np.float64)  # (runs, frames, measures)
     known = np.asarray(np.isfinite(values).all(axis=0))
-    values = np.where(known, values, math.nan)  # (runs, frames, measures)
+    values[:, ~known] = math.nan
     # the tests, over frames that count as independent
-    by_name = groups_by_name(names)
-    own = (runs[0].frames[name].group for name in names)
-    groups = [group or name for group, name in zip(own, by_name, strict=True)]
+    groups = [
+        first.frames[name].group or group
+        for name, group in zip(names, groups_by_name(names), strict=True)
+    ]
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     gains, exact = _gains(values, measures, clusters)
-    tests = len(gains) * len(measures)
+    compared = zip(runs, _names(runs), values, [{}, *gains], strict=True)
     return Comparison(
         frames=names,
         measures=measures,
-        scoring=runs[0].scoring,
+        scoring=first.scoring,
         runs=tuple(
             ComparedRun(
                 name=name,
                 path=run.path,
-                mean=_means(keys, of_run),
+                mean=_means(measures, of_run),
                 before=FrameMeans(
                     {key: run.scores(frame, BEFORE).get(key) for key in keys} for frame in names
                 ).means(),
@@ -179,18 +179,21 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
                 coverage=run.coverage(names),
                 gains=of_first,
             )
-            for name, run, of_run, of_first in zip(
-                _names(runs), runs, values, [{}, *gains], strict=True
-            )
+            for run, name, of_run, of_first in compared
         ),
         clusters=clusters,
         exact_p_values=exact,
-        tests=tests,
+        tests=len(gains) * len(measures),
         notes=[
-            *_notes(runs, names),
-            *_lacking(measures, known),
+            *_notes_on_pixels(runs, names),
+            *(
+                f"{measure.title}: over {has.sum():,} of {len(has):,} frames; the others lack it in"
+                " a run"
+                for measure, has in zip(measures, known.T, strict=True)
+                if not has.all()
+            ),
             *clusters.notes(),
-            *_cluster_notes(clusters, len(names), tests),
+            *_notes_on_clusters(clusters, len(names), len(gains) * len(measures)),
         ],
     )
 
@@ -198,12 +201,14 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
 def _shared_measures(runs: Sequence[Run], columns: Sequence[str] | None) -> tuple[Measure, ...]:
     """The measures of these keys that all runs have; the main ones for None."""
     shared = set.intersection(*({measure.key for measure in run.measures} for run in runs))
-    measures = tuple(measure for measure in runs[0].measures if measure.key in shared)
+    measures = [measure for measure in runs[0].measures if measure.key in shared]
     main = tuple(measure for measure in measures if measure.main)
     return main if columns is None and main else choose_measures(measures, columns)
 
 
-def _means(keys: Sequence[str], values: NDArray[np.float64]) -> dict[str, float | None]:
+def _means(measures: Sequence[Measure], values: NDArray[np.float64]) -> dict[str, float | None]:
+    """The means of values (frames, measures) by the key of the measure."""
+    keys = [measure.key for measure in measures]
     return FrameMeans(dict(zip(keys, frame, strict=True)) for frame in values.tolist()).means()
 
 
@@ -213,25 +218,23 @@ def _gains(
     """The gain of each run but the first by measure, and whether the p-values are exact.
 
     Args:
-        values: (runs, frames, measures), NaN where a frame lacks a measure.
+        values: (runs, frames, measures), NaN where a frame lacks a measure in any run.
         measures: Measures of the last axis.
         clusters: Clusters of the frames.
     """
-    keys = [measure.key for measure in measures]
     better = np.array([measure.sign for measure in measures], np.float64)
-    first, *others = values
-    means = [np.array([*_means(keys, of_run).values()], np.float64) for of_run in values]
+    first, *means = (np.array([*_means(measures, run).values()], np.float64) for run in values)
     rows, exact = [], True
-    for other, mean in zip(others, means[1:], strict=True):
-        ends = interval(lambda a, b: gain(a, b, better), (first, other), clusters)
-        p_values, exact = swap_p_values(first, other, clusters, PERMUTATIONS, SEED)
-        rows.append([gain(means[0], mean, better), *ends, mean - means[0], p_values])
+    for other, mean in zip(values[1:], means, strict=True):
+        ends = interval(lambda a, b: gain(a, b, better), (values[0], other), clusters)
+        p_values, exact = swap_p_values(values[0], other, clusters, PERMUTATIONS, SEED)
+        rows.append([gain(first, mean, better), *ends, mean - first, p_values])
     of_runs = np.array(rows)  # (runs − 1, 5, measures)
     of_runs = np.concatenate([of_runs, holm(of_runs[:, 4:])], axis=1)
     return [
         {
-            key: Gain(*(None if math.isnan(v) else v for v in row))
-            for key, row in zip(keys, of_run, strict=True)
+            measure.key: Gain(*(None if math.isnan(v) else v for v in row))
+            for measure, row in zip(measures, of_run, strict=True)
         }
         for of_run in of_runs.transpose(0, 2, 1).tolist()
     ], exact
@@ -259,41 +262,30 @@ def _names(runs: Sequence[Run]) -> list[str]:
     return [f"{run.name} ({number})" for number, run in enumerate(runs, start=1)]
 
 
-def _notes(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
+def _notes_on_pixels(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]:
     """Warnings of frames and pixels that not all runs scored."""
-    lines = []
     for run in runs:
         if unshared := [name for name in run.frames if name not in set(names)]:
-            lines.append(
+            yield (
                 f"warning: {len(unshared):,} frames of {run.path} are not scored in all runs and"
                 f" left out: {some_names(unshared)}"
             )
-    counts = {name: [run.counts(name) for run in runs] for name in names}
+    counts = {name: {run.counts(name) for run in runs} for name in names}
     other_truth = [name for name, of in counts.items() if len({known for _, known in of}) > 1]
     if other_truth:
-        lines.append(
+        yield (
             f"warning: {len(other_truth):,} frames have another number of pixels with ground truth"
             f" in another run, so the runs were not scored on the same: {some_names(other_truth)}"
         )
-    elif any(len({*of}) > 1 for of in counts.values()):
+    elif any(len(of) > 1 for of in counts.values()):
         shares = ", ".join(f"{run.coverage(names):.2%} in {run.path}" for run in runs)
-        lines.append(
+        yield (
             f"warning: coverage differs ({shares}), and a run that leaves hard pixels empty looks"
             " better; this is no ranking"
         )
-    return lines
 
 
-def _lacking(measures: Sequence[Measure], known: NDArray[np.bool_]) -> list[str]:
-    """A line for each measure that some frames lack."""
-    return [
-        f"{measure.title}: over {has.sum():,} of {len(has):,} frames; the others lack it in a run"
-        for measure, has in zip(measures, known.T, strict=True)
-        if not has.all()
-    ]
-
-
-def _cluster_notes(clusters: Clusters, frames: int, tests: int) -> list[str]:
+def _notes_on_clusters(clusters: Clusters, frames: int, tests: int) -> list[str]:
     """A warning where the frames are too dependent, or too few, to conclude anything."""
     smallest = 2.0 ** (1 - clusters.count)
     if frames == 1 or tests * smallest < ALPHA:
@@ -325,35 +317,29 @@ def read_run(text: str) -> Run:
     if colon and end in (BEFORE, AFTER) and not path.exists():
         path, stage = Path(start), end
     path = path / _SUMMARY if path.is_dir() else path
-    record, name = read_json(path), path.stem
-    if path.name == _SUMMARY:
-        name = path.resolve().parent.name
-    if record.get("command") == "eval" and stage == BEFORE:
+    name = path.resolve().parent.name if path.name == _SUMMARY else path.stem
+    content = read_json(path)
+    if content.get("command") == "eval" and stage == BEFORE:
         raise UsageError(f"{path} is of eval, which has no before; leave out :before")
     # The frames with scores, and the measures that all of them have.
-    entries, measures = record.get("frames"), record.get("measures", [])
-    scoring, varied = record.get("scoring"), record.get("varied", {})
     try:
-        records = [FrameRecord.from_json(entry, path) for entry in entries or ()]
-        frames = {
-            each.name: each for each in records if each.status != "failed" and GT in each.errors
-        }
-        if not frames:
+        records = [FrameRecord.from_json(entry, path) for entry in content.get("frames") or ()]
+        frames = {f.name: f for f in records if f.status != "failed" and GT in f.errors}
+        scores = [frame.errors[GT][stage] for frame in frames.values()]
+        if not scores:
             raise ValueError("no frame has scores")
-        known = [Measure.from_json(entry) for entry in measures] or MEASURES
-        own = [each.errors[GT][stage] for each in frames.values()]
+        measures = [Measure.from_json(entry) for entry in content.get("measures", ())] or MEASURES
         return Run(
             name=f"{name}:before" if stage == BEFORE else name,
             path=text,
             stage=stage,
-            measures=[each for each in known if all(each.key in scores for scores in own)],
-            scoring=dict(scoring or scoring_of(find_protocol("paper"))),
+            measures=[each for each in measures if all(each.key in own for own in scores)],
+            scoring=dict(content.get("scoring") or scoring_of(find_protocol("paper"))),
             frames=frames,
-            varied={str(key): str(value) for key, value in varied.items()},
+            varied={str(key): str(value) for key, value in content.get("varied", {}).items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        fact = one_line(repr(error))
         raise FileFormatError(
-            f"{path} does not hold scores as pnpdepth writes them ({fact}); give what eval --json"
-            " printed, or the summary of a batch with ground truth"
+            f"{path} does not hold scores as pnpdepth writes them ({one_line(repr(error))}); give"
+            " what eval --json printed, or the summary of a batch with ground truth"
         ) from error

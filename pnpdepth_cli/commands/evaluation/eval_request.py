@@ -30,9 +30,20 @@ def parse_thresholds(text: str) -> tuple[float, float, float]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScoringRules:
-    """What is scored, and how; None leaves what the protocol says."""
+class EvalRequest:
+    """What to score, and how; None leaves what the protocol says.
 
+    Raises:
+        UsageError: For an unknown protocol, or a setting out of its range.
+    """
+
+    prediction: Path
+    """A depth file, or a folder of them."""
+    ground_truth: Path
+    """A depth file, a folder of them, or a data set of a known layout."""
+    protocol: str = option(
+        "paper", "Preset of the rules.", choices=choices.PROTOCOLS, show_default=True
+    )
     max_depth: float | None = option(None, "Score ground truth below M metres.", metavar="M")
     thresholds: tuple[float, float, float] | None = option(
         None,
@@ -73,25 +84,6 @@ class ScoringRules:
     )
     exclude_sparse: bool = option(False, "Leave out pixels with a sparse point.")
 
-
-@dataclass(frozen=True, kw_only=True)
-class EvalRequest(ScoringRules):
-    """What to score, and how.
-
-    Raises:
-        UsageError: For an unknown protocol, or a setting out of its range.
-    """
-
-    prediction: Path
-    """A depth file, or a folder of them."""
-    ground_truth: Path
-    """A depth file, a folder of them, or a data set of a known layout."""
-    protocol: str = option(
-        "paper",
-        "Preset of the rules.",
-        choices=choices.PROTOCOLS,
-        show_default=True,
-    )
     pred_scale: float | None = option(None, "Integer predictions hold metres × S.", metavar="S")
     gt_scale: float | None = option(None, "Integer ground truth holds metres × S.", metavar="S")
 

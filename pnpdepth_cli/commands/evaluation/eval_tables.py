@@ -9,7 +9,7 @@ from typing import Any
 
 from pnpdepth_cli.commands.evaluation.compare import ALPHA, PERMUTATIONS, Comparison
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
-from pnpdepth_cli.commands.evaluation.scoring import PREDICTION, TRUTH, scores_of
+from pnpdepth_cli.commands.evaluation.scoring import FILES, scores_of
 from pnpdepth_cli.commands.tables import Cell, Style, Table
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.json_file import plain
@@ -17,7 +17,6 @@ from pnpdepth_cli.measures import COVERAGE, choose_measures
 
 _FRAMES_SHOWN = 12
 _FRAME_COLUMNS = 6
-_FILES = (PREDICTION, TRUTH, "sparse", "image")
 _STARS = (0.05, 0.01, 0.001)
 
 
@@ -53,13 +52,13 @@ def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     rows = []
     for frame in evaluation.frames:
         scores = plain(scores_of(frame))
-        files = (frame.inputs.get(name) for name in _FILES)
+        files = (frame.inputs.get(name) for name in FILES)
         row = [frame.name, frame.group, *(file and file.path for file in files)]
         row += [scores.get(name) for name in counts]
         row += [scores.get(measure.key) for measure in measures]
         rows.append([*row, frame.message])
     columns = [
-        COVERAGE if name == COVERAGE.key else name for name in ("name", "group", *_FILES, *counts)
+        COVERAGE if name == COVERAGE.key else name for name in ("name", "group", *FILES, *counts)
     ]
     return Table(columns=[*columns, *measures, "error"], rows=rows)
 
@@ -75,15 +74,14 @@ def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     return replace(table, title=title + _without_sparse(evaluation.request.rules.exclude_sparse))
 
 
-def worst(evaluation: Evaluation) -> tuple[FrameRecord, ...]:
+def worst(evaluation: Evaluation) -> list[FrameRecord]:
     """Returns the scored frames by RMSE, worst first, those with NaN at the very end."""
 
-    def rank(frame: FrameRecord) -> tuple[bool, float]:
+    def rank(frame: FrameRecord) -> float:
         rmse = scores_of(frame)["rmse"]
-        unknown = rmse is None or math.isnan(rmse)
-        return unknown, 0.0 if unknown else -(rmse or 0.0)
+        return math.inf if rmse is None or math.isnan(rmse) else -rmse
 
-    return tuple(sorted(evaluation.scored, key=rank))
+    return sorted(evaluation.scored, key=rank)
 
 
 def comparison_table(comparison: Comparison) -> Table:

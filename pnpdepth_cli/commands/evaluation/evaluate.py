@@ -14,21 +14,9 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
-from pnpdepth_cli.commands.evaluation.scoring import (
-    PREDICTION,
-    TRUTH,
-    is_missing,
-    score_pair,
-    scores_of,
-)
+from pnpdepth_cli.commands.evaluation.scoring import is_missing, score_pair, scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
-from pnpdepth_cli.commands.statistics import (
-    LEVEL,
-    MIN_CLUSTERS,
-    Clusters,
-    find_clusters,
-    interval,
-)
+from pnpdepth_cli.commands.statistics import LEVEL, MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError
@@ -40,7 +28,7 @@ from pnpdepth_cli.measures import OF_SIGMA, FrameMeans, Measure
 from pnpdepth_cli.points import METRES
 
 _LISTED = 3
-_OPTIONS = {PREDICTION: "--pred-scale", TRUTH: "--gt-scale"}
+_OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +36,9 @@ class Evaluation:
     """Scored frames and their means."""
 
     request: EvalRequest
-    pairs: tuple[FramePair, ...]
+    pairs: list[FramePair]
     """The files of each frame of the ground truth, in its order."""
-    frames: tuple[FrameRecord, ...]
+    frames: list[FrameRecord]
     """The scores of each."""
     measures: tuple[Measure, ...]
     """Measures of the request, and of the standard deviation where a frame has one."""
@@ -59,33 +47,30 @@ class Evaluation:
     interval: dict[str, tuple[float, float]] | None
     """The ends of the 95 % interval of each mean; None with too few independent frames."""
     clusters: Clusters
-    notes: tuple[str, ...]
+    notes: list[str]
 
     @property
-    def scored(self) -> tuple[FrameRecord, ...]:
+    def scored(self) -> list[FrameRecord]:
         """The frames that are in the means."""
-        return tuple(frame for frame in self.frames if frame.status == "done")
+        return [frame for frame in self.frames if frame.status == "done"]
 
     @property
     def pixels(self) -> int:
         """Number of scored pixels of all frames."""
-        return self._sum("pixels")
+        return int(sum(_numbers(self.frames, "pixels")))
 
     @property
     def coverage(self) -> float:
         """Fraction of all ground truth, of frames without prediction too, that has a prediction."""
-        known = self._sum("known")
-        return self._sum("predicted") / known if known else math.nan
-
-    def _sum(self, count: str) -> int:
-        return sum(int(scores_of(frame).get(count) or 0) for frame in self.frames)
+        known = sum(_numbers(self.frames, "known"))
+        return sum(_numbers(self.frames, "predicted")) / known if known else math.nan
 
     def describe(self) -> str:
         """Returns the protocol and every scale of files that was assumed, on one line."""
         readings = (
             f"{side}: {reading}"
             for side in _OPTIONS
-            for reading, _ in readings_of(self.frames, side)
+            for reading, _ in _readings(self.frames, side)
             if reading.assumed
         )
         return "; ".join([self.request.describe(), *readings])
@@ -94,8 +79,8 @@ class Evaluation:
         """Returns why frames are in no mean; empty if all are."""
         missing = sum(map(is_missing, self.frames))
         faulty = len(self.frames) - len(self.scored) - missing
-        reasons = [f"{missing:,} without prediction"] * bool(missing)
-        return ", ".join([*reasons, *[f"{faulty:,} with a faulty file"] * bool(faulty)])
+        reasons = ((missing, "without prediction"), (faulty, "with a faulty file"))
+        return ", ".join(f"{count:,} {reason}" for count, reason in reasons if count)
 
     def to_json(self) -> dict[str, Any]:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
@@ -143,8 +128,7 @@ def evaluate(
     Raises:
         PnpDepthError: For what concerns all frames, or if none could be scored.
     """
-    pairs, notes = pair_frames(request.prediction, request.ground_truth, part=request.rules.part)
-
+    pairs, notes = pair_frames(request.prediction, request.ground_truth, request.rules.part)
     rows: list[FrameRecord] = []
     for row in in_order(lambda pair: score_pair(pair, request), pairs, THREADS):
         rows.append(row)
@@ -162,7 +146,7 @@ def evaluate(
     clusters = find_clusters([row.group or "" for row in scored], values)
     if request.is_devkit:
         exact = devkit_mean(values[:, : len(request.measures)]).tolist()
-        mean |= dict(zip((m.key for m in request.measures), exact, strict=True))
+        mean |= dict(zip(keys, exact, strict=False))
     notes += clusters.notes()
     if len(scored) > 1 and clusters.count < MIN_CLUSTERS:
         notes.append(
@@ -171,21 +155,18 @@ def evaluate(
         )
     return Evaluation(
         request=request,
-        pairs=tuple(pairs),
-        frames=tuple(rows),
+        pairs=pairs,
+        frames=rows,
         measures=measures,
         mean=mean,
         interval=_intervals(measures, values, clusters),
         clusters=clusters,
-        notes=(
+        notes=[
             *notes,
-            *_reading_notes(rows),
-            *_notes_on_unscored(rows),
-            *_ground_truth(rows),
-            *_empty_pixels(scored, request),
-            *_scales(scored, request),
-            *_given_points(scored, request),
-        ),
+            *_notes_on_files(rows),
+            *_notes_on_pixels(scored, request),
+            *_notes_on_scales(scored, request),
+        ],
     )
 
 
@@ -201,46 +182,11 @@ def _intervals(
     return dict(zip((measure.key for measure in measures), ends, strict=True))
 
 
-def readings_of(rows: Sequence[FrameRecord], side: str) -> list[tuple[Reading, int]]:
-    """Returns how the files "prediction" or "gt" were read with their number, frequent first."""
+def _readings(rows: Sequence[FrameRecord], side: str) -> list[tuple[Reading, int]]:
+    """How the files "prediction" or "gt" were read with their number, frequent first."""
     files = (row.inputs[side] for row in rows if side in row.inputs)
     readings = (Reading(f.read_as, f.scale, f.assumed) for f in files if f.read_as is not None)
     return Counter(readings).most_common()
-
-
-def _reading_notes(rows: Sequence[FrameRecord]) -> list[str]:
-    """A line for the predictions, and one for the ground truth."""
-    lines = []
-    for side, option in _OPTIONS.items():
-        texts = [
-            reading.source
-            + (f"; {option} to change" if reading.assumed else "")
-            + (f" ({count:,} of {len(rows):,})" if count < len(rows) else "")
-            for reading, count in readings_of(rows, side)
-        ]
-        if texts:
-            lines.append(f"{side}: {some_names(texts)}")
-    return lines
-
-
-def _notes_on_unscored(rows: Sequence[FrameRecord]) -> Iterator[str]:
-    """Frames that are in no mean."""
-    if missing := [row.name for row in rows if is_missing(row)]:
-        yield f"warning: {len(missing):,} frames have no prediction: {some_names(missing)}"
-    if faulty := [row for row in rows if row.status == "failed" and not is_missing(row)]:
-        for row in faulty[:_LISTED]:
-            yield f"warning: frame {one_line(row.name)} was not scored: {row.message}"
-        if (more := len(faulty) - _LISTED) > 0:
-            yield f"warning: {more:,} more frames were not scored"
-
-
-def _ground_truth(rows: Sequence[FrameRecord]) -> Iterator[str]:
-    """What was made of ground truth that is none."""
-    noted = [row for row in rows if row.notes]
-    for row in noted[:_LISTED]:
-        yield from (f"frame {one_line(row.name)}: {note}" for note in row.notes)
-    if (more := len(noted) - _LISTED) > 0:
-        yield f"{more:,} more frames have such ground truth"
 
 
 def _numbers(rows: Sequence[FrameRecord], key: str) -> list[float]:
@@ -248,8 +194,35 @@ def _numbers(rows: Sequence[FrameRecord], key: str) -> list[float]:
     return [value for row in rows if (value := scores_of(row).get(key)) is not None]
 
 
-def _empty_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
-    """Pixels of the ground truth without prediction."""
+def _notes_on_files(rows: Sequence[FrameRecord]) -> Iterator[str]:
+    """How files were read, and which of them were not scored or changed."""
+    for side, option in _OPTIONS.items():
+        texts = [
+            reading.source
+            + (f"; {option} to change" if reading.assumed else "")
+            + (f" ({count:,} of {len(rows):,})" if count < len(rows) else "")
+            for reading, count in _readings(rows, side)
+        ]
+        if texts:
+            yield f"{side}: {some_names(texts)}"
+    # Frames that are in no mean.
+    if missing := [row.name for row in rows if is_missing(row)]:
+        yield f"warning: {len(missing):,} frames have no prediction: {some_names(missing)}"
+    faulty = [row for row in rows if row.status == "failed" and not is_missing(row)]
+    for row in faulty[:_LISTED]:
+        yield f"warning: frame {one_line(row.name)} was not scored: {row.message}"
+    if (more := len(faulty) - _LISTED) > 0:
+        yield f"warning: {more:,} more frames were not scored"
+    # What was made of ground truth that is none.
+    noted = [row for row in rows if row.notes]
+    for row in noted[:_LISTED]:
+        yield from (f"frame {one_line(row.name)}: {note}" for note in row.notes)
+    if (more := len(noted) - _LISTED) > 0:
+        yield f"{more:,} more frames have such ground truth"
+
+
+def _notes_on_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
+    """Pixels of the ground truth without prediction, and those that the network was given."""
     known = sum(_numbers(scored, "known"))
     treatment = "lowers the coverage and is in no error"
     if request.rules.missing == "min":
@@ -268,9 +241,16 @@ def _empty_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterat
             f" development kit sets to −1 m and scores (its logarithmic errors are then NaN):"
             f" {some_names(holes)}"
         )
+    given = round(sum(_numbers(scored, "given")))
+    if given and not request.rules.exclude_sparse:
+        known = sum(_numbers([f for f in scored if scores_of(f)["given"] is not None], "pixels"))
+        yield (
+            f"{given:,} of the scored pixels ({given / known:.2%}) have a point of the sparse"
+            " input; --exclude-sparse leaves them out"
+        )
 
 
-def _scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
+def _notes_on_scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
     """How predictions were scaled, and what looks like a wrong scale.
 
     Raises:
@@ -290,19 +270,8 @@ def _scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str
         )
     ratios = _numbers(scored, "median_ratio") or [math.nan]
     by_option = {
-        option: next((reading for reading, _ in readings_of(scored, side)), None)
+        option: next((reading for reading, _ in _readings(scored, side)), None)
         for side, option in _OPTIONS.items()
     }
     if warning := scale_warning("predictions", float(np.median(ratios)), by_option):
         yield warning
-
-
-def _given_points(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
-    """Scored pixels at which the network was given a depth."""
-    given = round(sum(_numbers(scored, "given")))
-    if given and not request.rules.exclude_sparse:
-        known = [row for row in scored if scores_of(row)["given"] is not None]
-        yield (
-            f"{given:,} of the scored pixels ({given / sum(_numbers(known, 'pixels')):.2%}) have a"
-            " point of the sparse input; --exclude-sparse leaves them out"
-        )

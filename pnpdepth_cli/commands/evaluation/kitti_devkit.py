@@ -12,8 +12,7 @@ relative errors by 100.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,50 +51,25 @@ def fill_background(depth: Floats) -> Floats:
     return filled
 
 
-class _Pixels(NamedTuple):
-    """The scored pixels of a frame, (N,) each, in the order in which the kit adds them up."""
-
-    error: Floats
-    """|g − p|"""
-    log_error: Floats
-    """log g − log p"""
-    inverse_error: Floats
-    """|1/g − 1/p|"""
-    gt: Floats
-
-    def mean(self, values: Floats) -> np.float32:
-        return _sum(values) / np.float32(len(values))
-
-
-def _row(
-    title: str, formula: Callable[[_Pixels], np.float32 | np.float64], unit: str = ""
-) -> Measure:
-    key = title.lower().replace(" ", "_")
-    return Measure(
-        key=key,
+DEVKIT_MEASURES = tuple(
+    Measure(
+        key=title.lower().replace(" ", "_"),
         title=title,
         unit=unit,
         decimals=6,
-        main=key in ("mae", "rmse", "inverse_mae", "inverse_rmse"),
-        formula=lambda pixels: float(formula(pixels)),
+        main=bool(unit),
     )
-
-
-def _scale_invariant(pixels: _Pixels) -> np.float32:
-    count, total = np.float32(len(pixels.gt)), _sum(pixels.log_error)
-    return np.float32(np.sqrt(pixels.mean(pixels.log_error**2) - total * total / (count * count)))
-
-
-DEVKIT_MEASURES = (
-    _row("MAE", lambda p: p.mean(p.error), "m"),
-    _row("RMSE", lambda p: np.sqrt(p.mean(p.error * p.error)), "m"),
-    _row("inverse MAE", lambda p: p.mean(p.inverse_error), "1/m"),
-    _row("inverse RMSE", lambda p: np.sqrt(p.mean(p.inverse_error**2)), "1/m"),
-    _row("log MAE", lambda p: p.mean(np.abs(p.log_error))),
-    _row("log RMSE", lambda p: np.sqrt(p.mean(p.log_error**2))),
-    _row("scale invariant log", _scale_invariant),
-    _row("abs relative", lambda p: p.mean(p.error / p.gt)),
-    _row("squared relative", lambda p: p.mean(p.error * p.error / (p.gt * p.gt))),
+    for title, unit in (
+        ("MAE", "m"),
+        ("RMSE", "m"),
+        ("inverse MAE", "1/m"),
+        ("inverse RMSE", "1/m"),
+        ("log MAE", ""),
+        ("log RMSE", ""),
+        ("scale invariant log", ""),
+        ("abs relative", ""),
+        ("squared relative", ""),
+    )
 )
 """Measures in the kit's order, with its six decimals. Its squared relative is (p − g)²/g²."""
 
@@ -107,18 +81,28 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
         predicted: (H, W) metres, 0 where unknown.
         gt: (H, W) metres, 0 where unknown; some of it known.
     """
-    filled = fill_background(predicted)
-    known = gt.T > 0  # the kit walks down each column
-    p, g = filled.T[known], gt.T[known]
+    # the scored pixels, down each column as the kit walks
+    known = gt.T > 0
+    p, g = fill_background(predicted).T[known], gt.T[known]
+    error = np.abs(g - p)
     with np.errstate(invalid="ignore"):
-        inverse_error = np.abs(1.0 / g.astype(np.float64) - 1.0 / p.astype(np.float64))
-        pixels = _Pixels(
-            error=np.abs(g - p),
-            log_error=_log(g) - _log(p),
-            inverse_error=inverse_error.astype(np.float32),
-            gt=g,
+        log_error = _log(g) - _log(p)
+        inverse = np.abs(1.0 / g.astype(np.float64) - 1.0 / p.astype(np.float64)).astype(np.float32)
+        # the errors in the kit's order
+        count = np.float32(len(g))
+        log_squares, log_total = _sum(log_error**2) / count, _sum(log_error)
+        values = (
+            _sum(error) / count,
+            np.sqrt(_sum(error * error) / count),
+            _sum(inverse) / count,
+            np.sqrt(_sum(inverse**2) / count),
+            _sum(np.abs(log_error)) / count,
+            np.sqrt(log_squares),
+            np.sqrt(log_squares - log_total * log_total / (count * count)),
+            _sum(error / g) / count,
+            _sum(error * error / (g * g)) / count,
         )
-        return {measure.key: measure.value(pixels) for measure in DEVKIT_MEASURES}
+    return {m.key: float(value) for m, value in zip(DEVKIT_MEASURES, values, strict=True)}
 
 
 def devkit_mean(values: NDArray[Any]) -> NDArray[np.float64]:

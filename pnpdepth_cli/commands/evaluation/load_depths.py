@@ -6,9 +6,9 @@ Predictions of relative networks are scaled to the ground truth of each image (`
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,21 +19,19 @@ from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.dataset.arrays import apply_masks, depth_of, read_image
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
-from pnpdepth_cli.io.depth import (
-    depth_from_stored,
-    known_metres,
-    load_stored,
-)
+from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_depth
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.protocols import Protocol
-from pnpdepth_cli.sensors import sample_points
+from pnpdepth_cli.sensors import SamplePattern, sample_points
 from pnpdepth_cli.sensors.pixels import pixel_index
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Size = tuple[int, ...]
+Fit = tuple[float, float]
+"""(factor, shift): depth = factor · predicted + shift, or the same in disparity (1/m)."""
 
 # (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
 # Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found by
@@ -44,13 +42,6 @@ _CROP_FRACTIONS = {
 }
 # Eigen et al. 2014 for NYU Depth v2: rows 45 to 470, columns 41 to 600 of 480x640 pixels.
 _NYU_CROP = (slice(45, 471), slice(41, 601))
-
-
-class Fit(NamedTuple):
-    """depth = factor · predicted + shift, or the same in disparity (1/m)."""
-
-    factor: float
-    shift: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +61,7 @@ class LoadedFrame:
     fit: Fit | None = None
     sigma: Depth | None = None
     """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
-    notes: tuple[str, ...] = ()
+    notes: list[str]
     """What a person should know of the ground truth."""
 
 
@@ -81,27 +72,24 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
         InputError: For a file that cannot be read.
         SizeError: Where sizes differ.
     """
+    frame, rules = pair.files, request.rules
     # The ground truth, in the part of the frame that the protocol keeps.
-    frame = pair.frame
-    scale = request.gt_scale if request.gt_scale is not None else frame.gt_scale
+    scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
     assert frame.gt is not None
-    if not isinstance(frame.gt, Path):
-        reading = Reading(f"{frame.gt.path.suffix} array")
-        whole = DepthFile(values=depth_of(frame.gt), reading=reading)
-    else:
+    if isinstance(frame.gt, Path):
         whole = _read(frame.gt, scale, request)
-    masked_gt = apply_masks(whole.values, frame.masks)
-    values, notes = plausible_map(masked_gt, whole.reading, "gt", "--gt-scale", scale)
+    else:
+        whole = DepthFile(
+            values=depth_of(frame.gt), reading=Reading(f"{frame.gt.path.suffix} array")
+        )
+    values, notes = plausible_map(
+        apply_masks(whole.values, frame.masks), whole.reading, "gt", "--gt-scale", scale
+    )
     gt = np.ascontiguousarray(frame.part.apply(values))
     # The pixels that are scored.
-    given = _given_points(pair, gt, required=request.rules.exclude_sparse)
-    scored = _scored_mask(gt, request.rules)
-    if request.rules.exclude_sparse:
-        if given is None:
-            raise InputError(
-                f"frame {pair.name} has no sparse depth file to exclude: neither the record beside"
-                " the prediction nor the data set names one"
-            )
+    given = _given_points(pair, gt, required=rules.exclude_sparse)
+    scored = _scored_mask(gt, rules)
+    if given is not None and rules.exclude_sparse:
         scored &= ~given
     # The prediction is fitted to those.
     loaded = LoadedFrame(
@@ -109,43 +97,43 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
         gt=np.where(scored, gt, np.float32(0)),
         readings={"gt": whole.reading},
         given=given,
-        notes=tuple(notes),
+        notes=notes,
     )
-    return loaded if pair.prediction is None else _with_prediction(loaded, pair, request)
+    return loaded if pair.result is None else _with_prediction(loaded, pair, request)
 
 
 def _with_prediction(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> LoadedFrame:
     """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
-    assert pair.prediction is not None
-    rules, size = request.rules, frame.gt.shape
-    image = _read(pair.prediction, request.pred_scale, request)
-    values = _to_size(pair, image.values, size, request.resize)
+    assert pair.result is not None
+    rules, size, result = request.rules, frame.gt.shape, pair.result
+    image = _read(result.depth, request.pred_scale, request)
+    values = image.values
+    if values.shape != size:
+        if request.resize is None:
+            raise _different(
+                pair, f"prediction {result.depth}", values.shape, size,
+                "; --resize nearest or bilinear scales predictions if both show the same view",
+            )  # fmt: skip
+        values = _resize(values, size, request.resize)
     depth, fit = scale_prediction(values, frame.gt, request.prediction_kind, request.scale_by)
     if rules.clip:
         clipped = np.clip(depth, rules.min_depth, rules.max_depth)
         depth = np.where(depth > 0, clipped, 0).astype(np.float32)
     if rules.missing == "min":
         depth = np.where(depth > 0, depth, np.float32(rules.min_depth))
-    has_sigma = fit is None and request.prediction_kind == "depth"
+    # A standard deviation is of unscaled depth.
+    sigma = None
+    if result.sigma is not None and fit is None and request.prediction_kind == "depth":
+        with suppress(InputError):
+            sigma = read_depth(result.sigma).values
     return replace(
         frame,
         depth=depth,
         readings={"prediction": image.reading, **frame.readings},
         predicted=values > 0,
         fit=fit,
-        sigma=_read_sigma(pair.sigma, size) if has_sigma else None,
+        sigma=sigma if sigma is not None and sigma.shape == size else None,
     )
-
-
-def _read_sigma(path: Path | None, size: Size) -> Depth | None:
-    """(H, W) the standard deviation in metres, 0 where unknown; None where it is not known."""
-    if path is None:
-        return None
-    try:
-        values = depth_from_stored(path, load_stored(path), None).values
-    except InputError:
-        return None
-    return values if values.shape == size else None
 
 
 def _read(path: Path, scale: float | None, request: EvalRequest) -> DepthFile:
@@ -164,20 +152,27 @@ def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
 
     Points that were drawn from the ground truth (H, W) are drawn again.
     """
-    size = gt.shape[0], gt.shape[1]
+    frame, size = pair.files, (gt.shape[0], gt.shape[1])
+    record = None if pair.result is None else pair.result.record
+    sparse = None if record is None else record.inputs.get("sparse")
+    drawn = None if sparse is None else sparse.sampled
     try:
-        if pair.drawn is not None and pair.drawn.size == size:
-            image = image_of(pair, size) if pair.drawn.pattern.kind == "features" else None
-            xy = sample_points(gt, pair.drawn.pattern, pair.drawn.seed, image=image).xy
-        elif pair.sparse is not None:
-            sparse, _ = read_sparse(pair.sparse, size=size, scale=pair.frame.sparse_scale)
-            xy = sparse.xy
-            if sparse.size != size:
-                xy = pair.frame.part.in_crop(xy, sparse.size)
-                if pair.frame.part.apply(np.zeros(sparse.size, bool)).shape != size:
-                    raise _different(pair, "sparse depth", pair.sparse, sparse.size, size)
+        if record is not None and drawn is not None and record.size == size[::-1]:
+            pattern = SamplePattern(kind=drawn.kind, count=drawn.count, fraction=drawn.fraction)
+            image = image_of(pair, size) if drawn.kind == "features" else None
+            xy = sample_points(gt, pattern, drawn.seed, image=image).xy
+        elif frame.sparse is not None:
+            points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
+            xy = points.xy
+            if points.size != size:
+                xy = frame.part.in_crop(xy, points.size)
+                if frame.part.apply(np.zeros(points.size, bool)).shape != size:
+                    raise _different(pair, f"sparse depth {frame.sparse}", points.size, size)
         else:
-            return None
+            raise InputError(
+                f"frame {frame.name} has no sparse depth file to exclude: neither the record beside"
+                " the prediction nor the data set names one"
+            )
     except PnpDepthError:
         if required:
             raise
@@ -193,11 +188,11 @@ def image_of(pair: FramePair, size: Size) -> Depth | None:
     Raises:
         InputError: If it cannot be read.
     """
-    if pair.image is None:
+    if pair.files.image is None:
         return None
-    rgb = read_image(pair.image)
+    rgb = read_image(pair.files.image)
     if rgb.shape[:2] != size:
-        rgb = pair.frame.part.apply(rgb)
+        rgb = pair.files.part.apply(rgb)
     return rgb if rgb.shape[:2] == size else None
 
 
@@ -230,17 +225,7 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     return slice(*map(int, rows)), slice(*map(int, columns))
 
 
-def _to_size(pair: FramePair, depth: Depth, size: Size, resize: str | None) -> Depth:
-    """The depth map at the ground truth's size: as it is, or resized if allowed."""
-    if depth.shape != size and resize is None:
-        raise _different(
-            pair, "prediction", pair.prediction, depth.shape, size,
-            advice="; --resize nearest or bilinear scales predictions if both show the same view",
-        )  # fmt: skip
-    return depth if depth.shape == size else _resize(depth, size, resize)
-
-
-def _resize(depth: Depth, size: Size, method: str | None) -> Depth:
+def _resize(depth: Depth, size: Size, method: str) -> Depth:
     target = size[1], size[0]
     if method == "nearest":
         return cv2.resize(depth, target, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
@@ -250,11 +235,9 @@ def _resize(depth: Depth, size: Size, method: str | None) -> Depth:
     return np.where(weight > 0.5, total / np.maximum(weight, 0.5), 0).astype(np.float32)
 
 
-def _different(
-    pair: FramePair, what: str, path: Path | None, shape: Size, size: Size, *, advice: str = ""
-) -> SizeError:
+def _different(pair: FramePair, what: str, shape: Size, size: Size, advice: str = "") -> SizeError:
     return SizeError(
-        f"{what} {path} is {shape[1]}×{shape[0]} but the ground truth {pair.frame.gt} is"
+        f"{what} is {shape[1]}×{shape[0]} but the ground truth {pair.files.gt} is"
         f" {size[1]}×{size[0]}{advice}"
     )
 
@@ -292,19 +275,20 @@ def scale_prediction(
     if in_disparity:
         depth = values if kind == "disparity" else _inverse(depth)
     p, g = depth[both].astype(np.float64), gt[both].astype(np.float64)
+    factor, shift = 1.0, 0.0
     if scale_by == "median":
-        fit = Fit(float(np.median(g) / np.median(p)))
+        factor = float(np.median(g) / np.median(p))
     elif scale_by == "log":
-        fit = Fit(float(np.exp((np.log(g) - np.log(p)).mean())))
-    elif not (variance := float(p.var())):
-        raise InputError("the prediction is constant, so that no scale and shift can be fitted")
+        factor = float(np.exp((np.log(g) - np.log(p)).mean()))
     else:
-        target = 1 / g if in_disparity else g
+        target, variance = 1 / g if in_disparity else g, float(p.var())
+        if not variance:
+            raise InputError("the prediction is constant, so that no scale and shift can be fitted")
         factor = float(((p - p.mean()) * (target - target.mean())).mean()) / variance
-        fit = Fit(factor, float(target.mean() - factor * p.mean()))
-    fitted = depth * np.float64(fit.factor) + fit.shift
+        shift = float(target.mean() - factor * p.mean())
+    fitted = depth * np.float64(factor) + shift
     result = np.where((depth > 0) & (fitted > 0), fitted, 0).astype(np.float32)
-    return _inverse(result) if in_disparity else result, fit
+    return _inverse(result) if in_disparity else result, (factor, shift)
 
 
 def _inverse(values: Depth) -> Depth:

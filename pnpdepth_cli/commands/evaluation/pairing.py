@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
-from pnpdepth_cli.dataset.frame_files import (
-    FrameFiles,
-    ImageSource,
-    RawDepth,
-    find_files,
-    groups_by_name,
-)
-from pnpdepth_cli.dataset.frame_record import FrameRecord
+from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_by_name
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
@@ -25,58 +18,28 @@ from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.json_file import read_json
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.protocols import WHOLE, FramePart
-from pnpdepth_cli.sensors import SamplePattern
 
-_DEPTH_MARKS = ("_depth", ".depth")
-_COMPANIONS = ("_sigma_preview", "_preview", "_improvement", "_sigma", "_valid")
+_MARK = re.compile(r"(?<=.)[_.]depth$", re.DOTALL)
+# What a refinement writes beside x_depth.
+_COMPANION = re.compile(r"(?<=.)_(sigma_preview|preview|improvement|sigma|valid)$", re.DOTALL)
 # KITTI's selection names the kind of file in the middle.
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5
 
 
-class DrawnPoints(NamedTuple):
-    """The pattern and the random seed of points that were drawn from ground truth of (H, W)."""
+class FramePair(NamedTuple):
+    """The files of one frame to score."""
 
-    pattern: SamplePattern
-    seed: int
-    size: tuple[int, int]
+    files: FrameFiles
+    """The ground truth's frame, with `gt`; sparse depth and image by the record of the prediction.
 
-
-@dataclass(frozen=True, kw_only=True)
-class FramePair:
-    """The files of one frame to score; parts that it does not have are None."""
-
-    name: str
-    """Name by which runs are compared."""
-    prediction: Path | None
-    frame: FrameFiles
-    """The ground truth's frame; it has `gt`."""
-    group: str = ""
-    """The sequence of the frame: the data set's, the manifest's, or what its name says."""
-    sparse: Path | None = None
-    """The network's sparse input, of the run's record or the data set."""
-    sigma: Path | None = None
-    drawn: DrawnPoints | None = None
-    """How the network's sparse input was drawn from the ground truth, by the run's record."""
-    unit: str = METRES
-    image: ImageSource | None = None
-
-    @property
-    def paths(self) -> dict[str, ImageSource | RawDepth | None]:
-        """The files of the frame."""
-        return {
-            "prediction": self.prediction,
-            "truth": self.frame.gt,
-            "sparse": self.sparse,
-            "image": self.image,
-        }
+    Sparse depth is None where its file does not say which points the network saw."""
+    result: ResultFrame | None
+    """The prediction, and what lies beside it; None without."""
 
 
 def pair_frames(
-    prediction: Path,
-    ground_truth: Path,
-    *,
-    part: FramePart | None = None,
+    prediction: Path, ground_truth: Path, part: FramePart | None = None
 ) -> tuple[list[FramePair], list[str]]:
     """Returns the frames of the ground truth in its order, and notes.
 
@@ -90,41 +53,47 @@ def pair_frames(
         InputError: For a missing path, or folders without a common name.
     """
     # Two files, two folders, or a folder and a data set.
-    for path in filter(None, (prediction, ground_truth)):
+    for path in (prediction, ground_truth):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
-    layout, true_frames = _data_set(prediction, ground_truth)
-    if layout is None and prediction.is_dir() != ground_truth.is_dir():
+    layout, frames = _data_set(prediction, ground_truth)
+    if prediction.is_dir() != (layout is not None or ground_truth.is_dir()):
         raise UsageError(
-            f"give two files or two folders, not one of each: {prediction}, {ground_truth}"
+            f"give two files, two folders, or a folder and a data set: {prediction}, {ground_truth}"
         )
-    if layout is not None and prediction.is_file():
-        raise UsageError(f"{ground_truth} is a data set but {prediction} one file; give a folder")
-    # The frames with ground truth, and the predictions by name.
-    notes: list[str] = []
+    # The predictions by name, and the frames with ground truth.
+    name, notes, more = frame_name(prediction.stem), list[str](), list[str]()
+    predictions = {name: prediction}
     if prediction.is_dir():
         predictions, notes = depth_files(prediction)
-        frames, more_notes = _true_frames(ground_truth, layout, true_frames, part)
-        notes += more_notes
+    if layout is not None:
+        frames, more = _with_truth(ground_truth, layout, frames, part)
+    elif ground_truth.is_dir():
+        files, more = depth_files(ground_truth)
+        frames = [FrameFiles(name=name, gt=path) for name, path in files.items()]
     else:
-        name = frame_name(prediction.stem)
-        frames, predictions = [FrameFiles(name=name, gt=ground_truth)], {name: prediction}
+        frames = [FrameFiles(name=name, gt=ground_truth)]
+    notes += more
     # At least one name must be common to both.
-    names = {frame.name for frame in frames}
-    if names.isdisjoint(predictions):
+    names = {frame.name: None for frame in frames}
+    extra = [name for name in sorted(predictions) if name not in names]
+    if len(extra) == len(predictions):
         raise InputError(
             "no prediction has the name of a ground truth file: predictions are"
             f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}"
         )
-    if extra := sorted(set(predictions) - names):
+    if extra:
         notes.append(
             f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
             f" and are not scored: {some_names(extra)}"
         )
     # Each frame with its prediction.
-    groups = groups_by_name([frame.name for frame in frames])
+    groups = groups_by_name([*names])
     return [
-        _pair(frame, predictions.get(frame.name), group)
+        _pair(
+            replace(frame, group=group if frame.group is None else frame.group),
+            predictions.get(frame.name),
+        )
         for frame, group in zip(frames, groups, strict=True)
     ], notes
 
@@ -143,78 +112,42 @@ def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFil
     return None, []
 
 
-def _true_frames(
-    folder: Path, layout: str | None, found: Sequence[FrameFiles], part: FramePart | None
+def _with_truth(
+    folder: Path, layout: str, frames: list[FrameFiles], part: FramePart | None
 ) -> tuple[list[FrameFiles], list[str]]:
-    """The frames with ground truth of a folder of files or a data set, and notes."""
-    if layout is None:
-        files, notes = depth_files(folder)
-        return [FrameFiles(name=name, gt=path) for name, path in files.items()], notes
-    frames = [frame for frame in found if frame.gt is not None]
+    """The frames of a data set that have ground truth, and a note."""
+    frames = [
+        frame if part is None else replace(frame, part=part)
+        for frame in frames
+        if frame.gt is not None
+    ]
     if not frames:
         raise InputError(f"{folder} looks like {layout!r}, and no frame in it has ground truth")
-    if part is not None:
-        frames = [replace(frame, part=part) for frame in frames]
     cuts = ", ".join(sorted({str(frame.part) for frame in frames if frame.part != WHOLE}))
     note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
     return frames, [note + (f", of which {cuts} is used" if cuts else "")]
 
 
-def _pair(frame: FrameFiles, prediction: Path | None, group: str) -> FramePair:
+def _pair(files: FrameFiles, prediction: Path | None) -> FramePair:
     """The frame with what the record of a refinement, beside its depth, says of its inputs."""
-    result: ResultFrame | None = None
-    if prediction is not None:
-        with contextlib.suppress(PnpDepthError):
-            (result,) = result_frames(prediction)
-    pair = FramePair(
-        name=frame.name,
-        prediction=prediction,
-        frame=frame,
-        group=group if frame.group is None else frame.group,
-        sparse=_not_a_scan(frame.sparse),
-        image=frame.image,
-    )
-    if result is None:
-        return pair
-    return replace(
-        pair,
-        sparse=_sparse_file(result.record) or pair.sparse,
-        drawn=_drawn_points(result.record),
-        sigma=result.sigma,
-        image=result.image or pair.image,
-        unit=result.unit,
-    )
-
-
-def _not_a_scan(path: Path | None) -> Path | None:
-    """The path; None for a scan, of which the file does not say which points the network saw."""
-    return path if path is not None and path.suffix.lower() in DEPTH_SUFFIXES else None
-
-
-def _sparse_file(record: FrameRecord | None) -> Path | None:
-    """The sparse depth of a record, if it exists and is no projected scan."""
-    sparse = None if record is None else record.inputs.get("sparse")
-    if sparse is None or sparse.sampled or sparse.calibration or not Path(sparse.path).is_file():
-        return None
-    return Path(sparse.path)
-
-
-def _drawn_points(record: FrameRecord | None) -> DrawnPoints | None:
-    """The points that a record says were drawn from the ground truth; None if it does not."""
-    sparse = None if record is None else record.inputs.get("sparse")
-    if record is None or sparse is None or sparse.sampled is None:
-        return None
-    drawn, (width, height) = sparse.sampled, record.size or (0, 0)
-    with contextlib.suppress(UsageError):
-        pattern = SamplePattern(kind=drawn.kind, count=drawn.count, fraction=drawn.fraction)
-        return DrawnPoints(pattern, drawn.seed, (height, width))
-    return None
+    if files.sparse is not None and files.sparse.suffix.lower() not in DEPTH_SUFFIXES:
+        files = replace(files, sparse=None)  # a scan
+    if prediction is None:
+        return FramePair(files, None)
+    try:
+        (result,) = result_frames(prediction)
+    except PnpDepthError:  # the record is damaged
+        return FramePair(files, ResultFrame(name=files.name, depth=prediction))
+    sparse = None if result.record is None else result.record.inputs.get("sparse")
+    if sparse is not None and not (sparse.sampled or sparse.calibration):
+        path = Path(sparse.path)
+        files = replace(files, sparse=path if path.is_file() else files.sparse)
+    return FramePair(replace(files, image=result.image or files.image), result)
 
 
 def frame_name(stem: str) -> str:
     """Returns the frame of a file with this stem: without `_depth` and KITTI's file kind."""
-    name = _KITTI_KIND.sub("_sync_", stem)
-    return _base(name, _DEPTH_MARKS) or name
+    return _MARK.sub("", _KITTI_KIND.sub("_sync_", stem))
 
 
 def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
@@ -230,12 +163,11 @@ def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     for problem in problems:
         if problem.path.is_file():
             raise InputError(str(problem))
-    bases = (_base(stem, _DEPTH_MARKS) for stem in found)
-    marked = {base for base in bases if base is not None}  # stems with a _depth file
+    marked = {_MARK.sub("", stem) for stem in found if _MARK.search(stem)}
     by_frame: dict[str, Path] = {}
     for stem, path in found.items():
         name = frame_name(stem)
-        if stem in marked or _base(stem, _COMPANIONS) in marked:
+        if stem in marked or (_COMPANION.search(stem) and _COMPANION.sub("", stem) in marked):
             continue
         if name in by_frame:
             raise InputError(f"{path} and {by_frame[name].name} are one frame; keep one")
@@ -247,11 +179,6 @@ def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     if ignored := [found[stem].name for stem in sorted(marked & found.keys())]:
         notes.append(f"{folder}: ignored, as there is a _depth of each: {some_names(ignored)}")
     return dict(sorted(by_frame.items())), notes
-
-
-def _base(stem: str, marks: Sequence[str]) -> str | None:
-    """The stem without the mark at its end; None if it has none of the marks."""
-    return next((stem.removesuffix(m) for m in marks if stem.endswith(m) and stem != m), None)
 
 
 def some_names(names: Iterable[str]) -> str:

@@ -8,18 +8,19 @@ import numpy as np
 import torch
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
-from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors, fill_background
-from pnpdepth_cli.commands.evaluation.load_depths import Depth, LoadedFrame, load_frame
+from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
+from pnpdepth_cli.commands.evaluation.load_depths import LoadedFrame, load_frame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
+from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.measures import OF_SIGMA, Formula
 from pnpdepth_cli.stages import AFTER, GT
 
-PREDICTION, TRUTH = "prediction", "gt"
-"""The files of a frame that are compared."""
+FILES = ("prediction", "gt", "sparse", "image")
+"""The files of a frame in its record; the first two are compared."""
 
 
 def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
@@ -30,41 +31,41 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
     the network was given a point. "coverage" is predicted over known. "median_ratio" is that of
     prediction over ground truth. A prediction that was scaled has "factor" and "shift".
     """
-    record = FrameRecord(name=pair.name, group=pair.group, unit=pair.unit, inputs=_files_of(pair))
+    files, result = pair
+    paths = (result and result.depth, files.gt, files.sparse, files.image)
+    inputs = {
+        name: FileRecord(path=str(path))
+        for name, path in zip(FILES, paths, strict=True)
+        if path is not None
+    }
+    record = FrameRecord(
+        name=files.name,
+        group=files.group,
+        unit=METRES if result is None else result.unit,
+        inputs=inputs,
+    )
     try:
         frame = load_frame(pair, request)
     except PnpDepthError as error:
         return replace(record, status="failed", message=str(error))
-    # How the files were read.
-    inputs = record.inputs | {
-        side: replace(
-            record.inputs[side],
-            read_as=reading.source,
-            scale=reading.scale,
-            assumed=reading.assumed,
-        )
-        for side, reading in frame.readings.items()
+    read = {
+        name: replace(inputs[name], read_as=each.source, scale=each.scale, assumed=each.assumed)
+        for name, each in frame.readings.items()
     }
-    record = replace(record, inputs=inputs, notes=list(frame.notes))
-    # There must be something to score.
-    if not (frame.gt > 0).any():
-        return replace(
-            record,
-            status="failed",
-            message=f"{pair.frame.gt} has no known depth where protocol {request.protocol} scores",
-        )
-    scores, fault = _scores_of(frame, pair, request)
+    scores, fault = _score(frame, pair, request)
     return replace(
         record,
+        inputs=inputs | read,
+        notes=frame.notes,
         status="failed" if fault else "done",
         message=fault,
-        errors={GT: {AFTER: scores}},
+        errors={GT: {AFTER: scores}} if scores else {},
     )
 
 
 def is_missing(record: FrameRecord) -> bool:
     """Returns whether the frame has no prediction."""
-    return PREDICTION not in record.inputs
+    return "prediction" not in record.inputs
 
 
 def scores_of(record: FrameRecord) -> Scores:
@@ -72,31 +73,28 @@ def scores_of(record: FrameRecord) -> Scores:
     return record.errors.get(GT, {}).get(AFTER, {})
 
 
-def _files_of(pair: FramePair) -> dict[str, FileRecord]:
-    files = (pair.prediction, pair.frame.gt, pair.sparse, pair.image)
-    named = zip((PREDICTION, TRUTH, "sparse", "image"), files, strict=True)
-    return {name: FileRecord(path=str(path)) for name, path in named if path is not None}
-
-
-def _scores_of(
-    frame: LoadedFrame, pair: FramePair, request: EvalRequest
-) -> tuple[Scores, str | None]:
-    """The scores of a frame with ground truth, and why they are counts alone."""
-    depth, gt = frame.depth, frame.gt
+def _score(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> tuple[Scores, str | None]:
+    """The scores of a frame, and why they are counts alone or nothing."""
+    depth, gt, files = frame.depth, frame.gt, pair.files
     known, both = gt > 0, (gt > 0) & (depth > 0)
+    if not known.any():
+        return {}, f"{files.gt} has no known depth where protocol {request.protocol} scores"
+    # Counts of pixels.
     counts: Scores = {"pixels": 0, "known": int(known.sum()), "predicted": 0, "coverage": 0.0}
-    if frame.predicted is None:
+    if pair.result is None or frame.predicted is None:
         return counts, "there is no prediction"
     predicted = int((frame.predicted & known).sum())
+    factor, shift = frame.fit or (None, None)
     counts |= {
         "pixels": int(both.sum()),
         "predicted": predicted,
         "coverage": predicted / int(known.sum()),
         "given": None if frame.given is None else int((frame.given & both).sum()),
         "median_ratio": float(np.median(depth[both] / gt[both])) if both.any() else None,
-        "factor": None if frame.fit is None else frame.fit.factor,
-        "shift": None if frame.fit is None else frame.fit.shift,
+        "factor": factor,
+        "shift": shift,
     }
+    # Measures of sums over pixels, then those of whole images.
     of_sigma: Scores = {}
     if frame.sigma is not None:
         of_sigma = {m.key: m.value(depth, gt, frame.sigma) for m in OF_SIGMA}
@@ -104,8 +102,7 @@ def _scores_of(
         return devkit_errors(depth, gt) | of_sigma | counts, None
     if not both.any():
         where = " where the ground truth is known" if (depth > 0).any() else ""
-        return counts, f"{pair.prediction} holds no valid depth{where}"
-    # measures of sums over pixels, then those of whole images
+        return counts, f"{pair.result.depth} holds no valid depth{where}"
     summed = [m for m in request.measures if isinstance(m.formula, Formula)]
     depths = torch.from_numpy(depth), torch.from_numpy(gt)
     sums = error_sums(*depths, request.rules.thresholds, summed)
@@ -113,8 +110,3 @@ def _scores_of(
     values: Scores = {measure.key: value for measure, value in of_pixels}
     values |= {m.key: m.value(depth, gt) for m in request.measures if m.key not in values}
     return values | of_sigma | counts, None
-
-
-def fill_missing(depth: Depth) -> Depth:
-    """Returns the depth with what the development kit fills in, without its −1."""
-    return np.maximum(fill_background(depth), np.float32(0))

@@ -11,9 +11,10 @@ import numpy as np
 
 from pnpdepth_cli.commands.evaluation.eval_tables import means_table
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
+from pnpdepth_cli.commands.evaluation.kitti_devkit import fill_background
 from pnpdepth_cli.commands.evaluation.load_depths import image_of, load_frame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.commands.evaluation.scoring import fill_missing, scores_of
+from pnpdepth_cli.commands.evaluation.scoring import scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, PnpDepthError
@@ -110,7 +111,7 @@ def _entry(
     notes = [f"Scored: {pixels:,} of {known:,} pixels of the ground truth."]
     if given:
         notes.append(f"{given:,} of them were given to the network as sparse depth.")
-    notes += [f"Prediction: {pair.prediction}", f"Ground truth: {pair.frame.gt}"]
+    notes += [f"Prediction: {frame.inputs['prediction'].path}", f"Ground truth: {pair.files.gt}"]
     try:
         drawn = _draw(pair, evaluation, images)
     except InputError as error:  # the file has changed since it was scored
@@ -130,7 +131,7 @@ def _draw(pair: FramePair, evaluation: Evaluation, images: Path) -> dict[str, An
     loaded = load_frame(pair, evaluation.request)
     gt, depth = loaded.gt, loaded.depth
     if evaluation.request.is_devkit:
-        depth = fill_missing(depth)
+        depth = np.maximum(fill_background(depth), np.float32(0))
     try:
         image = image_of(pair, gt.shape)
     except PnpDepthError:
@@ -140,7 +141,7 @@ def _draw(pair: FramePair, evaluation: Evaluation, images: Path) -> dict[str, An
     views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors}
     if image is not None:
         views["image"] = np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
-    key = image_key(pair.name)
+    key = image_key(pair.files.name)
     amount = f"by {strongest_m:.3g} m or more"
     return {
         "key": key,

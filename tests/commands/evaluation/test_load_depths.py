@@ -36,7 +36,7 @@ def test_median_is_that_of_monodepth2_and_empty_predictions_stay_empty() -> None
     ratio = np.median(GT[both]) / np.median(predicted[both])
     depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), "depth", "median")
     assert fit is not None
-    assert fit.factor == pytest.approx(ratio, rel=1e-6)
+    assert fit == pytest.approx((ratio, 0), rel=1e-6)
     assert depth == pytest.approx(predicted * ratio, rel=1e-6)
 
 
@@ -53,7 +53,7 @@ def test_affine_is_the_least_squares_fit_of_marigold_and_midas(scale_by: str) ->
     kind = "depth" if in_depth else "disparity"
     depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), kind, scale_by)
     assert fit is not None
-    assert (fit.factor, fit.shift) == pytest.approx((s, t), rel=1e-5)
+    assert fit == pytest.approx((s, t), rel=1e-5)
     assert not depth[:3].any()
     fitted = np.maximum(s * predicted + t, 0)[3:]
     assert depth[3:] == pytest.approx(fitted if in_depth else 1 / fitted, rel=1e-4, abs=1e-6)

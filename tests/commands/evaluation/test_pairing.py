@@ -37,7 +37,7 @@ def folders(root: Path, predictions: list[str], truths: list[str]) -> tuple[Path
 
 
 def matched(pairs: list[FramePair]) -> dict[str, str | None]:
-    return {f.name: f.prediction.name if f.prediction else None for f in pairs}
+    return {files.name: result.depth.name if result else None for files, result in pairs}
 
 
 NAMES = [
@@ -101,8 +101,8 @@ REFUSED = [
     (["a.png"], ["a.png"], "out/b.png", "gt/a.png", InputError, "b.png: no such file or folder"),
     (["1.png"], ["0001.png"], "out", "gt", InputError,
      "file: predictions are 1; ground truth is 0001"),
-    (["a.png"], ["a.png"], "out/a.png", "gt", UsageError, "two files or two folders"),
-    (["a.png"], ["a.png"], "out", "gt/a.png", UsageError, "two files or two folders"),
+    (["a.png"], ["a.png"], "out/a.png", "gt", UsageError, "two files, two folders"),
+    (["a.png"], ["a.png"], "out", "gt/a.png", UsageError, "two files, two folders"),
 ]  # fmt: skip
 
 
@@ -130,13 +130,13 @@ def test_a_folder_of_data_sets_is_read_as_a_batch_reads_it(
         depth_at(tmp_path / f"out/{place}/0_depth.png")
     (tmp_path / "out/summary.json").write_text(json.dumps({"layout": stated}))
     pairs, _ = pair_frames(tmp_path / "out", tmp_path / "sets")
-    assert [pair.name for pair in pairs] == ["north/0", "south/0"]
-    assert all(pair.prediction is not None for pair in pairs)
+    assert [pair.files.name for pair in pairs] == ["north/0", "south/0"]
+    assert all(pair.result is not None for pair in pairs)
 
 
 def test_two_files_are_one_frame_whatever_they_are_called(tmp_path: Path) -> None:
     (pair,), _ = pair_frames(depth_at(tmp_path / "p_depth.png"), depth_at(tmp_path / "g.npy"))
-    assert (pair.name, pair.frame.gt) == ("p", tmp_path / "g.npy")
+    assert (pair.files.name, pair.files.gt) == ("p", tmp_path / "g.npy")
 
 
 def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -> None:
@@ -149,7 +149,8 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     FrameRecord(inputs={"sparse": scan}).write(out / "b.json")
     (out / "c.json").write_text("not JSON at all")
     frames, _ = pair_frames(out, gt)
-    assert [(f.sparse, f.image) for f in frames] == [(sparse, image), (None, None), (None, None)]
+    inputs = [(files.sparse, files.image) for files, _ in frames]
+    assert inputs == [(sparse, image), (None, None), (None, None)]
 
 
 def test_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> None:
