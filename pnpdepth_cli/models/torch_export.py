@@ -14,7 +14,6 @@ import math
 import operator
 import re
 import zipfile
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,7 @@ from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, graph_definition
-from pnpdepth_cli.models.onnx.limits import run_first
-from pnpdepth_cli.models.onnx.table import Unsupported
-from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
+from pnpdepth_cli.models.steps import Step, Steps, Unsupported, Value
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
 from pnpdepth_cli.models.weights.torch_file import refuse_inflated
 
@@ -91,19 +88,14 @@ class ExportedGraph(nn.Module):
             for spec in module["signature"]["output_specs"]
             if "user_output" in spec
         ]
-        self._allowed: set[tuple[torch.Size, ...]] = set()
-        self._steps = with_ends(list(self._steps_of(module["graph"])), self._outputs)
+        steps = list(self._steps_of(module["graph"]))
+        self._steps = Steps(steps, self._outputs, kind="operation")
 
     def forward(self, *inputs: Tensor) -> Any:
         """Returns the output, or a tuple of several."""
         values: dict[str, Any] = dict(zip(self.inputs, inputs, strict=True))
         values |= {name: getattr(self, attribute) for name, attribute in self.held.items()}
-        sizes = tuple(each.shape for each in inputs)
-        if sizes in self._allowed:
-            deque(run_steps(self._steps, values), maxlen=0)
-        else:
-            run_first(self._steps, values, 0, "operation")
-            self._allowed.add(sizes)
+        self._steps.run(values, tuple(each.shape for each in inputs))
         outputs = tuple(values[name] for name in self._outputs)
         return outputs if len(outputs) > 1 else outputs[0]
 

@@ -111,7 +111,7 @@ def test_a_network_that_onnxruntime_does_not_open_is_no_damaged_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     onnx(tmp_path / "n.onnx")
-    from pnpdepth_cli.models.onnx.quantised import session_of
+    from pnpdepth_cli.models.onnx.runtime import session_of
 
     monkeypatch.setattr("onnxruntime.InferenceSession", broken)
     with pytest.raises(AttributeError):

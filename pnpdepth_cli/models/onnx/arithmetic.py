@@ -10,17 +10,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.onnx.table import (
+from pnpdepth_cli.models.onnx import (
     Inputs,
     Node,
     Operator,
-    Unsupported,
     operator,
     optional,
     register,
     stated,
     whole_numbers,
 )
+from pnpdepth_cli.models.steps import Unsupported
 
 _UNARY = (
     *("Relu", "Sigmoid", "Tanh", "Erf", "Exp", "Log", "Sqrt", "Reciprocal", "Abs", "Neg", "Floor"),

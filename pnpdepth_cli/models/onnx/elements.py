@@ -8,16 +8,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.onnx.table import (
+from pnpdepth_cli.models.onnx import (
     Inputs,
     Node,
-    Unsupported,
     operator,
     optional,
     register,
     stated,
     whole_numbers,
 )
+from pnpdepth_cli.models.steps import Unsupported
 
 TYPES = {
     1: torch.float32, 2: torch.uint8, 3: torch.int8, 5: torch.int16, 6: torch.int32,

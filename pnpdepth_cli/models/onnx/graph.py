@@ -8,7 +8,7 @@ network can be cut at it.
 from __future__ import annotations
 
 import functools
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,16 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.onnx import (  # noqa: F401  (each registers its operators)
+from pnpdepth_cli.models.onnx import (  # noqa: F401  (each file registers its operators)
+    HOST_INPUTS,
+    OPERATORS,
+    Node,
     arithmetic,
     elements,
     layers,
     resizing,
 )
-from pnpdepth_cli.models.onnx.limits import SizeLimit, run_first
-from pnpdepth_cli.models.onnx.table import HOST_INPUTS, OPERATORS, Node, Unsupported
-from pnpdepth_cli.models.steps import Step, Value, run_steps, with_ends
+from pnpdepth_cli.models.steps import SizeLimit, Step, Steps, Unsupported, Value
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
@@ -115,9 +116,11 @@ class OnnxGraph(nn.Module):
         self.output_names = tuple(o.name for o in graph.output)
         self._stored = sum(constant.numel() for constant in constants.values())
         nodes = zip(_names(graph.node), graph.node, strict=True)
-        self._steps = with_ends(self._steps_of(nodes, opset, constants, path), self.output_names)
+        self._steps = Steps(
+            self._steps_of(nodes, opset, constants, path), self.output_names,
+            kind="ONNX node", stored=self._stored,
+        )  # fmt: skip
         self._constants = {n: constants[n] for n in self.output_names if n in constants}
-        self._allowed: set[tuple[torch.Size, ...]] = set()  # sizes of inputs
 
     def _steps_of(
         self, nodes: Iterable[tuple[str, Any]], opset: int, constants: dict[str, Tensor], path: Path
@@ -156,14 +159,9 @@ class OnnxGraph(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Any:
         """Returns the output, or several outputs by name."""
-        sizes = tuple(one.shape for one in inputs)
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
         self._device = inputs[0].device
-        if sizes in self._allowed:
-            deque(run_steps(self._steps, values), maxlen=0)
-        else:
-            run_first(self._steps, values, self._stored, "ONNX node")
-            self._allowed.add(sizes)
+        self._steps.run(values, tuple(one.shape for one in inputs))
         outputs = {n: values[n] if n in values else self._constants[n] for n in self.output_names}
         return outputs if len(outputs) > 1 else outputs[self.output_names[0]]
 

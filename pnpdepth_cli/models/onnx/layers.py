@@ -9,14 +9,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.onnx.table import (
+from pnpdepth_cli.models.onnx import (
     Inputs,
     Node,
-    Unsupported,
     operator,
     optional,
     register,
 )
+from pnpdepth_cli.models.steps import Unsupported
 
 _CONV = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
 _TRANSPOSED = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}

@@ -6,17 +6,17 @@ pnpdepth[onnx]`.
 
 from __future__ import annotations
 
+import functools
 import graphlib
-import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from pnpdepth_cli.budget import check_claim
+from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import (
@@ -26,15 +26,15 @@ from pnpdepth_cli.models.definition import (
     graph_definition,
 )
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
-from pnpdepth_cli.models.onnx.limits import inline, load_external
-from pnpdepth_cli.models.onnx.quantised import Quantised, outputs_of, quantises, session_of
+from pnpdepth_cli.models.onnx.runtime import FirstImageCheck, Quantised
 
-MISMATCH = 1e-3
-"""The largest deviation from onnxruntime's output, relative to that output's range."""
-
-_HALF_MISMATCH = 1e-2  # half precision itself is no better
 _OPSETS = range(7, 25)  # onnxruntime runs none that is older
 _MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
+_MAX_WRITTEN_OUT = 1 << 28  # bytes
+_NODE_BYTES = 1 << 12  # that a node takes in memory at least; depth networks have up to 10,000
+_SHARED = 2  # tensors that may have the same bytes of a file beside the model
+_QUANTISES = re.compile("Quantize|QLinear|QGemm|Integer")  # not DequantizeLinear of weights
+_ENDLESS = ("Loop", "Scan")
 
 
 def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> ModelDefinition:
@@ -49,7 +49,7 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
     Raises:
         ModelError: The file cannot be read, or the network cannot be run.
     """
-    model = inline(_read(file), file)
+    model = _inlined(_read(file), file)
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
     is_part = _prune(model, _choose_output(model, output, file), file)
@@ -61,15 +61,17 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
         build=lambda: OnnxGraph(model, file),
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
         output=_as_map,
-        verify=_FirstImageCheck(source, file),
+        verify=FirstImageCheck(source, file),
     )  # fmt: skip
-    if not quantises(model):
+    if not any(_QUANTISES.search(node.op_type) for node in model.graph.node):
         return definition
-    if len(inputs) > 1:
-        raise ModelError(f"ONNX file {file} is quantised and has several inputs: not covered")
+    # A quantised network is left to onnxruntime.
+    if len(inputs) > 1 or any(n.op_type in _ENDLESS for n in _nodes_in(model.graph.node)):
+        raise ModelError(f"ONNX file {file} is quantised and has several inputs or loops")
+    stored = sum(tensor.ByteSize() for tensor in model.graph.initializer)
     return replace(
         definition,
-        build=lambda: Quantised(source, file, model, next(iter(inputs))),
+        build=lambda: Quantised(source, file, stored, next(iter(inputs))),
         verify=None,
         layers=("output",),
         defaults=replace(definition.defaults, iterations=0),
@@ -78,7 +80,121 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
     )
 
 
-def _prune(model: Any, output: str, path: Path) -> bool:
+def _read(file: Path) -> Any:
+    """The onnx.ModelProto with its weights, of an opset that is covered."""
+    # The file, and the packages that read it.
+    if not file.is_file():
+        raise ModelError(f"ONNX file {file} does not exist")
+    size = file.stat().st_size
+    check_claim(f"ONNX file {file} has {size:,} bytes", size, _MAX_BYTES, error=ModelError)
+    try:
+        import onnx
+        import onnxruntime  # noqa: F401
+        from google.protobuf.message import DecodeError
+    except ImportError as error:
+        raise ModelError(
+            f"{file} is an ONNX file, which needs the package {error.name!r}:"
+            " pip install 'pnpdepth[onnx]'"
+        ) from None
+    try:
+        model = onnx.load(str(file), load_external_data=False)
+        _load_external(model, file.parent)
+    except (DecodeError, onnx.checker.ValidationError, ValueError, TypeError, OSError) as error:
+        raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
+    # A graph whose names are text, of an opset that is covered.
+    if not model.graph.node:
+        raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
+    for node in (*model.graph.node, *(node for f in model.functions for node in f.node)):
+        words = (node.name, node.op_type, node.domain, *node.input, *node.output)
+        if not all(isinstance(word, str) for word in words):
+            raise ModelError(f"ONNX file {file} cannot be read: its names are not text in UTF-8")
+    if _opset(model) not in _OPSETS:
+        raise ModelError(
+            f"ONNX file {file} is of opset {_opset(model)}; export it with one from"
+            f" {_OPSETS[0]} to {_OPSETS[-1]}"
+        )
+    return model
+
+
+def _load_external(model: Any, folder: Path) -> None:
+    """Reads the tensors that lie in files beside the model into it.
+
+    ValueError if they claim more than these files have, or more than memory holds.
+    """
+    from onnx import external_data_helper as external
+
+    claims = [
+        external.ExternalDataInfo(tensor)
+        for tensor in external._get_all_tensors(model)
+        if external.uses_external_data(tensor)
+    ]
+    sizes = {claim.location: (folder / claim.location).stat().st_size for claim in claims}
+    claimed = sum(claim.length or sizes[claim.location] for claim in claims)
+    most = min(_SHARED * sum(sizes.values()), budget().max_decoded_bytes)
+    check_claim(
+        f"its tensors have {claimed:,} bytes in other files", claimed, most, error=ValueError
+    )
+    external.load_external_data_for_model(model, str(folder))
+
+
+def _inlined(model: Any, file: Path) -> Any:
+    """The model without functions of its own, which may call each other and become endless."""
+    if not model.functions:
+        return model
+    functions = {(f.domain, f.name, getattr(f, "overload", "")): f for f in model.functions}
+
+    @functools.cache
+    def size_of_function(key: tuple[str, str, str]) -> int:
+        return int(functions[key].ByteSize()) + size(functions[key])
+
+    def size(graph: Any) -> int:
+        calls = [(n.domain, n.op_type, getattr(n, "overload", "")) for n in _nodes_in(graph.node)]
+        return sum(size_of_function(call) if call in functions else _NODE_BYTES for call in calls)
+
+    try:
+        claimed = size(model.graph)
+    except RecursionError:
+        raise ModelError(f"ONNX file {file}: its functions call each other without end") from None
+    claim = f"ONNX file {file}: its functions, written out, are {claimed:,} bytes"
+    check_claim(claim, claimed, _MAX_WRITTEN_OUT, error=ModelError)
+    from onnx import inliner
+
+    return inliner.inline_local_functions(model)
+
+
+def _nodes_in(nodes: Sequence[Any]) -> Iterator[Any]:
+    """The nodes, and those in the graphs that are their attributes."""
+    for node in nodes:
+        yield node
+        for attribute in node.attribute:
+            for graph in (*attribute.graphs, attribute.g):
+                yield from _nodes_in(graph.node)
+
+
+def _opset(model: Any) -> int:
+    return max((o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), default=1)
+
+
+def _shape(value: Any) -> list[int | str]:
+    dims = value.type.tensor_type.shape.dim
+    return [d.dim_value if d.dim_value > 0 else d.dim_param or "?" for d in dims]
+
+
+def _choose_output(model: Any, wanted: str | None, file: Path) -> str:
+    outputs: dict[str, str] = {o.name: "×".join(map(str, _shape(o))) for o in model.graph.output}
+    if wanted is None and len(outputs) == 1:
+        return next(iter(outputs))
+    if wanted is not None and wanted in outputs:
+        return wanted
+    listed = ", ".join(f"{name} {shape}" for name, shape in outputs.items())
+    first = next(iter(outputs), "OUTPUT")
+    fact = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
+    raise ModelError(
+        f"ONNX file {file} has {fact}; name the depth as --model {file}:{first}; it has {listed}"
+    )
+
+
+def _prune(model: Any, output: str, file: Path) -> bool:
     """Leaves in the model one output and the nodes that it needs. True if others were there.
 
     Each node comes after those it reads. The order is that of the file if possible; files converted
@@ -100,7 +216,7 @@ def _prune(model: Any, output: str, path: Path) -> bool:
         inputs = {name for name in nodes[n].input if name and name not in known}
         absent = sorted(inputs - producer.keys())
         if absent:
-            raise ModelError(f"ONNX file {path}: a node reads {absent[0]!r}, which nothing gives")
+            raise ModelError(f"ONNX file {file}: a node reads {absent[0]!r}, which nothing gives")
         reads[n] = {producer[name] for name in inputs}
         pending += reads[n]
     # Their order is the file's, unless a node would come before what it reads.
@@ -110,80 +226,21 @@ def _prune(model: Any, output: str, path: Path) -> bool:
             by_number = dict(sorted(reads.items()))
             order = [*graphlib.TopologicalSorter(by_number).static_order()]
         except graphlib.CycleError:
-            raise ModelError(f"ONNX file {path}: its nodes read each other in a circle") from None
+            raise ModelError(f"ONNX file {file}: its nodes read each other in a circle") from None
     # They replace the graph's.
-    pruned = len(order) < len(nodes) or len(outputs) < len(graph.output)
+    is_part = len(order) < len(nodes) or len(outputs) < len(graph.output)
     kept = type(graph)()
     kept.node.extend(nodes[n] for n in order)
     kept.output.extend(outputs)
     graph.ClearField("node")
     graph.ClearField("output")
     graph.MergeFrom(kept)
-    return pruned
+    return is_part
 
 
-def _as_map(output: Any) -> Tensor:
-    tensor: Tensor = output
-    last = tensor.ndim == 4 and tensor.shape[-1] == 1 and tensor.shape[1] != 1
-    return tensor.permute(0, 3, 1, 2) if last else tensor
-
-
-def _read(file: Path) -> Any:
-    # The file, and the packages that read it.
-    if not file.is_file():
-        raise ModelError(f"ONNX file {file} does not exist")
-    size = file.stat().st_size
-    check_claim(f"ONNX file {file} has {size:,} bytes", size, _MAX_BYTES, error=ModelError)
-    try:
-        import onnx
-        import onnxruntime  # noqa: F401
-        from google.protobuf.message import DecodeError
-    except ImportError as error:
-        raise ModelError(
-            f"{file} is an ONNX file, which needs the package {error.name!r}:"
-            " pip install 'pnpdepth[onnx]'"
-        ) from None
-    try:
-        model = onnx.load(str(file), load_external_data=False)
-        load_external(model, file.parent)
-    except (DecodeError, onnx.checker.ValidationError, ValueError, TypeError, OSError) as error:
-        raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
-    # A graph whose names are text, of an opset that is covered.
-    if not model.graph.node:
-        raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
-    for node in (*model.graph.node, *(node for f in model.functions for node in f.node)):
-        words = (node.name, node.op_type, node.domain, *node.input, *node.output)
-        if not all(isinstance(word, str) for word in words):
-            raise ModelError(f"ONNX file {file} cannot be read: its names are not text in UTF-8")
-    if _opset(model) not in _OPSETS:
-        raise ModelError(
-            f"ONNX file {file} is of opset {_opset(model)}; export it with one from"
-            f" {_OPSETS[0]} to {_OPSETS[-1]}"
-        )
-    return model
-
-
-def _opset(model: Any) -> int:
-    return max((o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), default=1)
-
-
-def _shape(value: Any) -> list[int | str]:
-    dims = value.type.tensor_type.shape.dim
-    return [d.dim_value if d.dim_value > 0 else d.dim_param or "?" for d in dims]
-
-
-def _choose_output(model: Any, wanted: str | None, file: Path) -> str:
-    outputs: dict[str, list[int | str]] = {o.name: _shape(o) for o in model.graph.output}
-    if wanted is None and len(outputs) == 1:
-        return next(iter(outputs))
-    if wanted in outputs:
-        return str(wanted)
-    listed = ", ".join(f"{n} {'×'.join(map(str, s))}" for n, s in outputs.items())
-    first = next(iter(outputs), "OUTPUT")
-    fact = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
-    raise ModelError(
-        f"ONNX file {file} has {fact}; name the depth as --model {file}:{first}; it has {listed}"
-    )
+def _as_map(output: Tensor) -> Tensor:
+    last = output.ndim == 4 and output.shape[-1] == 1 and output.shape[1] != 1
+    return output.permute(0, 3, 1, 2) if last else output
 
 
 def _patch_size(model: Any) -> int | None:
@@ -195,49 +252,3 @@ def _patch_size(model: Any) -> int | None:
             if kernel == stride and kernel and min(kernel) >= 8:
                 return int(kernel[0])
     return None
-
-
-class _FirstImageCheck:
-    """Compares the network with onnxruntime on the first image.
-
-    Args:
-        source: File that onnxruntime reads, or the content of one.
-        file: The network's file, for messages.
-    """
-
-    def __init__(self, source: str | bytes, file: Path) -> None:
-        self._source, self._file, self._note = source, file, ""
-
-    def __call__(self, module: nn.Module, arguments: Sequence[Tensor]) -> str:
-        """Returns how well they agree; compares only once. ModelError if they differ."""
-        if self._note:
-            return self._note
-        assert isinstance(module, OnnxGraph)
-        inputs = {n: a.detach().cpu() for n, a in zip(module.input_names, arguments, strict=True)}
-        with torch.no_grad():
-            actual = module(*arguments).cpu()  # first, since it allocates no more than it should
-        expected = outputs_of(session_of(self._source, self._file), inputs, self._file)
-        deviation = _deviation(actual, expected)
-        if not deviation <= (_HALF_MISMATCH if module.is_half else MISMATCH):
-            raise ModelError(
-                f"ONNX file {self._file}: its reading by torch differs from onnxruntime's by"
-                f" {deviation:.2g} of the output's range"
-            )
-        self._note = f"ONNX: agrees with onnxruntime on this image to {deviation:.1g} of its range"
-        return self._note
-
-
-def _deviation(actual: Tensor, expected: Tensor) -> float:
-    """The largest difference relative to the largest expected value."""
-    if actual.shape != expected.shape:
-        return math.inf
-    if not expected.numel():
-        return 0.0
-    known = expected.isfinite()
-    both = known & actual.isfinite()  # a network may be inf or NaN in the sky
-    if int((known != actual.isfinite()).sum()) > MISMATCH * expected.numel():
-        return math.inf
-    actual, expected = actual[both].float(), expected[both]
-    largest = float(expected.abs().amax()) if len(expected) else 0.0
-    difference = float((actual - expected).abs().amax()) if len(expected) else math.inf
-    return difference / largest if largest else difference

@@ -14,14 +14,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.onnx.table import (
+from pnpdepth_cli.models.onnx import (
     Inputs,
     Node,
-    Unsupported,
     operator,
     optional,
     whole_numbers,
 )
+from pnpdepth_cli.models.steps import Unsupported
 
 
 @operator("Upsample", "Resize", host=(1, 2, 3))

@@ -21,10 +21,10 @@ from onnx import helper, numpy_helper
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import LayerError, ModelError
+from pnpdepth_cli.models import steps
 from pnpdepth_cli.models.definition import Multiple
 from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.models.onnx import graph, limits
-from pnpdepth_cli.models.onnx.table import OPERATORS
+from pnpdepth_cli.models.onnx import OPERATORS, graph
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 from tests.models.onnx.onnx_files import write_network
@@ -423,8 +423,8 @@ def test_an_image_size_beyond_the_budget_is_refused(sides: Any, tmp_path: Path) 
 def test_activations_that_are_needed_at_a_time_are_bounded_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "_ACTIVATION_ELEMENTS", 10**5)
-    monkeypatch.setattr(limits, "_ACTIVATION_GROWTH", 0)
+    monkeypatch.setattr(steps, "_ACTIVATION_ELEMENTS", 10**5)
+    monkeypatch.setattr(steps, "_ACTIVATION_GROWTH", 0)
     tiles = [
         node
         for n in range(6)
