@@ -63,7 +63,7 @@ def read_colmap_points(
     # The image in the model, whose camera must have the photo's view.
     model = read_model(path)
     name = name_in_model(model, image)
-    camera = model.cameras[model.images[name].camera]
+    camera = model.images[name].camera
     assert camera.size is not None  # of every camera of a model
     check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
     # Its points, without far values.
@@ -73,7 +73,7 @@ def read_colmap_points(
     far, lines = far_values(points.depth, unit)
     points = points.select(~far)
     # What a person should know.
-    turn, shift = model.images[name].rotation.T, model.images[name].translation
+    turn, shift = model.images[name].pose.inverse()
     reading = Reading(
         f"COLMAP model, image {name}, {camera.source}",
         scale=_output_scale(model) if unit == MODEL_UNITS else None,
@@ -92,7 +92,7 @@ def read_colmap_points(
         points=points.resized(*size),
         calibrated=True,
         camera=replace(camera.resized(*size), source=f"COLMAP model {path}"),
-        pose=np.column_stack([turn, -turn @ shift * (unit_scale or 1.0)]),
+        pose=np.column_stack([turn, shift * (unit_scale or 1.0)]),
         unit=unit,
         reading=reading,
         record=FileRecord(
@@ -113,7 +113,7 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
     They are the points of its tracks. Without tracks they are all points that are not occluded.
     """
     image, points = model.images[name], model.points
-    camera = model.cameras[image.camera]
+    camera = image.camera
     assert camera.size is not None
     # The points of the image's tracks, else all.
     row = np.flatnonzero(np.isin(points.number, image.points))
@@ -128,7 +128,7 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
     why = f"with a reprojection error above {_MOST_REPROJECTION_PX:g} px"
     row = row[drops.keep(points.error[row] <= _MOST_REPROJECTION_PX, why)]
     # The others are projected.
-    seen = points.xyz[row] @ image.rotation.T + image.translation
+    seen = image.pose.apply(points.xyz[row])
     front = drops.keep(seen[:, 2] > 0, "behind the camera")
     if len(row) and not front.any():
         raise InputError(
@@ -163,6 +163,6 @@ def _output_scale(model: ColmapModel) -> float:
     centre = np.median(model.points.xyz, axis=0)
     extent = float(np.median(np.linalg.norm(model.points.xyz - centre, axis=1)))
     poses = model.images.values()
-    path = [np.linalg.norm(image.rotation.T @ image.translation + centre) for image in poses]
+    path = [np.linalg.norm(image.pose.inverse().translation - centre) for image in poses]
     farthest = _SIZES_IN_RANGE * max(extent, float(np.median(path)), 1e-9)
     return float(2.0 ** np.floor(np.log2(SATURATED_CODE / farthest)))

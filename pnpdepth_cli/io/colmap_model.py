@@ -10,6 +10,7 @@ import functools
 import struct
 import threading
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.extrinsics import rotation_of
 from pnpdepth_cli.io.file_bytes import (
@@ -34,11 +35,10 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapImage:
-    """A registered image: x_camera = rotation · x_model + translation, in model units."""
+    """A registered image."""
 
-    camera: int
-    rotation: Floats
-    translation: Floats
+    camera: Camera
+    pose: Extrinsics  # of the model's coordinates in the camera's, in model units
     points: Integers  # numbers of the points that are observed in it, sorted and unique
 
 
@@ -54,11 +54,10 @@ class ColmapPoints:
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapModel:
-    """A sparse model: its cameras by number, and its registered images by name."""
+    """A sparse model."""
 
     folder: Path
-    cameras: dict[int, Camera]
-    images: dict[str, ColmapImage]  # the name is a path below the image folder
+    images: dict[str, ColmapImage]  # by name, a path below the image folder
     points: ColmapPoints
 
 
@@ -88,7 +87,7 @@ MODELS = {
     "FISHEYE": _CameraModel(15, 2, _FISHEYE, 0),
 }
 """COLMAP's camera models whose lenses are in `choices.LENSES`."""
-_NAMES = {model.number: name for name, model in MODELS.items()} | {17: "EQUIRECTANGULAR"}
+_NAMES = {model.number: name for name, model in MODELS.items()}
 _LARGEST = 1e9
 
 MODEL_PARTS = ("cameras", "images", "points3D")
@@ -140,36 +139,28 @@ def read_model(path: Path) -> ColmapModel:
 @functools.lru_cache(maxsize=2)
 def _read(states: tuple[tuple[Path, int, int], ...]) -> ColmapModel:
     """The model in files of this size and time; kept for other images of a batch."""
-    # The readers, of binary files or of text.
-    camera_file, image_file, point_file = (state[0] for state in states)
-    if camera_file.suffix == ".bin":
-        read_cameras, read_images, read_points = _binary_cameras, _binary_images, _binary_points
-    else:
-        read_cameras, read_images, read_points = _text_cameras, _text_images, _text_points
+    camera_file, image_file, point_file = (path for path, _, _ in states)
+    is_binary = camera_file.suffix == ".bin"
     # The cameras.
-    cameras = {
-        number: _camera(camera_file, name, size, parameters)
-        for number, name, size, parameters in read_cameras(camera_file)
-    }
+    cameras = dict((_binary_cameras if is_binary else _text_cameras)(camera_file))
     # The images, each of a name of its own and a camera that is there.
     images: dict[str, ColmapImage] = {}
-    for name, camera, pose, points in read_images(image_file):
+    for name, camera, pose, seen in (_binary_images if is_binary else _text_images)(image_file):
         if name in images:
-            raise FileFormatError(
-                f"{image_file}: the image {name!r} is in it twice; create it again"
-            )
+            raise _damaged(image_file, f"has two images {name!r}")
         if camera not in cameras:
-            raise FileFormatError(
-                f"{image_file}: an image has camera {camera}, which {camera_file.name} lacks;"
-                " create the model again"
-            )
-        images[name] = _image(image_file, name, camera, pose, points)
-    return ColmapModel(
-        folder=camera_file.parent,
-        cameras=cameras,
-        images=images,
-        points=_points(point_file, *read_points(point_file)),
+            raise _damaged(image_file, f"has an image of camera {camera}, which is not described")
+        points = np.unique(seen[seen != -1])
+        images[name] = ColmapImage(camera=cameras[camera], pose=pose, points=points)
+    # The points.
+    number, rows, track = (_binary_points if is_binary else _text_points)(point_file)
+    if not np.isfinite(rows).all():
+        raise _damaged(point_file, "has points without finite coordinates")
+    order = np.argsort(number, kind="stable")
+    sorted_points = ColmapPoints(
+        number=number[order], xyz=rows[order, :3], error=rows[order, 3], track=track[order]
     )
+    return ColmapModel(folder=camera_file.parent, images=images, points=sorted_points)
 
 
 def name_in_model(model: ColmapModel, image: Path) -> str:
@@ -202,32 +193,27 @@ def _listing(names: Iterable[str]) -> str:
     return ", ".join(first[:3]) + (", …" if len(first) > 3 else "")
 
 
-def _parameter_count(path: Path, name: str) -> int:
-    """The parameters of a camera model. Raises FileFormatError if it is unknown."""
-    if name == "EQUIRECTANGULAR":
-        raise FileFormatError(
-            f"{path}: a camera of model EQUIRECTANGULAR has no z axis; render perspective views of"
-            " its panoramas"
-        )
+def _damaged(path: Path, fact: str) -> FileFormatError:
+    return damaged(path, "COLMAP model", fact)
+
+
+def _camera_model(path: Path, name: str) -> _CameraModel:
     if name not in MODELS:
         raise FileFormatError(
             f"{path}: camera model {one_line(name)[:40]!r} is not one of {', '.join(MODELS)};"
             " `colmap image_undistorter` writes images and a model of pinhole cameras"
         )
-    return MODELS[name].parameters
+    return MODELS[name]
 
 
 def _camera(path: Path, name: str, size: tuple[int, int], parameters: Sequence[float]) -> Camera:
-    """The camera of a model `name` with its parameters in COLMAP's order."""
+    """The camera of a model with its parameters in COLMAP's order."""
     model = MODELS[name]
     check_pixel_count(path, size[1], size[0])
     fx, fy = parameters[0], parameters[model.focals - 1]
     cx, cy = parameters[model.focals : model.focals + 2]
     if not (np.abs(parameters) < _LARGEST).all() or min(fx, fy) <= 0:
-        raise FileFormatError(
-            f"{path}: a {name} camera with parameters {one_line(list(parameters))[:80]} cannot"
-            " exist; create the model again"
-        )
+        raise _damaged(path, f"has a {name} camera with parameters {list(parameters)}")
     distortion = tuple(parameters[model.focals + 2 :])
     if model.lens == _RADIAL and distortion:
         distortion = (*distortion, *[0.0] * (4 - len(distortion)))
@@ -241,37 +227,12 @@ def _camera(path: Path, name: str, size: tuple[int, int], parameters: Sequence[f
     )
 
 
-def _image(
-    path: Path, name: str, camera: int, pose: Sequence[float], points: Integers
-) -> ColmapImage:
-    """The image of a pose qw qx qy qz tx ty tz, with the points at its keypoints, -1 for none."""
-    values = np.array(pose, np.float64)
-    length = float(np.linalg.norm(values[:4]))
-    if not np.isfinite(values).all() or not 1e-6 < length < 1e6:
-        raise FileFormatError(
-            f"{path}: the pose of {one_line(name)!r} is not made of finite numbers; create the"
-            " model again"
-        )
-    return ColmapImage(
-        camera=camera,
-        rotation=rotation_of(values[:4]),
-        translation=values[4:],
-        points=np.unique(points[points != -1]),
-    )
-
-
-def _points(path: Path, number: Integers, rows: Floats, track: Integers) -> ColmapPoints:
-    """The points of rows (N, 4) of x y z and reprojection error."""
-    bad = ~np.isfinite(rows).all(axis=1)
-    if bad.any():
-        raise FileFormatError(
-            f"{path}: {int(bad.sum()):,} of {len(rows):,} points have no finite coordinates;"
-            " create the model again"
-        )
-    order = np.argsort(number, kind="stable")
-    return ColmapPoints(
-        number=number[order], xyz=rows[order, :3], error=rows[order, 3], track=track[order]
-    )
+def _pose(path: Path, name: str, numbers: Sequence[float]) -> Extrinsics:
+    """The pose of qw qx qy qz tx ty tz."""
+    values = np.array(numbers, np.float64)
+    if not np.isfinite(values).all() or not 1e-6 < np.linalg.norm(values[:4]) < 1e6:
+        raise _damaged(path, f"has no pose of finite numbers for {name!r}")
+    return Extrinsics(rotation_of(values[:4]), values[4:])
 
 
 class _Reader:
@@ -284,7 +245,7 @@ class _Reader:
         """Moves on by so many bytes, and returns where they begin."""
         begin = self.position
         if size > len(self.data) - begin:
-            raise damaged(self.path, "COLMAP model", f"is cut short at byte {begin:,}")
+            raise _damaged(self.path, f"is cut short at byte {begin:,}")
         self.position += size
         return begin
 
@@ -296,26 +257,23 @@ class _Reader:
         """Returns the number of records that follow, each of at least so many bytes."""
         (count,) = self.unpack(_COUNT)
         if count * smallest > len(self.data) - self.position:
-            fact = f"claims {count:,} records in {len(self.data):,} bytes; it is cut short or wrong"
-            raise damaged(self.path, "COLMAP model", fact)
+            raise _damaged(self.path, f"claims {count:,} records in {len(self.data):,} bytes")
         return int(count)
 
 
-Described = tuple[int, str, tuple[int, int], Sequence[float]]
-"""Number, model, (H, W) and parameters of a camera."""
-Registered = tuple[str, int, Sequence[float], Integers]
-"""Name, camera, pose and points of an image."""
+Registered = tuple[str, int, Extrinsics, Integers]
+"""Name, number of the camera, pose and points of an image; -1 is no point."""
 Table = tuple[Integers, Floats, Integers]
 """Numbers (N,), rows (N, 4) of x y z and error, and lengths of the tracks (N,) of points."""
 
 
-def _binary_cameras(path: Path) -> Iterator[Described]:
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     reader = _Reader(path)
     for _ in range(reader.count(_CAMERA.size)):
         number, model, width, height = reader.unpack(_CAMERA)
         name = _NAMES.get(model, f"number {model}")
-        parameters = reader.unpack(struct.Struct(f"<{_parameter_count(path, name)}d"))
-        yield number, name, (height, width), parameters
+        parameters = reader.unpack(struct.Struct(f"<{_camera_model(path, name).parameters}d"))
+        yield number, _camera(path, name, (height, width), parameters)
 
 
 def _binary_images(path: Path) -> Iterator[Registered]:
@@ -328,7 +286,7 @@ def _binary_images(path: Path) -> Iterator[Registered]:
         observations = reader.count(_OBSERVATION.itemsize)
         begin = reader.take(observations * _OBSERVATION.itemsize)
         seen = np.frombuffer(reader.data, _OBSERVATION, observations, begin)["point"]
-        yield name, camera, pose, seen
+        yield name, camera, _pose(path, name, pose), seen
 
 
 def _binary_points(path: Path) -> Table:
@@ -344,23 +302,14 @@ def _binary_points(path: Path) -> Table:
     return number, rows, track
 
 
-def _text_cameras(path: Path) -> Iterator[Described]:
+def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for line, text in _lines(path):
-        words = text.split()
-        if len(words) < 4:
-            raise _invalid(path, line, text, "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS")
-        needed = _parameter_count(path, words[1])
-        if len(words) != 4 + needed:
-            raise FileFormatError(
-                f"{path}, line {line}: a {words[1]} camera has {needed} parameters, not"
-                f" {len(words) - 4}; create the model again"
-            )
-        try:
-            number, width, height = (int(words[i]) for i in (0, 2, 3))
-            parameters = [float(word) for word in words[4:]]
-        except ValueError as error:
-            raise _invalid(path, line, text, "numbers of a camera") from error
-        yield number, words[1], (height, width), parameters
+        with _naming(path, line):
+            number, name, width, height, *parameters = text.split()
+            if len(parameters) != (needed := _camera_model(path, name).parameters):
+                raise ValueError(f"a {name} camera has {needed} parameters")
+            size = int(height), int(width)
+            yield int(number), _camera(path, name, size, [float(word) for word in parameters])
 
 
 def _text_images(path: Path) -> Iterator[Registered]:
@@ -369,51 +318,43 @@ def _text_images(path: Path) -> Iterator[Registered]:
     for line, text in lines:
         if not text.strip():
             continue
-        words = text.split(maxsplit=9)
-        following = next(lines, None)
-        if following is None and len(words) == 10:
-            raise FileFormatError(
-                f"{path}, line {line}: the line of keypoints after it is missing; the file is cut"
-                " short"
-            )
-        try:
-            pose, camera, name = [float(w) for w in words[1:8]], int(words[8]), words[9].strip()
-            keypoints = following[1].split() if following else []
-            if len(keypoints) % 3:
-                raise ValueError("not triples")
+        with _naming(path, line):
+            _, *pose, camera, name = text.split(maxsplit=9)
+            keypoints = next(lines)[1].split()
+            if len(pose) != 7 or len(keypoints) % 3:
+                raise ValueError("a pose has 7 numbers, and each keypoint 3")
             seen = np.array([int(word) for word in keypoints[2::3]], np.int64)
-        except (ValueError, IndexError, OverflowError) as error:
-            wanted = "an image and its keypoints (or the file is cut short)"
-            raise _invalid(path, line, text, wanted) from error
-        yield name, camera, pose, seen
+            name = name.strip()
+            yield name, int(camera), _pose(path, name, [float(word) for word in pose]), seen
 
 
 def _text_points(path: Path) -> Table:
     numbers, rows, tracks = [], [], []
     for line, text in _lines(path):
         words = text.split()
-        try:
+        with _naming(path, line):
+            if len(words) < 8 or len(words) % 2:
+                raise ValueError("a point has 8 numbers, and each observation 2")
             numbers.append(np.int64(words[0]))
             rows.append([float(words[i]) for i in (1, 2, 3, 7)])
-            if len(words) % 2:
-                raise ValueError("not pairs")
-        except (ValueError, IndexError, OverflowError) as error:
-            wanted = "a point and its track (or the file is cut short)"
-            raise _invalid(path, line, text, wanted) from error
-        tracks.append((len(words) - 8) // 2)
+        tracks.append(len(words) // 2 - 4)
     table = np.array(rows, np.float64).reshape(-1, 4)
     return np.array(numbers, np.int64), table, np.array(tracks, np.int64)
 
 
 def _lines(path: Path, *, with_empty: bool = False) -> Iterator[tuple[int, str]]:
     """Lines with their numbers, without comments."""
-    lines = read_bytes(path).decode("utf-8", "replace").split("\n")
-    if lines[-1] == "":
-        lines.pop()
+    lines = read_bytes(path).decode("utf-8", "replace").removesuffix("\n").split("\n")
     for number, line in enumerate(lines, start=1):
         if not line.startswith("#") and (with_empty or line.strip()):
             yield number, line
 
 
-def _invalid(path: Path, line: int, text: str, wanted: str) -> FileFormatError:
-    return FileFormatError(f"{path}, line {line}: {one_line(text)[:60]!r} is not {wanted}")
+@contextmanager
+def _naming(path: Path, line: int) -> Iterator[None]:
+    """Names the line in an error of the numbers in it."""
+    try:
+        yield
+    except (ValueError, OverflowError, StopIteration) as error:
+        fact = one_line(error) or "the file is cut short"
+        raise _damaged(path, f"has a wrong line {line} ({fact})") from error

@@ -207,7 +207,7 @@ def test_a_pose_with_one_number_that_is_none_is_refused(project: Path, position:
     pose = ["1", "0", "0", "0", "0.0", "0", "0"]
     damaged = " ".join([*pose[:position], "nan", *pose[position + 1 :]])
     change(project, "images.txt", f"1 {' '.join(pose)} 1 a.png", f"1 {damaged} 1 a.png")
-    with pytest.raises(FileFormatError, match=r"the pose of 'a\.png' is not made of finite"):
+    with pytest.raises(FileFormatError, match=r"a\.png"):
         read(project)
 
 

@@ -19,7 +19,7 @@ PARTS = ("cameras", "images", "points3D")
 def test_a_binary_model_is_read_as_written(tmp_path: Path) -> None:
     write_binary_model(tmp_path)
     model = read_model(tmp_path)
-    camera = model.cameras[1]
+    camera = model.images["dir/1.png"].camera
     assert (camera.source, camera.size, camera.lens) == (
         "SIMPLE_RADIAL camera",
         (48, 64),
@@ -28,7 +28,7 @@ def test_a_binary_model_is_read_as_written(tmp_path: Path) -> None:
     assert camera.intrinsics.tolist() == [[50, 0, 31.5], [0, 50, 23.5], [0, 0, 1]]
     assert camera.distortion == (0.1, 0, 0, 0)
     assert list(model.images) == ["dir/1.png", "dir/2.png"]
-    assert model.images["dir/2.png"].translation.tolist() == [0.2, 0, 0]
+    assert model.images["dir/2.png"].pose.translation.tolist() == [0.2, 0, 0]
     assert model.images["dir/2.png"].points.tolist() == [7]
     points = model.points
     assert points.xyz.tolist() == [[0.5, -0.25, 4.0]]
@@ -80,7 +80,7 @@ def test_the_camera_models_have_the_numbers_of_pycolmap() -> None:
 def test_points_project_as_in_pycolmap_for_every_camera_model(name: str, tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     write_text_model(tmp_path, camera=name)
-    ours = read_model(tmp_path).cameras[1]
+    ours = read_model(tmp_path).images["a.png"].camera
     theirs = pycolmap.Reconstruction(str(tmp_path)).cameras[1]
     assert theirs.model.name == name
     rng = np.random.default_rng(0)
@@ -112,7 +112,7 @@ def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:
     )
     assert model.points.track.tolist() == [2, 0]
     assert model.images["b.png"].points.tolist() == [1, 2, 3]
-    assert model.images["b.png"].translation.tolist() == [0.1, 0, 0]
+    assert model.images["b.png"].pose.translation.tolist() == [0.1, 0, 0]
 
 
 IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"

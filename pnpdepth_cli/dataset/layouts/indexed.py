@@ -153,12 +153,12 @@ def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
             why = f"is another model, of {len(other.images):,} images, in a unit of its own"
             yield Unmatched(path=other.folder, why=why, spare=True)
     for name, image in sorted(model.images.items()):
-        path, turn = photos / name, image.rotation.T  # the pose is the inverse of COLMAP's
+        path = photos / name
         if not path.is_file():
             why = f"is missing, but registered in {model.folder}; add it"
             yield Unmatched(path=path, why=why)
             continue
-        pose = as_pose(np.column_stack([turn, -turn @ image.translation]))
+        pose = as_pose(np.column_stack(image.pose.inverse()))  # COLMAP's is of the world
         stem = Path(name).with_suffix("").as_posix()
         yield FrameFiles(name=stem, image=path, sparse=model.folder, pose=pose)
 
