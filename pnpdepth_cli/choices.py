@@ -161,7 +161,7 @@ NETWORKS = OpenList(
 """The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
 
 FORMATS = OpenList(
-    "pnpdepth_cli.io.formats",
+    "pnpdepth_cli.io.depth",
     group="formats",
     noun="depth format",
     names=("png", "exr", "npy", "npz", "pfm", "tiff"),

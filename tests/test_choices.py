@@ -15,7 +15,7 @@ from pnpdepth_cli.core import losses, update_rules
 from pnpdepth_cli.core.update_rules import SCHEDULES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.models.precision import dtype_of
 from pnpdepth_cli.sensors import LIDARS, PATTERNS
 

@@ -13,8 +13,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import ImageSource, file_of, find_files, source_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Pose
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
-from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.points import METRES
 

@@ -26,8 +26,7 @@ from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.rgb import read_rgb, sizes_of
-from pnpdepth_cli.io.video import read_video_frame
+from pnpdepth_cli.io.rgb import read_rgb, read_video_frame, sizes_of
 
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""

@@ -116,7 +116,7 @@ def camera_of_fov(fov_deg: float, size: tuple[int, int]) -> Camera:
 def camera_of_exif(image: Path, size: tuple[int, int]) -> Camera | None:
     """Returns the camera of an image's EXIF, without distortion; None if EXIF does not give it."""
     focal = read_focal_length(image, size)
-    return None if focal is None else _pinhole(focal.pixels, size, focal.source)
+    return None if focal is None else _pinhole(focal[0], size, focal[1])
 
 
 def describe_pinhole(camera: Camera) -> str:

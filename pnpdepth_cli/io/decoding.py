@@ -21,14 +21,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, one_line
+from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 
 if TYPE_CHECKING:
     import PIL.Image
 
 _BYTES_OF_TYPE = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 _POINTERS = (34665, 34853, 40965)  # to further tags: Exif, GPS and interoperability
-_EXIF_ORIENTATION = 0x0112
 IMAGE_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, LookupError, ArithmeticError),
     *(RuntimeError, struct.error, zlib.error),  # RuntimeError: libheif
@@ -104,12 +103,9 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
                 )  # fmt: skip
                 yield image
     except IMAGE_ERRORS as error:
-        kinds = {"truncated": "is cut short", "checksum": "has a wrong checksum"}
-        text = one_line(error) or type(error).__name__
-        fact = next((f for word, f in kinds.items() if word in text.lower()), "cannot be decoded")
         # Pillow names the in-memory buffer, which means nothing to a reader
-        reason = "unknown content" if "BytesIO" in text else text
-        raise damaged(path, kind, f"{fact} ({reason})") from error
+        reason = "unknown content" if "BytesIO" in str(error) else error
+        raise damaged(path, kind, f"cannot be decoded ({reason})") from error
 
 
 def raw_mode(image: PIL.Image.Image) -> str:
@@ -121,9 +117,11 @@ def raw_mode(image: PIL.Image.Image) -> str:
 
 def orientation_of(image: PIL.Image.Image) -> int:
     """Returns the EXIF orientation 1..8, or another number that means nothing."""
+    from PIL.ExifTags import Base
+
     try:
         check_exif(image)
-        return int(image.getexif().get(_EXIF_ORIENTATION, 1))
+        return int(image.getexif().get(Base.Orientation, 1))
     except IMAGE_ERRORS:  # unreadable EXIF in a valid image says nothing of its rotation
         return 1
 

@@ -15,19 +15,34 @@ from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeEr
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import check_pixel_count, read_bytes
 from pnpdepth_cli.io.formats import (
-    DEPTH_SUFFIXES,
     KITTI_SCALE,
     LARGEST_CODE,
     SATURATED_CODE,
     SCALE_KEY,
     DepthFile,
+    DepthFormat,
     Reading,
+    array_files,
     check_scale,
     eight_bits,
     format_of_content,
     format_of_suffix,
+    images,
     kind_of,
 )
+
+TABLE: dict[str, DepthFormat] = {
+    "png": images.PNG,
+    "exr": images.EXR,
+    "npy": array_files.NPY,
+    "npz": array_files.NPZ,
+    "pfm": array_files.PFM,
+    "tiff": images.TIFF,
+}
+"""The formats of this package by their names in `choices.FORMATS`."""
+
+DEPTH_SUFFIXES: tuple[str, ...] = tuple(s for kind in FORMATS.values() for s in kind.suffixes)
+"""The suffixes that depth can be written to; PNG holds integer codes, the others float32 metres."""
 
 _FARTHEST_INDOORS_M = 40.0
 """Below it, a map read by KITTI's scale may be a room in millimetres: 40 m are 10.2 m then."""

@@ -27,8 +27,7 @@ from pnpdepth_cli.io.atomic import (
     make_folder,
     remove_leftovers,
 )
-from pnpdepth_cli.io.colours import LOGARITHMIC_FROM, DepthScale, Pixels, hex_colours
-from pnpdepth_cli.io.figure import resized
+from pnpdepth_cli.io.figure import LOGARITHMIC_FROM, DepthScale, Pixels, hex_colours, resized
 from pnpdepth_cli.io.json_file import plain, read_json, write_json
 from pnpdepth_cli.measures import Measure
 

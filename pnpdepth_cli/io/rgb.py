@@ -1,10 +1,11 @@
-"""RGB images from PNG, JPEG, TIFF, WebP, HEIC and EXR files, and the focal length in their EXIF."""
+"""RGB images of PNG, JPEG, TIFF, WebP, HEIC, EXR and videos, and the focal length in EXIF."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+import threading
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.decoding import (
     IMAGE_ERRORS,
     check_exif,
@@ -22,19 +23,23 @@ from pnpdepth_cli.io.decoding import (
     raw_mode,
     silence,
 )
-from pnpdepth_cli.io.file_bytes import read_bytes
+from pnpdepth_cli.io.file_bytes import (
+    check_pixel_count,
+    damaged,
+    read_bytes,
+    size_of_regular_file,
+)
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.images import read_exr_channels, read_tiff_facts
 
-_EXIF_FOLDER = 0x8769
-_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
-_RESOLUTION, _RESOLUTION_UNIT = 0xA20E, 0xA210
-_WIDTH, _HEIGHT = 0xA002, 0xA003
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _BLOCK = 1 << 20  # values that are converted at a time
 _PLAUSIBLE = (0.2, 50.0)
 """Focal length as a multiple of the image's longer side: fields of view of 136° to 1°."""
+_FRAMES_IN_MEMORY = 8
+"""Frames of a video that are kept, as threads ask for them slightly out of order."""
+_VIDEO_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,10 +75,8 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     if kind == "TIFF":
         facts = read_tiff_facts(path, data)
         if facts.number != "uint" or facts.bits > 16:
-            raise FileFormatError(
-                f"{path} is a {facts.bits}-bit {facts.number} TIFF; save the image with 8 or 16"
-                " bits"
-            )
+            kind = f"{facts.bits}-bit {facts.number} TIFF"
+            raise FileFormatError(f"{path} is a {kind}; save the image with 8 or 16 bits")
     note, white = None, 255.0
     with open_image(path, data, kind) as image:
         wide = ";16" in raw_mode(image)  # until the EXIF of a PNG is asked for, which decodes it
@@ -189,48 +192,45 @@ def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExifFocalLength:
-    """A focal length from EXIF."""
+def read_focal_length(path: Path, size: tuple[int, int]) -> tuple[float, str] | None:
+    """Returns the focal length in pixels by an image's EXIF, and what gave it, for a person.
 
-    pixels: float  # in pixels of the image
-    source: str  # what it was computed from, for a person
-
-
-def read_focal_length(path: Path, size: tuple[int, int]) -> ExifFocalLength | None:
-    """Returns the focal length in an image's EXIF; None if there is none that a camera can have.
+    None if there is none that a camera can have.
 
     The 35 mm equivalent is preferred. It is taken as one of equal diagonal field of view, which is
     how CIPA DCG-001 has it. Else the focal length and the resolution of the sensor are used
     (Exif 2.32, tags 0x920A, 0xA20E, 0xA210). The image is used at the size (H, W).
     """
+    from PIL.ExifTags import Base
+
     values = _tags(path)
-    film_mm, focal_mm, resolution = map(
-        values.get, (_FOCAL_LENGTH_35MM, _FOCAL_LENGTH, _RESOLUTION)
-    )
-    unit_mm = _UNIT_MM.get(int(values.get(_RESOLUTION_UNIT, 2)))
+    film_mm, focal_mm = values.get(Base.FocalLengthIn35mmFilm), values.get(Base.FocalLength)
+    resolution = values.get(Base.FocalPlaneXResolution)
+    unit_mm = _UNIT_MM.get(int(values.get(Base.FocalPlaneResolutionUnit, 2)))
     if film_mm:
         pixels = film_mm / _FILM_DIAGONAL_MM * math.hypot(*size)
         source = f"EXIF, equivalent to {film_mm:g} mm on film"
     elif focal_mm and resolution and unit_mm:
-        taken = max(values.get(_WIDTH, 0), values.get(_HEIGHT, 0)) or max(size)
+        sides = (values.get(side, 0) for side in (Base.ExifImageWidth, Base.ExifImageHeight))
+        taken = max(sides) or max(size)
         pixels = focal_mm * resolution / unit_mm * max(size) / taken
         source = f"EXIF, {focal_mm:g} mm and the sensor's pixels"
     else:
         return None
     if not _PLAUSIBLE[0] <= pixels / max(size) <= _PLAUSIBLE[1]:
         return None
-    return ExifFocalLength(pixels=pixels, source=source)
+    return pixels, source
 
 
 def _tags(path: Path) -> dict[int, float]:
     """The numbers among the EXIF tags; none if they cannot be read."""
     from PIL import Image
+    from PIL.ExifTags import IFD
 
     try:
         with silence(), Image.open(path) as image:
             check_exif(image)
-            folder: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_FOLDER)
+            folder = image.getexif().get_ifd(IFD.Exif)
     except IMAGE_ERRORS:  # damaged EXIF gives no focal length
         return {}
     numbers = {}
@@ -242,3 +242,61 @@ def _tags(path: Path) -> dict[int, float]:
         if math.isfinite(number) and number > 0:
             numbers[tag] = number
     return numbers
+
+
+def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
+    """Returns frame `index` from 0, (H, W, 3) float32 in 0..1, as it is stored: not turned.
+
+    Raises:
+        InputError: There is no such file, or the video is shorter.
+        FileFormatError: It is no MP4 or MOV file, cannot be decoded, or exceeds the budget.
+    """
+    size_of_regular_file(path)
+    with _VIDEO_LOCK, silence():
+        bgr = _open_video(path, path.stat().st_mtime_ns).frame(index)
+    return np.divide(bgr[:, :, ::-1], np.float32(255), dtype=np.float32)
+
+
+class _Video:
+    """A video that is being decoded, and the last of its frames.
+
+    A frame is reached by decoding all before it: seeking is exact at a constant frame rate only,
+    which phones do not keep.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._begin()
+
+    def _begin(self) -> None:
+        import cv2
+
+        with self._path.open("rb") as file:
+            if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow the addresses in a playlist
+                raise FileFormatError(f"{self._path} is not an MP4 or MOV video; convert it")
+        self._capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
+        if not self._capture.isOpened():
+            raise damaged(self._path, "video", "cannot be decoded")
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        sides = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        width, height = (int(self._capture.get(side)) for side in sides)
+        check_pixel_count(self._path, width, height, channels=3)
+        self._done = 0
+        self._last = deque[NDArray[np.uint8]](maxlen=_FRAMES_IN_MEMORY)
+
+    def frame(self, index: int) -> NDArray[np.uint8]:
+        """Returns a frame (H, W, 3), blue first."""
+        if index < self._done - len(self._last):
+            self._begin()
+        while self._done <= index:
+            found, pixels = self._capture.read()
+            if not found:
+                raise InputError(f"{self._path} has {self._done:,} frames, so no frame {index:,}")
+            self._last.append(np.asarray(pixels, np.uint8))
+            self._done += 1
+        return self._last[index - self._done]
+
+
+@functools.lru_cache(maxsize=1)
+def _open_video(path: Path, mtime_ns: int) -> _Video:
+    return _Video(path)

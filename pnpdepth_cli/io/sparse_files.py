@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError, NoPointsError, SizeError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.depth import (
+    DEPTH_SUFFIXES,
     depth_from_stored,
     known_metres,
     load_stored,
     write_depth,
 )
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES, KITTI_SCALE, Reading, check_scale, kind_of
+from pnpdepth_cli.io.formats import KITTI_SCALE, Reading, check_scale, kind_of
 from pnpdepth_cli.points import SparsePoints
 
 SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import InputError, NoPointsError, SizeError
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.colours import (
+from pnpdepth_cli.io.figure import (
     DepthScale,
+    Panel,
     Pixels,
     depth_scale,
     dim,
-    grey_of,
-    paint_signed,
-)
-from pnpdepth_cli.io.figure import (
-    Panel,
     draw_discs,
+    grey_of,
     magnification,
+    paint_signed,
     resized,
     save_depth_figure,
     save_gain_figure,
@@ -62,10 +58,8 @@ def preview(
         made_by: Names of what made the depth before and the depth after.
 
     Raises:
-        SizeError: Image and depth differ in size.
         OutputError: The file cannot be written.
     """
-    _check_same_size(before, after=after, image=rgb)
     height, width = before.shape
     columns = 1 if width > _WIDE * height else 2
     factor = magnification(before.shape, columns=columns, legend=True)
@@ -177,77 +171,55 @@ def _change_panel(before: Depth, after: Depth, grey: NDArray[np.float32], factor
 def improvement(
     before: Depth,
     after: Depth,
-    gt: Depth,
+    truth: Depth,
     path: Path,
     *,
-    rgb: NDArray[np.float32] | None = None,
-) -> tuple[float, FigureRecord]:
-    """Writes a PNG of where |depth - gt| fell and rose, as figure 4(d) of the paper.
-
-    Only pixels with known ground truth count; equal errors are neither better nor worse. All are
-    (H, W) in metres; the image, (H, W, 3) in 0..1, is the ground of the map.
-
-    Returns:
-        The fraction of pixels whose error fell, and what the figure shows.
-
-    Raises:
-        InputError: No ground truth is known.
-        SizeError: The images differ in size.
-        OutputError: The file cannot be written.
-    """
-    _check_same_size(before, after=after, gt=gt, image=rgb)
-    known = np.isfinite(gt) & (gt > 0)
-    if not known.any():
-        raise InputError("the ground truth has no pixel with known depth; give another file")
-    gain = _gain(before[known], after[known], gt[known])
-    pixels, strongest = _paint(gain, known, None if rgb is None else grey_of(rgb), "gain")
-    factor = magnification(gt.shape, columns=1, legend=False)
-    panel = Panel(title="Change of error", pixels=resized(pixels, factor), remark=_GAIN)
-    unknown = "" if known.all() else "no ground truth"
-    amount = f"{strongest:.3g} m"
-    return save_gain_figure(path, panel, gain, amount=amount, noun="pixels", unknown=unknown)
-
-
-def improvement_at_points(
-    rgb_or_grey: NDArray[np.float32],
-    xy: NDArray[np.float32],
-    depth: Depth,
-    before_at: Depth,
-    after_at: Depth,
-    held_out: bool,
-    path: Path,
+    image: NDArray[np.float32] | None = None,
+    xy: NDArray[np.float32] | None = None,
+    held_out: bool = False,
     unit: str = "m",
 ) -> tuple[float, FigureRecord]:
-    """Writes a PNG of where the error at sparse points fell and rose, as discs on the grey image.
+    """Writes a PNG of where |depth - truth| fell and rose, as figure 4(d) of the paper.
 
-    The image is (H, W, 3) or (H, W) in 0..1, points are (N, 2) pixel coordinates. Depths in `unit`
-    are (N,): measured, before refinement, and after it. The PNG says whether the points were held
-    out of the refinement.
+    Equal errors are neither better nor worse. The map has a pixel for each known one of the truth,
+    or a disc for each point.
+
+    Args:
+        before: (H, W), or (N,) at the points, before refinement.
+        after: The same after refinement.
+        truth: The same as measured, some of it known.
+        path: The PNG.
+        image: (H, W, 3) or (H, W) in 0..1, the ground of the map; needed for points.
+        xy: (N, 2) pixel coordinates of the points; None for maps.
+        held_out: Whether the points were held out of the refinement, which the PNG says.
+        unit: Name of the unit of depth.
 
     Returns:
-        The fraction of points whose error fell, and what the figure shows.
+        The fraction of pixels or points whose error fell, and what the figure shows.
 
     Raises:
-        NoPointsError: There is no point.
-        SizeError: Points and depths differ in number.
         OutputError: The file cannot be written.
     """
-    if len(depth) == 0:
-        raise NoPointsError("there is no sparse point to compare at; give more points")
-    if not len(xy) == len(depth) == len(before_at) == len(after_at):
-        raise SizeError("points and depths to compare differ in number; give one depth a point")
-    gain = _gain(before_at, after_at, depth)
-    strongest = _strongest(gain)
-    grey = grey_of(rgb_or_grey)
-    factor = magnification(grey.shape, columns=1, legend=False)
-    colours = paint_signed(gain / strongest, np.full(len(gain), 0.92), "gain")
-    weakest_first = np.argsort(np.abs(gain), kind="stable")
-    discs = draw_discs(0.8 * grey, xy, colours, factor, weakest_first)
-    noun = "held-out points" if held_out else "points used"
-    remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
-    panel = Panel(title="Change of error", pixels=discs, remark=remark)
+    known = np.isfinite(truth) & (truth > 0)
+    gain = _gain(before[known], after[known], truth[known])
+    grey = None if image is None else grey_of(image)
+    if xy is None:
+        pixels, strongest = _paint(gain, known, grey, "gain")
+        pixels = resized(pixels, magnification(truth.shape, columns=1, legend=False))
+        noun, remark = "pixels", _GAIN
+    else:
+        assert grey is not None
+        strongest = _strongest(gain)
+        colours = paint_signed(gain / strongest, np.full(len(gain), 0.92), "gain")
+        weakest_first = np.argsort(np.abs(gain), kind="stable")
+        factor = magnification(grey.shape, columns=1, legend=False)
+        pixels = draw_discs(0.8 * grey, xy[known], colours, factor, weakest_first)
+        noun = "held-out points" if held_out else "points used"
+        remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
+    panel = Panel(title="Change of error", pixels=pixels, remark=remark)
+    unknown = "" if known.all() else "no ground truth"
     amount = f"{strongest:.3g} {unit}"
-    return save_gain_figure(path, panel, gain, amount=amount, noun=noun)
+    return save_gain_figure(path, panel, gain, amount=amount, noun=noun, unknown=unknown)
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:
@@ -265,10 +237,3 @@ def _strongest(gain: NDArray[np.float64]) -> float:
 
 def _bytes(image: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(255 * np.clip(np.nan_to_num(image), 0, 1)), dtype=np.uint8)
-
-
-def _check_same_size(before: Depth, **others: NDArray[Any] | None) -> None:
-    for name, other in others.items():
-        if other is not None and other.shape[:2] != before.shape:
-            sizes = " and ".join(f"{w}x{h}" for h, w in (before.shape, other.shape[:2]))
-            raise SizeError(f"depth and {name} differ in size ({sizes}); give matching files")

@@ -17,8 +17,7 @@ import pytest
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import bags as bounds
 from pnpdepth_cli.io.bags import open_bag
-from pnpdepth_cli.io.bags.messages import cloud_points, image_file
-from pnpdepth_cli.io.bags.transforms import camera_info_topic, camera_of_bag
+from pnpdepth_cli.io.bags.messages import camera_info_topic, camera_of_bag, cloud_points, image_file
 from tests.bags import write_bag
 
 pytest.importorskip("rosbags")

@@ -11,8 +11,7 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.depth import read_depth, write_depth
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
 from tests.exr_files import write_exr
 
 DEPTH = np.random.default_rng(5).uniform(0.5, 80, (40, 53)).astype(np.float32)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from pnpdepth_cli.errors import OutputError, PnpDepthError, SizeError, UsageError
-from pnpdepth_cli.io.depth import read_depth, write_depth
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
 
 FLOAT_SUFFIXES = [suffix for suffix in DEPTH_SUFFIXES if suffix != ".png"]
 images = array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12)

@@ -201,4 +201,4 @@ def test_the_focal_length_is_that_of_film_else_of_the_sensor_if_a_camera_can_hav
     tmp_path: Path, name: str, tags: dict[int, object], pixels: float | None
 ) -> None:
     focal = read_focal_length(photo(tmp_path / name, tags), (300, 400))
-    assert (focal.pixels if focal else None) == (pixels and pytest.approx(pixels))
+    assert (focal[0] if focal else None) == (pixels and pytest.approx(pixels))

@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.io.colours import UNKNOWN, DepthScale, depth_scale
-from pnpdepth_cli.io.figure import MARGIN, magnification, resized
+from pnpdepth_cli.io.figure import MARGIN, UNKNOWN, DepthScale, depth_scale, magnification, resized
 from pnpdepth_cli.io.visualisation import (
     error_map,
     improvement,
-    improvement_at_points,
     preview,
     sigma_preview,
 )
@@ -174,7 +172,7 @@ def test_points_are_coloured_discs_where_they_lie(
     xy, truth = np.array([[5, 5], [30, 20]], np.float32), np.array([2, 3], np.float32)
     before, after = (truth + np.array(error, np.float32) for error in ([1, 0], [0, 1]))
     image, path = rgb[:, :, 0] if grey else rgb, tmp_path / "i.png"
-    share, content = improvement_at_points(image, xy, truth, before, after, held_out, path)
+    share, content = improvement(before, after, truth, path, image=image, xy=xy, held_out=held_out)
     assert share == 0.5
     factor = int(magnification((30, 40), columns=1, legend=False))
     colours = panels_of(path, content)["Change of error"][

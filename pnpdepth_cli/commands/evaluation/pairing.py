@@ -13,8 +13,8 @@ from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_by_name
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
 from pnpdepth_cli.io.json_file import read_json
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.protocols import WHOLE, FramePart

@@ -8,7 +8,7 @@ from pathlib import Path
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 
 _FILE_SUFFIXES = {
     *(*IMAGE_SUFFIXES, *DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES),

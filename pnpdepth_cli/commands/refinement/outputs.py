@@ -19,13 +19,12 @@ from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.colours import depth_scale
 from pnpdepth_cli.io.depth import metres, write_depth
+from pnpdepth_cli.io.figure import depth_scale
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
 from pnpdepth_cli.io.json_file import write_json
 from pnpdepth_cli.io.visualisation import (
     improvement,
-    improvement_at_points,
     preview,
     sigma_preview,
     write_mask,
@@ -152,16 +151,19 @@ def _write_improvement(
     path: Path, image: Image | None, inputs: Frame, frame: Refined
 ) -> tuple[float, FigureRecord]:
     if inputs.gt is not None:
-        return improvement(frame.before, frame.after, inputs.gt, path, rgb=image)
+        return improvement(frame.before, frame.after, inputs.gt, path, image=image)
     points = frame.held_out if len(frame.held_out) else frame.used
-    return improvement_at_points(
-        image if image is not None else frame.before,
-        points.xy.numpy(),
+    before, after = (
+        points.sample(torch.from_numpy(depth)).numpy() for depth in (frame.before, frame.after)
+    )
+    return improvement(
+        before,
+        after,
         points.depth.numpy(),
-        points.sample(torch.from_numpy(frame.before)).numpy(),
-        points.sample(torch.from_numpy(frame.after)).numpy(),
+        path,
+        image=image if image is not None else frame.before,
+        xy=points.xy.numpy(),
         held_out=bool(len(frame.held_out)),
-        path=path,
         unit=inputs.unit,
     )
 

@@ -25,7 +25,7 @@ from pnpdepth_cli.commands.error_tables import (
 )
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import OutputError
-from pnpdepth_cli.io.colours import hex_colours, signed_bar
+from pnpdepth_cli.io.figure import hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
     IMAGES,
     Head,

@@ -18,7 +18,7 @@ from pnpdepth_cli.commands.evaluation.scoring import scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, PnpDepthError
-from pnpdepth_cli.io.colours import depth_scale, grey_of, hex_colours, signed_bar
+from pnpdepth_cli.io.figure import depth_scale, grey_of, hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
     Head,
     check_report_folder,

@@ -33,19 +33,17 @@ from pnpdepth_cli.io.bags import (
 )
 from pnpdepth_cli.io.bags.messages import (
     Stamped,
-    cloud_points,
-    depth_image,
-    image_file,
-    is_depth,
-    nearest_pairs,
-    seconds_of,
-)
-from pnpdepth_cli.io.bags.transforms import (
     camera_info_topic,
     camera_of_bag,
     camera_trajectory,
+    cloud_points,
+    depth_image,
     frame_of,
+    image_file,
+    is_depth,
+    nearest_pairs,
     poses_topics,
+    seconds_of,
     static_pose,
 )
 from pnpdepth_cli.io.calibration import Calibration

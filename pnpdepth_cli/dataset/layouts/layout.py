@@ -19,7 +19,7 @@ from pnpdepth_cli.dataset.frame_files import (
     natural_order,
     one_of_each,
 )
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 
 _SUFFIXES = {
     "IMAGE": IMAGE_SUFFIXES,

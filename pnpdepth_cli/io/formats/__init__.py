@@ -1,32 +1,75 @@
-"""The depth file formats, listed in `choices.FORMATS`.
-
-A new format is one more `DepthFormat` in `TABLE`, with its name in `choices.FORMATS`, or an entry
-point of the group `pnpdepth.formats`.
-"""
+"""What a depth file format is; those of this package are in `TABLE` of `pnpdepth_cli.io.depth`."""
 
 from __future__ import annotations
 
-from pnpdepth_cli.choices import FORMATS
-from pnpdepth_cli.io.formats import array_files, images
-from pnpdepth_cli.io.formats.depth_format import KITTI_SCALE as KITTI_SCALE
-from pnpdepth_cli.io.formats.depth_format import LARGEST_CODE as LARGEST_CODE
-from pnpdepth_cli.io.formats.depth_format import SATURATED_CODE as SATURATED_CODE
-from pnpdepth_cli.io.formats.depth_format import SCALE_KEY as SCALE_KEY
-from pnpdepth_cli.io.formats.depth_format import DepthFile as DepthFile
-from pnpdepth_cli.io.formats.depth_format import DepthFormat as DepthFormat
-from pnpdepth_cli.io.formats.depth_format import Reading as Reading
-from pnpdepth_cli.io.formats.depth_format import check_scale as check_scale
-from pnpdepth_cli.io.formats.depth_format import eight_bits as eight_bits
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
-TABLE: dict[str, DepthFormat] = {
-    "png": images.PNG,
-    "exr": images.EXR,
-    "npy": array_files.NPY,
-    "npz": array_files.NPZ,
-    "pfm": array_files.PFM,
-    "tiff": images.TIFF,
-}
-"""The formats of this package by name."""
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.choices import FORMATS
+from pnpdepth_cli.errors import FileFormatError, UsageError
+
+KITTI_SCALE = 256.0
+"""Codes per metre in the KITTI depth files, assumed for integers that do not say their own."""
+
+SCALE_KEY = "pnpdepth:scale"
+"""Key under which our own 16-bit files keep their codes per metre."""
+
+SATURATED_CODE = 65535
+"""The largest 16-bit code: what a sensor gives beyond its range, so never a measurement."""
+
+LARGEST_CODE = SATURATED_CODE - 1
+"""The largest code that is written."""
+
+
+class Reading(NamedTuple):
+    """How depth was read from a file, or made."""
+
+    source: str  # in words, such as "16-bit PNG ÷ 256"
+    scale: float | None = None  # codes per metre; None for floats
+    assumed: bool = False
+    """Whether the scale is assumed, as neither the file nor the user nor the data set states it."""
+
+    def __str__(self) -> str:
+        return self.source + ", assumed" * self.assumed
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthFile:
+    """The numbers of a depth file: as stored, from a format; float32 metres, from `read_depth`."""
+
+    values: NDArray[Any]
+    """(H, W). As stored, floats in metres or integer codes, of any shape that `is_image` allows."""
+    reading: Reading
+    """How the file was read; of stored values, the scale is the one that the file itself states."""
+    is_image: bool = True  # false for NPY and NPZ, whose arrays may also be lists of points
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(H, W), true where depth is known."""
+        return self.values > 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthFormat:
+    """One file format of depth images."""
+
+    name: str  # as messages call it, such as "PNG"
+    suffixes: tuple[str, ...]
+    """Suffixes of its files in lower case; "." and the name in `choices.FORMATS` is one of them."""
+    magic: tuple[bytes, ...]
+    """What the content begins with; files are recognised by content, never by suffix."""
+    read: Callable[[Path, bytes], DepthFile]
+    """Reader of path (for messages) and content. Raises FileFormatError."""
+    write: Callable[[Path, NDArray[Any], Mapping[str, str]], None]
+    """(H, W) float32 metres or uint16 codes, 0 where unknown, into an existing empty file, with
+    texts by key where the format has room for them."""
+    integer: bool = False  # whether files hold 16-bit integer codes, not float32 metres
 
 
 def format_of_content(data: bytes) -> DepthFormat | None:
@@ -53,5 +96,15 @@ def kind_of(data: bytes) -> str | None:
     return None if depth_format is None else depth_format.name
 
 
-DEPTH_SUFFIXES: tuple[str, ...] = tuple(s for kind in FORMATS.values() for s in kind.suffixes)
-"""The suffixes that depth can be written to; PNG holds integer codes, the others float32 metres."""
+def eight_bits(path: Path, kind: str) -> FileFormatError:
+    """Returns the error for an 8-bit image given as depth."""
+    return FileFormatError(
+        f"{path} is an 8-bit {kind}; 8 bits cannot hold depth and it is probably an image of a "
+        "depth map, give the 16-bit PNG, EXR or NPY"
+    )
+
+
+def check_scale(scale: float | None) -> None:
+    """Raises UsageError unless the scale is None or a finite number above 0."""
+    if scale is not None and not (math.isfinite(scale) and scale > 0):
+        raise UsageError(f"--depth-scale must be a finite number above 0, not {scale:g}")

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.decoding import silence
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged, one_line
-from pnpdepth_cli.io.formats.depth_format import DepthFile, DepthFormat, Reading
+from pnpdepth_cli.io.formats import DepthFile, DepthFormat, Reading
 
 _LONGEST_HEADER = 1 << 14
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -72,10 +72,7 @@ def _npy_header(
     except _HEADER_ERRORS as error:
         raise damaged(path, kind, f"cannot be read ({type(error).__name__}: {error})") from error
     if dtype.hasobject:
-        raise FileFormatError(
-            f"{path} holds pickled Python objects, which are never loaded; save numbers, with"
-            " allow_pickle=False"
-        )
+        raise FileFormatError(f"{path} holds pickled objects; save numbers with allow_pickle=False")
     if dtype.kind not in "fiu":
         raise FileFormatError(f"{path} holds {dtype} values; depth is float or integer, save it so")
     return shape, "F" if is_fortran else "C", dtype, stream.tell()
@@ -101,26 +98,20 @@ COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compressions that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
 
 
-def parse_npz(path: Path, data: bytes) -> tuple[str, NDArray[Any]]:
-    """Returns the name and content of the only array.
-
-    Raises:
-        FileFormatError: The archive is damaged, does not hold one array of numbers, or sizes in it
-            are false or too large.
-    """
+def _read_npz(path: Path, data: bytes) -> DepthFile:
+    """The only array of an archive."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             name = _only(path, list(members))
             if members[name].compress_type not in COMPRESSIONS:
-                raise FileFormatError(
-                    f"{path}: array {name} has a compression that numpy does not write;"
-                    " save it with numpy.savez_compressed"
-                )
+                raise FileFormatError(f"{path} is compressed; save it by numpy.savez_compressed")
             with archive.open(members[name]) as member:
-                return name, _array(path, name, member, len(data))
+                array = _array(path, name, member, len(data))
     except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
+    reading = Reading(f"{array.dtype} NPZ array {name}")
+    return DepthFile(values=array, reading=reading, is_image=False)
 
 
 def _array(path: Path, name: str, member: IO[bytes], file_bytes: int) -> NDArray[Any]:
@@ -145,12 +136,6 @@ def _only(path: Path, keys: list[str]) -> str:
     return keys[0]
 
 
-def _read_npz(path: Path, data: bytes) -> DepthFile:
-    name, array = parse_npz(path, data)
-    reading = Reading(f"{array.dtype} NPZ array {name}")
-    return DepthFile(values=array, reading=reading, is_image=False)
-
-
 def _write_npz(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
     with file.open("wb") as stream:
         np.savez_compressed(stream, depth=metres)  # all members have the time 1980-01-01
@@ -168,14 +153,8 @@ NPZ = DepthFormat(
 _PFM_HEADER = re.compile(rb"(Pf|PF)\s+(\d{1,9})\s+(\d{1,9})\s+([-+0-9.eE]{1,40})[ \t]*\r?\n")
 
 
-def parse_pfm(path: Path, data: bytes) -> tuple[NDArray[np.float32], float]:
-    """Returns the (H, W) values, top row first, and the header's scale factor without its sign.
-
-    The sign gives the byte order: negative is little-endian.
-
-    Raises:
-        FileFormatError: The content is damaged, in colour, or has too many pixels.
-    """
+def _read_pfm(path: Path, data: bytes) -> DepthFile:
+    """Rows are stored from the bottom; the sign of the scale factor gives the byte order."""
     match = _PFM_HEADER.match(data)
     if match is None:
         raise damaged(path, "PFM", "has no valid header")
@@ -194,12 +173,8 @@ def parse_pfm(path: Path, data: bytes) -> tuple[NDArray[np.float32], float]:
         fact = f"holds {len(body):,} bytes where {width}x{height} needs {4 * width * height:,}"
         raise damaged(path, "PFM", fact)
     values = np.frombuffer(body, "<f4" if factor < 0 else ">f4").reshape(height, width)
-    return np.ascontiguousarray(values[::-1], dtype=np.float32), abs(factor)
-
-
-def _read_pfm(path: Path, data: bytes) -> DepthFile:
-    values, factor = parse_pfm(path, data)
-    unused = "" if factor == 1 else f", scale factor {factor:g} of its header not applied"
+    unused = "" if abs(factor) == 1 else f", scale factor {abs(factor):g} of its header not applied"
+    values = np.ascontiguousarray(values[::-1], dtype=np.float32)
     return DepthFile(values=values, reading=Reading(f"PFM{unused}"))
 
 

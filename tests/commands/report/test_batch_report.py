@@ -16,8 +16,8 @@ from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.report import batch_report as report_batch
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, StorageError
-from pnpdepth_cli.io.colours import paint_signed
 from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.figure import paint_signed
 from pnpdepth_cli.io.report import link_image
 from tests.commands.batches import NAMES, batch, done, pairs_on_disk, refinement
 from tests.commands.report_pages import everything, frames_of, images_of, page_data

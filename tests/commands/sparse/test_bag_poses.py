@@ -15,7 +15,7 @@ from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.sparse import bag_frames
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.bags import open_bag
-from pnpdepth_cli.io.bags.transforms import camera_trajectory
+from pnpdepth_cli.io.bags.messages import camera_trajectory
 from pnpdepth_cli.io.json_file import read_json
 from pnpdepth_cli.io.poses import read_poses
 from tests.bags import write_bag

@@ -27,8 +27,7 @@ from pnpdepth_cli.errors import (
     UsageError,
 )
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.formats import DEPTH_SUFFIXES
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.sensors import Lidar, SamplePattern, ideal_lidar
 from pnpdepth_cli.sensors.lens import unproject
