@@ -13,10 +13,10 @@ from pnpdepth_cli.commands.evaluation.load_depths import LoadedFrame, load_frame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
-from pnpdepth_cli.dataset.read_options import METRES
 from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.measures import OF_SIGMA, Formula
+from pnpdepth_cli.points import METRES
 from pnpdepth_cli.stages import AFTER, GT
 
 FILES = ("prediction", "gt", "sparse", "image")
