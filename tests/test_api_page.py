@@ -21,7 +21,9 @@ END = "<!-- end of the signatures -->\n"
 FOR_THE_PROGRAM = {
     "Scores": {"to_json"},
     "Settings": {"fixed_by", "with_preset", "given", "opened", "over", "closed"},
-    "SparsePoints": {"cropped", "joined", "select", "tensors"},
+    "SparsePoints": {
+        *("cropped", "joined", "resized", "sample", "scatter", "select", "tensors"),
+    },
     "Split": {"static_graph", "in_half"},
     "Network": {
         *("image_of", "arguments_of", "synthetic_arguments", "verify", "verified", "depth_of"),
@@ -34,8 +36,9 @@ WIDTH = 74
 
 
 def description(text: str | None) -> Iterator[str]:
-    """The first paragraph of a docstring, without the options' defaults."""
+    """The first sentence of a docstring, without the options' defaults."""
     first = " ".join((text or "").split("\n\n")[0].split()).split(" [default")[0]
+    first = re.split(r"(?<=\.) (?=[A-Z])", first)[0]
     if first:
         yield from textwrap.wrap(
             f'"""{first}"""', WIDTH, initial_indent=" " * 4, subsequent_indent=" " * 4

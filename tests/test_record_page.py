@@ -15,23 +15,25 @@ import msgspec
 from pnpdepth_cli import file_record
 from pnpdepth_cli.dataset import frame_record
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.io import fingerprint
 from tests.test_api_page import class_lines
 
+FOR_THE_PROGRAM = {"BatchState", "FigureRecord"}
+"""Types by which the program continues a batch and draws a report; the schema has them."""
 DOCS = Path(__file__).parent.parent / "docs"
 PAGE, SCHEMA = DOCS / "record.md", DOCS / "record.schema.json"
 BEGIN = "<!-- fields, written by `python -m tests.test_record_page` -->\n"
 
 
 def fields() -> str:
-    """The dataclasses of a record, the frame's first."""
+    """The dataclasses of a record that tell a user something, the frame's first."""
     found = {}
-    for module in (frame_record, file_record, fingerprint):
+    for module in (frame_record, file_record):
         tree = ast.parse(inspect.getsource(module))
         found |= {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    found = {name: node for name, node in found.items() if name not in FOR_THE_PROGRAM}
     ordered = [found.pop("FrameRecord"), *found.values()]
     blocks = ("\n".join(class_lines(node, of_record=True)) for node in ordered)
-    return "\n".join((BEGIN, *(f"```python\n{block}\n```\n" for block in blocks)))
+    return f"{BEGIN}\n```python\n" + "\n\n".join(blocks) + "\n```\n"
 
 
 def schema() -> str:
