@@ -1,26 +1,78 @@
-"""Scores one frame: its measures, and facts for warnings."""
+"""Scores one frame: reads its depths, masks what the protocol does not score, and measures.
+
+Predictions of relative networks are scaled to the ground truth of each image (`scale_prediction`).
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
-from pnpdepth_cli.commands.evaluation.load_depths import LoadedFrame, load_frame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.core.metrics import error_sums, measures_of
+from pnpdepth_cli.dataset.arrays import apply_masks, depth_of, read_image
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
-from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.dataset.plausible import plausible_map
+from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
 from pnpdepth_cli.file_record import FileRecord
+from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_depth
+from pnpdepth_cli.io.formats import Reading
+from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.measures import OF_SIGMA, Formula
-from pnpdepth_cli.points import METRES
+from pnpdepth_cli.points import METRES, in_frame
+from pnpdepth_cli.protocols import Protocol
+from pnpdepth_cli.sensors import SamplePattern, sample_points
+from pnpdepth_cli.sensors.pixels import pixel_index
 from pnpdepth_cli.stages import AFTER, GT
+
+Depth = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Size = tuple[int, ...]
+Fit = tuple[float, float]
+"""(factor, shift): depth = factor · predicted + shift, or the same in disparity (1/m)."""
 
 FILES = ("prediction", "gt", "sparse", "image")
 """The files of a frame in its record; the first two are compared."""
+# (top, bottom, left, right) as fractions of the height and the width, cut to whole pixels.
+_CROPS = {
+    "none": (0.0, 1.0, 0.0, 1.0),
+    # Garg et al. 2016 for KITTI; and what Godard et al. (monodepth, utils/evaluate_kitti.py) found
+    # by trial to reproduce Eigen et al. 2014. Nearly all later evaluations use these two.
+    "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),
+    "eigen": (0.3324324, 0.91351351, 0.0359477, 0.96405229),
+    # Eigen et al. 2014 for NYU Depth v2: rows 45 to 470, columns 41 to 600 of 480x640 pixels.
+    "nyu": (45 / 480, 471 / 480, 41 / 640, 601 / 640),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedFrame:
+    """The depths as they are scored: scaled, clipped, and filled in as the protocol says."""
+
+    depth: Depth
+    """(H, W) metres, 0 where unknown."""
+    gt: Depth
+    """(H, W) metres, 0 where unknown or not scored."""
+    readings: dict[str, Reading]
+    """How the files "prediction" and "gt" were read."""
+    given: Mask | None = None
+    """(H, W) true where the network was given a sparse point; None if that is not known."""
+    predicted: Mask
+    """(H, W) true where the file has a prediction."""
+    fit: Fit | None = None
+    sigma: Depth | None = None
+    """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
+    notes: list[str]
+    """What a person should know of the ground truth."""
 
 
 def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
@@ -33,11 +85,8 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
     """
     files, result = pair
     paths = (result and result.depth, files.gt, files.sparse, files.image)
-    inputs = {
-        name: FileRecord(path=str(path))
-        for name, path in zip(FILES, paths, strict=True)
-        if path is not None
-    }
+    named = zip(FILES, paths, strict=True)
+    inputs = {name: FileRecord(path=str(path)) for name, path in named if path is not None}
     record = FrameRecord(
         name=files.name,
         group=files.group,
@@ -48,14 +97,13 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
         frame = load_frame(pair, request)
     except PnpDepthError as error:
         return replace(record, status="failed", message=str(error))
-    read = {
-        name: replace(inputs[name], read_as=each.source, scale=each.scale, assumed=each.assumed)
-        for name, each in frame.readings.items()
-    }
+    for name, each in frame.readings.items():
+        inputs[name] = replace(
+            inputs[name], read_as=each.source, scale=each.scale, assumed=each.assumed
+        )
     scores, fault = _score(frame, pair, request)
     return replace(
         record,
-        inputs=inputs | read,
         notes=frame.notes,
         status="failed" if fault else "done",
         message=fault,
@@ -75,18 +123,15 @@ def scores_of(record: FrameRecord) -> Scores:
 
 def _score(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> tuple[Scores, str | None]:
     """The scores of a frame, and why they are counts alone or nothing."""
-    depth, gt, files = frame.depth, frame.gt, pair.files
+    depth, gt = frame.depth, frame.gt
     known, both = gt > 0, (gt > 0) & (depth > 0)
     if not known.any():
-        return {}, f"{files.gt} has no known depth where protocol {request.protocol} scores"
+        return {}, f"{pair.files.gt} has no known depth where protocol {request.protocol} scores"
     # Counts of pixels.
-    counts: Scores = {"pixels": 0, "known": int(known.sum()), "predicted": 0, "coverage": 0.0}
-    if pair.result is None or frame.predicted is None:
-        return counts, "there is no prediction"
-    predicted = int((frame.predicted & known).sum())
-    factor, shift = frame.fit or (None, None)
-    counts |= {
+    predicted, (factor, shift) = int((frame.predicted & known).sum()), frame.fit or (None, None)
+    counts: Scores = {
         "pixels": int(both.sum()),
+        "known": int(known.sum()),
         "predicted": predicted,
         "coverage": predicted / int(known.sum()),
         "given": None if frame.given is None else int((frame.given & both).sum()),
@@ -94,6 +139,8 @@ def _score(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> tuple[S
         "factor": factor,
         "shift": shift,
     }
+    if pair.result is None:
+        return counts, "there is no prediction"
     # Measures of sums over pixels, then those of whole images.
     of_sigma: Scores = {}
     if frame.sigma is not None:
@@ -110,3 +157,226 @@ def _score(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> tuple[S
     values: Scores = {measure.key: value for measure, value in of_pixels}
     values |= {m.key: m.value(depth, gt) for m in request.measures if m.key not in values}
     return values | of_sigma | counts, None
+
+
+def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
+    """Returns the frame's depths as the protocol scores them.
+
+    Raises:
+        InputError: For a file that cannot be read.
+        SizeError: Where sizes differ.
+    """
+    frame, rules = pair.files, request.rules
+    # The ground truth, in the part of the frame that the protocol keeps.
+    scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
+    assert frame.gt is not None
+    if isinstance(frame.gt, Path):
+        values, reading = _read(frame.gt, scale, request)
+    else:
+        values, reading = depth_of(frame.gt), Reading(f"{frame.gt.path.suffix} array")
+    values = apply_masks(values, frame.masks)
+    values, notes = plausible_map(values, reading, "gt", "--gt-scale", scale)
+    gt = np.ascontiguousarray(frame.part.apply(values))
+    # The pixels that are scored.
+    given = _given_points(pair, gt, required=rules.exclude_sparse)
+    scored = _scored_mask(gt, rules)
+    if given is not None and rules.exclude_sparse:
+        scored &= ~given
+    # The prediction is fitted to those.
+    loaded = LoadedFrame(
+        depth=np.zeros_like(gt),
+        gt=np.where(scored, gt, np.float32(0)),
+        readings={"gt": reading},
+        given=given,
+        predicted=np.zeros(gt.shape, bool),
+        notes=notes,
+    )
+    return loaded if pair.result is None else _with_prediction(loaded, pair, request)
+
+
+def _with_prediction(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> LoadedFrame:
+    """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
+    assert pair.result is not None
+    rules, size, result = request.rules, frame.gt.shape, pair.result
+    values, reading = _read(result.depth, request.pred_scale, request)
+    if values.shape != size:
+        if request.resize is None:
+            advice = "--resize nearest or bilinear scales predictions if both show the same view"
+            raise _different(pair, f"prediction {result.depth}", values.shape, size, f"; {advice}")
+        values = _resize(values, size, request.resize)
+    depth, fit = scale_prediction(values, frame.gt, request.prediction_kind, request.scale_by)
+    if rules.clip:
+        clipped = np.clip(depth, rules.min_depth, rules.max_depth)
+        depth = np.where(depth > 0, clipped, 0).astype(np.float32)
+    if rules.missing == "min":
+        depth = np.where(depth > 0, depth, np.float32(rules.min_depth))
+    # A standard deviation is of unscaled depth.
+    sigma = None
+    if result.sigma is not None and fit is None and request.prediction_kind == "depth":
+        with suppress(InputError):
+            sigma = read_depth(result.sigma).values
+    return replace(
+        frame,
+        depth=depth,
+        readings={"prediction": reading, **frame.readings},
+        predicted=values > 0,
+        fit=fit,
+        sigma=sigma if sigma is not None and sigma.shape == size else None,
+    )
+
+
+def _read(path: Path, scale: float | None, request: EvalRequest) -> tuple[Depth, Reading]:
+    """The depth image; codes are metres × the scale, else the file's own, else the protocol's."""
+    stored = load_stored(path)
+    assumed = scale is None and stored.reading.scale is None and stored.values.dtype.kind != "f"
+    image = depth_from_stored(path, stored, request.rules.scale if assumed else scale)
+    values = image.values
+    if request.is_devkit and image.reading.scale is not None and stored.values.ndim == 2:
+        # the development kit reads every code but 0 as a depth, the largest too
+        values = known_metres(stored.values / image.reading.scale)
+    return values, image.reading._replace(assumed=assumed)
+
+
+def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
+    """(H, W) true at the network's sparse points; None where they are not known or unusable.
+
+    Points that were drawn from the ground truth (H, W) are drawn again.
+    """
+    frame, size = pair.files, (gt.shape[0], gt.shape[1])
+    record = None if pair.result is None else pair.result.record
+    sparse = None if record is None else record.inputs.get("sparse")
+    drawn = None if sparse is None else sparse.sampled
+    try:
+        if record is not None and drawn is not None and record.size == size[::-1]:
+            pattern = SamplePattern(kind=drawn.kind, count=drawn.count, fraction=drawn.fraction)
+            image = image_of(pair, size) if drawn.kind == "features" else None
+            xy = sample_points(gt, pattern, drawn.seed, image=image).xy
+        elif frame.sparse is not None:
+            points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
+            xy = points.xy
+            if points.size != size:
+                xy = frame.part.in_crop(xy, points.size)
+                if frame.part.apply(np.zeros(points.size, bool)).shape != size:
+                    raise _different(pair, f"sparse depth {frame.sparse}", points.size, size)
+        else:
+            raise InputError(
+                f"frame {frame.name} has no sparse depth file to exclude: neither the record beside"
+                " the prediction nor the data set names one"
+            )
+    except PnpDepthError:
+        if required:
+            raise
+        return None
+    given = np.zeros(size, bool)
+    given.flat[pixel_index(xy[in_frame(xy, size)], size)] = True
+    return given
+
+
+def image_of(pair: FramePair, size: Size) -> Depth | None:
+    """Returns (H, W, 3) in 0…1, the frame's image; None unless one is known and of that size.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    if pair.files.image is None:
+        return None
+    rgb = read_image(pair.files.image)
+    if rgb.shape[:2] != size:
+        rgb = pair.files.part.apply(rgb)
+    return rgb if rgb.shape[:2] == size else None
+
+
+def _scored_mask(gt: Depth, rules: Protocol) -> Mask:
+    """(H, W) true where the protocol scores known ground truth."""
+    scored = np.zeros(gt.shape, bool)
+    scored[crop_window(rules.crop, gt.shape)] = True
+    highest = math.inf if rules.max_depth is None else rules.max_depth
+    return scored & (gt > rules.min_depth) & (gt < highest)
+
+
+def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
+    """Returns the rows and columns of a frame of `size` (H, W) pixels that lie in a crop.
+
+    Raises:
+        SizeError: If the crop does not fit the frame.
+    """
+    height, width = size
+    if crop == "nyu" and size != (480, 640):
+        raise SizeError(
+            f"crop nyu is for frames of 640×480 but this one is {width}×{height}; --protocol paper"
+            " scores any size"
+        )
+    top, bottom, left, right = _CROPS[crop]
+    rows, columns = (top * height, bottom * height), (left * width, right * width)
+    return slice(*map(int, rows)), slice(*map(int, columns))
+
+
+def _resize(depth: Depth, size: Size, method: str) -> Depth:
+    target = size[1], size[0]
+    if method == "nearest":
+        return cv2.resize(depth, target, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
+    known = (depth > 0).astype(np.float32)
+    total, weight = (cv2.resize(part, target) for part in (depth, known))  # bilinear
+    # a resized pixel is known where most of its interpolation weight is on known pixels
+    return np.where(weight > 0.5, total / np.maximum(weight, 0.5), 0).astype(np.float32)
+
+
+def _different(pair: FramePair, what: str, shape: Size, size: Size, advice: str = "") -> SizeError:
+    return SizeError(
+        f"{what} is {shape[1]}×{shape[0]} but the ground truth {pair.files.gt} is"
+        f" {size[1]}×{size[0]}{advice}"
+    )
+
+
+def scale_prediction(
+    values: Depth, gt: Depth, kind: str, scale_by: str
+) -> tuple[Depth, Fit | None]:
+    """Returns the prediction in metres, fitted to the ground truth of its image, and the fit.
+
+    The fits are
+
+    - median: ratio of the medians (Zhou et al. 2017, monodepth2),
+    - affine: least squares in depth (Ke et al. 2024, Marigold),
+    - affine-disparity: least squares in 1/m (Ranftl et al. 2020, MiDaS),
+    - log: mean of the logarithm (Eigen et al. 2014).
+
+    A fitted value that is not above 0 becomes unknown (0).
+
+    Args:
+        values: (H, W) predictions of the kind, 0 where unknown.
+        gt: (H, W) ground truth in metres, 0 where it is not scored.
+        kind: One of choices.PREDICTION_KINDS.
+        scale_by: One of choices.SCALINGS.
+
+    Raises:
+        InputError: If fewer than two pixels have both, or the prediction is constant.
+    """
+    depth = _inverse(values) if kind == "disparity" else values
+    if scale_by == "none":
+        return depth, None
+    both = (gt > 0) & (depth > 0)
+    if np.count_nonzero(both) < 2:
+        raise InputError(f"--scale-by {scale_by} needs 2 pixels with ground truth and prediction")
+    in_disparity = scale_by == "affine-disparity"
+    if in_disparity:
+        depth = values if kind == "disparity" else _inverse(depth)
+    p, g = depth[both].astype(np.float64), gt[both].astype(np.float64)
+    factor, shift = 1.0, 0.0
+    if scale_by == "median":
+        factor = float(np.median(g) / np.median(p))
+    elif scale_by == "log":
+        factor = float(np.exp((np.log(g) - np.log(p)).mean()))
+    else:
+        target, variance = 1 / g if in_disparity else g, float(p.var())
+        if not variance:
+            raise InputError("the prediction is constant, so that no scale and shift can be fitted")
+        factor = float(((p - p.mean()) * (target - target.mean())).mean()) / variance
+        shift = float(target.mean() - factor * p.mean())
+    fitted = depth * np.float64(factor) + shift
+    result = np.where((depth > 0) & (fitted > 0), fitted, 0).astype(np.float32)
+    return _inverse(result) if in_disparity else result, (factor, shift)
+
+
+def _inverse(values: Depth) -> Depth:
+    known = values > 0
+    return np.where(known, 1 / np.where(known, values, 1).astype(np.float64), 0).astype(np.float32)

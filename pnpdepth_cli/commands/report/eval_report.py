@@ -12,9 +12,8 @@ import numpy as np
 from pnpdepth_cli.commands.evaluation.eval_tables import means_table
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
 from pnpdepth_cli.commands.evaluation.kitti_devkit import fill_background
-from pnpdepth_cli.commands.evaluation.load_depths import image_of, load_frame
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.commands.evaluation.scoring import scores_of
+from pnpdepth_cli.commands.evaluation.scoring import image_of, load_frame, scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, PnpDepthError

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest, scoring_of
-from pnpdepth_cli.commands.evaluation.load_depths import crop_window
+from pnpdepth_cli.commands.evaluation.scoring import crop_window
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.protocols import PROTOCOLS, find_protocol
 

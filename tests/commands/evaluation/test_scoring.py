@@ -9,7 +9,7 @@ import pytest
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
-from pnpdepth_cli.commands.evaluation.load_depths import scale_prediction
+from pnpdepth_cli.commands.evaluation.scoring import scale_prediction
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import write_depth
 
