@@ -232,7 +232,7 @@ SENSORS = (
     *("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e"),
     *("paper-vlp-16", "paper-vlp-32c", "paper-hdl-32e", "paper-hdl-64e"),
 )
-"""LiDARs by data sheet, and as the paper has them: `pnpdepth_cli.sensors.LIDARS`."""
+"""LiDARs by data sheet, and as the paper has them: `pnpdepth_cli.sensors.lidar`."""
 
 LENSES = ("radial-tangential", "fisheye")
 """Lens distortions: `pnpdepth_cli.sensors.lens`."""

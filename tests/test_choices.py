@@ -17,7 +17,8 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.models.precision import dtype_of
-from pnpdepth_cli.sensors import LIDARS, PATTERNS
+from pnpdepth_cli.sensors.lidar import LIDARS
+from pnpdepth_cli.sensors.samplers import PATTERNS
 
 
 @pytest.fixture

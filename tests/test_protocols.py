@@ -21,7 +21,7 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS, FramePart
-from pnpdepth_cli.sensors import behind_foreground
+from pnpdepth_cli.sensors.projection import behind_foreground
 from tests.data_sets import SELECTED, eth3d, image, nyu_h5, void
 
 KITTI = (352, 1216)

@@ -23,9 +23,8 @@ from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.io.formats import SATURATED_CODE, Reading
 from pnpdepth_cli.points import METRES, MODEL_UNITS
-from pnpdepth_cli.sensors import Points
 from pnpdepth_cli.sensors.lens import pixels_of
-from pnpdepth_cli.sensors.pixels import DropCounter, describe_dropped
+from pnpdepth_cli.sensors.pixels import DropCounter, Points, describe_dropped
 from pnpdepth_cli.sensors.projection import hidden_among
 
 _SIZES_IN_RANGE = 8.0

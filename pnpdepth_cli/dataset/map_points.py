@@ -15,8 +15,8 @@ from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.sparse_files import read_sparse
-from pnpdepth_cli.sensors import behind_foreground, occluded_in_map
 from pnpdepth_cli.sensors.lens import unproject
+from pnpdepth_cli.sensors.projection import behind_foreground, occluded_in_map
 
 
 def read_map_points(

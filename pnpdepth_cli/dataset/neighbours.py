@@ -17,9 +17,10 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.fingerprint import fingerprint
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart
-from pnpdepth_cli.sensors import NeighbourScan, Points, accumulate
+from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulate
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.motion import Keypoints, MotionEstimate, keypoints_of, motion_of_images
+from pnpdepth_cli.sensors.pixels import Points
 
 _IN_MEMORY = 16
 """Number of images whose keypoints are kept."""

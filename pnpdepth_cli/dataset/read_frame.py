@@ -34,7 +34,8 @@ from pnpdepth_cli.io.depth import describe_range, read_depth
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.points import METRES, SparsePoints
-from pnpdepth_cli.sensors import Points, as_depth_image, sample_points
+from pnpdepth_cli.sensors.pixels import Points, as_depth_image
+from pnpdepth_cli.sensors.samplers import sample_points
 from pnpdepth_cli.settings import Settings
 
 _LEAK_FRACTION = 0.5  # of the ground truth's pixels equal to the sparse depth gives a warning

@@ -14,7 +14,7 @@ from pnpdepth_cli.settings import option, options_of
 
 if TYPE_CHECKING:
     from pnpdepth_cli.dataset.frame_files import FrameFiles
-    from pnpdepth_cli.sensors import SamplePattern
+    from pnpdepth_cli.sensors.samplers import SamplePattern
 
 
 @dataclass(frozen=True, kw_only=True)

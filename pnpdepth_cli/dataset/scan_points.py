@@ -27,9 +27,15 @@ from pnpdepth_cli.io.json_file import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors import Points, describe_dropped, edge_agreement, project_velodyne
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.projection import agreement_at, edge_ranks, near_jumps
+from pnpdepth_cli.sensors.pixels import Points, describe_dropped
+from pnpdepth_cli.sensors.projection import (
+    agreement_at,
+    edge_agreement,
+    edge_ranks,
+    near_jumps,
+    project_velodyne,
+)
 
 _MORE_IF_INVERTED = 3.0  # times as many points in the image with inverted extrinsics: a warning
 _NEXT_TO_NONE = 0.05  # of the points with them inverted; with fewer, extrinsics are an error

@@ -15,7 +15,7 @@ point of the frame, or of a scan nearer in time, lies within as many pixels as f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.pixels import DropCounter, Floats, Mask, Points
+from pnpdepth_cli.sensors.pixels import Floats, Mask, Points
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -94,21 +94,17 @@ def _add(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: in
     """The points known so far, joined by those of `xyz` (M, 3) that agree with measured ones."""
     from scipy.spatial import cKDTree
 
-    drops = DropCounter()
-    xyz = xyz[drops.keep(xyz[:, 2] > 0, "behind the camera")]
+    xyz = xyz[xyz[:, 2] > 0]
     xy = pixels_of(camera, xyz)
-    inside = drops.keep(in_frame(xy, known.size), "outside the image")
+    inside = in_frame(xy, known.size)
     xy, depth = xy[inside], xyz[inside, 2]
-    agrees = drops.keep(_agrees(xy, depth, surface), "moved, occluded or seen through")
+    agrees = _agrees(xy, depth, surface)
     xy, depth = xy[agrees], depth[agrees]
-    distance, _ = cKDTree(known.xy).query(xy)
-    free = drops.keep(distance >= apart, "beside a point nearer in time")
-    counts = {why: known.dropped.get(why, 0) + count for why, count in drops.dropped.items()}
-    return Points(
+    free = cKDTree(known.xy).query(xy)[0] >= apart
+    return replace(
+        known,
         xy=np.concatenate([known.xy, xy[free].astype(np.float32)]),
         depth=np.concatenate([known.depth, depth[free].astype(np.float32)]),
-        size=known.size,
-        dropped={**known.dropped, **counts},
     )
 
 

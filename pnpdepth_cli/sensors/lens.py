@@ -95,7 +95,7 @@ def distort(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
     """
     with np.errstate(all="ignore"):
         shown = _distorted(plane, lens, coefficients)
-        shown[_square(plane) > largest_radius(lens, coefficients) ** 2] = np.nan
+        shown[np.hypot(*plane.T) > largest_radius(lens, coefficients)] = np.nan
     return shown
 
 
@@ -155,10 +155,6 @@ def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats
 def _distorted(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
     """The points (N, 2) by the lens model, also beyond where it turns back."""
     return LENS_MODELS[lens].shown(plane, coefficients) if len(plane) else plane.copy()
-
-
-def _square(plane: Floats) -> Floats:
-    return np.asarray(np.einsum("ij,ij->i", plane, plane))
 
 
 class LensModel(NamedTuple):

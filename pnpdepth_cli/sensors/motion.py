@@ -18,9 +18,9 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.sensors.lens import rays_of, unproject
 from pnpdepth_cli.sensors.pixels import Floats, Mask, Points
 
-MIN_INLIERS = 30
+_MIN_INLIERS = 30
 """Matches that agree with the motion; fewer support no estimate."""
-MIN_FRACTION = 0.25
+_MIN_FRACTION = 0.25
 """Least fraction of the matches that agrees with the motion."""
 
 _KEYPOINTS = 3000
@@ -65,8 +65,8 @@ def motion_of_images(
     at, to = _matches(here, there)
     depth, known = _depth_at(points, at)
     at, to, depth = at[known], to[known], depth[known]
-    if len(at) < MIN_INLIERS:
-        return MotionEstimate(None, f"{len(at)} matches with depth, at least {MIN_INLIERS} needed")
+    if len(at) < _MIN_INLIERS:
+        return MotionEstimate(None, f"{len(at)} matches with depth, at least {_MIN_INLIERS} needed")
     focal_px = float(camera.intrinsics[0, 0])
     rays = rays_of(camera, to)
     solved, turn, shift, index = cv2.solvePnPRansac(
@@ -76,12 +76,16 @@ def motion_of_images(
     )  # fmt: skip
     inliers = np.empty(0, np.intp) if not solved or index is None else index.ravel()
     basis = f"{len(inliers)} of {len(at)} matches of the images"
-    if len(inliers) < max(MIN_INLIERS, MIN_FRACTION * len(at)):
+    if len(inliers) < max(_MIN_INLIERS, _MIN_FRACTION * len(at)):
         return MotionEstimate(None, f"{basis} agree")
     xyz = unproject(camera, at[inliers], depth[inliers])
     turn, shift = cv2.solvePnPRefineLM(xyz, rays[inliers], np.eye(3), None, turn, shift)
     motion = np.column_stack([cv2.Rodrigues(turn)[0], shift])
-    return _plausible(motion, float(np.median(points.depth)), basis)
+    length, median = float(np.linalg.norm(motion[:, 3])), float(np.median(points.depth))
+    if not length <= median:
+        basis = f"{length:.1f} m of motion at a median depth of {median:.1f} m"
+        return MotionEstimate(None, basis)
+    return MotionEstimate(motion, basis)
 
 
 def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
@@ -102,7 +106,7 @@ def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
     from scipy.spatial import QhullError, cKDTree
 
     nothing = np.zeros(len(xy)), np.zeros(len(xy), bool)
-    if len(points) < MIN_INLIERS or not len(xy):
+    if len(points) < _MIN_INLIERS or not len(xy):
         return nothing
     height, width = points.size
     spacing = np.sqrt(height * width / len(points))
@@ -115,12 +119,3 @@ def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
         return nothing
     known = smooth & (distance[:, 0] < _REACH * spacing) & np.isfinite(inverse)
     return np.divide(1, inverse, where=known, out=np.zeros(len(xy))), known
-
-
-def _plausible(motion: Floats, median: float, basis: str) -> MotionEstimate:
-    """The motion unless it is longer than the median depth."""
-    length = float(np.linalg.norm(motion[:, 3]))
-    if not length <= median:
-        basis = f"{length:.1f} m of motion at a median depth of {median:.1f} m"
-        return MotionEstimate(None, basis)
-    return MotionEstimate(motion, basis)

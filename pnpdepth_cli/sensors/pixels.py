@@ -12,9 +12,6 @@ from pnpdepth_cli.points import SparsePoints, in_frame
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FARTHEST_M = 1e9
-"""Metres; what noise moves farther is no measurement, and would overflow float32 in products."""
-
 Points = SparsePoints[NDArray[np.float32]]
 """Sparse depth in numpy arrays."""
 

@@ -12,6 +12,8 @@ along a scan line and farther apart across, and some lie between points of a nea
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +30,6 @@ from pnpdepth_cli.sensors.pixels import (
     as_depth_image,
     pixel_index,
 )
-
-Indices = NDArray[np.intp]
 
 NEARER = 0.08
 """Foreground is nearer by more than this fraction of the point's depth."""
@@ -148,53 +148,35 @@ def hidden_points(
         focal_px: Focal length in pixels.
         scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z.
     """
+    from scipy.spatial import cKDTree
+
     reach = max(1, round(np.radians(_REACH_DEG) * focal_px))
     margin = np.radians(_MARGIN_DEG) * focal_px
-    columns, rows = np.floor(xy + 0.5).astype(np.intp).T + reach
-    grid = np.full((size[0] + 2 * reach, size[1] + 2 * reach), np.inf, np.float32)
+    # Suspects are points with something nearer within reach.
+    cells = np.floor(xy + 0.5).astype(np.intp)
+    columns, rows = cells.T
+    grid = np.full(size, np.inf, np.float32)
     grid[rows, columns] = depth
-    limit = depth * (1 - NEARER)
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     nearest = cv2.erode(grid, window)[rows, columns].astype(np.float64)
+    limit = depth * (1 - NEARER)
     suspects = np.flatnonzero(nearest < limit)
+    # Pairs of a suspect and a nearer point, no farther apart than its parallax allows.
     beam = _beam_at(nearest[suspects], xy[suspects], depth[suspects], scanner) - xy[suspects]
-    farthest = margin + 0.5 * (1 + _STRETCH) * np.hypot(beam[:, 0], beam[:, 1])
-    sides = np.minimum(np.ceil(farthest), reach).astype(np.intp)
-    which, cell = _neighbours(grid, rows[suspects] * grid.shape[1] + columns[suspects], sides)
-    near = grid.ravel()[cell].astype(np.float64)
-    nearer = near < limit[suspects[which]]
-    point, near, cell = suspects[which[nearer]], near[nearer], cell[nearer]
+    farthest = margin + 0.5 * (1 + _STRETCH) * np.hypot(*beam.T)
+    sides = np.minimum(np.ceil(farthest), reach)
+    around = cKDTree(cells).query_ball_point(cells[suspects], sides, p=np.inf)
+    point = np.repeat(suspects, [len(each) for each in around])
+    other = np.fromiter(itertools.chain.from_iterable(around), np.intp, len(point))
+    near = grid[rows[other], columns[other]].astype(np.float64)
+    nearer = near < limit[point]
+    point, other, near = point[nearer], other[nearer], near[nearer]
+    # A suspect is hidden if the other is near the middle of its parallax segment.
     beam = _beam_at(near, xy[point], depth[point], scanner) - xy[point]
-    down, right = np.divmod(cell, grid.shape[1])
-    away = np.hypot(
-        right - columns[point] - 0.5 * beam[:, 0], down - rows[point] - 0.5 * beam[:, 1]
-    )
-    hides = away <= margin + _STRETCH * 0.5 * np.hypot(beam[:, 0], beam[:, 1])
+    away = np.hypot(*(cells[other] - cells[point] - 0.5 * beam).T)
     hidden = np.zeros(len(depth), bool)
-    hidden[point[hides]] = True
+    hidden[point[away <= margin + _STRETCH * 0.5 * np.hypot(*beam.T)]] = True
     return hidden
-
-
-def _neighbours(
-    grid: NDArray[np.float32], cells: Indices, sides: Indices
-) -> tuple[Indices, Indices]:
-    """Pairs of a position in `cells` and a finite cell at most `sides` (N,) rows and columns away.
-
-    The cell itself is among them.
-    """
-    known = np.isfinite(grid).ravel()
-    before = np.concatenate([[0], np.cumsum(known)])  # known cells before each, row by row
-    line_of, line = _ranges(-sides, 2 * sides + 1)
-    left = cells[line_of] + line * grid.shape[1] - sides[line_of]
-    first = before[left]
-    span, position = _ranges(first, before[left + 2 * sides[line_of] + 1] - first)
-    return line_of[span], np.flatnonzero(known)[position]
-
-
-def _ranges(first: Indices, count: Indices) -> tuple[Indices, Indices]:
-    """The values of the ranges first … first + count − 1, and the index of each one's range."""
-    which = np.repeat(np.arange(len(count)), count)
-    return which, np.arange(len(which)) + np.repeat(first - np.cumsum(count) + count, count)
 
 
 def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,14 +28,12 @@ class SamplePattern:
         count, fraction = self.count, self.fraction
         if self.kind not in PATTERNS:
             raise UsageError(f"pattern {self.kind!r} is not one of {', '.join(PATTERNS)}")
-        if count is not None and fraction is not None:
-            raise UsageError("give a number of points or a fraction of the pixels, not both")
+        if (count is None) == (fraction is None):
+            raise UsageError("give a number of points or a fraction of the pixels")
         if (count is not None and count < 1) or (fraction is not None and not 0 < fraction <= 1):
             raise UsageError("give at least one point, or a fraction above 0 and at most 100 %")
         if self.kind == "lines" and count is None:
             raise UsageError("pattern 'lines' needs the number of lines as its count")
-        if count is None and fraction is None:
-            raise UsageError(f"pattern {self.kind!r} needs a count, N or N %")
 
     def wanted(self, known: int) -> int:
         """Returns the number of points to sample from `known` pixels."""
@@ -43,8 +42,7 @@ class SamplePattern:
         return max(1, round((self.fraction or 0) * known))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Scene:
+class _Scene(NamedTuple):
     """A dense depth map that is sampled."""
 
     known: Pixels  # row-major indices of the pixels with known depth
@@ -52,7 +50,6 @@ class Scene:
     image: Image | None
     pattern: SamplePattern
     seed: int
-    rng: np.random.Generator
 
     @property
     def wanted(self) -> int:
@@ -85,12 +82,10 @@ def sample_points(
         raise SizeError(
             f"the image is {image.shape[1]}×{image.shape[0]} but the depth is {size[1]}×{size[0]}"
         )
-    rng = np.random.default_rng(seed)
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
     if not known.size:
         raise NoPointsError("the depth map has no pixel with known depth to sample from")
-    scene = Scene(known=known, size=size, image=image, pattern=pattern, seed=seed, rng=rng)
-    chosen = np.sort(PATTERNS[pattern.kind](scene))
+    chosen = np.sort(PATTERNS[pattern.kind](_Scene(known, size, image, pattern, seed)))
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, size[1])
@@ -101,21 +96,21 @@ def sample_points(
     )
 
 
-def _uniform(scene: Scene) -> Pixels:
+def _uniform(scene: _Scene) -> Pixels:
     count = scene.wanted
     if count > scene.known.size:
         raise UsageError(f"{count:,} points of {scene.known.size:,} known pixels; ask for fewer")
-    return scene.rng.choice(scene.known, count, replace=False)
+    return np.random.default_rng(scene.seed).choice(scene.known, count, replace=False)
 
 
-def _shuffle(scene: Scene) -> Pixels:
+def _shuffle(scene: _Scene) -> Pixels:
     """The first of the known pixels as numpy's legacy generator shuffles them (Marigold-DC)."""
     rows = scene.known[:, None].copy()  # rows of an array are shuffled unlike a flat one
     np.random.RandomState(scene.seed).shuffle(rows)
     return rows[: scene.wanted, 0]
 
 
-def _grid(scene: Scene) -> Pixels:
+def _grid(scene: _Scene) -> Pixels:
     """Known pixels of a square grid whose spacing gives a full map the wanted count."""
     height, width = scene.size
     if scene.pattern.fraction is not None:
@@ -130,7 +125,7 @@ def _grid(scene: Scene) -> Pixels:
     return np.intersect1d(nodes, scene.known)
 
 
-def _lines(scene: Scene) -> Pixels:
+def _lines(scene: _Scene) -> Pixels:
     """All known pixels of evenly spaced rows."""
     height, width = scene.size
     count = scene.pattern.wanted(height)
@@ -140,7 +135,7 @@ def _lines(scene: Scene) -> Pixels:
     return scene.known[np.isin(scene.known // width, rows)]
 
 
-def _features(scene: Scene) -> Pixels:
+def _features(scene: _Scene) -> Pixels:
     """The strongest ORB corners with known depth, as structure from motion has its points."""
     if scene.image is None:
         raise UsageError("pattern 'features' needs the image that the depth belongs to")

@@ -25,7 +25,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, Usag
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.from_arrays import frame_of_arrays
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors import SamplePattern
+from pnpdepth_cli.sensors.samplers import SamplePattern
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 INDOOR = STREET.parent / "indoor"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.sensors import LIDARS, Lidar, ideal_lidar
+from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, ideal_lidar
 
 
 @pytest.mark.parametrize(
@@ -48,28 +48,3 @@ def test_a_lidar_of_ones_own_has_evenly_spaced_beams_and_no_noise() -> None:
             ideal_lidar(5, top, bottom)
     with pytest.raises(UsageError):
         ideal_lidar(2, 91, 0)
-
-
-def lidar(**values: object) -> Lidar:
-    right = {"name": "x", "elevations_deg": (0.0,), "azimuth_step_deg": 1.0, "max_range": 5.0}
-    return Lidar(**(right | values))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("name", "wrong", "right"),
-    [
-        ("elevations_deg", [(), (90.1,), (np.nan,)], [(-90.0, 90.0)]),
-        ("azimuth_step_deg", [0.0, 0.0009, 360.1, np.nan], [0.001, 360.0]),
-        ("max_range", [0.0, -1.0, np.nan], [0.1]),
-        ("range_noise", [-0.1, np.inf, np.nan], [0.0]),
-        ("angle_noise_deg", [-0.1, np.inf], [0.0, 400.0]),
-    ],
-)
-def test_a_sensor_that_cannot_be_is_refused_and_one_at_the_bounds_taken(
-    name: str, wrong: list[object], right: list[object]
-) -> None:
-    for value in wrong:
-        with pytest.raises(UsageError):
-            lidar(**{name: value})
-    for value in right:
-        assert getattr(lidar(**{name: value}), name) == value

@@ -10,9 +10,9 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors import Points
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.motion import Keypoints, keypoints_of, motion_of_images
+from pnpdepth_cli.sensors.pixels import Points
 from tests.sensors.test_accumulation import CAMERA as ROOM_CAMERA
 from tests.sensors.test_accumulation import room
 

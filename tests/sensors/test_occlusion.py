@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import FORWARD_LEFT_UP, project_velodyne
 from pnpdepth_cli.sensors.lens import pixels_of
-from pnpdepth_cli.sensors.projection import edge_agreement, hidden_points
+from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP
+from pnpdepth_cli.sensors.projection import edge_agreement, hidden_points, project_velodyne
 
 K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
 CAMERA = Camera(intrinsics=K)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
-from pnpdepth_cli.sensors import PATTERNS, SamplePattern, sample_points
+from pnpdepth_cli.sensors.samplers import PATTERNS, SamplePattern, sample_points
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)
 HOLES = np.where(np.random.default_rng(8).random((60, 80)) < 0.3, 0, DEPTH).astype(np.float32)

@@ -5,7 +5,7 @@ import pytest
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import NoPointsError
-from pnpdepth_cli.sensors import LIDARS, Lidar, simulate_lidar
+from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, simulate_lidar
 
 K = np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
 CAMERA = Camera(intrinsics=K)

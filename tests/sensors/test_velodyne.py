@@ -3,8 +3,10 @@ from __future__ import annotations
 import numpy as np
 
 from pnpdepth_cli.camera import Camera, Extrinsics
-from pnpdepth_cli.sensors import FORWARD_LEFT_UP, as_depth_image, project_velodyne
 from pnpdepth_cli.sensors.lens import pixels_of
+from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP
+from pnpdepth_cli.sensors.pixels import as_depth_image
+from pnpdepth_cli.sensors.projection import project_velodyne
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 SIZE = (80, 101)

@@ -30,8 +30,8 @@ from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.measures import OF_SIGMA, Formula
 from pnpdepth_cli.points import METRES, in_frame
 from pnpdepth_cli.protocols import Protocol
-from pnpdepth_cli.sensors import SamplePattern, sample_points
 from pnpdepth_cli.sensors.pixels import pixel_index
+from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
 from pnpdepth_cli.stages import AFTER, GT
 
 Depth = NDArray[np.float32]

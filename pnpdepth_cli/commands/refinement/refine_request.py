@@ -17,7 +17,7 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.settings import Settings, option
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.sensors import SamplePattern
+    from pnpdepth_cli.sensors.samplers import SamplePattern
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +148,7 @@ class RefineRequest:
 
 def parse_sample(text: str) -> SamplePattern:
     """Returns the pattern of `500`, `5%` or `lines:16`. Raises UsageError for any other text."""
-    from pnpdepth_cli.sensors import SamplePattern
+    from pnpdepth_cli.sensors.samplers import SamplePattern
 
     kind, _, number = text.rpartition(":")
     try:

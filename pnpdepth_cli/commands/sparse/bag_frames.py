@@ -53,8 +53,8 @@ from pnpdepth_cli.io.json_file import plain, read_json, write_json
 from pnpdepth_cli.io.poses import POSES_FILE, Trajectory
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.sensors import describe_dropped
 from pnpdepth_cli.sensors.lens import unproject
+from pnpdepth_cli.sensors.pixels import describe_dropped
 
 RECORD = "frames.json"
 _FOLDERS = ("rgb", "sparse")

@@ -25,16 +25,9 @@ from pnpdepth_cli.io.json_file import plain, sha256_of, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
 from pnpdepth_cli.io.visualisation import overlay
-from pnpdepth_cli.sensors import (
-    LIDARS,
-    Lidar,
-    Points,
-    SamplePattern,
-    as_depth_image,
-    ideal_lidar,
-    sample_points,
-    simulate_lidar,
-)
+from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, ideal_lidar, simulate_lidar
+from pnpdepth_cli.sensors.pixels import Points, as_depth_image
+from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.sensors import SamplePattern
+from pnpdepth_cli.sensors.samplers import SamplePattern
 from tests.commands.batches import RecordingListener, batch, depths, done
 from tests.commands.drives import drive_on_disk, without_results
 from tests.commands.frames import frame_on_disk

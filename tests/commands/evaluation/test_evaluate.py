@@ -20,7 +20,8 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, Sampling
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.sensors import SamplePattern, as_depth_image, sample_points
+from pnpdepth_cli.sensors.pixels import as_depth_image
+from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
 
 
 def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:

@@ -27,7 +27,7 @@ from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors import SamplePattern
+from pnpdepth_cli.sensors.samplers import SamplePattern
 from tests.commands.frames import FrameOnDisk, run
 
 
