@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.batch.running import registering
 from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.frames.fixed import refine_fixed
 from pnpdepth_cli.frames.frame import Frame, Register, tensor_of
-from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.frames.method import Method, refine_fixed
 from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.depth import read_depth

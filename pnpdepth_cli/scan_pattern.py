@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 MIN_LINES = 12
 """With fewer scan lines, leaving some out is another task than filling in between them."""
@@ -39,13 +39,13 @@ class ScanPattern:
         )
 
 
-def scan_pattern(xy: NDArray[np.floating], size: tuple[int, int]) -> ScanPattern:
+def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> ScanPattern:
     """Returns the spacing along rows and columns of (N, 2) pixel coordinates in an image (H, W)."""
     import numpy as np
 
-    xy = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp)
-    x, y = np.minimum(xy, np.array(size)[::-1] - 1).T
-    return ScanPattern(points=len(xy), along_px=_median_gap(x, y), across_px=_median_gap(y, x))
+    pixels = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp)
+    x, y = np.minimum(pixels, np.array(size)[::-1] - 1).T
+    return ScanPattern(points=len(x), along_px=_median_gap(x, y), across_px=_median_gap(y, x))
 
 
 def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.intp] | None:

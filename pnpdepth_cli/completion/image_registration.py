@@ -9,7 +9,6 @@ correlation of two maps, computed for all shifts at once.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -17,7 +16,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import Delaunay
 from scipy.special import logsumexp
 
 from pnpdepth_cli.completion.residual_field import cielab
@@ -81,18 +80,11 @@ class ImageRegistration:
     def __str__(self) -> str:
         return f"{self.zoom:.3f},{self.right:.1f},{self.down:.1f}"
 
-    def inverse(self) -> ImageRegistration:
-        """Returns the registration that moves the image back."""
-        return ImageRegistration(
-            zoom=1 / self.zoom, right=-self.right / self.zoom, down=-self.down / self.zoom
-        )
-
     def apply_to(self, rgb: Image) -> Image:
         """Returns the image (H, W, 3) at the pixels of the depth camera, its border repeated."""
         height, width = rgb.shape[:2]
-        centre = np.array([(width - 1) / 2, (height - 1) / 2])
-        offset = (1 - self.zoom) * centre + (self.right, self.down)
-        matrix = np.array([[self.zoom, 0, offset[0]], [0, self.zoom, offset[1]]])
+        x, y = (1 - self.zoom) * np.array([width - 1, height - 1]) / 2 + (self.right, self.down)
+        matrix = np.array([[self.zoom, 0, x], [0, self.zoom, y]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         moved = cv2.warpAffine(
             rgb, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
@@ -104,53 +96,35 @@ class ImageRegistration:
 class Evidence:
     """What one frame tells of the registration, at the reduced size."""
 
-    edges: Image
-    """(h, w) strength of the image's edges."""
-    ends: Floats
-    """(M, 2, 2) x and y of neighbouring points, by pairs."""
-    weight: Floats
-    """(M,) change of depth between the two, as a weight."""
-    size: tuple[int, int]
-    """(H, W) of the image."""
-    points: int
-    """Number of points."""
-    jumps: int
-    """Number of pairs across a jump of depth."""
+    edges: Image  # (h, w) strength of the image's edges
+    between: Floats  # (S, 2) x and y of samples between neighbouring points
+    weight: Floats  # (S,) how much depth changes there
+    factor: float  # log likelihood per unit of correlation
+    size: tuple[int, int]  # (H, W) of the image
+    points: int  # number of points
+    jumps: int  # number of pairs of neighbouring points across a jump of depth
     short_jumps: int
     """Number of these that are short: all pairs as short have half of the length of all pairs."""
-
-    @functools.cached_property
-    def unmoved(self) -> Floats:
-        """(rows, columns) log likelihood of each shift of the image in its own zoom."""
-        return self.log_likelihood(1.0)
 
     def log_likelihood(self, zoom: float) -> Floats:
         """Returns (rows, columns), the log likelihood of each shift in pixels of the reduced image.
 
-        It is the sum over the pairs of weight × mean edge strength between their ends. Edges
-        outside the image have strength 0.
+        It is the sum over the samples of weight × edge strength. Edges outside the image have
+        strength 0.
         """
-        reach, padded, between, weights = self._drawn
+        reach = np.rint(_LARGEST_SHIFT * np.array(self.edges.shape)).astype(np.intp)
         centre = np.array(self.edges.shape[::-1]) / 2
         rows, columns = self.edges.shape + 2 * reach
-        x, y = np.floor((between - centre) * zoom + centre).astype(np.intp).T
+        # The weights at their pixels of a map that has the image in its middle.
+        x, y = np.floor((self.between - centre) * zoom + centre).astype(np.intp).T
         x, y = x + reach[1], y + reach[0]
         inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-        drawn = np.bincount((y * columns + x)[inside], weights[inside], rows * columns)
+        drawn = np.bincount((y * columns + x)[inside], self.weight[inside], rows * columns)
         template = drawn.reshape(rows, columns).astype(np.float32)
-        factor = _WEIGHT * min(1.0, _INDEPENDENT / float(np.linalg.norm(self.weight)))
-        return factor * cv2.matchTemplate(padded, template, cv2.TM_CCORR).astype(np.float64)
-
-    @functools.cached_property
-    def _drawn(self) -> tuple[NDArray[np.intp], Image, Floats, Floats]:
-        """What all zooms share: the largest shift, the edges with a border, and samples of the
-        pairs, (M · steps, 2), with their weights."""
-        reach = np.rint(_LARGEST_SHIFT * np.array(self.edges.shape)).astype(np.intp)
+        # Their correlation with the edges at all shifts.
         top, left = (int(n) for n in 2 * reach)
         padded = cv2.copyMakeBorder(self.edges, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
-        step = ((np.arange(_STEPS) + 0.5) / _STEPS)[None, :, None]
-        between = (self.ends[:, :1] * (1 - step) + self.ends[:, 1:] * step).reshape(-1, 2)
-        return reach, np.asarray(padded), between, np.repeat(self.weight / _STEPS, _STEPS)
+        return self.factor * cv2.matchTemplate(padded, template, cv2.TM_CCORR).astype(np.float64)
 
 
 def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
@@ -163,7 +137,7 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
         The evidence. None where the points tell nothing: they are too few, in a part of the image
         only, scan lines of a LiDAR, or were matched in the image, as SfM points are.
     """
-    xy, depth = points.xy.numpy().astype(np.float64), points.depth.numpy().astype(np.float64)
+    xy, depth = points.xy.double().numpy(), points.depth.double().numpy()
     # Points that cannot tell.
     if len(xy) < _MIN_POINTS or scan_pattern(xy, points.size).has_scan_lines:
         return None
@@ -187,26 +161,30 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
     at_edges = edges[y.clip(0, rows - 1), x.clip(0, columns - 1)].mean() * np.sqrt(len(at))
     if at_edges > _MOST_AT_EDGES:
         return None
-    # Pairs of neighbouring points, weighted by how much depth changes between them.
-    pairs = _pairs(at)
-    if pairs is None:
+    # Pairs of neighbouring points, and by how much log depth changes between the two.
+    pairs, length = _neighbours(at)
+    change = np.abs(np.diff(np.log(depth)[pairs], axis=1)[:, 0])
+    # By how many standard deviations it changes more than at other pairs of that length.
+    terms = np.stack([np.ones_like(length), np.log(length + 0.1)], axis=1)
+    log_change = np.log(change + _SMALLEST_CHANGE)
+    rest = log_change - terms @ np.linalg.lstsq(terms, log_change, rcond=None)[0]
+    if rest.std() < _LEAST_SPREAD:  # such as of a wall
         return None
-    weight = _depth_edges(at, np.log(depth), pairs)
-    if weight is None:
-        return None
-    # Jumps of depth, and how many of them lie between close points.
-    length = np.linalg.norm(np.diff(at[pairs], axis=1)[:, 0], axis=1)
+    weight = (rest / rest.std()).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
+    weight -= weight.mean()
+    # Samples of each pair; jumps of depth, and how many of them lie between close points.
+    step = ((np.arange(_STEPS) + 0.5) / _STEPS)[None, :, None]
     ordered = np.sort(length)
     half = ordered[np.searchsorted(ordered.cumsum(), ordered.sum() / 2)]
-    jump = np.abs(np.diff(np.log(depth[pairs]), axis=1)[:, 0]) > _JUMP
     return Evidence(
         edges=edges,
-        ends=at[pairs],
-        weight=weight,
+        between=(at[pairs][:, :1] * (1 - step) + at[pairs][:, 1:] * step).reshape(-1, 2),
+        weight=np.repeat(weight / _STEPS, _STEPS),
+        factor=_WEIGHT * min(1.0, _INDEPENDENT / float(np.linalg.norm(weight))),
         size=points.size,
         points=len(xy),
-        jumps=int(jump.sum()),
-        short_jumps=int((jump & (length < half)).sum()),
+        jumps=int((change > _JUMP).sum()),
+        short_jumps=int(((change > _JUMP) & (length < half)).sum()),
     )
 
 
@@ -221,31 +199,30 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
             size.
     """
     known = [frame for frame in frames if frame is not None]
-    if not known:
-        return None
-    size = known[0].size
-    usable = [frame for frame in known if frame.size == size]
+    usable = [frame for frame in known if frame.size == known[0].size]
     # Beside jumps of depth there must be points.
-    if sum(e.short_jumps for e in usable) < _LEAST_SHORT * sum(e.jumps for e in usable):
+    if not usable or (
+        sum(e.short_jumps for e in usable) < _LEAST_SHORT * sum(e.jumps for e in usable)
+    ):
         return None
     # An image that belongs to its points as it is stays.
-    middle = tuple(count // 2 for count in usable[0].unmoved.shape)
-    if _bayes_factor(usable, [frame.unmoved for frame in usable], middle) > REGISTERED:
+    unmoved = [frame.log_likelihood(1.0) for frame in usable]
+    middle = tuple(count // 2 for count in unmoved[0].shape)
+    if _bayes_factor(usable, unmoved, middle) > REGISTERED:
         return None
     # The posterior over zoom, down and right: likelihood of all frames, and prior.
-    total = np.stack(
-        [np.sum([frame.log_likelihood(zoom) for frame in usable], axis=0) for zoom in _ZOOMS]
-    )
-    down, right = (_shifts(count, size) for count in total.shape[1:])
+    total = np.stack([np.sum([e.log_likelihood(zoom) for e in usable], axis=0) for zoom in _ZOOMS])
+    height, width = usable[0].size
+    scale = min(1.0, _LONGEST_PX / max(height, width))
+    down, right = ((np.arange(count) - count // 2) / scale for count in total.shape[1:])
     prior = (
         (np.abs(np.log(_ZOOMS)) / _ZOOM_SCALE)[:, None, None]
-        + ((down / size[0] / _SHIFT_SIGMA) ** 2 / 2)[None, :, None]
-        + ((right / size[1] / _SHIFT_SIGMA) ** 2 / 2)[None, None, :]
+        + ((down / height / _SHIFT_SIGMA) ** 2 / 2)[None, :, None]
+        + ((right / width / _SHIFT_SIGMA) ** 2 / 2)[None, None, :]
     )
     logits = total - prior - logsumexp(-prior)
     # It must be far better than no registration.
-    unmoved = sum(float(frame.unmoved[middle]) for frame in usable)
-    if logsumexp(logits) - unmoved < FOUND:
+    if logsumexp(logits) - sum(float(each[middle]) for each in unmoved) < FOUND:
         return None
     # The best registration must be better than chance.
     number, *place = np.unravel_index(logits.argmax(), logits.shape)
@@ -262,7 +239,7 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
 
 
 def _bayes_factor(
-    frames: Sequence[Evidence], maps: Sequence[Floats], place: tuple[np.intp, ...]
+    frames: Sequence[Evidence], maps: Sequence[Floats], place: tuple[int | np.intp, ...]
 ) -> float:
     """Log of the Bayes factor of images that belong to their points at one shift over chance.
 
@@ -274,11 +251,6 @@ def _bayes_factor(
     points = np.array([frame.points for frame in frames])
     expected = _EVIDENCE * np.log(np.maximum(points / _NO_EVIDENCE, 1.0))
     return float(np.sum(expected * (standing - expected / 2)))
-
-
-def _shifts(count: int, size: tuple[int, int]) -> Floats:
-    """Shifts in pixels of the image, `count` of them around 0."""
-    return (np.arange(count) - count // 2) / min(1.0, _LONGEST_PX / max(size))
 
 
 def _edges(rgb: Image) -> Image:
@@ -297,29 +269,11 @@ def _edges(rgb: Image) -> Image:
     return np.asarray(edges / (edges.std() + 1e-9), np.float32)
 
 
-def _pairs(at: Floats) -> NDArray[np.intp] | None:
-    """(M, 2) neighbouring points: the edges of the triangulation without the longest."""
-    try:
-        triangles = Delaunay(at, qhull_options="QJ").simplices
-    except QhullError:  # all points on one line
-        return None
+def _neighbours(at: Floats) -> tuple[NDArray[np.intp], Floats]:
+    """(M, 2) pairs of neighbouring points and (M,) their distances: triangles' sides, not long."""
+    triangles = Delaunay(at, qhull_options="QJ").simplices
     sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, ::2]]))
     pairs = np.unique(sides, axis=0).astype(np.intp)
     length = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
-    near: NDArray[np.intp] = pairs[length <= np.quantile(length, _LONGEST_PAIR)]
-    return near
-
-
-def _depth_edges(at: Floats, log_depth: Floats, pairs: NDArray[np.intp]) -> Floats | None:
-    """(M,) by how many standard deviations depth changes more than at pairs of that length.
-
-    None where depth has no edges, such as of a wall.
-    """
-    change = np.log(np.abs(np.diff(log_depth[pairs], axis=1)[:, 0]) + _SMALLEST_CHANGE)
-    length = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
-    terms = np.stack([np.ones_like(length), np.log(length + 0.1)], axis=1)
-    rest = change - terms @ np.linalg.lstsq(terms, change, rcond=None)[0]
-    if rest.std() < _LEAST_SPREAD:
-        return None
-    clipped = (rest / rest.std()).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
-    return np.asarray(clipped - clipped.mean(), np.float64)
+    near = length <= np.quantile(length, _LONGEST_PAIR)
+    return pairs[near], length[near]

@@ -70,7 +70,7 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
 
 def in_hull(points: SparsePoints) -> Tensor:
     """Returns bool (H, W), whether each pixel lies in the convex hull of the points."""
-    pixels = _queries(points, None)
+    pixels = pixels_of(points.size)
     inside = torch.ones(len(pixels), dtype=torch.bool)
     try:
         planes = ConvexHull(points.xy.double().cpu().numpy()).equations
@@ -158,10 +158,13 @@ def distinct(points: SparsePoints) -> SparsePoints:
 
 
 def _queries(points: SparsePoints, xy: Tensor | None) -> Tensor:
-    """(M, 2) float64: the coordinates, or those of every pixel of the frame, row after row."""
-    if xy is not None:
-        return xy.double().cpu()
-    rows, columns = (torch.arange(n, dtype=torch.float64) for n in points.size)
+    """(M, 2) float64: the coordinates, or those of every pixel of the frame."""
+    return pixels_of(points.size) if xy is None else xy.double().cpu()
+
+
+def pixels_of(size: tuple[int, int]) -> Tensor:
+    """Returns x and y of every pixel of a frame (H, W), row after row, (HW, 2) float64."""
+    rows, columns = (torch.arange(n, dtype=torch.float64) for n in size)
     return torch.cartesian_prod(rows, columns).flip(1)
 
 

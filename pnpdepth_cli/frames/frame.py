@@ -132,8 +132,3 @@ def is_dense(points: SparsePoints) -> bool:
     """Returns whether the mean spacing of the points is below `DENSE_SPACING` pixels."""
     height, width = points.size
     return height * width < DENSE_SPACING**2 * len(points)
-
-
-def no_points(points: SparsePoints) -> SparsePoints:
-    """Returns an empty selection of the points."""
-    return points.select(torch.zeros(len(points), dtype=torch.bool))

@@ -1,7 +1,8 @@
 """A method of refinement, with nothing left open, for any number of frames in memory.
 
 This is what `refine`, `batch`, Ray workers and the Python API call; reading and writing are around
-it.
+it. The default method is `frames.default`. A fixed method is one network, refined as the settings
+say.
 """
 
 from __future__ import annotations
@@ -11,19 +12,23 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration, evidence
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.refine import OnIteration
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.errors import PnpDepthError, UsageError
 from pnpdepth_cli.frames.default import refine_default
-from pnpdepth_cli.frames.fixed import refine_fixed
 from pnpdepth_cli.frames.frame import Frame, Register
+from pnpdepth_cli.frames.fuse import Split, split_frame
 from pnpdepth_cli.frames.open_network import Member, OpenNetwork
-from pnpdepth_cli.frames.refined import Refined
+from pnpdepth_cli.frames.refined import Refined, Validation, make_refined
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_member
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.settings import ClosedSettings, Settings
+from pnpdepth_cli.stages import AFTER, BEFORE, LINEAR
 
 COMPANION = "compact"
 """The network that is fused with the user's, where there is an image."""
@@ -158,3 +163,60 @@ class Method:
                 break
         if usable:
             self.registrations = {usable[0].size: estimate_registration(usable)}
+
+
+def refine_fixed(
+    network: OpenNetwork,
+    frame: Frame,
+    *,
+    seed: int = 0,
+    validated: bool = False,
+    on_iteration: OnIteration = lambda done, loss: None,
+) -> Refined:
+    """Returns the frame refined by its one network, also if it diverged after a good depth.
+
+    Args:
+        network: The network, open.
+        frame: The frame, its image moved to its points.
+        seed: Random seed of the validation points.
+        validated: Whether the result is validated, for which the frame is refined again.
+        on_iteration: Callback after each update of z.
+
+    Raises:
+        PnpDepthError: The frame cannot be refined.
+    """
+    network.next_image()
+    network.cut()
+    own = network.refine(frame, on_iteration=on_iteration)
+    kind = network.member.settings.propagate
+    depth = _propagate(own.after, frame, kind)
+    split = split_frame(frame, depth, seed) if validated else None
+    validation = None
+    if split is not None and len(split.points):
+        validation = _validation(network, split, kind)
+    return make_refined(frame, own, depth, used=frame.points, validation=validation)
+
+
+def _propagate(depth: Tensor, frame: Frame, kind: str) -> Tensor:
+    """Depth (H, W) with its residual at the points propagated; "none" keeps it."""
+    return depth if kind == "none" else propagate(depth, frame.points, frame.rgb, kind=kind).depth
+
+
+def _validation(network: OpenNetwork, split: Split, kind: str) -> Validation | None:
+    """Depth at validation points, refined without them. None where the method fails."""
+    points, kept = split.points, split.kept
+    try:
+        again = network.refine(kept)
+    except PnpDepthError:
+        return None
+    return Validation(
+        points=points,
+        kept=kept.points,
+        network=again.before,
+        weights=split.weights,
+        predicted={
+            BEFORE: points.sample(again.before),
+            LINEAR: linear(kept.points, points.xy),
+            AFTER: points.sample(_propagate(again.after, kept, kind)),
+        },
+    )

@@ -52,6 +52,11 @@ class Member:
         """Whether another network's depth is an input."""
         return self.network.definition.takes_prior
 
+    @property
+    def weighs_points(self) -> bool:
+        """Whether it finds out itself which points are wrong."""
+        return self.network.definition.weighs_points
+
 
 class OpenNetwork:
     """A network that stays open from frame to frame, as a context manager.

@@ -13,7 +13,7 @@ from pnpdepth_cli.completion.alignment import Alignment
 from pnpdepth_cli.completion.image_registration import ImageRegistration
 from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.errors import DivergedError
-from pnpdepth_cli.frames.frame import DepthMap, Frame, no_points
+from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.points import SparsePoints
 
 
@@ -123,20 +123,19 @@ def make_refined(
         weights: Weights of the experts by name.
     """
     if frame.registration is not None:
-        moved = f"image: moved into the frame of the points by {frame.registration}"
-        notes = (moved, *own.notes, *notes)
-    else:
-        notes = (*own.notes, *notes)
+        notes = (f"image: moved into the frame of the points by {frame.registration}", *notes)
+    stages = stages or {}
+    before, after, *others = (each.numpy() for each in (own.before, depth, *stages.values()))
     return Refined(
-        before=own.before.numpy(),
-        after=depth.numpy(),
+        before=before,
+        after=after,
         used=used,
-        held_out=no_points(used) if frame.held_out is None else frame.held_out,
+        held_out=used.select(slice(0)) if frame.held_out is None else frame.held_out,
         refinement=own.refinement,
         diverged=own.diverged,
         alignment=own.alignment,
-        notes=notes,
-        stages={name: stage.numpy() for name, stage in (stages or {}).items()},
+        notes=(*own.notes, *notes),
+        stages=dict(zip(stages, others, strict=True)),
         validation=validation,
         weights=weights or {},
         registration=frame.registration,

@@ -19,14 +19,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
-from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points
-from pnpdepth_cli.frames.frame import DepthMap, is_dense
+from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points, pixels_of
+from pnpdepth_cli.frames.frame import is_dense
 from pnpdepth_cli.frames.refined import Refined, Validation
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_pattern
@@ -71,27 +69,25 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
         frame: The refined frame.
         of_matches: Whether its points were matched in images, as those of COLMAP.
     """
-    points, depth = frame.used, frame.after
-    network = torch.from_numpy(frame.before)
-    shape = relative_shape(points, network, torch.from_numpy(depth))
-    residual = sigma = torch.empty(0)
+    points = frame.used
+    network, depth = (torch.from_numpy(each) for each in (frame.before, frame.after))
+    # The shape of the standard deviation, calibrated at the validation points.
+    shape, residual, sigma = relative_shape(points, network, depth), torch.empty(0), torch.empty(0)
     note = "uncertainty: too few points to calibrate it with"
     if frame.validation is not None:
         residual, sigma = _residuals(frame.validation)
         note = f"uncertainty: calibrated with {len(residual):,} validation points"
-    factor = calibration(residual, sigma, len(points))
-    sigma_m = (factor * shape.numpy() * depth).astype(np.float32)
+    sigma_m = calibration(residual, sigma, len(points)) * shape * depth
     valid = valid_depth(points, depth, sigma_m)
-    if not valid.all():
-        part = 100 * float((~valid).mean())
+    # What it does not cover.
+    if not bool(valid.all()):
+        part = 100 * float((~valid).double().mean())
         note += f"; {part:.0f} % of the depth is beyond what the points support, and not valid"
-    limits = [*[_OF_MATCHES] * of_matches, *[_OF_MAP] * _is_map(points)]
-    return replace(frame, sigma=sigma_m, valid=valid, notes=(*frame.notes, note, *limits))
-
-
-def _is_map(points: SparsePoints) -> bool:
-    """Whether the points are as dense as those of a depth camera, without scan lines."""
-    return is_dense(points) and not scan_pattern(points.xy.numpy(), points.size).has_scan_lines
+    notes = [*frame.notes, note, *[_OF_MATCHES] * of_matches]
+    if is_dense(points) and not scan_pattern(points.xy, points.size).has_scan_lines:
+        notes.append(_OF_MAP)
+    of_depth, is_valid = (each.numpy() for each in (sigma_m, valid))
+    return replace(frame, sigma=of_depth, valid=is_valid, notes=tuple(notes))
 
 
 def _residuals(validation: Validation) -> tuple[Tensor, Tensor]:
@@ -122,14 +118,12 @@ def relative_shape(
     steps = F.max_pool2d(own, _WINDOW, 1, half) + F.max_pool2d(-own, _WINDOW, 1, half)
     # Where the standard deviation is asked for, and that range there.
     if xy is None:
-        height, width = depth.shape
-        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        queries, step = torch.stack([x, y], dim=-1).reshape(-1, 2), steps.flatten()
+        queries, step = pixels_of(points.size), steps.flatten()
     else:
-        queries = xy
+        queries = xy.double()
         step = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size).sample(steps[0, 0])
     # Log depth of the nearest points.
-    _, near = nearest_points(points, queries.double(), min(_AMONG, len(points)))
+    _, near = nearest_points(points, queries, min(_AMONG, len(points)))
     near_depths = points.depth.double().log()[near.reshape(len(queries), -1)]
     low, high = near_depths.aminmax(dim=1)
     flat = log_depth.flatten()
@@ -175,7 +169,7 @@ def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
     return min(max(factor, low), high)
 
 
-def valid_depth(points: SparsePoints, depth: DepthMap, sigma: DepthMap) -> NDArray[np.bool_]:
+def valid_depth(points: SparsePoints, depth: Tensor, sigma: Tensor) -> Tensor:
     """Returns (H, W) true where the depth map is supported by the points.
 
     False where depth is unknown or far beyond the farthest point, and where σ is above a quarter of
@@ -197,4 +191,4 @@ def valid_depth(points: SparsePoints, depth: DepthMap, sigma: DepthMap) -> NDArr
         typical = float(nearest_points(points, sample.double(), 1)[0].quantile(0.95))
         distance = nearest_points(points, outside.double(), 1)[0].flatten()
         inside[~inside] = distance <= _BEYOND_HULL * typical
-    return np.asarray(valid & inside.numpy(), dtype=bool)
+    return valid & inside

@@ -38,7 +38,9 @@ def frame(
     rgb, depth = boxes(seed)
     inner = tuple(slice(side // 2, side // 2 + side) for side in SIZE)
     if registration is not None:  # as the other camera sees the scene: moved by the inverse
-        rgb = registration.inverse().apply_to(rgb)
+        zoom = 1 / registration.zoom
+        right, down = -registration.right * zoom, -registration.down * zoom
+        rgb = ImageRegistration(zoom=zoom, right=right, down=down).apply_to(rgb)
     rgb, depth = np.clip(rgb[inner], 0, 1), depth[inner]
     jump = cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0.1
     beside = cv2.dilate(jump.astype(np.uint8), np.ones(2 * (2 * gap_px + 1,))) > 0

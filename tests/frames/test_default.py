@@ -13,21 +13,24 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.split import Split as Cut
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.frames import default, fuse, validation
+from pnpdepth_cli.frames import default, fuse
 from pnpdepth_cli.frames.default import refine_default, without_outliers
 from pnpdepth_cli.frames.frame import Frame, is_dense
 from pnpdepth_cli.frames.fuse import (
     FEW_POINTS,
+    FOLDS,
+    MIN_POINTS,
     OWN_SCANNER,
     Expert,
+    Split,
     fit_weights,
+    split_frame,
     trust,
     weighted_mean,
 )
 from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Prediction, Refined
 from pnpdepth_cli.frames.uncertainty import calibration, relative_shape, with_uncertainty
-from pnpdepth_cli.frames.validation import FOLDS, MIN_POINTS, ValidationSplit, split_points
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
@@ -88,16 +91,20 @@ def scan_frame() -> Frame:
 
 def expert(name: str, at: Tensor, weight: float = 1.0) -> Expert:
     """An expert with these predictions at the validation points."""
-    dense = torch.ones(SIZE)
-    return Expert(name=name, weight=weight, dense=lambda: dense, at=at, aligned=dense, updated=at)
+    return Expert(name=name, weight=weight, at=at)
 
 
-def split_of(depth: Tensor) -> ValidationSplit:
+def split_of(depth: Tensor) -> Split:
     """A frame with validation points of these depths."""
     xy = torch.stack([torch.arange(len(depth)) % 128, torch.arange(len(depth)) // 128], 1).float()
     points = SparsePoints(xy=xy, depth=depth, size=SIZE)
     frame = frame_in_memory(60)
-    return ValidationSplit(whole=frame, kept=frame, points=points, weights=torch.ones(len(depth)))
+    return Split(whole=frame, kept=frame, points=points, weights=torch.ones(len(depth)))
+
+
+def split_of_frame(count: int) -> Split:
+    """A frame of so many points with and without its validation points."""
+    return split_frame(frame_in_memory(count), depth_of_scene(), 0)
 
 
 def test_a_network_alone_is_aligned_updated_and_propagated() -> None:
@@ -167,7 +174,7 @@ def test_trust_grows_with_what_a_network_explains() -> None:
     for share in (0.0, 0.6, 1.0):  # of noise in the depth
         predicted = torch.exp(depth.log() * (1 - share) + 0.6 * share * noise)
         shown = replace(predicted_by(member(Brightness), frame), before=predicted)
-        one = replace(expert("net", torch.ones(200)), prediction=shown)
+        one = replace(expert("net", torch.ones(200)), whole=shown)
         found.append(trust(one, split, expert("compact", torch.ones(200))))
     assert found[0] == pytest.approx(1)
     assert found[0] > found[1] > found[2] == 0
@@ -181,7 +188,7 @@ def test_trust_in_a_network_that_takes_points_falls_with_its_error_at_validation
         trust(
             replace(
                 expert("own", depth + off),
-                prediction=predicted_by(own, frame),
+                whole=predicted_by(own, frame),
                 network=OpenNetwork(own),
             ),
             split,
@@ -355,30 +362,26 @@ def test_the_limits_of_sigma_are_said_of_matches_and_of_dense_points(
 def test_nothing_is_hidden_where_a_fold_is_everything_or_nothing(
     fold: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        validation, "spatial_folds", lambda p, *_, **__: torch.full((len(p),), fold)
-    )
-    assert split_points(frame_in_memory(60).points, 0) is None
+    monkeypatch.setattr(fuse, "spatial_folds", lambda p, *_, **__: torch.full((len(p),), fold))
+    split = split_of_frame(60)
+    assert not len(split.points)
+    assert split.kept is split.whole
 
 
 def test_validation_points_are_a_fifth_and_the_others_are_kept() -> None:
-    points = frame_in_memory(60).points
-    parts = split_points(points, 0)
-    assert parts is not None
-    kept, points_left_out = parts
-    assert len(points_left_out) == 60 // FOLDS
-    rows = {tuple(xy) for xy in points.xy.tolist()}
+    split = split_of_frame(60)
+    parts = (split.kept.points, split.points)
+    assert [len(part) for part in parts] == [60 - 60 // FOLDS, 60 // FOLDS]
+    rows = {tuple(xy) for xy in split.whole.points.xy.tolist()}
     assert {tuple(xy) for part in parts for xy in part.xy.tolist()} == rows
-    assert len(kept) + len(points_left_out) == 60
 
 
 def test_of_many_validation_points_a_part_is_predicted_and_none_is_shown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(validation, "MOST_VALIDATION_POINTS", 7)
-    parts = split_points(frame_in_memory(60).points, 0)
-    assert parts is not None
-    assert [len(part) for part in parts] == [48, 7]
+    monkeypatch.setattr(fuse, "MOST_VALIDATION_POINTS", 7)
+    split = split_of_frame(60)
+    assert [len(part) for part in (split.kept.points, split.points)] == [48, 7]
 
 
 @pytest.mark.parametrize("count", [1, MIN_POINTS - 1, MIN_POINTS, 7])
@@ -451,9 +454,9 @@ def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:
 
 def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
     frame, bad = spoiled(frame_in_memory(60))
-    with opened(member(Brightness)) as networks:
-        inliers, _ = without_outliers(networks, frame)
-        clean, _ = without_outliers(networks, frame_in_memory(60))
+    with OpenNetwork(member(Brightness)) as judge:
+        inliers, _ = without_outliers(judge, frame)
+        clean, _ = without_outliers(judge, frame_in_memory(60))
     assert inliers.outliers is not None
     assert torch.equal(inliers.outliers.xy, frame.points.xy[bad])
     assert torch.equal(inliers.points.xy, frame.points.xy[~bad])
@@ -469,7 +472,7 @@ def test_outliers_among_few_points_are_those_beside_the_network_and_else_those_o
     frame, bad = spoiled(frame_in_memory(count))
     found = iter([bad & alone, bad & beside])
     monkeypatch.setattr(default, "outliers", lambda *_: next(found))
-    with opened(member(Brightness)) as networks:
-        inliers, _ = without_outliers(networks, frame)
+    with OpenNetwork(member(Brightness)) as judge:
+        inliers, _ = without_outliers(judge, frame)
     expected = frame.points.select(~(bad & (beside or count >= FEW_POINTS)))
     assert torch.equal(inliers.points.xy, expected.xy)

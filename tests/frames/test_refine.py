@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.errors import DivergedError, ModelError, NoPointsError
-from pnpdepth_cli.frames.fixed import refine_fixed
 from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.method import refine_fixed
 from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.models.definition import Fixed

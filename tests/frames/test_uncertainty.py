@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
@@ -45,15 +44,15 @@ def lidar_points() -> SparsePoints:
 
 
 def test_the_sky_above_scan_lines_is_not_valid() -> None:
-    depth = np.full((60, 100), 10, np.float32)
-    valid = valid_depth(lidar_points(), depth, np.full_like(depth, 0.1))
+    depth = torch.full((60, 100), 10.0)
+    valid = valid_depth(lidar_points(), depth, torch.full_like(depth, 0.1))
     assert not valid[:20].any()
     assert valid[30:59].all()
 
 
 def test_depth_beyond_the_points_or_too_uncertain_is_not_valid() -> None:
-    depth = np.full((60, 100), 10, np.float32)
-    sigma = np.full_like(depth, 0.1)
+    depth = torch.full((60, 100), 10.0)
+    sigma = torch.full_like(depth, 0.1)
     depth[40, 10], depth[40, 11], sigma[40, 12] = 0, 31, 2.6
     valid = valid_depth(lidar_points(), depth, sigma)
     assert valid[40, 9:14].tolist() == [True, False, False, False, True]

@@ -12,7 +12,7 @@ import torch
 
 from pnpdepth_cli.commands.refinement.outputs import output_scale, within_range
 from pnpdepth_cli.core.refine import Refinement
-from pnpdepth_cli.frames.frame import Frame, no_points
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.points import SparsePoints
@@ -34,7 +34,7 @@ def refined_to(*depths: float, inputs: Frame) -> Refined:
         before=depth,
         after=depth,
         used=inputs.points,
-        held_out=no_points(inputs.points),
+        held_out=inputs.points.select(slice(0)),
         refinement=Refinement(before=dense, after=dense, losses=(0.0,), step=0.0),
         diverged=None,
     )
