@@ -27,7 +27,7 @@ FOR_THE_PROGRAM = {
     "Split": {"static_graph", "in_half"},
     "Network": {
         *("image_of", "arguments_of", "synthetic_arguments", "verify", "verified", "depth_of"),
-        "raw_of",
+        *("raw_of", "known_of"),
     },
     "ModelDefinition": {"default_layer", "default_alignment", "call_arguments"},
 }

@@ -37,7 +37,7 @@ def models() -> None:
 @options.as_json
 def list_command(as_json: bool) -> None:
     """List the networks that --model takes by name, with their inputs, outputs and defaults."""
-    from pnpdepth_cli.commands.networks.describe import list_models
+    from pnpdepth_cli.commands.networks import list_models
 
     listed = list_models()
     if as_json:
@@ -71,7 +71,7 @@ def check(network: str, image: Path | None, checkpoint: Path | None, as_json: bo
 
     A .py file is Python code and is run.
     """
-    from pnpdepth_cli.commands.networks.describe import check_model
+    from pnpdepth_cli.commands.networks import check_model
 
     show = print_json if as_json else _print
     show(check_model(network, checkpoint, image))
@@ -104,7 +104,7 @@ def layers(every: bool, as_json: bool, **values: Any) -> None:
     For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
     every update repeats), and the influential field of one sparse point in z and in the depth map.
     """
-    from pnpdepth_cli.commands.networks.describe import list_layers
+    from pnpdepth_cli.commands.networks import list_layers
 
     choice = NetworkChoice(**values)
     with progress_bar("layers", "layer") as show:

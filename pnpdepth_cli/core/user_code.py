@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from pnpdepth_cli.errors import ModelError, PnpDepthError
+from pnpdepth_cli.errors import DeviceError, ModelError, PnpDepthError
 
 
 @contextmanager
@@ -43,3 +43,16 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, torch.cuda.OutOfMemoryError | MemoryError) or (
         isinstance(error, RuntimeError) and any(message in str(error) for message in messages)
     )
+
+
+@contextmanager
+def out_of_memory_is_a_device_error(device: torch.device) -> Iterator[None]:
+    """Inside, running out of memory becomes a DeviceError."""
+    try:
+        yield
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        raise DeviceError(
+            f"device {str(device)!r} is out of memory; use a smaller image or another device"
+        ) from None

@@ -17,13 +17,13 @@ from torch import Tensor
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import OnIteration, Refinement, refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.user_code import wrap_user_errors
+from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.errors import DivergedError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refined import Prediction
 from pnpdepth_cli.models.aligned import AlignedDepth
-from pnpdepth_cli.models.network import Network, out_of_memory_is_a_device_error
+from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.settings import ClosedSettings
 
 

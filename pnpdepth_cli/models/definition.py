@@ -29,9 +29,11 @@ sense raises ModelError as soon as the object is made.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +42,6 @@ from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.choices import Fit, OutputKind, OutputScale
 from pnpdepth_cli.choices import InputKind as InputKind  # for definition files
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models import validity
 from pnpdepth_cli.settings import Settings as Settings  # for definition files
 
 if TYPE_CHECKING:
@@ -48,6 +49,41 @@ if TYPE_CHECKING:
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+
+_MAX_SHOWN = 60  # characters of a wrong value that are shown
+_SYNONYMS = {
+    "disparity": "; disparity is 'inverse'",
+    "relative": "; relative depth is 'scale' (up to a factor) or 'affine' (a shift as well)",
+}
+"""Hints for words that others use."""
+
+
+def _check(owner: object, field: str, good: bool, wanted: str) -> None:
+    """ModelError with type and name of the owner, the field and its value, unless it is good."""
+    if good:
+        return
+    name = getattr(owner, "name", None)
+    named = f"{type(owner).__name__} {name!r}" if isinstance(name, str) else type(owner).__name__
+    shown = " ".join(repr(getattr(owner, field)).split())
+    shown = shown if len(shown) <= _MAX_SHOWN else f"{shown[: _MAX_SHOWN - 1]}…"
+    raise ModelError(f"{named}: {field}={shown} is not {wanted}")
+
+
+def _check_choice(owner: object, field: str, valid: Collection[str]) -> None:
+    value = getattr(owner, field)
+    hint = _SYNONYMS.get(value, "") if isinstance(value, str) else ""
+    _check(owner, field, value in valid, f"one of {', '.join(map(repr, valid))}{hint}")
+
+
+def _check_whole(owner: object, *fields: str) -> None:
+    for field in fields:
+        value = getattr(owner, field)
+        good = isinstance(value, Integral) and _is_number(value) and int(value) > 0
+        _check(owner, field, good, "a whole number of at least 1")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 @dataclass(frozen=True)
@@ -64,9 +100,8 @@ class Fixed:
     """
 
     def __post_init__(self) -> None:
-        validity.whole(self, "height")
-        validity.whole(self, "width")
-        validity.one_of(self, "fit", choices.FITS)
+        _check_whole(self, "height", "width")
+        _check_choice(self, "fit", choices.FITS)
 
 
 @dataclass(frozen=True)
@@ -79,9 +114,7 @@ class Multiple:
     """Images with a longer side, in pixels, are shrunk to it first; None shrinks none."""
 
     def __post_init__(self) -> None:
-        validity.whole(self, "of")
-        if self.longest is not None:
-            validity.whole(self, "longest")
+        _check_whole(self, "of", *["longest"] * (self.longest is not None))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,10 +128,8 @@ class Near:
     """Columns to approach, or None. With neither, the image keeps about its own size."""
 
     def __post_init__(self) -> None:
-        validity.whole(self, "of")
-        for side in ("height", "width"):
-            if getattr(self, side) is not None:
-                validity.whole(self, side)
+        sides = [side for side in ("height", "width") if getattr(self, side) is not None]
+        _check_whole(self, "of", *sides)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,8 +141,12 @@ class Normalisation:
     """Above 0; 1/255 of each channel makes the input 0…255."""
 
     def __post_init__(self) -> None:
-        validity.per_channel(self, "mean")
-        validity.per_channel(self, "std", positive=True)
+        for field, least in (("mean", -math.inf), ("std", 0.0)):
+            value = getattr(self, field)
+            numbers = list(value) if isinstance(value, Iterable) else []
+            good = len(numbers) == 3 and all(_is_number(n) and n > least for n in numbers)
+            above = " above 0" if least == 0 else ""
+            _check(self, field, good, f"three numbers{above}, for red, green and blue")
 
 
 UNTUNED_DEFAULTS = Settings(
@@ -204,24 +239,26 @@ class ModelDefinition:
     """What was assumed where no definition was given; it is printed."""
 
     def __post_init__(self) -> None:
-        size = "Fixed(height, width), Multiple(of) or Near(of=…)"
-        validity.instance(self, "name", str, "a text")
-        validity.one_of(self, "input_kind", choices.INPUT_KINDS)
-        validity.instance(self, "size", (Fixed, Multiple, Near), size)
-        validity.function(self, "build")
-        validity.one_of(self, "output_kind", choices.OUTPUT_KINDS)
-        validity.one_of(self, "output_scale", choices.OUTPUT_SCALES)
-        validity.names(self, "layers")
-        validity.instance(self, "defaults", Settings, "Settings(…)")
-        for field, kind, wanted in (
-            ("normalisation", Normalisation, "Normalisation(mean=…, std=…)"),
-            ("image_encoder", str, "the name of a submodule"),
-            ("checkpoint", Path, "a pathlib.Path"),
+        _check_choice(self, "input_kind", choices.INPUT_KINDS)
+        _check_choice(self, "output_kind", choices.OUTPUT_KINDS)
+        _check_choice(self, "output_scale", choices.OUTPUT_SCALES)
+        none = type(None)
+        for field, kinds, wanted in (
+            ("name", (str,), "a text"),
+            ("size", (Fixed, Multiple, Near), "Fixed(height, width), Multiple(of) or Near(of=…)"),
+            ("defaults", (Settings,), "Settings(…)"),
+            ("normalisation", (Normalisation, none), "Normalisation(mean=…, std=…)"),
+            ("image_encoder", (str, none), "the name of a submodule"),
+            ("checkpoint", (Path, none), "a pathlib.Path"),
         ):
-            validity.instance(self, field, (kind, type(None)), wanted)
-        for hook in ("read_checkpoint", "arguments", "output", "verify", "coarse"):
-            if getattr(self, hook) is not None:
-                validity.function(self, hook)
+            _check(self, field, isinstance(getattr(self, field), kinds), wanted)
+        names = self.layers if isinstance(self.layers, tuple | list) else [None]
+        good = all(isinstance(name, str) for name in names)
+        _check(self, "layers", good, "a tuple of texts, as in ('encoder', 'decoder.up1')")
+        for hook in ("build", "read_checkpoint", "arguments", "output", "verify", "coarse"):
+            value = getattr(self, hook)
+            good = callable(value) or (value is None and hook != "build")
+            _check(self, hook, good, "a function or a class")
 
     @property
     def default_layer(self) -> str | None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,13 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import tensors_in
-from pnpdepth_cli.core.user_code import is_out_of_memory, wrap_user_errors
+from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
+from pnpdepth_cli.models.cut_layers import suggest_layers
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, file_and_part
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_camera, synthetic_frame
 from pnpdepth_cli.models.precision import dtype_of, lower
-from pnpdepth_cli.models.python_file import importing_beside
-from pnpdepth_cli.models.registry import find_definition
-from pnpdepth_cli.models.suggest_layers import suggest_layers
+from pnpdepth_cli.models.registry import find_definition, importing_beside
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 from pnpdepth_cli.points import SparsePoints
 
@@ -116,11 +114,16 @@ class Network:
             )
         return arguments if prior is None else (*arguments, prior)
 
-    def synthetic_arguments(self, frame: FrameMap) -> tuple[Tensor, ...]:
-        """Returns the arguments for a synthetic frame of this size."""
-        rgb, points = synthetic_frame(frame.image)
+    def synthetic_arguments(self, frame: FrameMap, rgb: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Returns the arguments for synthetic points and camera, and a synthetic image.
+
+        Args:
+            frame: Map from pixels of the image to those of the network.
+            rgb: (1, 3, H, W) in 0…1, an image instead of the synthetic one.
+        """
+        synthetic, points = synthetic_frame(frame.image)
         return self.arguments_of(
-            self.image_of(frame, rgb),
+            self.image_of(frame, synthetic if rgb is None else rgb),
             frame.points_to_network(points),
             intrinsics=frame.intrinsics_to_network(synthetic_camera(frame.image)),
         )
@@ -165,16 +168,11 @@ class Network:
                 )
         else:
             tensors: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
-            if not tensors:
-                raise ModelError(
-                    f"network {name!r} returns a {type(output).__name__} without a tensor in it;"
-                    " its forward, or `output` of its definition, must give the depth"
-                )
             if len(tensors) != 1:
                 paths = ", ".join(".".join(path) for path, _ in tensors)
                 raise ModelError(
-                    f"network {name!r} returns {len(tensors)} tensors ({paths}); its definition"
-                    " must pick the depth with `output`"
+                    f"network {name!r} returns a {type(output).__name__} with {len(tensors)}"
+                    f" tensors in it ({paths}); `output` of its definition must pick the depth"
                 )
             chosen = tensors[0][1]
         # One map, with or without axes of batch and channel.
@@ -192,6 +190,10 @@ class Network:
             return tensor
         _read_nan_gradients_as_zero(tensor)
         return torch.where(known, tensor, torch.nan)
+
+    def known_of(self, output: Any) -> Tensor:
+        """Returns `raw_of` the output, 0 where it is not finite."""
+        return self.raw_of(output).nan_to_num()
 
 
 def _read_nan_gradients_as_zero(tensor: Tensor) -> None:
@@ -235,44 +237,24 @@ def load_network(
     torch_device = find_device(device)
     dtype = dtype_of(precision, torch_device)
     definition = find_definition(spec) if isinstance(spec, str) else spec
-    path = checkpoint or definition.checkpoint
-    if isinstance(definition.build, nn.Module):
-        raise ModelError(
-            f"build of network {definition.name!r} is a {type(definition.build).__name__} that is"
-            " made already; a class or a function that makes it is expected, as in lambda: net"
-        )
     # `build` may import modules beside the model file.
     beside = importing_beside(spec) if isinstance(spec, str) else nullcontext()
     with wrap_user_errors(f"build of network {definition.name!r}"), beside:
-        module = definition.build()
+        # A module is called as well, but it is made already.
+        module = None if isinstance(definition.build, nn.Module) else definition.build()
     if not isinstance(module, nn.Module):
-        raise ModelError(f"build of {definition.name!r} gives no torch module")
-    notes: list[str] = []
-    if definition.complete:
-        if checkpoint is not None:
-            raise UsageError(
-                f"network {definition.name!r} comes with its weights; --checkpoint does not go with"
-                " it"
-            )
-    elif path is not None:
-        if path.parent.parent.name == "model_zoo_defs" and not path.is_file():
-            raise CheckpointError(
-                f"checkpoint {path} does not exist, as the package has the weights of few"
-                f" networks; take {path.name} from the repository, and name it with"
-                " --checkpoint"
-            )
-        notes = load_checkpoint(module, definition, path)
-    elif module.state_dict():
-        raise CheckpointError(
-            f"network {definition.name!r} comes without weights; name them with --checkpoint, or,"
-            " where its build loads them itself, say complete=True in a definition"
+        raise ModelError(
+            f"build of network {definition.name!r} gives no torch module; a class or a function"
+            " that makes one is expected, as in lambda: net"
         )
+    path = checkpoint or definition.checkpoint
+    notes = [f"model: {definition.assumed}"] if definition.assumed else []
+    notes += _load_weights(module, definition, checkpoint)
     module.eval().requires_grad_(False)
     with out_of_memory_is_a_device_error(torch_device):
         module.to(torch_device)
     if dtype is not None:
         lower(module, dtype, torch_device)
-    notes = [f"model: {definition.assumed}", *notes] if definition.assumed else notes
     network = Network(
         definition=definition,
         module=module,
@@ -286,31 +268,54 @@ def load_network(
     return _with_suggested_layers(network)
 
 
+def _load_weights(
+    module: nn.Module, definition: ModelDefinition, checkpoint: Path | None
+) -> list[str]:
+    """Loads the weights named, or those of the definition; returns notes. Never random weights."""
+    name, path = definition.name, checkpoint or definition.checkpoint
+    if definition.complete:
+        if checkpoint is not None:
+            raise UsageError(
+                f"network {name!r} comes with its weights; --checkpoint does not go with it"
+            )
+        return []
+    if path is None:
+        if module.state_dict():
+            raise CheckpointError(
+                f"network {name!r} comes without weights; name them with --checkpoint, or, where"
+                " its build loads them itself, say complete=True in a definition"
+            )
+        return []
+    if path.parent.parent.name == "model_zoo_defs" and not path.is_file():
+        raise CheckpointError(
+            f"checkpoint {path} does not exist, as the package has the weights of few networks;"
+            f" take {path.name} from the repository, and name it with --checkpoint"
+        )
+    return load_checkpoint(module, definition, path)
+
+
 def _with_suggested_layers(network: Network) -> Network:
     """The network with layers to cut at, for a definition that lists none."""
     size = network.definition.size
     if isinstance(size, Fixed):
-        height, width = size.height, size.width
-        check_claim(
-            f"network {network.definition.name!r} takes images of {height}×{width} pixels",
-            height * width, budget().max_pixels, error=ModelError, way_out="raise --max-pixels",
-        )  # fmt: skip
+        sides = size.height, size.width
     else:
-        height = width = -(-_SUGGESTION_SIDE // size.of) * size.of
+        sides = (-(-_SUGGESTION_SIDE // size.of) * size.of,) * 2
+    claim = f"network {network.definition.name!r} takes images of {sides[0]}×{sides[1]} pixels"
+    check_claim(
+        claim, math.prod(sides), budget().max_pixels, error=ModelError, way_out="raise --max-pixels"
+    )
     with out_of_memory_is_a_device_error(network.device):
-        arguments = network.synthetic_arguments(FrameMap.fit(size, height, width))
+        arguments = network.synthetic_arguments(FrameMap.fit(size, *sides))
         layers = suggest_layers(network.module, arguments, network.raw_of)
     if not layers:
         return network
-    return replace(
-        network,
-        definition=replace(network.definition, layers=layers),
-        notes=(
-            *network.notes,
-            f"layers: the definition of {network.definition.name!r} lists none; suggested by shape:"
-            f" {', '.join(layers)}; the first is the bottleneck",
-        ),
+    note = (
+        f"layers: the definition of {network.definition.name!r} lists none; suggested by shape:"
+        f" {', '.join(layers)}; the first is the bottleneck"
     )
+    definition = replace(network.definition, layers=layers)
+    return replace(network, definition=definition, notes=(*network.notes, note))
 
 
 def find_device(name: str) -> torch.device:
@@ -326,16 +331,3 @@ def find_device(name: str) -> torch.device:
         reason = (str(error).splitlines() or [""])[0][:120]
         raise DeviceError(f"device {name!r} cannot be used: {reason}; try --device cpu") from None
     return device
-
-
-@contextmanager
-def out_of_memory_is_a_device_error(device: torch.device) -> Iterator[None]:
-    """Inside, running out of memory becomes a DeviceError."""
-    try:
-        yield
-    except Exception as error:
-        if not is_out_of_memory(error):
-            raise
-        raise DeviceError(
-            f"device {str(device)!r} is out of memory; use a smaller image or another device"
-        ) from None

@@ -6,22 +6,27 @@ entry point, also the object itself) with one of
 
     definition = ModelDefinition(...)
     definitions = {"my-net": ModelDefinition(...), "my-net-tiny": ModelDefinition(...)}
+
+A Python file is run, as importing it would run it. `net.py` holds a `definition`, or is one network
+whose class takes no arguments; `net.py:NAME` names another definition, class or function in it.
 """
 
 from __future__ import annotations
 
 import difflib
+import importlib.util
 import re
-from collections.abc import Mapping
-from contextlib import suppress
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError, PnpDepthError
-from pnpdepth_cli.models.definition import ModelDefinition
-from pnpdepth_cli.models.python_file import python_definition
+from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, assume_definition
 from pnpdepth_cli.models.weights.checkpoint import WEIGHT_SUFFIXES
 
 _TORCHSCRIPT = (".ts", ".torchscript")
@@ -100,7 +105,7 @@ def _from_file(spec: str) -> ModelDefinition | None:
     if (found := re.fullmatch(r"(.*\.(?:py|onnx)):([^:]*)", spec, re.DOTALL)) is not None:
         file, part = found.groups()
     if file.endswith(".py"):
-        return python_definition(Path(file), part)
+        return _python_definition(Path(file), part)
     if file.endswith(".onnx"):
         from pnpdepth_cli.models.onnx.onnx_file import onnx_definition
 
@@ -120,3 +125,86 @@ def _from_file(spec: str) -> ModelDefinition | None:
 
         return hf_definition(Path(spec))
     return None
+
+
+def _python_definition(file: Path, attribute: str | None) -> ModelDefinition:
+    """The definition in a Python file, or one assumed for the network class in it."""
+    module = _run(file)
+    named = attribute or "definition"
+    value = getattr(module, named, None)
+    if value is None and attribute is None:
+        named, value = _only_network_class(module) or (named, None)
+    if value is None:
+        raise ModelError(f"model file {file} defines no {named!r}; name it as {file}:ATTRIBUTE")
+    if isinstance(value, ModelDefinition):
+        return value
+    if not callable(value):
+        raise ModelError(
+            f"{named!r} in model file {file} is a {type(value).__name__}, not a ModelDefinition"
+        )
+    return assume_definition(
+        name=f"{file.stem}.{named}",
+        summary=f"{named} of {file.name}",
+        build=value,
+        assumed=f"{named!r} of {file.name} is not a definition; assumed: one rgb image in, sides"
+        f" padded to multiples of {ASSUMED_MULTIPLE}; what its numbers mean is decided from the"
+        " points",
+    )
+
+
+def _run(file: Path) -> ModuleType:
+    """The module that a Python file makes."""
+    if not file.is_file():
+        raise ModelError(f"model file {file} does not exist")
+    name = f"pnpdepth_user_model_{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and pickling inside the file look it up
+    try:
+        with importing_beside(str(file)):
+            spec.loader.exec_module(module)
+    except PnpDepthError as error:
+        reason = describe(error, file).removeprefix(f"{type(error).__name__}: ")
+        raise ModelError(f"model file {file}: {reason}") from error
+    except (Exception, SystemExit) as error:
+        raise ModelError(f"model file {file} raises {describe(error, file)}") from error
+    return module
+
+
+def _only_network_class(module: ModuleType) -> tuple[str, Callable[[], Any]] | None:
+    """The one network class that the file itself defines and no other class in it uses."""
+    from torch import nn
+
+    own = {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type)
+        and issubclass(value, nn.Module)
+        and value.__module__ == module.__name__
+    }
+    codes = (getattr(network.__init__, "__code__", None) for network in own.values())
+    blocks = {name for code in codes if code is not None for name in code.co_names}
+    networks = [(name, value) for name, value in own.items() if name not in blocks]
+    return networks[0] if len(networks) == 1 else None
+
+
+@contextmanager
+def importing_beside(spec: str) -> Iterator[None]:
+    """Inside, modules beside the Python file that `spec` names can be imported.
+
+    The file itself runs inside this context, and so must a `build` that imports when it is called.
+    If `spec` names no Python file, nothing changes.
+    """
+    file = Path(spec if spec.endswith(".py") else spec.rpartition(":")[0])
+    if file.suffix != ".py":
+        yield
+        return
+    folder = str(file.resolve().parent)
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        with suppress(ValueError):  # the file's own code may have removed it
+            sys.path.remove(folder)

@@ -8,8 +8,8 @@ import pytest
 
 import model_zoo_defs
 from pnpdepth_cli import choices
-from pnpdepth_cli.commands.networks import describe
-from pnpdepth_cli.commands.networks.describe import list_models
+from pnpdepth_cli.commands import networks
+from pnpdepth_cli.commands.networks import list_models
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.registry import families, find_definition, names
 
@@ -34,12 +34,12 @@ SEVERAL = ONE.replace("definition =", "one =") + "definitions = {one.name: one}\
 @pytest.fixture
 def open_list(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A folder whose files count as files of model_zoo_defs, and whose packages are installed."""
-    monkeypatch.setattr(model_zoo_defs, "__path__", [*model_zoo_defs.__path__, str(tmp_path)])
+    folders = [*model_zoo_defs.__path__, str(tmp_path)]
+    monkeypatch.setattr(model_zoo_defs, "__path__", folders)
+    monkeypatch.setattr(model_zoo_defs.__spec__, "submodule_search_locations", folders)
     monkeypatch.syspath_prepend(str(tmp_path))
     old = choices.NETWORKS
-    table = choices.OpenList(
-        "", None, group="models", noun="network", first=tuple(old), package="model_zoo_defs"
-    )
+    table = choices.OpenList("model_zoo_defs", group="models", noun="network", first=tuple(old))
     monkeypatch.setattr(choices, "NETWORKS", table)
     return tmp_path
 
@@ -62,7 +62,7 @@ def test_one_new_file_in_model_zoo_defs_adds_a_network(
     assert names()[-1] == name
     assert find_definition(name).build().out_channels == 1
     mine = {name: families()[name]}
-    monkeypatch.setattr(describe, "families", lambda: mine)  # the others take long
+    monkeypatch.setattr(networks, "families", lambda: mine)  # the others take long
     assert [one["name"] for one in list_models()] == [name]
 
 

@@ -1,16 +1,35 @@
-"""Suggests layers worth cutting at, for a network whose definition names none."""
+"""Layers worth cutting a network at: by their shapes, and for the spacing of the points.
+
+The paper's rule of thumb: the influential field of a point should reach the next points, so that
+updates reach all pixels. Of such layers, the one with the least of the network behind it is the
+cheapest. On real frames fields several gaps wide, and at least half the image, were better: a
+network's error is smooth over surfaces, and later layers follow each point and its noise.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.core.influence import influential_field
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import map_tensors
-from pnpdepth_cli.core.user_code import wrap_user_errors
+from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.frame_map import FrameMap
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.models.network import Network
+
+GAPS = 6.0
+"""Gaps between points that a field should span."""
+LEAST_FRACTION = 0.5
+"""Fraction of the image's shorter side that a field should span in any case. Both are the best of
+several for FastDepth on even frames of ICL-NUIM, 7-Scenes and KITTI, 100 points to LiDAR."""
 
 _SIMILAR_ASPECT = 1.3
 """A feature map's aspect ratio is at most this factor away from the image's."""
@@ -19,10 +38,74 @@ Maps = dict[str, Tensor]
 """What submodules returned, by name in the order in which they ran: maps (1, c, h, w)."""
 
 
+def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
+    """Returns the layer whose output z is updated if no option names one.
+
+    It is the definition's, else the best one for so many points in an image of this size (rows,
+    columns), measured on a synthetic frame. None if the definition has no layers.
+    """
+    definition = network.definition
+    if definition.defaults.layer is not None or len(definition.layers) < 2:
+        return definition.default_layer
+    frame = FrameMap.fit(definition.size, *size)
+    with out_of_memory_is_a_device_error(network.device):
+        arguments = network.synthetic_arguments(frame)
+        return best_layer(network, arguments, frame.network, point_count) or definition.layers[0]
+
+
+def best_layer(
+    network: Network, arguments: tuple[Tensor, ...], size: tuple[int, int], point_count: int
+) -> str | None:
+    """Returns the layer of the definition to cut at for so many points in a frame.
+
+    It is the last one whose influential field in the depth map is wide enough, because that costs
+    least. If none is wide enough, it is the one with the widest field.
+
+    Args:
+        network: Network whose definition's layers are measured.
+        arguments: The network's arguments for the frame, real or synthetic.
+        size: Rows and columns of the network's input.
+        point_count: Sparse points in the frame, taken to be spread evenly.
+
+    Returns:
+        None if there are no points, or no layer that the network can be cut at.
+    """
+    if not point_count:
+        return None
+    # No field is wider than the image, and of equally wide ones the last layer is taken.
+    enough = min(wanted_field(size, point_count), *size)
+    layers, widths = list(network.definition.layers), dict[str, int]()
+    # The more of the network lies behind a layer, the wider is its field: bisection finds the last
+    # layer that reaches far enough, which is the one of least cost.
+    first, end = 0, len(layers)
+    while first < end:
+        middle = (first + end) // 2
+        try:
+            with Split(network.module, layers[middle]) as split, torch.no_grad():
+                z = split.front(*arguments)
+                width = min(influential_field(split, z, network.known_of, enough).in_output)
+        except ModelError:
+            del layers[middle]
+            end -= 1
+            continue
+        widths[layers[middle]] = width
+        if width >= enough:
+            first = middle + 1
+        else:
+            end = middle
+    last_first = [name for name in reversed(layers) if name in widths]
+    wide = [name for name in last_first if widths[name] >= enough]
+    return wide[0] if wide else max(last_first, key=widths.__getitem__, default=None)
+
+
+def wanted_field(size: tuple[int, int], point_count: int) -> float:
+    """Returns how wide an influential field should be, in pixels, for so many even points."""
+    spacing = math.sqrt(size[0] * size[1] / point_count)
+    return max(GAPS * spacing, LEAST_FRACTION * min(size))
+
+
 def suggest_layers(
-    module: nn.Module,
-    arguments: tuple[Tensor, ...],
-    prediction_of: Callable[[Any], Tensor],
+    module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[Any], Tensor]
 ) -> tuple[str, ...]:
     """Returns the bottleneck and, behind it, the last layer of each finer resolution.
 
@@ -31,6 +114,8 @@ def suggest_layers(
     prediction depends on.
 
     Args:
+        module: The network.
+        arguments: Its arguments for a frame, real or synthetic.
         prediction_of: Returns the prediction (1, 1, h, w) from what the network returns.
 
     Returns:
@@ -43,8 +128,9 @@ def suggest_layers(
     if image is None:
         return ()
     sides = image.shape[1:3] if image.shape[-1] <= 4 else image.shape[2:4]
+    # Where the front has no gradients, the layers behind it may.
     prediction, maps, _ = _observe(module, arguments, prediction_of)
-    if not prediction.requires_grad:  # the front has no gradients, the layers behind it may
+    if not prediction.requires_grad:
         prediction, maps, copies = _observe(module, arguments, prediction_of, reach_all=True)
         if not _reaches_features(prediction, copies):
             raise ModelError(
@@ -52,23 +138,30 @@ def suggest_layers(
                 " its forward run under torch.no_grad or inference_mode, detach, or go through"
                 " numpy? take that out"
             )
-    useful = {
-        n: map_ for n, map_ in maps.items() if _area(map_) > 1 and _has_aspect_of(map_, sides)
-    }
+    # Feature maps that the prediction depends on.
+    useful = {n: m for n, m in maps.items() if m.shape[1] > 1 and _has_aspect_of(m, sides)}
     gradients = _gradients(prediction, list(useful.values()))
-    reached = {
-        name: useful[name]
+    areas = {
+        name: _area(useful[name])
         for name, gradient in zip(useful, gradients, strict=True)
-        if gradient is not None and bool(gradient.any()) and useful[name].shape[1] > 1
+        if gradient is not None and bool(gradient.any())
     }
-    chosen = _last_of_each_resolution({name: _area(m) for name, m in reached.items()})
+    chosen = _last_of_each_resolution(areas)
     finest = _area(prediction)
-    return tuple(n for n in chosen if _area(maps[n]) < finest or len(chosen) == 1)
+    return tuple(n for n in chosen if areas[n] < finest or len(chosen) == 1)
 
 
 def _area(output: Tensor) -> int:
     """Rows times columns of a map (1, c, h, w)."""
     return output[0, 0].numel()
+
+
+def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:
+    height, width = output.shape[2:4]
+    if min(height, width) < 2:
+        return False
+    ratio = (height / width) / (sides[0] / sides[1])
+    return 1 / _SIMILAR_ASPECT < ratio < _SIMILAR_ASPECT
 
 
 def _gradients(prediction: Tensor, tensors: list[Tensor]) -> tuple[Tensor | None, ...]:
@@ -148,11 +241,3 @@ def _reaches_features(prediction: Tensor, copies: list[Tensor]) -> bool:
     depth = prediction.squeeze().shape
     features = [t for t in copies if t.ndim > 2 and t.shape[1] > 1 and t.squeeze().shape != depth]
     return any(gradient is not None for gradient in _gradients(prediction, features))
-
-
-def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:
-    height, width = output.shape[2:4]
-    if min(height, width) < 2:
-        return False
-    ratio = (height / width) / (sides[0] / sides[1])
-    return 1 / _SIMILAR_ASPECT < ratio < _SIMILAR_ASPECT

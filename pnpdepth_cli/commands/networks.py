@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
 
 from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice
+from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.core.user_code import wrap_user_errors
+from pnpdepth_cli.core.split.cut_point import LayerName
+from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.errors import ModelError, UsageError
-from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.prepare import prepare
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
-from pnpdepth_cli.models.frame_map import synthetic_camera, synthetic_frame
-from pnpdepth_cli.models.measure_layers import MeasuredLayer, measure_layers
-from pnpdepth_cli.models.network import Network, load_network, out_of_memory_is_a_device_error
+from pnpdepth_cli.models.frame_map import FrameMap
+from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import families
-from pnpdepth_cli.points import SparsePoints
 
 DEFAULT_SIZE = (240, 320)
 """Rows and columns of the synthetic frame of a network without a size of its own."""
@@ -53,7 +54,7 @@ def _describe(definition: ModelDefinition, family: str) -> dict[str, Any]:
         "input_kind": definition.input_kind,
         "size": _size(definition.size),
         "output_kind": definition.output_kind,
-        "parameters": sum(parameter.numel() for parameter in module.parameters()),
+        "parameters": _parameters_of(module),
         "checkpoint": str(path) if path and path.is_file() else None,
         "layers": definition.layers,
         "layer": definition.default_layer,
@@ -72,6 +73,17 @@ def _size(size: Fixed | Multiple | Near) -> str:
     return "any" if size.longest is None else f"any, shrunk to {size.longest}"
 
 
+def _parameters_of(module: torch.nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def _synthetic_map(network: Network) -> FrameMap:
+    """The map of an image of the network's own size."""
+    size = network.definition.size
+    own = (size.height, size.width) if isinstance(size, Fixed) else DEFAULT_SIZE
+    return FrameMap.fit(size, *own)
+
+
 def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict[str, Any]:
     """Loads a network, runs it once, and cuts it at every layer of its definition.
 
@@ -82,7 +94,7 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         model: Name or file of the network, as `pnpdepth_cli.models.registry.find_definition` takes
             it.
         checkpoint: Weights of the network; None takes those of the definition.
-        image: The rgb image to run it on; None runs it on a synthetic frame.
+        image: The rgb image to run it on; None runs it on a synthetic one. Points are synthetic.
 
     Returns:
         input, output: rows and columns. range: least and greatest value of the prediction as the
@@ -96,12 +108,12 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         InputError: The image cannot be read.
     """
     network = load_network(model, checkpoint)
-    definition = network.definition
+    definition, frame, rgb = network.definition, _synthetic_map(network), None
+    if image is not None:
+        rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1).contiguous()[None]
+        frame = FrameMap.fit(definition.size, *rgb.shape[-2:])
     with out_of_memory_is_a_device_error(network.device):
-        prepared = prepare(
-            network, _synthetic(_own_size(network)) if image is None else _read(image)
-        )
-        arguments = prepared.arguments
+        arguments = network.synthetic_arguments(frame, rgb)
         notes = [*network.notes, *network.verify(arguments)]
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
@@ -109,32 +121,15 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         layers = {name: _check_layer(network, name, arguments, raw) for name in definition.layers}
     return {
         "name": definition.name,
-        "input": list(prepared.map.network),
+        "input": list(frame.network),
         "output": list(raw.shape[-2:]),
         "output_kind": definition.output_kind,
         "output_scale": definition.output_scale,
         "range": [float(known.min()), float(known.max())] if len(known) else [],
-        "parameters": sum(p.numel() for p in network.module.parameters()),
+        "parameters": _parameters_of(network.module),
         "layers": layers,
         "notes": notes,
     }
-
-
-def _own_size(network: Network) -> tuple[int, int]:
-    size = network.definition.size
-    return (size.height, size.width) if isinstance(size, Fixed) else DEFAULT_SIZE
-
-
-def _synthetic(size: tuple[int, int]) -> Frame:
-    rgb, points = synthetic_frame(size)
-    return Frame(rgb=rgb[0], points=points, camera=synthetic_camera(size))
-
-
-def _read(image: Path) -> Frame:
-    rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1).contiguous()
-    height, width = rgb.shape[-2:]
-    no_points = SparsePoints(xy=torch.zeros(0, 2), depth=torch.zeros(0), size=(height, width))
-    return Frame(rgb=rgb, points=no_points, camera=synthetic_camera((height, width)))
 
 
 def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], whole: Tensor) -> str:
@@ -144,7 +139,7 @@ def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], who
             with torch.no_grad():
                 z = split.front(*arguments)
             z.requires_grad_(True)
-            raw = network.raw_of(split.rear(z)).nan_to_num()
+            raw = network.known_of(split.rear(z))
             if not torch.equal(raw.detach(), whole.nan_to_num()):
                 return "the cut network gives something else than the whole one"
             gradient = gradient_at(z, raw.sum())
@@ -153,6 +148,27 @@ def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], who
     if gradient is None:
         return "no gradient comes back from the prediction"
     return "ok" if bool(gradient.isfinite().all()) else "the gradient is not finite"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredLayer:
+    """A layer and what a cut there costs and reaches; all but the name is None with a problem.
+
+    stride: network pixels per element of z; None if z has no two spatial axes. cost_behind:
+    fraction of the network's floating-point operations behind the cut, which every update repeats;
+    seconds_behind: time of one pass of that part. parameters: weights of the layer itself. Fields:
+    rows and columns that one point influences, see `InfluentialField`.
+    """
+
+    name: str
+    shape: tuple[int, ...] | None = None
+    stride: float | None = None
+    cost_behind: float | None = None
+    seconds_behind: float | None = None
+    parameters: int | None = None
+    field_in_z: tuple[int, int] | None = None
+    field_in_output: tuple[int, int] | None = None
+    problem: str | None = None
 
 
 def list_layers(
@@ -182,6 +198,40 @@ def list_layers(
         raise UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
+    frame, measured = _synthetic_map(network), []
     with out_of_memory_is_a_device_error(network.device):
-        prepared = prepare(network, _synthetic(_own_size(network)))
-        return measure_layers(network, names, prepared.arguments, prepared.map.network, on_layer)
+        arguments = network.synthetic_arguments(frame)
+        with torch.no_grad(), FlopCounterMode(display=False) as whole:
+            network.depth_of(network.module(*arguments))
+        for done, name in enumerate(names, start=1):
+            measured.append(_measure(network, name, arguments, frame, whole.get_total_flops()))
+            on_layer(done, len(names))
+    return measured
+
+
+def _measure(
+    network: Network, name: str, arguments: tuple[Tensor, ...], frame: FrameMap, whole_flops: int
+) -> MeasuredLayer:
+    try:
+        with Split(network.module, name) as split, torch.no_grad():
+            z = split.front(*arguments)
+            split.rear(z)  # the first pass learns the cut
+            with FlopCounterMode(display=False) as behind:
+                split.rear(z)
+            start = time.perf_counter()
+            split.rear(z)
+            seconds = time.perf_counter() - start
+            field = influential_field(split, z, network.known_of)
+    except ModelError as error:
+        return MeasuredLayer(name=name, problem=str(error))
+    module = dict(network.module.named_modules())[LayerName.parse(name).module]
+    return MeasuredLayer(
+        name=name,
+        shape=tuple(z.shape),
+        stride=frame.network[0] / z.shape[-2] if z.ndim == 4 else None,
+        cost_behind=behind.get_total_flops() / whole_flops if whole_flops else None,
+        seconds_behind=seconds,
+        parameters=_parameters_of(module),
+        field_in_z=field.in_z,
+        field_in_output=field.in_output,
+    )

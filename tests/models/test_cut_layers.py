@@ -1,8 +1,9 @@
-"""Suggested layers, chosen by their shapes and gradients."""
+"""Layers to cut at: suggested by shapes and gradients, chosen for the spacing of the points."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,7 +11,16 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.suggest_layers import suggest_layers
+from pnpdepth_cli.models import cut_layers
+from pnpdepth_cli.models.cut_layers import (
+    best_layer,
+    default_layer,
+    suggest_layers,
+    wanted_field,
+)
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.settings import Settings
 
 IMAGE = torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(0))
 
@@ -93,3 +103,51 @@ def test_a_layer_that_runs_twice_is_not_listed() -> None:
 
 def test_what_gives_no_maps_has_no_layers_and_is_no_fault() -> None:
     assert layers_of(nn.Identity()) == ()
+
+
+# ------------------------------------------------------------------ for the points
+
+
+class Deep(nn.Module):
+    """A layer at stride 16, and one at full size."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.deep = nn.Conv2d(3, 4, 16, stride=16)
+        self.up = nn.ConvTranspose2d(4, 4, 16, stride=16)
+        self.late = nn.Conv2d(4, 4, 3, padding=1)
+        self.head = nn.Conv2d(4, 1, 1)
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        return self.head(self.late(self.up(self.deep(rgb)))) + 5  # type: ignore[no-any-return]
+
+
+@pytest.fixture
+def network() -> Network:
+    definition = ModelDefinition(
+        name="net", input_kind="rgb", size=Multiple(16), build=Deep, complete=True,
+        layers=("deep", "late"),
+    )  # fmt: skip
+    return load_network(definition, None)
+
+
+def test_a_field_spans_several_gaps_between_points_and_half_the_image() -> None:
+    assert wanted_field((100, 400), 100) == 120
+    assert wanted_field((100, 400), 10_000) == 50
+
+
+def test_few_points_want_a_deep_layer_and_many_a_late_one(
+    network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cut_layers, "LEAST_FRACTION", 0.0)
+    image = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
+    assert best_layer(network, (image,), (64, 96), 20) == "deep"
+    assert best_layer(network, (image,), (1, 1), 36) == "late"
+    assert best_layer(network, (image,), (64, 96), 0) is None
+
+
+def test_the_default_is_the_definitions_layer_else_the_best_one(network: Network) -> None:
+    assert default_layer(network, (160, 192), 50) == "deep"
+    named = replace(network.definition, defaults=Settings(layer="late"))
+    assert default_layer(replace(network, definition=named), (160, 192), 50) == "late"
