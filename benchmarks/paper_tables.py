@@ -4,7 +4,7 @@
 
 The tiny editions that come with the program, on rooms and streets rendered from seeds that nothing
 else uses (into --cache, once; needs pnpdepth[train]), and with --shared on the real frames at hand.
-Networks with published weights on NYU and KITTI are measured by `pnpdepth batch --preset paper` and
+Networks with published weights on NYU and KITTI are measured by `pnpdepth batch --method paper` and
 `pnpdepth eval`.
 
 Each network: as it is, refined at the paper's setting (sign, α = 0.01, K = 5, L1, the paper's z)

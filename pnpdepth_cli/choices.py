@@ -195,7 +195,8 @@ MEASURES = OpenList(
 """Measures that `eval` computes only on request: `pnpdepth_cli.measures.Measure`."""
 
 # The method
-PRESETS = ("paper",)  # methods by one name: `pnpdepth_cli.settings.PAPER`
+UNKNOWN = ("keep", "zero")  # depth that no points support, in the depth file
+METHODS = ("fused", "alone", "paper")  # without and with the included network; the paper's
 SCHEDULES = ("constant", "linear")  # of the step size over the updates
 ALIGNMENTS = ("none", "median", "scale", "affine", "auto")  # of the output with the points
 

@@ -78,11 +78,12 @@ class Settings:
         UsageError: A value is out of range.
     """
 
-    preset: str | None = option(
-        None,
-        "paper: the paper's setting and nothing else.  [default: the networks refined, fused and"
-        " propagated]",
-        choices=choices.PRESETS,
+    method: str = option(
+        "fused",
+        "fused: NETWORK and the included network `compact` refined, fused and propagated; alone:"
+        " the same without `compact`; paper: the paper's setting and nothing else.",
+        choices=choices.METHODS,
+        show_default=True,
     )
     layer: str | None = option(
         None,
@@ -138,13 +139,18 @@ class Settings:
         given = self.given()
         flags = {each.name: each.name for each in fields(self)}
         flags |= {each.name: each.flag for each in options_of(Settings)}
-        if self.preset is not None:
-            flags["preset"] += f" {self.preset}"
-        return " ".join(flags[name] for name in given if name != "seed")
+        flags["method"] = f"--method {self.method}"
+        not_fixed = {"seed"} if self.is_paper else {"seed", "method"}
+        return " ".join(flags[name] for name in given if name not in not_fixed)
 
-    def with_preset(self) -> Settings:
-        """Returns these settings, and those of the preset where these are open."""
-        return self if self.preset is None else self.over(PAPER)
+    @property
+    def is_paper(self) -> bool:
+        """Whether the method is the paper's."""
+        return self.method == "paper"
+
+    def with_paper(self) -> Settings:
+        """Returns these settings; with the paper's method, its settings where these are open."""
+        return self.over(PAPER) if self.is_paper else self
 
     def given(self) -> dict[str, Any]:
         """Returns the fields that are not open."""

@@ -24,9 +24,9 @@ def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
     user, network = Settings(lr="3%", blur=0.0), Settings(lr=0.5, blur=2.0, loss="log")
     assert user.over(network) == Settings(lr="3%", blur=0.0, loss="log")
     assert user.over(network).opened("blur") == Settings(lr="3%", loss="log")
-    preset = Settings(preset="paper", iterations=2).with_preset()
-    assert preset == Settings(preset="paper", iterations=2).over(PAPER)
-    assert Settings(iterations=2).with_preset() == Settings(iterations=2)
+    paper = Settings(method="paper", iterations=2).with_paper()
+    assert paper == Settings(method="paper", iterations=2).over(PAPER)
+    assert Settings(iterations=2).with_paper() == Settings(iterations=2)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
         (Settings(), ""),
         (Settings(seed=3), ""),
         (Settings(iterations=2, blur=1.0), "--iterations blur"),
-        (Settings(preset="paper", iterations=2), "--preset paper --iterations"),
+        (Settings(method="paper", iterations=2), "--method paper --iterations"),
     ],
 )
 def test_any_setting_of_the_method_fixes_it(settings: Settings, by: str) -> None:
@@ -48,7 +48,7 @@ def test_any_setting_of_the_method_fixes_it(settings: Settings, by: str) -> None
         *(("iterations", value) for value in ("5", -1, 2.0)),
         *(("lr", value) for value in ("x%", "", 0, -1, NAN, INF, "inf")),
         *(("blur", value) for value in (-1, NAN, INF, "1")),
-        *((field, "foo") for field in ("preset", "loss", "update", "schedule", "align")),
+        *((field, "foo") for field in ("method", "loss", "update", "schedule", "align")),
         ("align", ["auto"]),
         ("layer", 3),
         ("seed", -1),

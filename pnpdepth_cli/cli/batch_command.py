@@ -44,7 +44,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     cls=grouped_help.GroupedCommand,
     common=frozenset(
         {
-            *("--layout", "--sample", "--limit", "--shard", "--model", "--checkpoint", "--preset"),
+            *("--layout", "--sample", "--limit", "--shard", "--model", "--checkpoint", "--method"),
             *("--holdout", "--uncertainty", "--output", "--html", "--vary"),
         }
     ),
@@ -86,7 +86,7 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
     pnpdepth batch drive_0001/ -o out/ --shard 1/4        # one of four processes
     pnpdepth batch drive_0001/ -o out/ --ray              # all devices of this machine
     pnpdepth batch drive_0001/ -o out/ --html report/     # then open report/index.html
-    pnpdepth batch frames.csv -o study/ --vary preset=default,paper --vary sample=20,100,500
+    pnpdepth batch frames.csv -o study/ --vary method=fused,paper --vary sample=20,100,500
 
     The layout of a folder is recognised from its content. The simplest layout has files of the same
     stem in rgb/, sparse/, gt/ (optional) and calib/ (optional). A list has a header with image,

@@ -19,7 +19,7 @@ from pnpdepth_cli.settings import Settings
     cls=grouped_help.GroupedCommand,
     common=frozenset(
         {
-            *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--preset", "--layer"),
+            *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--method", "--layer"),
             *("--holdout", "--uncertainty", "--output", "--overwrite", "--json"),
         }
     ),

@@ -52,7 +52,7 @@ def read_map_points(
         hidden, why = occluded_in_map(points), "hidden by foreground"
         said = (
             "a projected LiDAR scan; dropped {:,} points occluded from the camera by nearer ones;"
-            " --preset paper keeps them"
+            " --method paper keeps them"
         )
     if hidden is not None and hidden.any():
         points, dropped = points.select(~hidden), {why: int(hidden.sum())}

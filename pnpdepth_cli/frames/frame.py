@@ -110,7 +110,7 @@ class Frame:
 
 
 def registration_to_make(registration: Registration, settings: Settings) -> Register:
-    """Returns how images are to be moved. The paper's preset moves none unless numbers are given.
+    """Returns how images are to be moved. The paper's method moves none unless numbers are given.
 
     Raises:
         UsageError: There is no such registration.
@@ -120,7 +120,7 @@ def registration_to_make(registration: Registration, settings: Settings) -> Regi
         return ImageRegistration(zoom=zoom, right=right, down=down)
     if registration not in ("auto", "off"):
         raise UsageError(f"registration must be auto, off or three numbers, got {registration!r}")
-    return "auto" if registration == "auto" and settings.preset is None else None
+    return "auto" if registration == "auto" and not settings.is_paper else None
 
 
 def tensor_of(image: NDArray[np.float32]) -> Tensor:

@@ -47,8 +47,6 @@ class Method:
         by it alone; without, by the default method.
         first: The first frame, which decides what definitions leave open.
         more: Function of further frames, which decide as well; called only if a network needs it.
-        compact: Whether the default method fuses the networks with the included network `compact`,
-            where there is an image.
         validated: Whether a fixed method is validated, for which each frame is refined again.
         uncertainty: Whether the standard deviation of the depth is estimated too.
 
@@ -64,7 +62,6 @@ class Method:
         first: Frame,
         more: Callable[[], Sequence[Frame]] = tuple,
         *,
-        compact: bool = True,
         validated: bool = False,
         uncertainty: bool = False,
     ) -> None:
@@ -84,7 +81,7 @@ class Method:
         ]
         # The included network joins, unless it is there.
         named = {network.definition.name for network in resolved}
-        fused = self.is_default and compact and first.rgb is not None
+        fused = self.is_default and asked.method == "fused" and first.rgb is not None
         if fused and COMPANION not in named:
             device, precision = str(resolved[0].device), resolved[0].precision
             companion = load_network(COMPANION, None, device, precision=precision)

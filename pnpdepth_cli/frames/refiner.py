@@ -36,8 +36,6 @@ class Refiner:
         settings: Settings of the refinement; what they leave open, the network decides. With any
         setting of the method, `network` alone is refined by it; without, by the default method.
         uncertainty: Whether the standard deviation of the depth is estimated too.
-        compact: Whether the default method fuses `network` with the included network `compact`,
-            where there is an image. Without, `network` alone is refined.
         registration: Whether images are moved to their points: "auto", if their depth edges show
         that they are not registered; "off"; or by (zoom, right, down), pixels.
         adapt: Frames of the same sequence, (image, sparse) each. Before the first frame is refined,
@@ -56,7 +54,6 @@ class Refiner:
         settings: Settings | None = None,
         *,
         uncertainty: bool = False,
-        compact: bool = True,
         registration: Registration = "auto",
         adapt: Sequence[Pair] = (),
     ) -> None:
@@ -66,7 +63,7 @@ class Refiner:
         if not isinstance(settings, Settings | None):
             raise UsageError(f"settings must be Settings, not {type(settings).__name__}")
         self._asked = settings or Settings()
-        self._uncertainty, self._compact = uncertainty, compact
+        self._uncertainty = uncertainty
         self._register = registration_to_make(registration, self._asked)
         self._adapt = [frame_of_arrays(*pair, self._register, None) for pair in adapt]
         self._method: Method | None = None
@@ -144,7 +141,6 @@ class Refiner:
                 networks,
                 self._asked,
                 first,
-                compact=self._compact,
                 uncertainty=self._uncertainty,
             )
             self._method = self._stack.enter_context(method)

@@ -129,7 +129,7 @@ def resolve_settings(
         UsageError: The settings contradict each other.
     """
     defaults = definition.defaults
-    settings = settings.with_preset()
+    settings = settings.with_paper()
     if settings.update not in (None, defaults.closed().update):
         defaults = defaults.opened("lr", "schedule", "blur")
     alignment = definition.default_alignment
@@ -151,7 +151,7 @@ def resolve_member(network: Network, frame: Frame, asked: Settings, *, is_defaul
         is_default: Whether the default method refines it.
     """
     definition, layer = network.definition, asked.layer
-    if layer is None and asked.preset is None:
+    if layer is None and not asked.is_paper:
         layer = default_layer(network, frame.size, len(frame.points))
     layer = resolve_layer(definition, layer)
     settings = resolve_settings(definition, asked, metric=frame.unit == METRES)

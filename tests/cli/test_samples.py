@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 
 from pnpdepth_cli.cli.main import run
@@ -66,10 +67,10 @@ def result(capsys: pytest.CaptureFixture[str], line: str) -> Any:
         ("--model fcrn-tiny --uncertainty", 1.041, 0.070, SIGMA),
         ("--model fcrn-tiny --holdout 0.2", 1.039, 0.075, set()),
         ("--model fcrn-tiny --propagate none", 1.386, 0.592, set()),
-        ("--model fcrn-tiny --preset paper", 1.386, 1.317, set()),
-        ("--model fcrn-tiny --preset paper --loss l2", 1.386, 1.318, set()),
-        ("--model fcrn-tiny --preset paper --iterations 10", 1.386, 1.256, set()),
-        ("--model sparse2dense-tiny --preset paper --update sgd --lr 0.1", 0.451, 0.450, set()),
+        ("--model fcrn-tiny --method paper", 1.386, 1.317, set()),
+        ("--model fcrn-tiny --method paper --loss l2", 1.386, 1.318, set()),
+        ("--model fcrn-tiny --method paper --iterations 10", 1.386, 1.256, set()),
+        ("--model sparse2dense-tiny --method paper --update sgd --lr 0.1", 0.451, 0.450, set()),
     ],
 )
 def test_refine_writes_its_files_and_lowers_the_error(
@@ -128,10 +129,33 @@ def test_refine_takes_a_scan_with_its_calibration(capsys: pytest.CaptureFixture[
     assert {path.name for path in Path("out").iterdir()} == FILES
 
 
+def test_depth_that_no_points_support_is_said_and_written_as_zero_if_asked(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    street = SAMPLES / "street"
+    scan = f"{street}/rgb.png --sparse {street}/000000.bin --calib {street}/calib.txt"
+    scan += " --iterations 1"
+    line = f"refine {scan} --gt {street}/gt.png --uncertainty"
+    kept, zero = (result(capsys, f"{line} --unknown {how} -o {how}") for how in ("keep", "zero"))
+    depth, truth = (
+        read_depth(path).values for path in (Path("zero/rgb_depth.png"), street / "gt.png")
+    )
+    valid = cv2.imread("zero/rgb_valid.png", cv2.IMREAD_GRAYSCALE) > 0
+    whole = read_depth(Path("keep/rgb_depth.png")).values
+    assert (depth == np.where(valid, whole, 0)).all()
+    # The errors of all stages are those of the pixels whose depth is kept.
+    errors, known = zero["errors"]["ground_truth"], (truth > 0) & valid
+    assert errors["after"]["mae"] == pytest.approx(np.abs(depth - truth)[known].mean(), abs=0.01)
+    assert errors["after"]["coverage"] == pytest.approx(known.sum() / (truth > 0).sum())
+    assert errors["linear"]["mae"] < kept["errors"]["ground_truth"]["linear"]["mae"]
+    # Without a mask, a note gives the part that lies outside of the scan.
+    assert any("--unknown zero" in note for note in result(capsys, f"refine {scan}")["notes"])
+
+
 def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    line = f"batch {SAMPLES}/frames.csv -o out --model fcrn-tiny --preset paper"
+    line = f"batch {SAMPLES}/frames.csv -o out --model fcrn-tiny --method paper"
     output(capsys, line)
     frames = json.loads(Path("out/summary.json").read_text())["frames"]
     mae = {frame["name"]: frame["errors"]["ground_truth"]["after"]["mae"] for frame in frames}

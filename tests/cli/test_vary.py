@@ -40,10 +40,10 @@ def test_every_combination_is_the_batch_with_these_options(root: Path) -> None:
 
 
 def test_the_default_method_and_the_number_of_points_can_be_varied(root: Path) -> None:
-    assert batch("--vary", "preset=default,paper", "--vary", "sample=20,10%", "--limit", "1") == 0
+    assert batch("--vary", "method=fused,paper", "--vary", "sample=20,10%", "--limit", "1") == 0
     fixed_by = {name: summary(name)["fixed_by"] for name in folders()}
-    assert [fixed_by[f"preset=default,sample={n}"] for n in ("20", "10%")] == [""] * 2
-    assert [fixed_by[f"preset=paper,sample={n}"] for n in ("20", "10%")] == ["--preset paper"] * 2
+    assert [fixed_by[f"method=fused,sample={n}"] for n in ("20", "10%")] == [""] * 2
+    assert [fixed_by[f"method=paper,sample={n}"] for n in ("20", "10%")] == ["--method paper"] * 2
 
 
 def test_a_second_run_does_only_what_is_missing(

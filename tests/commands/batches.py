@@ -68,7 +68,7 @@ def add_frame(root: Path, name: str, image: Any = None, gt: bool = True) -> None
 def refinement(root: Path, **changes: Any) -> RefineRequest:
     """A request to refine with the network in net/, without the choice unless it is asked for."""
     fields: dict[str, Any] = {
-        "propagate": None if {"preset", "auto"} & changes.keys() else "none",
+        "propagate": None if {"method", "auto"} & changes.keys() else "none",
         "model": str(root / "net" / "my_net.py"),
         "checkpoint": root / "net" / "my_net.safetensors",
     }

@@ -87,6 +87,6 @@ def run(frame: FrameOnDisk, **changes: Any) -> RefineOutcome:
         "output": frame.folder / "out",
         "model": str(frame.model),
         "checkpoint": frame.checkpoint,
-        "propagate": None if "preset" in changes else "none",
+        "propagate": None if "method" in changes else "none",
     }
     return refine_image(RefineRequest.from_fields(**(request | changes)))

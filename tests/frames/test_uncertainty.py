@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
+import numpy as np
 import pytest
 import torch
 
+import pnpdepth_cli as pnp
 from pnpdepth_cli.frames.uncertainty import calibration, valid_depth
+from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.points import SparsePoints
+
+INDOOR = Path(__file__).parents[2] / "samples" / "indoor"
 
 
 def test_normal_residuals_are_calibrated_to_their_standard_deviation() -> None:
@@ -56,3 +64,18 @@ def test_depth_beyond_the_points_or_too_uncertain_is_not_valid() -> None:
     depth[40, 10], depth[40, 11], sigma[40, 12] = 0, 31, 2.6
     valid = valid_depth(lidar_points(), depth, sigma)
     assert valid[40, 9:14].tolist() == [True, False, False, False, True]
+
+
+def test_the_deviation_of_a_dense_map_holds_an_error_that_its_points_share() -> None:
+    rgb = cv2.cvtColor(cv2.imread(str(INDOOR / "rgb.png")), cv2.COLOR_BGR2RGB)
+    truth = read_depth(INDOOR / "gt.png").values
+    wave = np.random.default_rng(0).normal(size=(4, 5)).astype(np.float32)
+    wave = cv2.resize(wave, truth.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    measured = np.zeros_like(truth)
+    measured[2::4, 2::4] = (truth * (1 + 0.01 * wave / wave.std()))[2::4, 2::4]
+    settings = pnp.Settings(iterations=0)
+    with pnp.Refiner(pnp.load_network("compact"), settings, uncertainty=True) as refiner:
+        refined = refiner.refine(rgb, measured)
+    assert refined.sigma is not None
+    error = np.abs(refined.after - truth)[truth > 0]
+    assert (error <= 2 * refined.sigma[truth > 0]).mean() > 0.85  # 0.2 without the sensor's

@@ -83,11 +83,11 @@ def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: 
     read = read_requested(RefineRequest(files=files))
     count = read.sources["sparse"].dropped["hidden by foreground"]
     assert len(read.points) == len(points) - count < len(points)
-    assert sum("--preset paper" in note for note in read.notes) == 1
+    assert sum("--method paper" in note for note in read.notes) == 1
     kept = read_frame(files, ReadOptions(scan=ScanOptions(keep_occluded=True)))
     assert len(kept.points) == len(points)
     assert not any("occluded" in note for note in kept.notes)
-    paper = RefineRequest(files=files, method=Settings(preset="paper"))
+    paper = RefineRequest(files=files, method=Settings(method="paper"))
     assert len(read_requested(paper).points) == len(points)
 
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.output_files import Outputs
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.completion.interpolation import in_hull
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refined import Refined
@@ -42,6 +44,9 @@ _FINER = (1000.0, 10_000.0, 100_000.0)  # where 256 would round them
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
 
+_MUCH = 0.1
+"""Part of an image outside of the points from which it is said."""
+
 LARGEST_VIEW = 200_000
 """Most points of a 3D view."""
 
@@ -66,6 +71,24 @@ def output_scale(inputs: Frame) -> float:
         if nearest * scale < _LEAST_CODES and _BEYOND_POINTS * farthest * finer <= LARGEST_CODE:
             scale = finer
     return scale
+
+
+def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Refined:
+    """Returns the frame with 0 where no points support its depth, if that is asked for.
+
+    Where it is not, a note tells how much of a scan's image lies outside of its points.
+    """
+    if request.outputs.unknown == "zero" and frame.valid is not None:
+        return replace(frame, after=np.where(frame.valid, frame.after, np.float32(0)))
+    source = inputs.sources.get("sparse")
+    if frame.valid is not None or source is None or source.calibration is None:
+        return frame
+    outside = 1 - float(in_hull(frame.used).double().mean())
+    note = (
+        f"note: {100 * outside:.0f} % of the pixels lie outside of the scan's points, and their"
+        " depth is a guess; --unknown zero writes 0 where points do not support it"
+    )
+    return replace(frame, notes=(*frame.notes, note)) if outside > _MUCH else frame
 
 
 def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from pnpdepth_cli.commands.error_tables import names_of_depths
 from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs, stale_outputs
-from pnpdepth_cli.commands.refinement.outputs import within_range, write_outputs
+from pnpdepth_cli.commands.refinement.outputs import within_range, without_unknown, write_outputs
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.refinement.refined_record import record_of
 from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb
@@ -92,9 +92,8 @@ def load_method(
         request.method,
         first,
         more,
-        compact=not choice.no_compact,
         validated=hold_out.baselines,
-        uncertainty=hold_out.uncertainty,
+        uncertainty=hold_out.uncertainty or request.outputs.unknown == "zero",
     )
 
 
@@ -110,7 +109,7 @@ def write_refined(
 
     The record is the same from run to run, except `seconds` and `peak_memory_mb`.
     """
-    frame = within_range(outputs, inputs, frame)
+    frame = within_range(outputs, inputs, without_unknown(request, inputs, frame))
     record = record_of(request, method, inputs, frame)
     stale = []
     if "record" in outputs:

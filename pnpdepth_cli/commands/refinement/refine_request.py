@@ -31,9 +31,6 @@ class NetworkChoice:
         metavar="NETWORK",
         show_default=True,
     )
-    no_compact: bool = option(
-        False, "Refine NETWORK alone; the included network `compact` takes no part in the result."
-    )
     more_models: tuple[str, ...] = ()
     """Further networks, with their own weights, which are fused with the first."""
     checkpoint: Path | None = option(
@@ -78,6 +75,12 @@ class OutputOptions:
         choices=choices.FORMATS,
         show_default=True,
     )
+    unknown: str = option(
+        "keep",
+        "Depth that the points do not support, such as of the sky above a scan: keep it, or zero.",
+        choices=choices.UNKNOWN,
+        show_default=True,
+    )
     view_3d: bool = False
     overwrite: bool = option(False, "Replace existing results.")
 
@@ -111,7 +114,7 @@ class RefineRequest:
     @property
     def read_options(self) -> ReadOptions:
         """How the frame's files are read. The paper's setting moves and drops nothing."""
-        if self.method.preset is None:
+        if not self.method.is_paper:
             return self.reading
         registration = self.reading.registration
         return replace(

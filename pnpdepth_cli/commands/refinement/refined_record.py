@@ -63,7 +63,7 @@ def record_of(
             networks=[member.network.definition.name for member in method.members],
         ),
         settings={
-            "preset": method.asked.preset,
+            "method": method.asked.method,
             "layer": method.own.layer,
             **asdict(method.settings),
             "seed": method.asked.seed,
@@ -142,13 +142,14 @@ def _against_truth(
     maps: dict[str, DepthMap],
     beside: dict[str, DepthMap],
 ) -> Stages:
-    """Scores of the stages; those of baselines on the pixels where the result is known."""
+    """Scores of the result, and those of all others on the pixels where the result is known."""
     if gt is None:
         return {}
-    stages = {name: depth for name, depth in refined.stages.items() if name != BEFORE}
     known = np.where(refined.after > 0, gt, np.float32(0))
-    return {name: _scores(depth, gt) for name, depth in (maps | stages).items()} | {
-        name: _scores(depth, known) for name, depth in beside.items()
+    stages = {name: depth for name, depth in refined.stages.items() if name != BEFORE}
+    return {
+        name: _scores(depth, gt if name == AFTER else known)
+        for name, depth in (maps | stages | beside).items()
     }
 
 

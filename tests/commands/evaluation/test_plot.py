@@ -55,11 +55,11 @@ def test_numbers_lie_along_the_axis_and_names_make_lines(
 
 
 def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path, figures: list[Any]) -> None:
-    runs = [batch(tmp_path, 0.5, preset=name) for name in ("paper", "default")]
+    runs = [batch(tmp_path, 0.5, method=name) for name in ("paper", "fused")]
     for name in ("one.png", "two.png"):
         plot_comparison(compare(runs), tmp_path / name)
     (_, below), ticks = figures[0].axes, figures[0].axes[1].get_xticklabels()
-    assert [tick.get_text() for tick in ticks] == ["paper", "default"]
+    assert [tick.get_text() for tick in ticks] == ["paper", "fused"]
     assert below.get_lines()[0].get_xdata().tolist() == [0, 1]
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
 

@@ -15,16 +15,16 @@ from pnpdepth_cli.io.depth import read_depth
 from tests.commands.frames import FrameOnDisk, run
 
 
-def test_the_papers_preset_is_the_papers_setting_bit_for_bit(frame: FrameOnDisk) -> None:
+def test_the_papers_method_is_the_papers_setting_bit_for_bit(frame: FrameOnDisk) -> None:
     paper = {
         "layer": "middle", "update": "sign", "lr": "0.01", "iterations": 5, "loss": "l1",
         "schedule": "constant", "blur": 0.0, "align": "none", "propagate": "none",
     }  # fmt: skip
-    one, other = (frame.folder / name for name in ("preset.npy", "options.npy"))
-    by_name = run(frame, preset="paper", output=one).record
+    one, other = (frame.folder / name for name in ("method.npy", "options.npy"))
+    by_name = run(frame, method="paper", output=one).record
     by_options = run(frame, **paper, output=other).record
     assert one.read_bytes() == other.read_bytes()
-    assert by_name.settings == by_options.settings | {"preset": "paper"}
+    assert by_name.settings == by_options.settings | {"method": "paper"}
 
 
 def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:

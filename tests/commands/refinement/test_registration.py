@@ -52,10 +52,10 @@ def test_an_unregistered_image_is_moved_and_the_record_says_so(
     assert any(note.startswith("image: moved into the frame of the") for note in record.notes)
 
 
-def test_off_and_the_papers_preset_leave_the_image_and_numbers_are_recorded(
+def test_off_and_the_papers_method_leave_the_image_and_numbers_are_recorded(
     tmp_path: Path, frame: FrameOnDisk
 ) -> None:
-    assert refined(tmp_path / "a", frame, preset="paper").registration is None
+    assert refined(tmp_path / "a", frame, method="paper").registration is None
     assert refined(tmp_path / "a", frame, registration="off").registration is None
     request = RefineRequest.from_fields(**write_frame(tmp_path, 0, 500), registration="off")
     assert read_requested(request).one_view
