@@ -91,8 +91,9 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     if files.as_json:
         print_json(evaluation.to_json())
     elif not to_stdout:
-        for table in tables.text_tables(evaluation, keys):
-            print_table(table)
+        print_table(means)
+        if len(evaluation.frames) > 1:
+            print_table(tables.worst_frames(evaluation, keys))
     if html is not None:
         with progress_bar("report", "frame") as show:
             report_eval.write_eval_report(html, evaluation, keys, on_frame=show)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.tables import Cell, Style, Table
+from pnpdepth_cli.commands.tables import Cell, Table
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.measures import MEASURES
 from pnpdepth_cli.stages import (
@@ -64,22 +64,19 @@ def error_table(
         bases: Names of what the errors are on; None for `bases_of`.
     """
     rows = []
-    for basis in bases_of(errors) if bases is None else bases:
-        stages = errors[basis]
-        sides = [stages.get(stage, {}) for stage in (BEFORE, AFTER, LINEAR)]
+    for basis in bases or bases_of(errors):
+        sides = [errors[basis].get(stage, {}) for stage in (BEFORE, AFTER, LINEAR)]
         count = "" if "frames" in sides[1] else f"{sides[1].get('points', 0):,} "
+        start = f"error {BASES[basis].replace('at ', f'at {count}')}, "
         for key in (key for key in keys or _MEASURES if key in sides[0]):
-            name = _title(key)
+            name = _title(key) if basis == GT else start + _title(key)
             values = [side.get(key) for side in sides]
-            if basis == USED:
-                values[2] = None
-            shown = [format_error(key, value, unit) for value in values]
-            changes = ["", ""]
-            if basis != USED:
+            before, after, linear = (format_error(key, value, unit) for value in values)
+            if basis == USED:  # a change there proves nothing
+                rows.append([name, before, after, "", "–", ""])
+            else:
                 changes = [change(key, beside, values[1]) for beside in (values[0], values[2])]
-            if basis != GT:
-                name = f"error {BASES[basis].replace('at ', f'at {count}')}, {name}"
-            rows.append([name, *shown[:2], changes[0], shown[2], changes[1]])
+                rows.append([name, before, after, changes[0], linear, changes[1]])
     columns = ["", "before", "after", "change", "linear", "vs linear"]
     return Table(title=title, columns=columns, rows=rows)
 
@@ -130,33 +127,36 @@ def _stages_table(record: FrameRecord) -> Table:
     """The stages of the default method: scores on the ground truth, or at validation points."""
     assert record.method is not None
     names, errors = record.method.networks, record.errors
-    keys, rows, scored = (
-        ["mae"],
-        dict[str, Scores](),
-        "too few points to validate the result at some",
-    )
-    # Scores on the ground truth, or at validation points.
-    if stages := errors.get(GT):
-        rows = {name: stages[name] for name in _STAGES if name in stages}
-        keys, scored = ["rmse", "mae", "mre", "delta1"], _describe_pixels(stages[LINEAR])
-    elif stages := errors.get(VALIDATION):
-        rows = {name: stages[name] for name in _STAGES if name in stages}
+    keys, stages = ["mae"], errors.get(VALIDATION, {})
+    scored = "too few points to validate the result at some"
+    if GT in errors:
+        keys, stages = ["rmse", "mae", "mre", "delta1"], errors[GT]
+        scored = _describe_pixels(stages[LINEAR])
+    elif stages:
         scored = f"at {stages[LINEAR]['points']:,} validation points, which the rows did not get"
-    # The result is no stage of its own where one expert has all the weight.
-    if sum(weight > 0 for weight in record.weights.values()) == 1 and ALONE not in rows:
-        rows.pop(AFTER, None)  # the network's own
-    last = [name for name in rows if name != LINEAR][-1:]
+    shown = [stage for stage in _STAGES if stage in stages]
+    # The result is no stage of its own where one expert, the network, has all the weight.
+    of_one = sum(weight > 0 for weight in record.weights.values()) == 1 and ALONE not in shown
+    shown = [stage for stage in shown if stage != AFTER or not of_one]
+    last = next((stage for stage in reversed(shown) if stage != LINEAR), "")
     # A row for each stage, the last in bold.
     of_names = {"name": names[0], "fusing": names[-1], "weights": weights_text(record.weights)}
-    lines = []
-    for name, scores in rows.items():
-        style: Style = "bold" if [name] == last else ""
-        against = "" if name == LINEAR else change("mae", rows[LINEAR]["mae"], scores["mae"])
-        cells = [format_error(key, scores[key], record.unit) for key in keys]
-        title = _STAGES[name].format(**of_names)
-        lines.append([*(Cell(text, style) for text in (title, *cells)), against])
-    columns = ["", *(_title(key) for key in keys), "MAE vs linear"]
-    return Table(title=f"{' + '.join(names)}; {scored}", columns=columns, rows=lines)
+    rows = []
+    for stage in shown:
+        title, own = _STAGES[stage].format(**of_names), stages[stage]
+        against = change("mae", stages[LINEAR]["mae"], own["mae"])
+        row = _stage_row(title, [(key, own) for key in keys], record.unit, bold=stage == last)
+        rows.append([*row, "" if stage == LINEAR else against])
+    columns = ["", *map(_title, keys), "MAE vs linear"]
+    return Table(title=f"{' + '.join(names)}; {scored}", columns=columns, rows=rows)
+
+
+def _stage_row(
+    title: str, scores: Sequence[tuple[str, Scores]], unit: str, *, bold: bool
+) -> list[Cell]:
+    """The title of a stage, and its errors: each the one of this key in the scores."""
+    texts = [title, *(format_error(key, own.get(key), unit) for key, own in scores)]
+    return [Cell(text, "bold" if bold else "") for text in texts]
 
 
 def weights_text(weights: Mapping[str, float]) -> str:
@@ -179,22 +179,18 @@ def has_baselines(errors: Errors) -> bool:
 
 def baselines_table(errors: Errors, unit: str) -> Table:
     """Returns the baselines, the network and the result, best first at the validation points."""
-    titles = {BEFORE: "network", AFTER: "result"}
+    titles = {name: name for name in BASELINES} | {BEFORE: "network", AFTER: "result"}
     checked, scored = errors.get(VALIDATION, {}), errors.get(GT, {})
-    names = [name for name in (*BASELINES, *titles) if name in checked or name in scored]
-    columns = {"MAE, validation points": (checked, "mae")}
+    columns = {"MAE, validation points": ("mae", checked)}
     if scored:
-        columns |= {f"{key.upper()}, ground truth": (scored, key) for key in ("mae", "rmse")}
-    known = [name for name in names if checked.get(name, {}).get("mae") is not None]
-    lines = []
-    for name in sorted(known, key=lambda name: checked[name]["mae"] or 0) or names:
-        style: Style = "bold" if name == AFTER else ""
-        cells = [
-            format_error(key, stages.get(name, {}).get(key), unit)
-            for stages, key in columns.values()
-        ]
-        lines.append([Cell(text, style) for text in (titles.get(name, name), *cells)])
-    return Table(title="against every simple baseline", columns=["", *columns], rows=lines)
+        columns |= {f"{key.upper()}, ground truth": (key, scored) for key in ("mae", "rmse")}
+    maes = {stage: mae for stage, own in checked.items() if (mae := own.get("mae")) is not None}
+    best_first = sorted((stage for stage in titles if stage in maes), key=maes.__getitem__)
+    rows = []
+    for stage in best_first or [each for each in titles if each in checked or each in scored]:
+        own = [(key, stages.get(stage, {})) for key, stages in columns.values()]
+        rows.append(_stage_row(titles[stage], own, unit, bold=stage == AFTER))
+    return Table(title="against every simple baseline", columns=["", *columns], rows=rows)
 
 
 def format_error(key: str, value: float | None, unit: str) -> str:
@@ -211,16 +207,14 @@ def _title(key: str) -> str:
 
 def change(key: str, before: float | None, after: float | None) -> Cell:
     """Returns how much a measure rose or fell, in per cent or percentage points."""
-    if before is None or after is None or math.isnan(before) or math.isnan(after):
-        return Cell("–", "dim")
     measure = _MEASURES[key]
-    if measure.percent:
-        rise, text = after - before, f"{100 * (after - before):+.2f} pt"
-    elif before == 0:
+    if before is None or after is None or math.isnan(before - after):
         return Cell("–", "dim")
-    else:
-        rise, text = after / before - 1, f"{after / before - 1:+.1%}"
+    if before == 0 and not measure.percent:
+        return Cell("–", "dim")
+    rise = after - before if measure.percent else after / before - 1
     gain = measure.sign * rise
+    text = f"{100 * rise:+.2f} pt" if measure.percent else f"{rise:+.1%}"
     return Cell(text, "good" if gain > 0 else "bad" if gain < 0 else "dim")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import zip_longest
 from pathlib import Path
@@ -44,21 +44,20 @@ class Run(NamedTuple):
     name: str
     """Name of the folder, or of the file without its ending."""
     path: str
-    stage: str
-    """The depth that is compared: before or after refinement."""
     measures: list[Measure]
+    """Measures that all frames have."""
     scoring: dict[str, Any]
-    frames: dict[str, FrameRecord]
+    scores: dict[str, Scores]
+    """Scores of the depth that is compared: before or after refinement."""
+    before: dict[str, Scores]
+    """Scores before refinement; empty where there are none."""
+    groups: dict[str, str | None]
     varied: dict[str, str]
     """Options that `batch --vary` varied, with their values; empty for other runs."""
 
-    def scores(self, name: str, stage: str | None = None) -> Scores:
-        """Returns the scores of a frame; empty for a stage that the run does not have."""
-        return self.frames[name].errors[GT].get(stage or self.stage, {})
-
     def counts(self, name: str) -> tuple[int, int]:
         """Returns the numbers of scored pixels and of pixels with ground truth of a frame."""
-        scores = self.scores(name)
+        scores = self.scores[name]
         pixels, coverage = scores.get("pixels") or 0, scores.get("coverage")
         known = scores.get("known", pixels / coverage if coverage else 0)
         return round(pixels), round(known or 0)
@@ -145,24 +144,22 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     for run in runs[1:]:
         _check_rules(first, run)
     # the frames and the measures that all runs have
-    names = tuple(name for name in first.frames if all(name in run.frames for run in runs))
+    names = tuple(name for name in first.scores if all(name in run.scores for run in runs))
     if not names:
-        own, other = (some_names(run.frames) or "none" for run in (first, runs[-1]))
+        own, other = (some_names(run.scores) or "none" for run in (first, runs[-1]))
         raise InputError(f"the runs have no scored frame in common: {own}; and {other}")
     measures = _shared_measures(runs, columns)
     keys = [measure.key for measure in measures]
-    scores = [[[*map(run.scores(name).get, keys)] for name in names] for run in runs]
+    scores = [[[*map(run.scores[name].get, keys)] for name in names] for run in runs]
     values = np.array(scores, np.float64)  # (runs, frames, measures)
     known = np.asarray(np.isfinite(values).all(axis=0))
     values[:, ~known] = math.nan
     # the tests, over frames that count as independent
-    groups = [
-        first.frames[name].group or group
-        for name, group in zip(names, groups_by_name(names), strict=True)
-    ]
+    by_name = zip(names, groups_by_name(names), strict=True)
+    groups = [first.groups[name] or group for name, group in by_name]
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
-    gains, exact = _gains(values, measures, clusters)
-    compared = zip(runs, _names(runs), values, [{}, *gains], strict=True)
+    means = [_means(keys, of_run) for of_run in values.tolist()]
+    gains, exact = _gains(values, means, measures, clusters)
     return Comparison(
         frames=names,
         measures=measures,
@@ -171,30 +168,20 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
             ComparedRun(
                 name=name,
                 path=run.path,
-                mean=_means(measures, of_run),
-                before=FrameMeans(
-                    {key: run.scores(frame, BEFORE).get(key) for key in keys} for frame in names
-                ).means(),
+                mean=mean,
+                before=_means(keys, ([*map(run.before[frame].get, keys)] for frame in names)),
                 varied=run.varied,
                 coverage=run.coverage(names),
                 gains=of_first,
             )
-            for run, name, of_run, of_first in compared
+            for run, name, mean, of_first in zip(
+                runs, _names(runs), means, [{}, *gains], strict=True
+            )
         ),
         clusters=clusters,
         exact_p_values=exact,
         tests=len(gains) * len(measures),
-        notes=[
-            *_notes_on_pixels(runs, names),
-            *(
-                f"{measure.title}: over {has.sum():,} of {len(has):,} frames; the others lack it in"
-                " a run"
-                for measure, has in zip(measures, known.T, strict=True)
-                if not has.all()
-            ),
-            *clusters.notes(),
-            *_notes_on_clusters(clusters, len(names), len(gains) * len(measures)),
-        ],
+        notes=[*_notes_on_frames(runs, names), *_notes_on_tests(measures, known, clusters, gains)],
     )
 
 
@@ -206,26 +193,31 @@ def _shared_measures(runs: Sequence[Run], columns: Sequence[str] | None) -> tupl
     return main if columns is None and main else choose_measures(measures, columns)
 
 
-def _means(measures: Sequence[Measure], values: NDArray[np.float64]) -> dict[str, float | None]:
-    """The means of values (frames, measures) by the key of the measure."""
-    keys = [measure.key for measure in measures]
-    return FrameMeans(dict(zip(keys, frame, strict=True)) for frame in values.tolist()).means()
+def _means(
+    keys: Sequence[str], frames: Iterable[Iterable[float | None]]
+) -> dict[str, float | None]:
+    """The means of each frame's values, by their keys."""
+    return FrameMeans(dict(zip(keys, frame, strict=True)) for frame in frames).means()
 
 
 def _gains(
-    values: NDArray[np.float64], measures: Sequence[Measure], clusters: Clusters
+    values: NDArray[np.float64],
+    means: Sequence[dict[str, float | None]],
+    measures: Sequence[Measure],
+    clusters: Clusters,
 ) -> tuple[list[dict[str, Gain]], bool]:
     """The gain of each run but the first by measure, and whether the p-values are exact.
 
     Args:
         values: (runs, frames, measures), NaN where a frame lacks a measure in any run.
+        means: Means over the frames, by measure.
         measures: Measures of the last axis.
         clusters: Clusters of the frames.
     """
     better = np.array([measure.sign for measure in measures], np.float64)
-    first, *means = (np.array([*_means(measures, run).values()], np.float64) for run in values)
+    first, *others = (np.array([*mean.values()], np.float64) for mean in means)
     rows, exact = [], True
-    for other, mean in zip(values[1:], means, strict=True):
+    for other, mean in zip(values[1:], others, strict=True):
         ends = interval(lambda a, b: gain(a, b, better), (values[0], other), clusters)
         p_values, exact = swap_p_values(values[0], other, clusters, PERMUTATIONS, SEED)
         rows.append([gain(first, mean, better), *ends, mean - first, p_values])
@@ -262,10 +254,10 @@ def _names(runs: Sequence[Run]) -> list[str]:
     return [f"{run.name} ({number})" for number, run in enumerate(runs, start=1)]
 
 
-def _notes_on_pixels(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]:
+def _notes_on_frames(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]:
     """Warnings of frames and pixels that not all runs scored."""
     for run in runs:
-        if unshared := [name for name in run.frames if name not in set(names)]:
+        if unshared := [name for name in run.scores if name not in set(names)]:
             yield (
                 f"warning: {len(unshared):,} frames of {run.path} are not scored in all runs and"
                 f" left out: {some_names(unshared)}"
@@ -285,17 +277,28 @@ def _notes_on_pixels(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]
         )
 
 
-def _notes_on_clusters(clusters: Clusters, frames: int, tests: int) -> list[str]:
-    """A warning where the frames are too dependent, or too few, to conclude anything."""
-    smallest = 2.0 ** (1 - clusters.count)
-    if frames == 1 or tests * smallest < ALPHA:
-        return []
-    adjusted = min(1.0, tests * smallest)
-    return [
-        f"warning: {clusters.describe()} are too few independent ones to conclude anything from"
-        f" {tests} tests: the smallest possible p is {smallest:.2g}, adjusted {adjusted:.2g}"
-        + ("" if clusters.count >= MIN_CLUSTERS else f"; there is no interval below {MIN_CLUSTERS}")
-    ]
+def _notes_on_tests(
+    measures: Sequence[Measure],
+    known: NDArray[np.bool_],
+    clusters: Clusters,
+    gains: Sequence[dict[str, Gain]],
+) -> Iterator[str]:
+    """Measures that frames lack, and whether frames are too dependent or too few to conclude."""
+    frames, tests, smallest = len(known), len(gains) * len(measures), 2.0 ** (1 - clusters.count)
+    for measure, has in zip(measures, known.T, strict=True):
+        if not has.all():
+            yield (
+                f"{measure.title}: over {has.sum():,} of {frames:,} frames; the others lack it in a"
+                " run"
+            )
+    yield from clusters.notes()
+    if frames > 1 and tests * smallest >= ALPHA:
+        few = f"; there is no interval below {MIN_CLUSTERS}" * (clusters.count < MIN_CLUSTERS)
+        yield (
+            f"warning: {clusters.describe()} are too few independent ones to conclude anything from"
+            f" {tests} tests: the smallest possible p is {smallest:.2g}, adjusted"
+            f" {min(1.0, tests * smallest):.2g}{few}"
+        )
 
 
 def read_run(text: str) -> Run:
@@ -325,17 +328,18 @@ def read_run(text: str) -> Run:
     try:
         records = [FrameRecord.from_json(entry, path) for entry in content.get("frames") or ()]
         frames = {f.name: f for f in records if f.status != "failed" and GT in f.errors}
-        scores = [frame.errors[GT][stage] for frame in frames.values()]
+        scores = {name: frame.errors[GT][stage] for name, frame in frames.items()}
         if not scores:
             raise ValueError("no frame has scores")
         measures = [Measure.from_json(entry) for entry in content.get("measures", ())] or MEASURES
         return Run(
             name=f"{name}:before" if stage == BEFORE else name,
             path=text,
-            stage=stage,
-            measures=[each for each in measures if all(each.key in own for own in scores)],
+            measures=[m for m in measures if all(m.key in own for own in scores.values())],
             scoring=dict(content.get("scoring") or scoring_of(find_protocol("paper"))),
-            frames=frames,
+            scores=scores,
+            before={name: frame.errors[GT].get(BEFORE, {}) for name, frame in frames.items()},
+            groups={name: frame.group for name, frame in frames.items()},
             varied={str(key): str(value) for key, value in content.get("varied", {}).items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:

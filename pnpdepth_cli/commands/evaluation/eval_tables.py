@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from pnpdepth_cli.commands.evaluation.compare import ALPHA, PERMUTATIONS, Comparison
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
@@ -17,30 +16,24 @@ from pnpdepth_cli.measures import COVERAGE, choose_measures
 
 _FRAMES_SHOWN = 12
 _FRAME_COLUMNS = 6
+_COUNTS = ("pixels", "known", COVERAGE.key, "given", "median_ratio", "factor", "shift")
 _STARS = (0.05, 0.01, 0.001)
-
-
-def text_tables(evaluation: Evaluation, keys: Sequence[str] | None) -> list[Table]:
-    """Returns what the terminal shows: the means, and the frames or the worst of them."""
-    frames = [worst_frames(evaluation, keys)] if len(evaluation.frames) > 1 else []
-    return [means_table(evaluation, keys), *frames]
 
 
 def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
-    count = len(evaluation.scored)
-    title = f"Means over {count:,} frame{'' if count == 1 else 's'}, {evaluation.pixels:,} pixels"
-    columns, intervals = ["", "mean"], evaluation.interval
+    count, intervals = len(evaluation.scored), evaluation.interval
+    title = f"Means over {count:,} frame{'s' * (count != 1)}, {evaluation.pixels:,} pixels"
+    columns = ["", "mean"]
     if intervals is not None:
         columns.append("95 %")
         title += f"; 95 % interval over {evaluation.clusters.describe()}"
     rows = []
     mean = evaluation.mean | {COVERAGE.key: evaluation.coverage}
     for measure in (*choose_measures(evaluation.measures, keys), COVERAGE):
-        row = [measure.heading, measure.text(mean[measure.key])]
-        if intervals is not None:
-            row.append(" … ".join(measure.text(end) for end in intervals.get(measure.key, ())))
-        rows.append(row)
+        ends = [] if intervals is None else [intervals.get(measure.key, ())]
+        texts = (" … ".join(map(measure.text, each)) for each in ends)
+        rows.append([measure.heading, measure.text(mean[measure.key]), *texts])
     title += _without_sparse(evaluation.request.rules.exclude_sparse)
     return Table(title=title, columns=columns, rows=rows)
 
@@ -48,19 +41,14 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
 def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
     measures = choose_measures(evaluation.measures, keys)
-    counts = ("pixels", "known", COVERAGE.key, "given", "median_ratio", "factor", "shift")
     rows = []
     for frame in evaluation.frames:
-        scores = plain(scores_of(frame))
-        files = (frame.inputs.get(name) for name in FILES)
+        files, scores = (frame.inputs.get(name) for name in FILES), plain(scores_of(frame))
         row = [frame.name, frame.group, *(file and file.path for file in files)]
-        row += [scores.get(name) for name in counts]
-        row += [scores.get(measure.key) for measure in measures]
+        row += map(scores.get, (*_COUNTS, *(measure.key for measure in measures)))
         rows.append([*row, frame.message])
-    columns = [
-        COVERAGE if name == COVERAGE.key else name for name in ("name", "group", *FILES, *counts)
-    ]
-    return Table(columns=[*columns, *measures, "error"], rows=rows)
+    counts = [COVERAGE if name == COVERAGE.key else name for name in _COUNTS]
+    return Table(columns=["name", "group", *FILES, *counts, *measures, "error"], rows=rows)
 
 
 def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
@@ -86,23 +74,21 @@ def worst(evaluation: Evaluation) -> list[FrameRecord]:
 
 def comparison_table(comparison: Comparison) -> Table:
     """Returns a row for each measure and run; all runs but the first have gain and p."""
-    # The first run has means only, the others gains too.
     first, *others = comparison.runs
-    rows: list[list[Any]] = []
+    rows: list[list[str]] = []
     for measure in comparison.measures:
-        rows.append([measure.heading, first.name, measure.text(first.mean[measure.key])])
-        rows[-1] += ["–"] * 4
+        rows.append([measure.heading, first.name, measure.text(first.mean[measure.key]), *"––––"])
         for run in others:
-            found = run.gains[measure.key]
+            found, p = run.gains[measure.key], run.gains[measure.key].p_adjusted
             style: Style = "good" if (found.percent or 0) > 0 else "bad"
-            p = found.p_adjusted
+            percents = (found.percent, found.low_percent, found.high_percent)
+            percent, *ends = ("–" if value is None else f"{value:+.2f}" for value in percents)
             rows.append([
                 measure.heading,
                 run.name,
                 measure.text(run.mean[measure.key]),
-                Cell(_gain_text(found.percent), style if p is not None and p < ALPHA else "dim"),
-                _gain_text(found.low_percent),
-                _gain_text(found.high_percent),
+                Cell(percent, style if p is not None and p < ALPHA else "dim"),
+                *ends,
                 "–" if p is None else f"{p:.4f}",
             ])  # fmt: skip
     # What was tested, in the title.
@@ -123,24 +109,24 @@ def methods_table(comparison: Comparison) -> Table:
 
     Stars mark where a run differs from the first significantly.
     """
-    runs, measures = comparison.runs, comparison.measures
+    runs = comparison.runs
     rows: list[list[str]] = [[run.name] for run in runs]
-    for measure in measures:
-        key = measure.key
+    for measure in comparison.measures:
+        means = [run.mean[measure.key] for run in runs]
         pick = max if measure.better == "higher" else min
-        known = [mean for run in runs if (mean := run.mean[key]) is not None]
-        best = measure.text(pick(known, default=None))
-        for row, run in zip(rows, runs, strict=True):
-            text, p = measure.text(run.mean[key]), run.gains[key].p_adjusted if run.gains else None
+        best = measure.text(pick((mean for mean in means if mean is not None), default=None))
+        for row, run, mean in zip(rows, runs, means, strict=True):
+            p = run.gains[measure.key].p_adjusted if run.gains else None
             stars = "*" * sum(p is not None and p < limit for limit in _STARS)
-            is_best = run.mean[key] is not None and text == best and measure.sign != 0
+            text = measure.text(mean)
+            is_best = mean is not None and text == best and measure.sign != 0
             row.append(Cell(text + stars, "bold" if is_best else ""))
     return Table(
         title=(
             f"means over {len(comparison.frames):,} frames, the best in bold; *, **, ***:"
             f" differs from {runs[0].name} with p < 0.05, 0.01, 0.001 {_describe_tests(comparison)}"
         ),
-        columns=["", *measures],
+        columns=["", *comparison.measures],
         rows=rows,
     )
 
@@ -154,7 +140,3 @@ def _describe_tests(comparison: Comparison) -> str:
 
 def _without_sparse(excluded: bool) -> str:
     return "; without the pixels of sparse points" if excluded else ""
-
-
-def _gain_text(value: float | None) -> str:
-    return "–" if value is None else f"{value:+.2f}"
