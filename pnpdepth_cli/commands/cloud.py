@@ -26,9 +26,9 @@ from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.dataset.plausible import far_values
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.cloud_files import write_cloud
-from pnpdepth_cli.io.json_file import plain, write_json
 from pnpdepth_cli.io.poses import poses_of_frames
+from pnpdepth_cli.io.scans import write_cloud
+from pnpdepth_cli.io.text_files import plain, write_json
 from pnpdepth_cli.sensors.point_cloud import (
     PointCloud,
     View,

@@ -23,8 +23,12 @@ from pnpdepth_cli.dataset.frame_files import (
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import known_metres, load_stored
-from pnpdepth_cli.io.file_bytes import check_value_count, one_line, size_of_regular_file
-from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.io.file_bytes import (
+    check_value_count,
+    fingerprint,
+    one_line,
+    size_of_regular_file,
+)
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.rgb import read_rgb, read_video_frame, sizes_of
 

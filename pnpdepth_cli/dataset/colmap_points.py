@@ -20,7 +20,7 @@ from pnpdepth_cli.io.colmap_model import (
     read_model,
 )
 from pnpdepth_cli.io.depth import describe_range
-from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.formats import SATURATED_CODE, Reading
 from pnpdepth_cli.points import METRES, MODEL_UNITS
 from pnpdepth_cli.sensors.lens import pixels_of

@@ -17,9 +17,8 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord
-from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.fingerprint import Fingerprint
-from pnpdepth_cli.io.json_file import plain, read_json, write_json
+from pnpdepth_cli.io.file_bytes import Fingerprint, one_line
+from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.stages import AFTER, GT, HELD_OUT, LINEAR, VALIDATION
 

@@ -14,7 +14,7 @@ from pnpdepth_cli.dataset.arrays import read_image, record_of
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ImageSource, Neighbour, file_of
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.file_record import FileRecord
-from pnpdepth_cli.io.fingerprint import fingerprint
+from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulate

@@ -1,4 +1,4 @@
-"""Output files that are written whole or not at all."""
+"""Output files that are written whole or not at all, by one run at a time in a folder."""
 
 from __future__ import annotations
 
@@ -18,6 +18,11 @@ from pnpdepth_cli.io.file_bytes import one_line
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}(\.[A-Za-z0-9]+)?")
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _OF_THE_NAME = {errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL, errno.EISDIR, errno.ENOTDIR}
+LOCKS = ".batch*.lock"
+"""Pattern of the names of all lock files."""
+_WHOLE = ".batch.lock"
+_TRIED_S = 0.2
+"""Longest wait for a lock; another process that looks for shards holds it for a moment."""
 
 
 @contextmanager
@@ -147,3 +152,54 @@ def _empty_file_beside(target: Path) -> Path:
             raise OutputError(message) from error
         raise cannot_write(target, error) from error
     return temporary
+
+
+@contextmanager
+def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None]:
+    """Holds the lock of a run or of a shard until the end of the block.
+
+    The operating system locks the file, so that the lock ends with the process, however that ends.
+
+    Args:
+        folder: The output folder.
+        shard: Number i of n that run at once, (i, n); None for all frames.
+
+    Raises:
+        OutputError: Another run writes there, or the folder cannot be written to.
+    """
+    own = folder / (_WHOLE if shard is None else f".batch.{shard[0]}of{shard[1]}.lock")
+    with _hold(own):
+        for other in sorted(folder.glob(LOCKS)) if shard is None else [folder / _WHOLE]:
+            if other != own and other.exists():
+                with _hold(other):
+                    pass
+        yield
+
+
+@contextmanager
+def in_turn(folder: Path) -> Iterator[None]:
+    """No other shard is inside at the same time; each waits for the one before."""
+    with _hold(folder / ".batch.summary.lock", timeout_s=-1):
+        yield
+
+
+@contextmanager
+def _hold(path: Path, timeout_s: float | None = None) -> Iterator[None]:
+    """Holds a lock; a negative timeout waits for ever. OutputError if another process does."""
+    from filelock import FileLock, Timeout  # it imports asyncio
+
+    if not path.parent.is_dir():  # filelock would make it
+        raise cannot_write(path.parent, FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)))
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=_TRIED_S if timeout_s is None else timeout_s)
+    except Timeout:
+        raise OutputError(f"another batch writes to {path.parent}; wait for it to end") from None
+    except NotImplementedError as error:
+        raise OutputError(f"{path} cannot be locked; choose another output folder") from error
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    try:
+        yield
+    finally:
+        lock.release()

@@ -11,16 +11,17 @@ separate, and a value may continue over several lines:
     size: [1242, 375]                          # optional: width and height
 
 Bare numbers are K alone: 9, 16 of a 4×4 matrix (ScanNet), or fx fy cx cy [width height]. Record3D's
-metadata.json has K by columns. YAML is
-OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain, with the intrinsics of the raw image; a
-matrix T_camera_lidar there is the pose of the scanner. A folder is KITTI's raw data or KITTI-360.
+metadata.json has K by columns. YAML is OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain,
+with the intrinsics of the raw image; a matrix T_camera_lidar there is the pose of the scanner. A
+folder is KITTI's raw data or KITTI-360.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.extrinsics import check_pose, numbers_in, pose_of_matrix
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_text_size, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.json_file import read_json
-from pnpdepth_cli.io.yaml_file import parse_yaml
+from pnpdepth_cli.io.text_files import parse_yaml, read_json
 
 CAMERA = 2
 """KITTI's left colour camera, whose images the benchmarks have."""
@@ -49,19 +49,14 @@ _DISTORTIONS = (
     *("distortion", "D", "d"),
 )
 _POSES = ("T_camera_lidar", "T_cam_lidar", "T_camera_scanner", "T_cam_velo")
-_LENSES = {
-    **dict.fromkeys(
-        ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "none", "", "pinhole"),
-        "radial-tangential",
-    ),
-    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "equi"), "fisheye"),
-}
+_LENSES = dict.fromkeys(
+    ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "none", "pinhole"),
+    "radial-tangential",
+) | dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "equi"), "fisheye")
 """Distortion models by their names in ROS and Kalibr."""
 
-_COEFFICIENTS = {
-    "radial-tangential": (0, 4, 5, 8, 12, 14),
-    "fisheye": (0, 4),
-}
+_COEFFICIENTS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (0, 4)}
+_FALSE = ("0", "false", "False")
 _FIELD = re.compile(r"^\s*([A-Za-z_]\w*)(?:\s*:|\s+(?=[-+.\d]))(.*)$")
 """A name and its value; KITTI's tracking set has names without a colon."""
 
@@ -86,6 +81,45 @@ class Calibration:
     Each has the pose of `camera` in its coordinates."""
 
 
+class _Fields:
+    """The named values of a calibration file."""
+
+    def __init__(self, path: Path, values: Mapping[str, Any]) -> None:
+        self.path, self.values = path, values
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.values
+
+    def first(self, names: Iterable[str]) -> str | None:
+        """Returns the first of the names that is there."""
+        return next((name for name in names if name in self.values), None)
+
+    def text(self, name: str, default: str) -> str:
+        """Returns a value as a word; an empty one is the default."""
+        return str(self.values.get(name) or default).strip(" \"'") or default
+
+    def numbers(self, name: str, count: int | None = None) -> list[float]:
+        """Returns the finite numbers of a value; so many, if there is a count."""
+        if name not in self.values:
+            raise FileFormatError(f"{self.path} has no {name}; it is incomplete or of another kind")
+        numbers = numbers_in(self.values[name])
+        if numbers is None or not np.isfinite(numbers).all():
+            raise FileFormatError(f"{self.path}: {name} is not made of finite numbers; correct it")
+        if (largest := max(map(abs, numbers), default=0)) > _LARGEST:
+            raise FileFormatError(f"{self.path}: {name} holds {largest:g}, which no camera has")
+        if count is not None and len(numbers) != count:
+            raise FileFormatError(f"{self.path}: {name} has {len(numbers)} numbers, not {count}")
+        return numbers
+
+    def matrix(self, name: str, *shape: int) -> Floats:
+        """Returns the numbers of a value as an array of this shape."""
+        return np.reshape(self.numbers(name, math.prod(shape)), shape)
+
+    def pose(self, shift: str) -> Extrinsics:
+        """Returns the pose of the rotation R and a translation of this name."""
+        return check_pose(self.path, "R", self.matrix("R", 3, 3), self.matrix(shift, 3))
+
+
 def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     """Returns the calibration in a file, or in a folder of KITTI's raw data.
 
@@ -99,37 +133,37 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         InputError: The file cannot be read.
         UsageError: There is no such camera.
     """
+    # Files that name their kind, by their own names or by words in them.
     if path.is_dir() or path.name in (_PERSPECTIVE, *_RAW_FILES):
         return _kitti_folder(path if path.is_dir() else path.parent, camera)
     text = _text(path)
     if text.lstrip().startswith("%YAML") or any(mark in text for mark in _YAML_MARKS):
         return camera_in_yaml(path, parse_yaml(path, text), camera)
-    fields: dict[str, Any]
+    # JSON, named values, or numbers alone.
+    source = "calibration"
     if text.lstrip().startswith("{"):
-        fields = read_json(path)
-        if {"K", "w", "h", "poses"} <= set(fields):  # Record3D's, with K by columns
-            by_rows = _matrix(path, fields, "K", (3, 3)).T.ravel().tolist()
-            fields = {"K": by_rows, "width": fields["w"], "height": fields["h"]}
-            return _single(path, fields, camera, "Record3D's metadata")
+        fields = _Fields(path, read_json(path))
+        if {"K", "w", "h", "poses"} <= set(fields.values):  # Record3D's, with K by columns
+            size, source = [fields.values["w"], fields.values["h"]], "Record3D's metadata"
+            by_rows = fields.matrix("K", 3, 3).T.ravel().tolist()
+            fields = _Fields(path, {"K": by_rows, "size": size})
     elif re.search(r"\b[A-Za-z_]\w*\s*:", text):
-        fields = _fields(path, text)
+        fields = _named_values(path, text)
     else:
-        fields = _bare_intrinsics(path, text)
-    if any(re.fullmatch(r"P\d", str(name)) for name in fields):
-        return _kitti(path, fields, camera)
-    unknown = sorted(set(fields) - set(_PLAIN))
+        fields = _Fields(path, _bare_intrinsics(text))
+    if any(re.fullmatch(r"P\d", str(name)) for name in fields.values):
+        return _kitti(fields, camera)
+    unknown = sorted(set(fields.values) - set(_PLAIN))
     if unknown:
         raise FileFormatError(
             f"{path}: {unknown[0]!r} is not part of a calibration; use {', '.join(_PLAIN)}"
         )
-    return _single(path, fields, camera, "calibration")
+    return _single(fields, camera, source)
 
 
 def read_rigid_motion(path: Path) -> Extrinsics:
     """Returns (rotation (3, 3), translation (3,) metres) of KITTI's raw files with R and T."""
-    fields = _fields(path, _text(path))
-    rotation = _matrix(path, fields, "R", (3, 3))
-    return check_pose(path, "R", rotation, _matrix(path, fields, "T", (3,)))
+    return _named_values(path, _text(path)).pose("T")
 
 
 def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
@@ -144,12 +178,12 @@ def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
         name = f"cam{0 if camera is None else camera}"
         if name not in chain:
             raise UsageError(f"{path} has no {name}; --camera can be one of: {', '.join(chain)}")
-        calibration = _kalibr(path, name, chain[name])
+        calibration = _kalibr(_Fields(path, chain[name]), name)
     else:
         kind = "ROS camera_info" if "distortion_model" in content else "OpenCV calibration"
         fields = {name: content[name] for name in content if name != "R"}  # the rectification
-        calibration = _single(path, fields, camera, kind)
-        rectified = _rectified_cameras(path, content, calibration.camera)
+        calibration = _single(_Fields(path, fields), camera, kind)
+        rectified = _rectified_cameras(_Fields(path, content), calibration.camera)
         calibration = replace(calibration, rectified=rectified)
     read = calibration.camera
     if not read.distortion:
@@ -157,9 +191,7 @@ def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
     return replace(calibration, camera=replace(read, source=f"{read.source}, {read.lens} lens"))
 
 
-def _rectified_cameras(
-    path: Path, content: Mapping[str, Any], raw: Camera
-) -> dict[str, tuple[Camera, Extrinsics]]:
+def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, Extrinsics]]:
     """The cameras of a rectified image of camera_info, without distortion.
 
     Whether the transforms lead to the rectified camera (kitti2bag) or to the raw one, to which R
@@ -167,40 +199,39 @@ def _rectified_cameras(
     has it. Empty without P, or where P describes the raw image.
     """
     p, r = (
-        next((np.array(_numbers(path, content, n)) for n in names if n in content), np.empty(0))
+        np.array([] if (name := fields.first(names)) is None else fields.numbers(name))
         for names in (("projection_matrix", "P", "p"), ("rectification_matrix", "R", "r"))
     )
-    if p.size != 12 or not (p[0] > 0 and p[5] > 0):
+    if p.size != 12 or min(p[0], p[5], np.linalg.det(p.reshape(3, 4)[:, :3])) <= 0:
         return {}
-    intrinsics, offset = p.reshape(3, 4)[:, :3], np.zeros(3)
+    intrinsics, column = p.reshape(3, 4)[:, :3], p.reshape(3, 4)[:, 3]
+    offset = np.linalg.solve(intrinsics, column)
     turn = r.reshape(3, 3) if r.size == 9 and r.any() else np.eye(3)
-    if np.linalg.det(intrinsics):
-        offset = np.linalg.solve(intrinsics, p.reshape(3, 4)[:, 3])
-    plain = Camera(intrinsics=intrinsics, size=raw.size, source=raw.source)
-    turned = not np.allclose(turn, np.eye(3), atol=1e-9)
-    cameras = {"P": (plain, SAME_PLACE)}
+    turned, shifted = not np.allclose(turn, np.eye(3), atol=1e-9), np.abs(offset).max() > 1e-9
+    poses: dict[str, Extrinsics] = {}
+    if shifted:
+        poses["P with its offset" + ", and R" * turned] = Extrinsics(turn, offset)
     if turned:
-        cameras = {"P and R": (plain, Extrinsics(turn, np.zeros(3)))} | cameras
-    if np.abs(offset).max() > 1e-9:
-        name = "P with its offset, and R" if turned else "P with its offset"
-        cameras = {name: (plain, Extrinsics(turn, offset))} | cameras
-    is_raw = np.allclose(intrinsics, raw.intrinsics, atol=1e-3) and not raw.distortion
-    return {} if is_raw and len(cameras) == 1 else cameras
+        poses["P and R"] = Extrinsics(turn, np.zeros(3))
+    if not poses and np.allclose(intrinsics, raw.intrinsics, atol=1e-3) and not raw.distortion:
+        return {}
+    plain = Camera(intrinsics=intrinsics, size=raw.size, source=raw.source)
+    return {name: (plain, pose) for name, pose in {**poses, "P": SAME_PLACE}.items()}
 
 
-def _kitti(path: Path, fields: Mapping[str, Any], camera: int | None) -> Calibration:
+def _kitti(fields: _Fields, camera: int | None) -> Calibration:
     """KITTI's object set (R0_rect, Tr_velo_to_cam), tracking set (R_rect, Tr_velo_cam) and odometry
     set (Tr, already rectified)."""
-    number = _camera(path, camera, [int(n[1:]) for n in fields if re.fullmatch(r"P\d", n)])
-    odometry = "Tr" in fields
-    turn = "R_rect" if "R_rect" in fields else "R0_rect"
-    velodyne = "Tr_velo_cam" if "Tr_velo_cam" in fields else "Tr_velo_to_cam"
-    scanner = _matrix(path, fields, "Tr" if odometry else velodyne, (3, 4))
-    pose = check_pose(path, "rotation of the scanner", scanner[:, :3], scanner[:, 3])
-    rectify = np.eye(3) if odometry else _matrix(path, fields, turn, (3, 3))
-    projection = _matrix(path, fields, f"P{number}", (3, 4))
+    number = _camera(fields, camera, r"P(\d)")
+    scanner = fields.first(("Tr", "Tr_velo_cam")) or "Tr_velo_to_cam"
+    matrix = fields.matrix(scanner, 3, 4)
+    turn = fields.first(("R_rect",)) or "R0_rect"
     return _rectified_calibration(
-        path, projection, rectify, pose, f"KITTI calibration, camera {number}"
+        fields.path,
+        fields.matrix(f"P{number}", 3, 4),
+        np.eye(3) if scanner == "Tr" else fields.matrix(turn, 3, 3),
+        check_pose(fields.path, "rotation of the scanner", matrix[:, :3], matrix[:, 3]),
+        f"KITTI calibration, camera {number}",
     )
 
 
@@ -213,35 +244,38 @@ def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
             f"{folder} has no {cameras.name}; give the folder with KITTI's {_RAW_FILES[0]} and"
             f" {_RAW_FILES[1]}, or one calibration file"
         )
+    # The pose of the scanner; KITTI-360's file maps camera 0 to the scanner.
     scanner = folder / (_FROM_CAMERA_0 if is_360 else _RAW_FILES[1])
     pose = None
-    if scanner.is_file() and is_360:  # it maps camera 0 to the scanner
+    if scanner.is_file() and is_360:
         pose = pose_of_matrix(scanner, "the matrix", numbers_in(_text(scanner)) or []).inverse()
     elif scanner.is_file():
         pose = read_rigid_motion(scanner)
-    fields = _fields(cameras, _text(cameras))
-    numbers = [int(name[-2:]) for name in fields if re.fullmatch(r"P_rect_\d\d", name)]
-    number = _camera(cameras, 0 if is_360 and camera is None else camera, numbers)
-    # The development kit of the raw data rotates every camera by camera 0's rectification.
+    # The camera. The development kit of the raw data rotates each by camera 0's rectification.
+    fields = _named_values(cameras, _text(cameras))
+    number = _camera(fields, 0 if is_360 and camera is None else camera, r"P_rect_(\d\d)")
     return _rectified_calibration(
         cameras,
-        _matrix(cameras, fields, f"P_rect_{number:02}", (3, 4)),
-        _matrix(cameras, fields, "R_rect_00", (3, 3)),
+        fields.matrix(f"P_rect_{number:02}", 3, 4),
+        fields.matrix("R_rect_00", 3, 3),
         pose,
         f"{'KITTI-360' if is_360 else 'KITTI raw'} calibration, camera {number}",
-        _height_width(cameras, _numbers(cameras, fields, f"S_rect_{number:02}", 2)),
+        _height_width(cameras, fields.numbers(f"S_rect_{number:02}", 2)),
     )
 
 
-def _bare_intrinsics(path: Path, text: str) -> dict[str, Any]:
+def _bare_intrinsics(text: str) -> dict[str, Any]:
     """K, and the size if it is there, of numbers without names."""
     numbers = numbers_in(text) or []
     if len(numbers) == 16:  # ScanNet's, by rows
         return {"K": [numbers[i] for i in (0, 1, 2, 4, 5, 6, 8, 9, 10)]}
     if len(numbers) in (4, 6):
-        fx, fy, cx, cy, *size = numbers
-        return {"K": [fx, 0, cx, 0, fy, cy, 0, 0, 1]} | ({"size": size} if size else {})
+        return {"K": _by_rows(*numbers[:4])} | ({"size": numbers[4:]} if numbers[4:] else {})
     return {"K": text}
+
+
+def _by_rows(fx: float, fy: float, cx: float, cy: float) -> list[float]:
+    return [fx, 0, cx, 0, fy, cy, 0, 0, 1]
 
 
 def _rectified_calibration(
@@ -263,33 +297,40 @@ def _rectified_calibration(
     )
 
 
-def _kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> Calibration:
-    model = str(fields.get("camera_model", "pinhole"))
-    values = _numbers(path, fields, "intrinsics")
-    lens = str(fields.get("distortion_model", "none"))
-    distortion = fields.get("distortion_coeffs", [])
+def _kalibr(fields: _Fields, name: str) -> Calibration:
+    model, values = fields.text("camera_model", "pinhole"), fields.numbers("intrinsics")
     if model != "pinhole" or len(values) != 4:
         raise FileFormatError(
-            f"{path}: {name} is a {one_line(model)[:20]} camera with {len(values)} intrinsics; only"
-            " pinhole (4) is known, so calibrate it as one"
+            f"{fields.path}: {name} is a {one_line(model)[:20]} camera with {len(values)}"
+            " intrinsics; only pinhole (4) is known, so calibrate it as one"
         )
-    fx, fy, cx, cy = values
-    single = {name: fields[name] for name in _POSES if name in fields}
-    single |= {"K": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "distortion": distortion, "lens": lens}
+    plain = {key: fields.values[key] for key in _POSES if key in fields}
+    plain |= {"K": _by_rows(*values), "lens": fields.text("distortion_model", "none")}
+    plain["distortion"] = fields.values.get("distortion_coeffs", [])
     if "resolution" in fields:
-        single["size"] = fields["resolution"]
-    return _single(path, single, None, f"Kalibr camchain, {name}")
+        plain["size"] = fields.values["resolution"]
+    return _single(_Fields(fields.path, plain), None, f"Kalibr camchain, {name}")
 
 
-def _single(path: Path, fields: Mapping[str, Any], camera: int | None, source: str) -> Calibration:
+def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:
     """The camera of a plain file, or of one of OpenCV or ROS."""
+    path = fields.path
     if camera is not None:
         raise UsageError(f"{path} describes one camera; leave out --camera {camera}")
-    matrix = next((name for name in _MATRICES if name in fields), "K")
-    intrinsics = _check_intrinsics(path, _matrix(path, fields, matrix, (3, 3)))
-    scanner = _pose(path, fields)
-    lens, distortion = _lens(path, fields)
-    size = _size(path, fields)
+    intrinsics = _check_intrinsics(path, fields.matrix(fields.first(_MATRICES) or "K", 3, 3))
+    lens, distortion = _lens(fields)
+    # The pose of the scanner, as a matrix or as R and t.
+    scanner = None
+    if name := fields.first(_POSES):
+        scanner = pose_of_matrix(path, name, fields.numbers(name))
+    elif "R" in fields or "t" in fields:
+        scanner = fields.pose("t")
+    # The size of the image.
+    size, sides = None, [fields.first((f"image_{side}", side)) for side in ("width", "height")]
+    if "size" in fields:
+        size = _height_width(path, fields.numbers("size", 2))
+    elif None not in sides:
+        size = _height_width(path, [fields.numbers(str(side), 1)[0] for side in sides])
     return Calibration(
         camera=Camera(
             intrinsics=intrinsics, lens=lens, distortion=distortion, size=size, source=source
@@ -298,50 +339,26 @@ def _single(path: Path, fields: Mapping[str, Any], camera: int | None, source: s
     )
 
 
-def _lens(path: Path, fields: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
-    model = str(fields.get("lens", fields.get("distortion_model")) or "none").strip(" \"'")
-    is_fisheye = str(fields.get("fisheye_model", "0")).lower() not in ("0", "false")
-    if is_fisheye and "distortion_model" not in fields:  # of OpenCV
-        model = "fisheye"
+def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
+    model = fields.text(fields.first(("lens", "distortion_model")) or "lens", "none")
+    if "distortion_model" not in fields and fields.text("fisheye_model", "0") not in _FALSE:
+        model = "fisheye"  # of OpenCV
     lens = _LENSES.get(model)
     if lens is None:
-        known = ", ".join(name for name in _LENSES if name)
         raise FileFormatError(
-            f"{path}: distortion model {one_line(model)[:30]!r} is not known; known are {known}"
+            f"{fields.path}: distortion model {one_line(model)[:30]!r} is not known; known are"
+            f" {', '.join(_LENSES)}"
         )
-    name = next((name for name in _DISTORTIONS if name in fields), None)
-    coefficients = () if name is None else tuple(_numbers(path, fields, name))
+    name = fields.first(_DISTORTIONS)
+    coefficients = () if name is None else tuple(fields.numbers(name))
     if lens == "radial-tangential" and not any(coefficients):
         coefficients = ()
     if len(coefficients) not in _COEFFICIENTS[lens]:
         wanted = " or ".join(str(count) for count in _COEFFICIENTS[lens])
         raise FileFormatError(
-            f"{path}: {len(coefficients)} coefficients of {lens} distortion instead of {wanted}"
+            f"{fields.path}: {len(coefficients)} coefficients of {lens} distortion, not {wanted}"
         )
     return lens, coefficients
-
-
-def _pose(path: Path, fields: Mapping[str, Any]) -> Extrinsics | None:
-    name = next((name for name in _POSES if name in fields), None)
-    if name is not None:
-        return pose_of_matrix(path, name, _numbers(path, fields, name))
-    present = [name for name in ("R", "t") if name in fields]
-    if not present:
-        return None
-    if len(present) == 1:
-        missing = "t" if present == ["R"] else "R"
-        raise FileFormatError(f"{path} has {present[0]} but no {missing}; give both")
-    rotation = _matrix(path, fields, "R", (3, 3))
-    return check_pose(path, "R", rotation, _matrix(path, fields, "t", (3,)))
-
-
-def _size(path: Path, fields: Mapping[str, Any]) -> tuple[int, int] | None:
-    if "size" in fields:
-        return _height_width(path, _numbers(path, fields, "size", 2))
-    names = [next((n for n in (f"image_{s}", s) if n in fields), "") for s in ("width", "height")]
-    if not all(names):
-        return None
-    return _height_width(path, [_numbers(path, fields, name, 1)[0] for name in names])
 
 
 def _text(path: Path) -> str:
@@ -349,81 +366,52 @@ def _text(path: Path) -> str:
         check_text_size(path)
     data = read_bytes(path)
     if kind_of(data) is None and b"\0" not in data:
-        try:
+        with suppress(UnicodeDecodeError):
             return data.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            pass
     raise FileFormatError(
         f"{path} is not a text file; give a calibration of KITTI, or JSON or text with K, R and t"
     )
 
 
-def _fields(path: Path, text: str) -> dict[str, Any]:
+def _named_values(path: Path, text: str) -> _Fields:
     """`name: value`; a line without a name continues the value before it."""
-    fields: dict[str, list[str]] = {}
+    values: dict[str, list[str]] = {}
     name = None
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.split("#", 1)[0]
         match = _FIELD.match(content)
         if match:
             name = match[1]
-            if name in fields:
+            if name in values:
                 raise FileFormatError(f"{path}, line {number}: {name} occurs twice; keep one")
-            fields[name] = [match[2]]
+            values[name] = [match[2]]
         elif content.strip() and content.strip() != "---":
             if name is None:
-                raise FileFormatError(
-                    f"{path}, line {number}: {one_line(content)[:60]!r} has no name before it;"
-                    " write NAME: NUMBERS"
-                )
-            fields[name].append(content)
-    return {name: " ".join(parts) for name, parts in fields.items()}
+                shown = one_line(content)[:60]
+                raise FileFormatError(f"{path}, line {number}: {shown!r} has no name before it")
+            values[name].append(content)
+    return _Fields(path, {name: " ".join(parts) for name, parts in values.items()})
 
 
-def _numbers(
-    path: Path, fields: Mapping[str, Any], name: str, count: int | None = None
-) -> list[float]:
-    """The finite numbers of a field; so many, if there is a count."""
-    if name not in fields:
-        raise FileFormatError(
-            f"{path} has no {name}; this calibration is incomplete or of another kind"
-        )
-    numbers = numbers_in(fields[name])
-    if numbers is None or not np.isfinite(numbers).all():
-        raise FileFormatError(f"{path}: {name} is not made of finite numbers; correct it")
-    if max(map(abs, numbers), default=0) > _LARGEST:
-        raise FileFormatError(
-            f"{path}: {name} holds {max(numbers, key=abs):g}, which no camera has; correct it"
-        )
-    if count is not None and len(numbers) != count:
-        raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers instead of {count}")
-    return numbers
-
-
-def _matrix(path: Path, fields: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Floats:
-    return np.reshape(_numbers(path, fields, name, math.prod(shape)), shape)
-
-
-def _camera(path: Path, wanted: int | None, present: list[int]) -> int:
+def _camera(fields: _Fields, wanted: int | None, pattern: str) -> int:
+    """The number of the camera, which must be among those of the names of this pattern."""
     number = CAMERA if wanted is None else wanted
+    matches = (re.fullmatch(pattern, name) for name in fields.values)
+    present = sorted(int(match[1]) for match in matches if match)
     if number not in present:
-        listing = ", ".join(str(n) for n in sorted(present)) or "none"
-        raise UsageError(f"{path} has no camera {number}; --camera can be one of: {listing}")
+        listing = ", ".join(map(str, present)) or "none"
+        raise UsageError(f"{fields.path} has no camera {number}; --camera can be one of: {listing}")
     return number
 
 
 def _check_intrinsics(path: Path, matrix: Floats) -> Floats:
     bottom = np.array_equal(matrix[2], [0, 0, 1])
     if not (bottom and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[1, 0] == 0):
-        raise FileFormatError(
-            f"{path}: the intrinsics are not of the form fx s cx, 0 fy cy, 0 0 1; correct them"
-        )
+        raise FileFormatError(f"{path}: the intrinsics are not fx s cx, 0 fy cy, 0 0 1")
     return matrix
 
 
 def _height_width(path: Path, size: Sequence[float]) -> tuple[int, int]:
     width, height = (round(value) for value in size)
-    if width < 1 or height < 1:
-        raise FileFormatError(f"{path}: an image of {width}×{height} pixels is no image")
     check_pixel_count(path, width, height)
     return height, width

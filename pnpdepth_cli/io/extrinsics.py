@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_text_size, one_line, read_bytes
-from pnpdepth_cli.io.yaml_file import parse_yaml
+from pnpdepth_cli.io.text_files import parse_yaml
 
 Floats = NDArray[np.float64]
 

@@ -1,9 +1,12 @@
-"""The bytes of an input file, within the budget of `pnpdepth_cli.budget`."""
+"""The bytes of an input file, within the budget of `pnpdepth_cli.budget`, and their digest."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import stat
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from pnpdepth_cli.budget import budget, check_claim
@@ -119,3 +122,68 @@ def check_value_count(
     if file_bytes is not None:
         claim = f"{path} claims {what} in {file_bytes:,} bytes"
         check_claim(claim, count, limits.max_values_from(file_bytes), way_out="create it again")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fingerprint:
+    """Size in bytes, times and digest of a file when it was read."""
+
+    size: int
+    sha256: str
+    mtime_ns: int  # when the content was changed last, as programs may set it
+    ctime_ns: int  # when content or properties were changed last, which programs cannot set
+
+
+def fingerprint(path: Path) -> Fingerprint:
+    """Returns the fingerprint of a file. Raises InputError if it cannot be read."""
+    size, mtime_ns, ctime_ns = now = _size_and_times(path)
+    return Fingerprint(size=size, mtime_ns=mtime_ns, ctime_ns=ctime_ns, sha256=_digest(path, *now))
+
+
+def is_unchanged(path: Path, known: Fingerprint) -> bool:
+    """Returns whether the file is there with that content; it is read unless no time differs."""
+    try:
+        now = _size_and_times(path)
+        if now == (known.size, known.mtime_ns, known.ctime_ns):
+            return True
+        return now[0] == known.size and _digest(path, *now) == known.sha256
+    except InputError:
+        return False
+
+
+def _size_and_times(path: Path) -> tuple[int, int, int]:
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:
+        raise cannot_read(path, error) from error
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+# Several frames may share one file: a calibration, or gigabytes of HDF5.
+@functools.lru_cache(maxsize=64)
+def _digest(path: Path, size: int, mtime_ns: int, ctime_ns: int) -> str:
+    return sha256_of(path)
+
+
+def sha256_of(path: Path) -> str:
+    """Returns the SHA-256 of the file's content, 64 hexadecimal digits.
+
+    Of a folder, that of its files' names and digests, in the order of the names.
+
+    Raises:
+        InputError: The file cannot be read, or is a device or a pipe.
+    """
+    digest = hashlib.sha256()
+    if path.is_dir():
+        for inside in sorted(path.iterdir()):
+            if inside.is_file():
+                digest.update(f"{inside.name} {sha256_of(inside)}\n".encode())
+        return digest.hexdigest()
+    size_of_regular_file(path)
+    try:
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    except OSError as error:
+        raise cannot_read(path, error) from error
+    return digest.hexdigest()

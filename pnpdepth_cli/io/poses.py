@@ -23,7 +23,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration, read_rigid_motion
 from pnpdepth_cli.io.extrinsics import is_rotation, rotation_of
 from pnpdepth_cli.io.file_bytes import numbered_lines, one_line, read_bytes
-from pnpdepth_cli.io.json_file import read_json
+from pnpdepth_cli.io.text_files import read_json
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 

@@ -28,7 +28,7 @@ from pnpdepth_cli.io.atomic import (
     remove_leftovers,
 )
 from pnpdepth_cli.io.figure import LOGARITHMIC_FROM, DepthScale, Pixels, hex_colours, resized
-from pnpdepth_cli.io.json_file import plain, read_json, write_json
+from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.measures import Measure
 
 PAGE = "index.html"

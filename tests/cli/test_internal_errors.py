@@ -19,7 +19,7 @@ from pnpdepth_cli.dataset.frame_files import Hdf5Array
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_focal_length, read_rgb
-from pnpdepth_cli.io.yaml_file import parse_yaml
+from pnpdepth_cli.io.text_files import parse_yaml
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
 

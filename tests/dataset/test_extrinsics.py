@@ -19,8 +19,8 @@ from pnpdepth_cli.dataset.scan_points import (
 )
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.json_file import read_json
 from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.io.text_files import read_json
 from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
 
 TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])

@@ -23,7 +23,7 @@ from pnpdepth_cli.dataset.frame_record import (
 )
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord, Sampling
-from pnpdepth_cli.io.fingerprint import Fingerprint
+from pnpdepth_cli.io.file_bytes import Fingerprint
 
 CAMERA = Camera(
     intrinsics=np.array([[50.1, 0, 31.3], [0, 51, 22], [0, 0, 1]]),

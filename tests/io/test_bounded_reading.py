@@ -21,10 +21,11 @@ from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, write_depth
-from pnpdepth_cli.io.json_file import read_json, sha256_of
+from pnpdepth_cli.io.file_bytes import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.io.sparse_files import read_sparse
+from pnpdepth_cli.io.text_files import read_json
 
 READERS = [read_depth, read_sparse, read_rgb, read_calibration, read_json, sha256_of, read_scan]
 DEPTH = np.full((6, 8), 2.5, np.float32)

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.io.cloud_files import write_cloud
-from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.io.scans import read_scan, write_cloud
 
 RNG = np.random.default_rng(0)
 XYZ = RNG.uniform(-5, 5, (200, 3)).astype(np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 
-from pnpdepth_cli.io.csv_text import write_csv
+from pnpdepth_cli.io.text_files import write_csv
 
 FORMULAS = ["=1+1", "+1+1", "-1+2", "@SUM(A1)", "\t=1", "-", "\t1"]
 OTHERS = ["frame", "1=1", "'=1", "", "-0.25", "+5.20", "-1e-3", "–"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.fingerprint import fingerprint, is_unchanged
+from pnpdepth_cli.io.file_bytes import fingerprint, is_unchanged
 
 
 def test_a_file_is_known_by_its_digest_whatever_its_times_say(tmp_path: Path) -> None:

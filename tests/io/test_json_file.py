@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError
-from pnpdepth_cli.io.json_file import read_json, sha256_of, write_json
+from pnpdepth_cli.io.file_bytes import sha256_of
+from pnpdepth_cli.io.text_files import read_json, write_json
 
 
 @dataclass

@@ -7,25 +7,23 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.errors import OutputError, StorageError
-from pnpdepth_cli.io import lock
-from pnpdepth_cli.io.lock import in_turn, lock_folder
+from pnpdepth_cli.io import atomic
+from pnpdepth_cli.io.atomic import in_turn, lock_folder
 
 
 @pytest.fixture(autouse=True)
 def no_long_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "_TRIED_S", 0.05)
+    monkeypatch.setattr(atomic, "_TRIED_S", 0.05)
 
 
 def test_one_run_at_a_time_and_after_it_another_also_after_an_error(tmp_path: Path) -> None:
     calls: list[int] = []
 
     def held(number: int) -> None:
-        with lock_folder(tmp_path, None, lambda: calls.append(number)):
-            with (
-                pytest.raises(OutputError),
-                lock_folder(tmp_path, None, pytest.fail),
-            ):
-                pass
+        with lock_folder(tmp_path):
+            calls.append(number)
+            with pytest.raises(OutputError), lock_folder(tmp_path):
+                pytest.fail("two at once")
             raise ZeroDivisionError
 
     for number in (1, 2):
@@ -35,7 +33,7 @@ def test_one_run_at_a_time_and_after_it_another_also_after_an_error(tmp_path: Pa
 
 
 def test_shards_run_together_but_not_twice_nor_beside_a_whole_run(tmp_path: Path) -> None:
-    with lock_folder(tmp_path, (1, 3)), lock_folder(tmp_path, (3, 3), pytest.fail):
+    with lock_folder(tmp_path, (1, 3)), lock_folder(tmp_path, (3, 3)):
         for shard in ((1, 3), (3, 3), None):
             with pytest.raises(OutputError), lock_folder(tmp_path, shard):
                 pass

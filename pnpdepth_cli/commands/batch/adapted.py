@@ -18,8 +18,8 @@ from pnpdepth_cli.commands.batch.records import settings_of
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import DivergedError, InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
-from pnpdepth_cli.io.fingerprint import fingerprint
-from pnpdepth_cli.io.json_file import read_json, write_json
+from pnpdepth_cli.io.file_bytes import fingerprint
+from pnpdepth_cli.io.text_files import read_json, write_json
 
 if TYPE_CHECKING:
     from pnpdepth_cli.frames.adapt import Learnt

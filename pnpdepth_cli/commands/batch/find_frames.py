@@ -26,10 +26,10 @@ from pnpdepth_cli.dataset.frame_files import (
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.io.atomic import LOCKS
 from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.lock import LOCKS
 from pnpdepth_cli.io.poses import POSES_FILE
 from pnpdepth_cli.protocols import find_protocol
 

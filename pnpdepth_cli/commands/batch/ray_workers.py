@@ -21,8 +21,8 @@ from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
+from pnpdepth_cli.io.atomic import LOCKS
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.lock import LOCKS
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.running import References

@@ -24,11 +24,9 @@ from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.file_record import FileRecord
-from pnpdepth_cli.io.atomic import cannot_write, make_folder, remove_leftovers
-from pnpdepth_cli.io.file_bytes import cannot_read
-from pnpdepth_cli.io.fingerprint import Fingerprint, is_unchanged
-from pnpdepth_cli.io.json_file import parse_json, plain, sha256_of
-from pnpdepth_cli.io.lock import LOCKS
+from pnpdepth_cli.io.atomic import LOCKS, cannot_write, make_folder, remove_leftovers
+from pnpdepth_cli.io.file_bytes import Fingerprint, cannot_read, is_unchanged, sha256_of
+from pnpdepth_cli.io.text_files import parse_json, plain
 from pnpdepth_cli.models.definition import file_and_part
 from pnpdepth_cli.settings import Settings
 

@@ -25,8 +25,7 @@ from pnpdepth_cli.commands.batch.summary import TEXT, BatchSummary, Tally, write
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.lock import in_turn, lock_folder
+from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 Result = TypeVar("Result")
@@ -183,13 +182,10 @@ class _Batch:
     def open_output(self, stack: ExitStack) -> None:
         """Makes the output folder, and locks it until the stack is left."""
         output = self.request.output
-
-        def clean() -> None:
-            if leftovers := remove_all_leftovers(output):
-                self._say(f"removed {leftovers:,} half-written files of a run that was killed")
-
         make_folder(output)
-        stack.enter_context(lock_folder(output, self.request.shard, clean))
+        stack.enter_context(lock_folder(output, self.request.shard))
+        if self.request.shard is None and (leftovers := remove_all_leftovers(output)):
+            self._say(f"removed {leftovers:,} half-written files of a run that was killed")
 
     def to_do(self) -> list[tuple[FrameFiles, str]]:
         """Returns the frames that are to be done, and why, and says how many."""

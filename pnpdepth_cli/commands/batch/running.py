@@ -32,7 +32,7 @@ from pnpdepth_cli.errors import (
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.refined import Refined
-from pnpdepth_cli.io.fingerprint import Fingerprint, fingerprint
+from pnpdepth_cli.io.file_bytes import Fingerprint, fingerprint
 
 Item = TypeVar("Item")
 REGISTERING = 16

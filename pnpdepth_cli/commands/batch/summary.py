@@ -16,8 +16,7 @@ from pnpdepth_cli.commands.statistics import find_clusters
 from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.csv_text import write_csv
-from pnpdepth_cli.io.json_file import plain
+from pnpdepth_cli.io.text_files import plain, write_csv
 from pnpdepth_cli.measures import COVERAGE, MEASURES, FrameMeans
 from pnpdepth_cli.stages import AFTER, BASES, GT
 

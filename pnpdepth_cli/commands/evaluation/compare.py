@@ -27,7 +27,7 @@ from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.json_file import plain, read_json
+from pnpdepth_cli.io.text_files import plain, read_json
 from pnpdepth_cli.measures import MEASURES, FrameMeans, Measure, choose_measures
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.stages import AFTER, BEFORE, GT

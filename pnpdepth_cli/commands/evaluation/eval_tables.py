@@ -11,7 +11,7 @@ from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
 from pnpdepth_cli.commands.evaluation.scoring import FILES, scores_of
 from pnpdepth_cli.commands.tables import Cell, Style, Table
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.io.json_file import plain
+from pnpdepth_cli.io.text_files import plain
 from pnpdepth_cli.measures import COVERAGE, choose_measures
 
 _FRAMES_SHOWN = 12

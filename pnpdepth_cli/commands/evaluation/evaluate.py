@@ -23,7 +23,7 @@ from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.json_file import plain
+from pnpdepth_cli.io.text_files import plain
 from pnpdepth_cli.measures import OF_SIGMA, FrameMeans, Measure
 from pnpdepth_cli.points import METRES
 

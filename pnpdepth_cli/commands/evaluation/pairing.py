@@ -15,7 +15,7 @@ from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.json_file import read_json
+from pnpdepth_cli.io.text_files import read_json
 from pnpdepth_cli.protocols import WHOLE, FramePart
 
 _MARK = re.compile(r"(?<=.)[_.]depth$", re.DOTALL)

@@ -27,8 +27,8 @@ from pnpdepth_cli.dataset.frame_files import ImageSource, file_of
 from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
-from pnpdepth_cli.io.json_file import write_json
 from pnpdepth_cli.io.rgb import sizes_of
+from pnpdepth_cli.io.text_files import write_json
 from pnpdepth_cli.points import MODEL_UNITS
 from pnpdepth_cli.sensors.point_cloud import PointCloud, cloud_from_depth
 

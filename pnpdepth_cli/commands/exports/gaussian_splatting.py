@@ -30,7 +30,7 @@ from pnpdepth_cli.commands.exports import (
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.colmap_model import MODEL_PARTS, model_files
-from pnpdepth_cli.io.json_file import write_json
+from pnpdepth_cli.io.text_files import write_json
 
 _CODES = 2**16
 _OURS = b"# Of pnpdepth export: the refined images, points of their depth\n"

@@ -18,10 +18,10 @@ import numpy as np
 from pnpdepth_cli.commands.exports import Export, ExportFrame
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.cloud_files import write_cloud
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.formats import LARGEST_CODE
-from pnpdepth_cli.io.json_file import write_json
+from pnpdepth_cli.io.scans import write_cloud
+from pnpdepth_cli.io.text_files import write_json
 from pnpdepth_cli.points import METRES
 
 _CODES_PER_UNIT = 1000.0

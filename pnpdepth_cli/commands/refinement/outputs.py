@@ -24,7 +24,7 @@ from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.depth import metres, write_depth
 from pnpdepth_cli.io.figure import depth_scale
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
-from pnpdepth_cli.io.json_file import write_json
+from pnpdepth_cli.io.text_files import write_json
 from pnpdepth_cli.io.visualisation import (
     improvement,
     preview,

@@ -28,7 +28,7 @@ from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import normalisation_name
-from pnpdepth_cli.io.json_file import sha256_of
+from pnpdepth_cli.io.file_bytes import sha256_of
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION

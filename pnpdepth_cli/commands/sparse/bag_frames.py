@@ -47,12 +47,11 @@ from pnpdepth_cli.io.bags.messages import (
     static_pose,
 )
 from pnpdepth_cli.io.calibration import Calibration
-from pnpdepth_cli.io.cloud_files import write_points
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.io.json_file import plain, read_json, write_json
 from pnpdepth_cli.io.poses import POSES_FILE, Trajectory
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.io.scans import read_scan, write_points
+from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.pixels import describe_dropped
 

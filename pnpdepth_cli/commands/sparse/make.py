@@ -20,10 +20,11 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import describe_range, read_depth
+from pnpdepth_cli.io.file_bytes import sha256_of
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.json_file import plain, sha256_of, write_json
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
+from pnpdepth_cli.io.text_files import plain, write_json
 from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, ideal_lidar, simulate_lidar
 from pnpdepth_cli.sensors.pixels import Points, as_depth_image

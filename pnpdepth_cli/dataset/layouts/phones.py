@@ -21,7 +21,7 @@ from pnpdepth_cli.dataset.layouts.layout import Files, row
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.extrinsics import rotation_of
 from pnpdepth_cli.io.file_bytes import read_bytes
-from pnpdepth_cli.io.json_file import read_json
+from pnpdepth_cli.io.text_files import read_json
 
 _ODOMETRY, _METADATA = "odometry.csv", "metadata.json"
 

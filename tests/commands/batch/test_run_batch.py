@@ -29,7 +29,7 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.json_file import plain
+from pnpdepth_cli.io.text_files import plain
 from pnpdepth_cli.sensors.samplers import SamplePattern
 from tests.commands.batches import (
     NAMES,

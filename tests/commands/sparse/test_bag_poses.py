@@ -16,8 +16,8 @@ from pnpdepth_cli.commands.sparse import bag_frames
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.bags.messages import camera_trajectory
-from pnpdepth_cli.io.json_file import read_json
 from pnpdepth_cli.io.poses import read_poses
+from pnpdepth_cli.io.text_files import read_json
 from tests.bags import write_bag
 from tests.commands.sparse.test_bags import KINDS, written
 

@@ -1,0 +1,145 @@
+"""JSON that is written whole and read strictly, YAML that is not trusted, CSV for spreadsheets."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+
+_LONGEST_YAML = 1 << 17
+"""Characters, parsed in 2 s at most; a calibration has a few thousand, a bag a line per topic."""
+
+_OPENCV_HEADER = re.compile(r"\A\s*%YAML:1\.\d\s*$", re.MULTILINE)
+"""OpenCV's first line, which YAML itself does not allow."""
+
+_STARTS_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
+
+def write_json(path: Path, mapping: Mapping[str, Any]) -> None:
+    """Writes the mapping as indented JSON in its own order; NaN and infinity become null."""
+    text = json.dumps(plain(mapping), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    with atomic_path(path) as temporary:
+        # A file name that is not UTF-8 has surrogates, which JSON spells as \udcff.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Returns the object in a JSON file.
+
+    Raises:
+        InputError: The file cannot be read, or holds anything else.
+    """
+    data = read_bytes(path)
+    try:
+        content = parse_json(data)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path} is not valid JSON ({one_line(error)})") from error
+    if not isinstance(content, dict):
+        raise FileFormatError(f"{path} holds no JSON object at its top level; create it again")
+    return content
+
+
+def plain(value: Any) -> Any:
+    """Returns the value in JSON's own types; NaN and infinity become None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def parse_json(data: bytes) -> Any:
+    """Returns the content of a JSON text. Raises ValueError or RecursionError if it is none.
+
+    NaN, infinity and numbers that are too large to be finite are no JSON numbers.
+    """
+    text = data.decode("utf-8-sig")
+    return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_whole)
+
+
+def _whole(text: str) -> int:
+    _finite(text)
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:20]} is not a JSON number")
+    return number
+
+
+def parse_yaml(path: Path, text: str) -> Any:
+    """Returns the content of a YAML or JSON text, of several documents the first.
+
+    Values are texts, also those of numbers. Tags are ignored, so that OpenCV's matrices are
+    mappings with rows, cols and data. Its own cv2.FileStorage is not used, because it aborts the
+    process on damaged files.
+
+    Raises:
+        FileFormatError: The text is too long, has aliases, or is not YAML.
+        UsageError: PyYAML is not installed.
+    """
+    try:
+        import yaml
+    except ImportError:
+        raise UsageError(f"reading {path} needs PyYAML: pip install 'pnpdepth[ros]'") from None
+    if len(text) > _LONGEST_YAML:
+        raise FileFormatError(f"{path} has {len(text):,} characters, more than {_LONGEST_YAML:,}")
+
+    class Loader(yaml.BaseLoader):  # type: ignore[misc]
+        """BaseLoader without aliases, which can make a small file large."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise yaml.YAMLError("it has an alias (*name), which is not allowed here")
+            return super().compose_node(parent, index)
+
+    try:
+        return next(yaml.load_all(_OPENCV_HEADER.sub("", text), Loader), None)
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        raise FileFormatError(f"{path} is not valid YAML ({one_line(error)})") from error
+
+
+def write_csv(file: TextIO, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Writes RFC 4180 with lines that end in \\n, each text as `text_cell`, None as nothing."""
+    writer = csv.writer(file, lineterminator="\n")
+    for row in itertools.chain([header], rows):
+        writer.writerow([text_cell(each) if isinstance(each, str) else each for each in row])
+
+
+def text_cell(text: str) -> str:
+    """Returns the text so that no spreadsheet takes it for a formula: with a "'" before a "=".
+
+    The same holds for "+", "-", "@", tab and carriage return, unless the text is a number; frame
+    names and file names are other people's.
+    """
+    return f"'{text}" if text.startswith(_STARTS_FORMULA) and not _is_number(text) else text
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return text[0] in "+-"
