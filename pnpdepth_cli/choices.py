@@ -166,7 +166,7 @@ FORMATS = OpenList(
     noun="depth format",
     names=("png", "exr", "npy", "npz", "pfm", "tiff"),
 )
-"""Depth file formats: `pnpdepth_cli.io.depth.DepthFormat`."""
+"""Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
 LAYOUTS = OpenList(
     "pnpdepth_cli.dataset.layouts",

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
+from pnpdepth_cli.cli.progress import BatchProgress, progress_bar
 from pnpdepth_cli.cli.streams import INTERRUPTED, say
 from pnpdepth_cli.cli.vary import Combination, combinations_of
 from pnpdepth_cli.commands.batch.batch_request import (
@@ -148,26 +149,23 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
 def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSummary, bool]:
     """Returns the batch's summary, which it prints, and whether the batch was stopped."""
     from pnpdepth_cli.cli.printing import print_batch
-    from pnpdepth_cli.cli.progress import BatchProgress
     from pnpdepth_cli.commands.batch.run_batch import run_batch
 
-    with BatchProgress() as progress:
+    with progress_bar("batch", "frame", stays=True) as show:
+        progress = BatchProgress(show)
         try:
             outcome = run_batch(request, progress, pressed)
         except StorageError as error:
             raise StorageError(f"{error}; run the same command to continue") from error
         except KeyboardInterrupt:
-            click.echo("stopped; run the same command to continue", err=True)
+            say("stopped; run the same command to continue")
             raise click.exceptions.Exit(INTERRUPTED) from None
     print_batch(outcome.summary)
     if request.html is not None:
         say(f"wrote {request.html / 'index.html'}")
     if outcome.stopped:
-        click.echo(
-            f"stopped after {progress.done:,} of {progress.to_do:,} frames; run the same command"
-            " to continue",
-            err=True,
-        )
+        count = f"{progress.done:,} of {progress.to_do:,} frames"
+        say(f"stopped after {count}; run the same command to continue")
     return outcome.summary, outcome.stopped
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from pnpdepth_cli.cli.streams import printable, say
@@ -32,10 +32,10 @@ def progress_bar(title: str, unit: str, *, stays: bool = False) -> Iterator[Call
 
     def show(done: int, total: int, text: str = "") -> None:
         nonlocal bar, began, printed_at
+        from tqdm import tqdm
+
         now = time.monotonic()
         if bar is None:
-            from tqdm import tqdm
-
             tqdm.monitor_interval = 0  # without its thread, image libraries can be silenced
             bar = tqdm(
                 desc=title, unit=unit, total=total, disable=None, dynamic_ncols=True,
@@ -44,7 +44,7 @@ def progress_bar(title: str, unit: str, *, stays: bool = False) -> Iterator[Call
             began = printed_at = now
         if bar.disable and done and now - printed_at >= _LINE_EVERY_S:
             printed_at = now
-            say(_pace(done, total, unit, now - began) + (f", {text}" if text else ""))
+            say(tqdm.format_meter(done, total, now - began, 0, title, unit=unit, postfix=text))
         bar.set_postfix_str(text, refresh=False)
         bar.update(done - bar.n)
 
@@ -61,17 +61,10 @@ class BatchProgress:
     `done`, `failed` and `to_do` are numbers of frames.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, show: Callable[..., None]) -> None:
         self.done = self.to_do = self.failed = 0
         self._said: set[str] = set()
-        self._open = ExitStack()
-        self._show = self._open.enter_context(progress_bar("batch", "frame", stays=True))
-
-    def __enter__(self) -> BatchProgress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._open.close()
+        self._show = show
 
     def say(self, text: str) -> None:
         """Prints a line on stderr, above the bar."""
@@ -93,16 +86,3 @@ class BatchProgress:
         self.done += 1
         self.failed += record.status == "failed"
         self._show(self.done, self.to_do, f"{self.failed:,} failed" if self.failed else "")
-
-
-def _pace(done: int, total: int, unit: str, spent_s: float) -> str:
-    rate = done / spent_s
-    pace = f"{1 / rate:.1f} s a {unit}" if rate < 1 else f"{rate:.1f} {unit}s a second"
-    return f"{done:,} of {total:,} {unit}s, {pace}, {_duration((total - done) / rate)} left"
-
-
-def _duration(seconds: float) -> str:
-    minutes = round(seconds / 60)
-    if minutes < 1:
-        return f"{seconds:.0f} s"
-    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"

@@ -12,7 +12,7 @@ import pytest
 from pnpdepth_cli.cli import batch_command as command
 from pnpdepth_cli.cli import progress
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.cli.progress import BatchProgress
+from pnpdepth_cli.cli.progress import BatchProgress, progress_bar
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.batches import add_frame
 
@@ -118,15 +118,16 @@ def test_without_a_terminal_there_is_a_line_a_minute(
 ) -> None:
     now = 0.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
-    assert [progress._duration(s) for s in (0.4, 90, 3599)] == ["0 s", "2 min", "1 h 0 min"]
-    with BatchProgress() as display:
+    with progress_bar("batch", "frame", stays=True) as show:
+        display = BatchProgress(show)
         display.begin(600)
         for number in range(300):
             now += 1.0
             display.frame(FAILED if number == 10 else FrameRecord(name="y"))
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "failed: x: bad"
-    assert lines[1] == "60 of 600 frames, 1.0 frames a second, 9 min left, 1 failed"
+    assert "60/600 [01:00<09:00" in lines[1]
+    assert "1 failed" in lines[1]
     assert len(lines) == 1 + 5
 
 
@@ -134,7 +135,8 @@ def test_on_a_terminal_there_is_a_bar(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with BatchProgress() as display:
+    with progress_bar("batch", "frame", stays=True) as show:
+        display = BatchProgress(show)
         display.begin(2)
         display.frame(FAILED)
         display.frame(FrameRecord(name="y"))
