@@ -100,7 +100,7 @@ def set_max_pixels(max_pixels: int | None) -> None:
     """
     global _chosen
     if max_pixels is not None and max_pixels < 1:
-        raise UsageError(f"--max-pixels is {max_pixels}; give a number of pixels above 0")
+        raise UsageError(f"max-pixels is {max_pixels}; give a number of pixels above 0")
     _chosen = max_pixels
 
 

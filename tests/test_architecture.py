@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 import traceback
@@ -74,6 +75,15 @@ def test_only_the_terminal_layer_imports_click_rich_and_tqdm() -> None:
     for file in PACKAGE.rglob("*.py"):
         tops = {name.split(".")[0] for name in imported_modules(file)}
         assert not (tops & {"click", "rich", "tqdm"}) or "cli" in file.parts[-2:], file
+
+
+@pytest.mark.parametrize("package", ["core", "completion", "models", "frames"])
+def test_errors_of_the_python_api_name_no_options_of_the_command_line(package: str) -> None:
+    for file in (PACKAGE / package).rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            texts = [each for each in ast.walk(node) if isinstance(each, ast.Constant)]
+            named = [t.value for t in texts if re.search(r"(^|[ (])--[a-z]", str(t.value))]
+            assert not isinstance(node, ast.Raise) or not named, file
 
 
 def test_a_network_file_knows_nothing_of_the_program_but_the_definition_contract() -> None:

@@ -22,7 +22,7 @@ def test_the_default_is_64_megapixels_or_less_and_files_grow_with_max_pixels() -
     set_max_pixels(9)
     assert (budget().max_pixels, budget().max_file_bytes) == (9, 1 << 20)
     for number in (0, -1):
-        with pytest.raises(UsageError, match="--max-pixels"):
+        with pytest.raises(UsageError, match="max-pixels"):
             set_max_pixels(number)
     set_max_pixels(None)
     assert 1 << 20 < budget().max_pixels <= 64_000_000

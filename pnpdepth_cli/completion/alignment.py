@@ -112,7 +112,7 @@ def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -
     if not fits and len(x) < 2:
         raise NoPointsError(
             f"alignment {kind!r} needs at least 2 sparse points where the network sees them,"
-            f" here is {len(x)}; --align scale needs only one"
+            f" here is {len(x)}; 'scale' needs only one"
         )
     if not fits:
         raise ModelError(

@@ -135,7 +135,7 @@ def _append(so_far: Refinement | None, depth: Tensor, loss: float, step: float) 
 def _diverged(quantity: str, updates: int, step: float, so_far: Refinement | None) -> DivergedError:
     return DivergedError(
         f"the {quantity} is not finite after {updates} update{'s' if updates != 1 else ''} of z"
-        f" (step {step:.3g}); try a smaller --lr or fewer --iterations",
+        f" (step {step:.3g}); try a smaller lr or fewer iterations",
         so_far,
     )
 

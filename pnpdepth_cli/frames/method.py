@@ -72,7 +72,8 @@ class Method:
         self._stack = ExitStack()
         self._open: list[OpenNetwork] = []
         if len(networks) > 1 and not self.is_default:
-            raise UsageError(f"several --model are fused, but {asked.fixed_by} fixes one network")
+            fixed = asked.fixed_by.replace("--", "")
+            raise UsageError(f"several networks are fused, but {fixed} fixes one")
         # What the definitions leave open is decided.
         first = first.registered()
         resolved = [

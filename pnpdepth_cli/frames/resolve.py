@@ -98,7 +98,7 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     """
     wanted = layer if layer is not None else definition.default_layer
     if wanted is None:
-        raise UsageError(f"network {definition.name!r} has no default layer; name one with --layer")
+        raise UsageError(f"network {definition.name!r} has no default layer; name a layer")
     try:
         fraction = float(wanted)
     except ValueError:

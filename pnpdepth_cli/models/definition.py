@@ -354,7 +354,7 @@ def graph_definition(
         known["normalisation"] = Normalisation()
     if isinstance(height, int) and isinstance(width, int):
         claim = f"{file} takes images of {width}×{height} pixels"
-        limit = "allow more with --max-pixels"
+        limit = "allow more pixels"
         check_claim(claim, height * width, budget().max_pixels, error=ModelError, way_out=limit)
         known["size"] = Fixed(height, width)
     known |= {"name": file.stem, "complete": True, "checkpoint": file, "arguments": arguments}

@@ -69,9 +69,7 @@ class Network:
         if "rgb" not in self.definition.input_kind:
             return None
         if rgb is None:
-            raise UsageError(
-                f"network {self.definition.name!r} takes an rgb image; name one before --sparse"
-            )
+            raise UsageError(f"network {self.definition.name!r} takes an rgb image; give one")
         normalise = self.definition.normalisation or Normalisation()
         mean = rgb.new_tensor(normalise.mean).reshape(1, 3, 1, 1)
         std = rgb.new_tensor(normalise.std).reshape(1, 3, 1, 1)
@@ -102,7 +100,7 @@ class Network:
         if self.definition.takes_intrinsics:
             if intrinsics is None:
                 raise UsageError(
-                    f"network {self.definition.name!r} takes the camera's intrinsics; give --calib"
+                    f"network {self.definition.name!r} takes the camera's intrinsics; give a camera"
                 )
             camera = intrinsics.to(self.device)
         with wrap_user_errors(f"arguments of network {self.definition.name!r}"):
@@ -275,21 +273,19 @@ def _load_weights(
     name, path = definition.name, checkpoint or definition.checkpoint
     if definition.complete:
         if checkpoint is not None:
-            raise UsageError(
-                f"network {name!r} comes with its weights; --checkpoint does not go with it"
-            )
+            raise UsageError(f"network {name!r} comes with its weights; leave out the checkpoint")
         return []
     if path is None:
         if module.state_dict():
             raise CheckpointError(
-                f"network {name!r} comes without weights; name them with --checkpoint, or, where"
+                f"network {name!r} comes without weights; name a checkpoint, or, where"
                 " its build loads them itself, say complete=True in a definition"
             )
         return []
     if path.parent.parent.name == "model_zoo_defs" and not path.is_file():
         raise CheckpointError(
             f"checkpoint {path} does not exist, as the package has the weights of few networks;"
-            f" take {path.name} from the repository, and name it with --checkpoint"
+            f" take {path.name} from the repository, and name it as the checkpoint"
         )
     return load_checkpoint(module, definition, path)
 
@@ -303,7 +299,7 @@ def _with_suggested_layers(network: Network) -> Network:
         sides = (-(-_SUGGESTION_SIDE // size.of) * size.of,) * 2
     claim = f"network {network.definition.name!r} takes images of {sides[0]}×{sides[1]} pixels"
     check_claim(
-        claim, math.prod(sides), budget().max_pixels, error=ModelError, way_out="raise --max-pixels"
+        claim, math.prod(sides), budget().max_pixels, error=ModelError, way_out="allow more pixels"
     )
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(FrameMap.fit(size, *sides))
@@ -329,5 +325,5 @@ def find_device(name: str) -> torch.device:
         float(torch.zeros(1, device=device))  # "meta" has no values
     except Exception as error:  # every backend raises another type if it is not there
         reason = (str(error).splitlines() or [""])[0][:120]
-        raise DeviceError(f"device {name!r} cannot be used: {reason}; try --device cpu") from None
+        raise DeviceError(f"device {name!r} cannot be used: {reason}; try device cpu") from None
     return device

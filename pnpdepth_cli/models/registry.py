@@ -117,8 +117,8 @@ def _from_file(spec: str) -> ModelDefinition | None:
     if spec.endswith((*WEIGHT_SUFFIXES, *_TORCHSCRIPT)):
         raise ModelError(
             f"model {spec} is a file of weights, a pickled module or a TorchScript archive, which"
-            " is not run; name the network's Python file with --model and the weights with"
-            " --checkpoint, or export the network by torch.export (.pt2) or to ONNX"
+            " is not run; name the network's Python file as the model and the weights as the"
+            " checkpoint, or export the network by torch.export (.pt2) or to ONNX"
         )
     if Path(spec).is_dir():
         from pnpdepth_cli.models.hugging_face import hf_definition

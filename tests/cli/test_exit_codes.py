@@ -25,7 +25,7 @@ COMMANDS = {
     [
         ("refine", "--layer encod", 4, "encode"),
         ("refine", "--checkpoint missing.pt", 4, "does not exist"),
-        ("refine", "--device cuda:9", 6, "--device cpu"),
+        ("refine", "--device cuda:9", 6, "device cpu"),
         ("batch", "--shard 0/2", 2, "1/4"),
         ("batch", "--html-3d", 2, "name its folder with --html"),
         ("batch", "--sample many", 2, "500"),
@@ -34,7 +34,7 @@ COMMANDS = {
         ("batch", "--poses one_pose.txt", 2, "--poses is for --accumulate"),
         ("batch", "--accumulate -1", 2, "-1 is not in the range x>=0"),
         ("batch", "--adapt --shard 1/2", 2, "--adapt does not go with --shard"),
-        ("batch", "--device cuda:9", 6, "--device cpu"),
+        ("batch", "--device cuda:9", 6, "device cpu"),
         ("sample", "--count many", 2, "neither a number such as 500 nor 5%"),
         ("simulate", "--beams 9 --vertical-fov 9 -9", 2, "give --sensor, or --beams"),
         ("sample", "--seed -1", 2, "--seed"),

@@ -190,7 +190,7 @@ def _choose_output(model: Any, wanted: str | None, file: Path) -> str:
     first = next(iter(outputs), "OUTPUT")
     fact = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
     raise ModelError(
-        f"ONNX file {file} has {fact}; name the depth as --model {file}:{first}; it has {listed}"
+        f"ONNX file {file} has {fact}; name the depth as {file}:{first}; it has {listed}"
     )
 
 

@@ -259,7 +259,7 @@ def _state_in(content: Any, path: Path, key: str) -> tuple[dict[str, Tensor], li
         return _state_in(content[key], path, "")
     fact = f"no state dict {key!r}" if key else "no state dict of plain tensors"
     held = _some([str(name) for name in content]) or "nothing"
-    way_out = f"; --checkpoint {path}:KEY reads that of {_some(list(states), ' or ')}"
+    way_out = f"; {path}:KEY reads that of {_some(list(states), ' or ')}"
     raise CheckpointError(f"checkpoint {path} has {fact}; it holds {held}{way_out * bool(states)}")
 
 

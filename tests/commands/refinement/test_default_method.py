@@ -35,7 +35,7 @@ def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:
     record = run(frame, **request).record
     assert record.method is not None
     assert record.method.networks == ["tiny", "second", "compact"]
-    with pytest.raises(UsageError, match="several --model are fused"):
+    with pytest.raises(UsageError, match="several networks are fused"):
         run(frame, **(request | {"propagate": "none", "overwrite": True}))
 
 
