@@ -203,10 +203,10 @@ def eth3d(root: Path, height: int = HEIGHT, width: int = WIDTH) -> None:
 
 def read_frames(root: Path, name: str | None = None) -> list[FrameFiles]:
     """The frames of a data set, all of which are complete."""
-    _, listing = list_frames(root, name)
-    if listing.broken:
-        raise InputError(str(listing.broken[0]))
-    return listing.frames
+    _, frames, unmatched = list_frames(root, name)
+    if unmatched and not frames:
+        raise InputError(str(unmatched[0]))
+    return frames
 
 
 def ground_truth(frame: FrameFiles) -> np.ndarray:

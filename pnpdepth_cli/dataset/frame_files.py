@@ -148,7 +148,6 @@ class Unmatched:
 
     path: Path
     why: str  # the reason, as the end of a sentence that begins with the path
-    spare: bool = False  # false for a file of a frame that lacks a part, or cannot be read
 
     def __post_init__(self) -> None:
         _check_path(self.path)

@@ -110,10 +110,9 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if source.is_dir() and _is_inside(source, output):
         raise _holds_the_frames(output)
     # The frames of the layout, without results that lie in the output.
-    layout, listing = list_frames(source, request.layout)
-    found, unmatched = _outside(output, listing.frames)
+    layout, listed, lost = list_frames(source, request.layout)
+    found, unmatched = _outside(output, listed)
     frames, refused = _with_own_files(found, request.refine)
-    lost = [*listing.broken, *listing.spare]
     unmatched += [each for each in lost if not _is_inside(each.path, output)]
     # There must be some, with sparse depth.
     if not found:

@@ -1,7 +1,7 @@
 """Data set layouts: which one a folder is, and its frames; `TABLE` has them by name.
 
-    layout, listing = list_frames(Path("KITTI/object"))     # layout guessed
-    layout, listing = list_frames(Path("frames"), "pairs")  # layout named
+    layout, frames, unmatched = list_frames(Path("KITTI/object"))     # layout guessed
+    layout, frames, unmatched = list_frames(Path("frames"), "pairs")  # layout named
 
 A new layout is a row of `rows`, or a `Layout` in `TABLE`, with its name in `choices.LAYOUTS`; or an
 entry point of the group `pnpdepth.layouts`.
@@ -11,15 +11,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
-from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest, nyu, phones, rows
+from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest, nyu, rows
 from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import InputError
 
-__all__ = ["LAYOUTS", "Layout", "Listing", "list_frames"]
+__all__ = ["LAYOUTS", "Layout", "list_frames"]
 
 TABLE: dict[str, Layout] = {
     **rows.ROWS,
@@ -31,18 +30,10 @@ TABLE: dict[str, Layout] = {
     "kitti-raw": kitti.RAW,
     "tum": indexed.TUM,
     "colmap": indexed.COLMAP,
-    "stray-scanner": phones.STRAY_SCANNER,
-    "record3d": phones.RECORD3D,
+    "stray-scanner": indexed.STRAY_SCANNER,
+    "record3d": indexed.RECORD3D,
 }
 """The layouts of this package, which `choices.LAYOUTS` lists in the order of guessing."""
-
-
-class Listing(NamedTuple):
-    """What a data set holds."""
-
-    frames: list[FrameFiles]  # complete frames, in a fixed order
-    broken: list[Unmatched]  # files of frames that lack a part, or cannot be read
-    spare: list[Unmatched]  # other files beside them
 
 
 def _match(root: Path, name: str | None) -> str | None:
@@ -69,8 +60,10 @@ def _nearest(root: Path) -> str:
     )
 
 
-def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
-    """Returns the name of a data set's layout, its frames, and all that is in no frame.
+def list_frames(
+    root: Path, name: str | None = None
+) -> tuple[str, list[FrameFiles], list[Unmatched]]:
+    """Returns the name of a data set's layout, its frames in a fixed order, and what is in none.
 
     Args:
         root: The data set, or a folder with several of one layout.
@@ -91,9 +84,7 @@ def list_frames(root: Path, name: str | None = None) -> tuple[str, Listing]:
         if isinstance(each, FrameFiles)
     ]
     lost = dict.fromkeys(each for _, each in found if isinstance(each, Unmatched))
-    return layout, Listing(
-        frames, [each for each in lost if not each.spare], [each for each in lost if each.spare]
-    )
+    return layout, frames, list(lost)
 
 
 def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:

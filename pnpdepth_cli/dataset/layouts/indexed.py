@@ -9,32 +9,46 @@ ETH3D's undistorted images in dslr_calibration_undistorted/, or Nerfstudio's col
 images of dense/, which COLMAP undistorts, are a project of their own: dense/images/ and
 dense/sparse/. Of several models, sparse/0 to sparse/N, the one with the most images is used. The
 folder of a model in a project is read, too.
+
+`stray-scanner`, of phones with a LiDAR, whose depth is of the image's view but smaller: the folder
+of the app Stray Scanner: rgb.mp4, depth/ in millimetres, confidence/ (0 to 2), camera_matrix.csv,
+and odometry.csv with a row of time, frame, position and quaternion for each frame, in axes x right,
+y down, z forward.
+
+`record3d`, of phones, too: the folder EXR_RGBD of Record3D's export "EXR + RGB": rgb/, depth/ in
+metres, and metadata.json with K and w, h of the images and a row of quaternion and position for
+each frame, in ARKit's axes x right, y up, z backwards.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pnpdepth_cli.dataset.frame_files import (
     IMAGE_SUFFIXES,
     FrameFiles,
+    Pose,
     Unmatched,
     as_pose,
     find_files,
 )
-from pnpdepth_cli.dataset.layouts.layout import Layout
+from pnpdepth_cli.dataset.layouts.layout import Files, Layout, row
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.colmap_model import model_files, read_model
-from pnpdepth_cli.io.file_bytes import numbered_lines, one_line
+from pnpdepth_cli.io.extrinsics import rotation_of
+from pnpdepth_cli.io.file_bytes import numbered_lines, one_line, read_bytes
 from pnpdepth_cli.io.poses import LONGEST_GAP_S, read_trajectory
+from pnpdepth_cli.io.text_files import read_json
 
 _OF_ETH3D = "dslr_calibration_undistorted"
 _ASSOCIATIONS = "associations.txt"
+_ODOMETRY, _METADATA = "odometry.csv", "metadata.json"
 _LONGEST_POSE_GAP_S = 0.1
 """Longest gap between poses that are interpolated; motion capture takes them at 100 Hz."""
 
@@ -70,7 +84,7 @@ def _frames_of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
             why = f"has no {other} within {LONGEST_GAP_S} s that is not another's"
             for number, (_, path) in enumerate(timed):
                 if number not in used:
-                    yield Unmatched(path=path, why=why, spare=True)
+                    yield Unmatched(path=path, why=why)
     # The frames, with poses where motion capture has them.
     for (time_s, image_path), (_, depth_path) in pairs:
         pose = None if trajectory is None else trajectory.at(time_s, _LONGEST_POSE_GAP_S)
@@ -147,11 +161,11 @@ def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
     for path in files.values():
         if path.relative_to(photos).as_posix() not in model.images:
             why = f"is not registered in {model.folder}"
-            yield Unmatched(path=path, why=why, spare=True)
+            yield Unmatched(path=path, why=why)
     for other in models:
         if other is not model:
             why = f"is another model, of {len(other.images):,} images, in a unit of its own"
-            yield Unmatched(path=other.folder, why=why, spare=True)
+            yield Unmatched(path=other.folder, why=why)
     for name, image in sorted(model.images.items()):
         path = photos / name
         if not path.is_file():
@@ -164,3 +178,63 @@ def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
 
 
 COLMAP = Layout(matches=_colmap_models, frames=_of_colmap, needs=("images", "sparse/*/cameras.*"))
+
+
+def _of_stray_scanner(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+    path, poses = place / _ODOMETRY, dict[int, Pose]()
+    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
+    for number, line in enumerate(lines[1:], start=2):
+        try:
+            _, frame, *values = map(float, line.split(",")[:9])
+            poses[int(frame)] = _pose(values[:3], values[3:])
+        except (ValueError, OverflowError):
+            raise FileFormatError(
+                f"{path}, line {number}: not timestamp, frame, x, y, z, qx, qy, qz, qw"
+            ) from None
+    return lambda files: {"pose": poses.get(int(files["sparse"].stem))}
+
+
+def _of_record3d(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+    path = place / _METADATA
+    try:
+        rows = [[float(value) for value in row] for row in read_json(path).get("poses", [])]
+        poses = [_pose(values[4:], values[:4], y_up=True) for values in rows]
+    except (TypeError, ValueError):
+        raise FileFormatError(f"{path}: poses are not rows of qx qy qz qw x y z") from None
+
+    def fields_of(files: Files) -> Mapping[str, Any]:
+        number = int(files["image"].stem)
+        return {"pose": poses[number] if number < len(poses) else None}
+
+    return fields_of
+
+
+def _pose(position: list[float], xyzw: list[float], y_up: bool = False) -> Pose:
+    """The pose with the axes x right, y down, z forward. ValueError for none."""
+    x, y, z, w = xyzw
+    turn = rotation_of(np.array([w, x, y, z]))
+    pose = np.column_stack([turn * (1, -1, -1) if y_up else turn, position])
+    if pose.shape != (3, 4) or not np.isfinite(pose).all():
+        raise ValueError
+    return as_pose(pose)
+
+
+STRAY_SCANNER = row(
+    {
+        "sparse": r"depth/(\d+).DEPTH",
+        "image": "rgb/*.IMAGE",
+        "sparse_mask": r"confidence/(\d+).png?",
+    },
+    marks=("camera_matrix.csv", _ODOMETRY),
+    calib="camera_matrix.csv",
+    more=_of_stray_scanner,
+    sparse_scale=1000.0,
+    one_view=True,
+)
+RECORD3D = row(
+    {"image": r"rgb/(\d+).IMAGE", "sparse": r"depth/(\d+).exr"},
+    marks=(_METADATA,),
+    calib=_METADATA,
+    more=_of_record3d,
+    one_view=True,
+)

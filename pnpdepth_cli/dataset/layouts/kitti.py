@@ -17,12 +17,12 @@ folder data_depth_annotated/{train,val}/ beside the dates has it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pnpdepth_cli.dataset.frame_files import Unmatched, as_pose
-from pnpdepth_cli.dataset.layouts.layout import Fields, Files, Layout, row
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, as_pose
+from pnpdepth_cli.dataset.layouts.layout import Files, Layout, Part, join_parts, row
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.poses import PACKETS, read_poses
 from pnpdepth_cli.protocols import ODOMETRY_PART
@@ -75,11 +75,6 @@ ODOMETRY = row(
 )
 
 
-def _name(root: Path, place: Path, stem: str) -> str:
-    drive = place.parents[2] if place.parent.name == "velodyne_raw" else place.parent
-    return f"{drive.name}_{stem}_{place.name}"
-
-
 def _of_drive(drive: Path, inside: Path, *beside: str) -> Path:
     """The data of a drive, in it or in its namesake in a folder beside; it may not exist."""
     drives = [drive, *(base / name / drive.name for base in drive.parents[:3] for name in beside)]
@@ -95,6 +90,11 @@ def _calibration_of(drive: Path) -> Path | None:
     return next((p for p in (drive.parent, drive) if (p / _CALIBRATION).is_file()), None)
 
 
+def _of_selection(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+    whole = {"calib": place} if (place / _CALIBRATION).is_file() else {}
+    return lambda files: {} if "calib" in files else whole
+
+
 _SELECTION = row(
     {
         "image": f"image/{_STEM}.IMAGE",
@@ -103,44 +103,40 @@ _SELECTION = row(
         "calib": f"intrinsics/{_STEM}.txt?",
     },
     marks=("velodyne_raw",),
-    name=lambda root, place, stem: stem,
-    more=lambda place: (
-        lambda files: (
-            {"calib": files.get("calib", place)} if (place / _CALIBRATION).is_file() else {}
-        )
-    ),
+    more=_of_selection,
     **_AS_PUBLISHED,
 )
-_TREE = row(
-    {"sparse": "*.png", "image": "*.IMAGE", "gt": "*.png?"},
-    places=lambda root: sorted(
-        path
-        for start in ("", "*/", "*/*/", "data_depth_velodyne/*/*/")
-        for path in root.glob(f"{start}proj_depth/velodyne_raw/{_CAMERAS}")
-        if path.is_dir()
-    ),
-    folders={
-        "image": lambda scans: _of_drive(
-            scans.parents[2],
-            Path(scans.name, "data"),
-            *(f"{raw}{scans.parents[2].name[:10]}" for raw in _RAW),
-        ),
-        "gt": lambda scans: _truth_of(scans.parents[2], scans.name),
-    },
-    name=_name,
-    more=lambda scans: (
-        lambda files: {
-            "calib": _calibration_of(files["image"].parents[2]),
-            "camera": int(scans.name[-1]),
+
+
+def _is_depth(root: Path) -> bool:
+    return bool(_SELECTION.matches(root) or _scans_of_tree(root))
+
+
+def _scans_of_tree(root: Path) -> list[Path]:
+    """The folders of scans, one for each camera of a drive."""
+    starts = ("", "*/", "*/*/", "data_depth_velodyne/*/*/")
+    found = (p for s in starts for p in root.glob(f"{s}proj_depth/velodyne_raw/{_CAMERAS}"))
+    return sorted(path for path in found if path.is_dir())
+
+
+def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
+    if _SELECTION.matches(root):
+        yield from _SELECTION.frames(root)
+        return
+    for scans in _scans_of_tree(root):
+        drive, camera = scans.parents[2], scans.name
+        dates = (f"{raw}{drive.name[:10]}" for raw in _RAW)
+        images = _of_drive(drive, Path(camera, "data"), *dates)
+        parts = {
+            "sparse": Part(scans, "*.png"),
+            "image": Part(images, "*.IMAGE"),
+            "gt": Part(_truth_of(drive, camera), "*.png?"),
         }
-    ),
-    **_AS_PUBLISHED,
-)
-DEPTH = Layout(
-    matches=lambda root: _SELECTION.matches(root) or _TREE.matches(root),
-    frames=lambda root: (_SELECTION if _SELECTION.matches(root) else _TREE).frames(root),
-    needs=_SELECTION.needs,
-)
+        calib = _calibration_of(images.parents[1])
+        yield from _frames_of_camera(drive, camera, parts, calib=calib, **_AS_PUBLISHED)
+
+
+DEPTH = Layout(matches=_is_depth, frames=_frames_of_depth, needs=_SELECTION.needs)
 
 
 def _raw_cameras(root: Path) -> list[Path]:
@@ -149,25 +145,35 @@ def _raw_cameras(root: Path) -> list[Path]:
     return sorted(p.parent for p in found if p.is_dir() and (p.parents[1] / _SCANS).is_dir())
 
 
-def _of_camera(camera: Path) -> Callable[[Files], Fields]:
-    calibration = _calibration_of(camera.parent)
-    if calibration is None:
-        why = f"has no {_CALIBRATION}; put KITTI's calibration into {camera.parents[1]}"
-        return lambda files: Unmatched(path=camera.parent, why=why)
-    return lambda files: {"calib": calibration, "camera": int(camera.name[-1])}
+def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
+    for camera in _raw_cameras(root):
+        drive, calibration = camera.parent, _calibration_of(camera.parent)
+        if calibration is None:
+            why = f"has no {_CALIBRATION}; put KITTI's calibration into {drive.parent}"
+            yield Unmatched(path=drive, why=why)
+            continue
+        parts = {
+            "image": Part(camera / "data", "*.IMAGE"),
+            "sparse": Part(drive / _SCANS, "*.bin"),
+            "gt": Part(_truth_of(drive, camera.name), "*.png?"),
+            "oxts": Part(drive / PACKETS, "*.txt?"),
+        }
+        yield from _frames_of_camera(drive, camera.name, parts, calib=calibration, gt_scale=256.0)
 
 
-RAW = row(
-    {"image": "data/*.IMAGE", "sparse": "*.bin", "gt": "*.png?", "oxts": "*.txt?"},
-    places=_raw_cameras,
-    folders={
-        "sparse": lambda camera: camera.parent / _SCANS,
-        "gt": lambda camera: _truth_of(camera.parent, camera.name),
-        "oxts": lambda camera: camera.parent / PACKETS,
-    },
+def _frames_of_camera(
+    drive: Path, camera: str, parts: Mapping[str, Part], **fields: Any
+) -> Iterator[FrameFiles | Unmatched]:
+    for found in join_parts(parts):
+        if isinstance(found, Unmatched):
+            yield found
+        else:
+            name = f"{drive.name}_{found.stem}_{camera}"
+            yield FrameFiles(name=name, camera=int(camera[-1]), **found.fields, **fields)
+
+
+RAW = Layout(
+    matches=_raw_cameras,
+    frames=_frames_of_raw,
     needs=(_SCANS, f"{_CAMERAS}/data", _CALIBRATION),
-    name=_name,
-    gaps=True,  # some drives lack scans of a few frames, which is no fault of the copy
-    more=_of_camera,
-    gt_scale=256.0,
 )

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pnpdepth_cli.dataset.frame_files import (
     IMAGE_SUFFIXES,
@@ -31,8 +31,6 @@ _SUFFIXES = {
 
 Files = dict[str, Path]
 """Files of one frame, by field of `FrameFiles`."""
-Fields = Mapping[str, Any] | Unmatched | None
-"""More fields of a frame, why it is none, or None for one that is not wanted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,38 +44,37 @@ class Layout:
     """Patterns of what the folder or one in it holds, for the message of an unknown folder."""
 
 
-class _FilePart:
+class Part(NamedTuple):
     """Where the files of one part of a frame lie, and what they are called."""
 
-    def __init__(self, text: str, find: Callable[[Path], Path] | None) -> None:
-        self.optional = text.endswith("?")
-        folder, _, names = text.removesuffix("?").rpartition("/")
-        self.folders, self._find = folder.split("|"), find
-        self._stem, _, self._suffix = names.rpartition(".")
+    folder: Path
+    names: str
+    """A pattern. The stem is what * stands for, or groups of a regular expression; ** stands for
+    paths below the folder. A part whose pattern ends with ? may be missing."""
 
-    def path(self, place: Path) -> Path:
-        """Returns the first of the folders that exists."""
-        if self._find is not None:
-            return self._find(place)
-        paths = [place / name for name in self.folders]
-        return next((path for path in paths if path.is_dir()), paths[0])
+    @property
+    def optional(self) -> bool:
+        """Whether a frame may lack it."""
+        return self.names.endswith("?")
 
-    def video(self, place: Path) -> Path | None:
-        """Returns the video that lies there instead of the folder of images."""
-        if self._suffix != "IMAGE" or self.path(place).is_dir():
+    @property
+    def video(self) -> Path | None:
+        """The video that lies there instead of the folder of images."""
+        if not self.names.endswith(".IMAGE") or self.folder.is_dir():
             return None
-        paths = (place / f"{name}{suffix}" for name in self.folders for suffix in VIDEO_SUFFIXES)
+        paths = (self.folder.with_name(self.folder.name + suffix) for suffix in VIDEO_SUFFIXES)
         return next((path for path in paths if path.is_file()), None)
 
-    def files(self, place: Path) -> tuple[dict[str, Path], list[Unmatched]]:
+    def files(self) -> tuple[Files, list[Unmatched]]:
         """Returns the files by stem, sorted by number, and what belongs to no frame."""
-        folder, suffixes = self.path(place), _SUFFIXES.get(self._suffix, (f".{self._suffix}",))
-        if self._stem == "**":
-            return find_files(folder, suffixes)
-        stem = self._stem if "(" in self._stem else re.escape(self._stem).replace(r"\*", "(.+)")
+        stem, _, suffix = self.names.removesuffix("?").rpartition(".")
+        suffixes = _SUFFIXES.get(suffix, (f".{suffix}",))
+        if stem == "**":
+            return find_files(self.folder, suffixes)
+        stem = stem if "(" in stem else re.escape(stem).replace(r"\*", "(.+)")
         endings = "|".join(map(re.escape, suffixes))
         pattern = re.compile(f"{stem}(?:{endings})", re.IGNORECASE | re.DOTALL)
-        paths = sorted(folder.iterdir()) if folder.is_dir() else []
+        paths = sorted(self.folder.iterdir()) if self.folder.is_dir() else []
         files, ambiguous = one_of_each(
             ("".join(match.groups("")), path)
             for path in paths
@@ -86,120 +83,111 @@ class _FilePart:
         return {stem: files[stem] for stem in sorted(files, key=natural_order)}, ambiguous
 
 
+class Joined(NamedTuple):
+    """The files of one stem."""
+
+    stem: str
+    files: Files
+    fields: dict[str, Any]
+    """The fields of `FrameFiles` that name them, with masks and frames of videos."""
+
+
+def join_parts(parts: Mapping[str, Part]) -> Iterator[Joined | Unmatched]:
+    """Yields the files of each frame, which the first part has, and those without a partner."""
+    # A part may be a video, which has each frame by its number.
+    videos = {field: video for field, part in parts.items() if (video := part.video)}
+    parts = {field: part for field, part in parts.items() if field not in videos}
+    first, *others = parts
+    needed = [field for field in others if not parts[field].optional]
+    for field in needed:
+        if not (folder := parts[field].folder).is_dir():
+            yield Unmatched(path=parts[first].folder, why=f"has no {folder}; add it")
+            return
+    files = dict[str, Files]()
+    for field, part in parts.items():
+        files[field], unreadable = part.files()
+        yield from unreadable
+    # Files without a partner.
+    for field, other in [*((first, each) for each in needed), *((each, first) for each in others)]:
+        for stem in (stem for stem in files[field] if stem not in files[other]):
+            why = f"has no partner {stem}.* in {parts[other].folder}; add or remove one"
+            yield Unmatched(path=files[field][stem], why=why)
+    # The frames.
+    for stem in files[first]:
+        own = {field: found[stem] for field, found in files.items() if stem in found}
+        if not own.keys() >= set(needed):
+            continue
+        number = re.search(r"\d+$", stem)
+        if videos and number is None:
+            why = f"has no number of a frame of {next(iter(videos.values()))} in its name"
+            yield Unmatched(path=own[first], why=why)
+            continue
+        masks = tuple(path for field, path in own.items() if field.startswith("mask"))
+        fields: dict[str, Any] = {f: path for f, path in own.items() if not f.startswith("mask")}
+        for field, path in videos.items():
+            fields[field] = VideoFrame(path=path, index=int(number[0] if number else 0))
+        yield Joined(stem, own, fields | {"masks": masks})
+
+
 def row(
     parts: Mapping[str, str],
     *,
-    name: Callable[[Path, Path, str], str],
+    name: Callable[[Path, Path, str], str] = lambda root, place, stem: stem,
     below: str = "",
     marks: tuple[str, ...] = (),
-    places: Callable[[Path], list[Path]] | None = None,
-    folders: Mapping[str, Callable[[Path], Path]] | None = None,
-    needs: tuple[str, ...] = (),
-    gaps: bool = False,
     calib: str = "",
-    more: Callable[[Path], Callable[[Files], Fields]] = lambda place: lambda files: {},
+    more: Callable[[Path], Callable[[Files], Mapping[str, Any] | None]] | None = None,
     **fields: Any,
 ) -> Layout:
     """Returns the layout of a data set whose parts lie in folders, with files of one stem.
 
     Args:
-        parts: Patterns of files by field of `FrameFiles`, or "mask…" for its masks. A pattern is
-            "folder|other folder/*.png": the first of these folders that exists in a place, and the
-            names of the files in it. `*`, or groups of a regular expression, make the stem. `**`
-            are paths in the folder and all folders in it. Instead of images, a video of the
-            folder's name may lie there (rgb.mp4). Its frame, from 0, is the number at the end of a
-            stem. A part that ends with ? may be missing; every frame has the first.
+        parts: Folder, or folders with | between them of which the first that exists counts, and
+            pattern (see `Part`) by field of `FrameFiles`. Every frame has the first part.
         name: Function of root, place and stem that gives the name of a frame.
         below: Patterns of where the places are, below the root, with | between them.
-        marks: Patterns of what else a place has. The first, or else the last part's folder, finds
-            a place.
-        places: Function of a root that gives the places, instead of `below` and `marks`.
-        folders: Functions of a place that give the folders of parts that lie elsewhere.
-        needs: Field `needs` of `Layout`, if not the folders of the parts and `marks`.
-        gaps: Whether a file of the first part without a partner is spare, not broken.
+        marks: Patterns of what else a place has. The first, or else the last needed part's folder,
+            finds a place.
         calib: File in a place, the calibration of frames without one of their own.
-        more: Function of a place. It gives a function from a frame's files to its further fields.
+        more: Function of a place. It gives a function from a frame's files to its further fields,
+            or to None for a frame that is not wanted.
         fields: Fields that all frames have.
     """
-    # The parts, and what finds a place.
-    kinds = {field: _FilePart(text, (folders or {}).get(field)) for field, text in parts.items()}
-    wanted = [kind for kind in kinds.values() if not kind.optional]
-    probe = marks[0] if marks else wanted[-1].folders[0]
+    needed = [text.rpartition("/")[0] for text in parts.values() if not text.endswith("?")]
+    probe = marks[0] if marks else needed[-1].split("|")[0]
 
     def find(root: Path) -> list[Path]:
         found = {path.parent for start in below.split("|") for path in root.glob(start + probe)}
         return sorted(
             place
             for place in found
-            if all(kind.path(place).is_dir() or kind.video(place) for kind in wanted)
+            if all(
+                part.optional or part.folder.is_dir() or part.video
+                for part in parts_in(place).values()
+            )
             and all(next(place.glob(mark), None) for mark in marks)
         )
 
-    find_places = places or find
+    def parts_in(place: Path) -> dict[str, Part]:
+        return {field: _part(place, text) for field, text in parts.items()}
 
     def frames(root: Path) -> Iterator[FrameFiles | Unmatched]:
-        for place in find_places(root):
-            # What all frames of the place share, and its videos.
-            fields_of = more(place)
+        for place in find(root):
             shared = {"calib": place / calib} if calib and (place / calib).is_file() else {}
-            videos = {field: path for field, kind in kinds.items() if (path := kind.video(place))}
-            others = {field: kind for field, kind in kinds.items() if field not in videos}
-            for found in _join_parts(place, others, gaps):
+            fields_of = more(place) if more else lambda files: {}
+            for found in join_parts(parts_in(place)):
                 if isinstance(found, Unmatched):
                     yield found
-                    continue
-                # A frame of a video has the number at the end of the stem.
-                stem, files = found
-                number = re.search(r"\d+$", stem)
-                if videos and number is None:
-                    why = f"has no number of a frame of {next(iter(videos.values()))} in its name"
-                    yield Unmatched(path=next(iter(files.values())), why=why)
-                    continue
-                # Further fields may rule the frame out.
-                extra = fields_of(files)
-                if isinstance(extra, Unmatched):
-                    yield extra
-                elif extra is not None:
-                    values = {**shared, **files, **fields, **extra}
-                    for field, path in videos.items():
-                        values[field] = VideoFrame(path=path, index=int(number[0] if number else 0))
-                    masks = tuple(values.pop(key) for key in files if key.startswith("mask"))
-                    yield FrameFiles(name=name(root, place, stem), masks=masks, **values)
+                elif (extra := fields_of(found.files)) is not None:
+                    stated = {**shared, **found.fields, **fields, **extra}
+                    yield FrameFiles(name=name(root, place, found.stem), **stated)
 
-    # What the layout needs, for messages.
-    missing = (*(kind.folders[0] for kind in wanted), *marks)
-    return Layout(
-        matches=find_places,
-        frames=frames,
-        needs=needs or tuple(dict.fromkeys(filter(None, missing))),
-    )
+    missing = (*(folders.split("|")[0] for folders in needed), *marks)
+    return Layout(matches=find, frames=frames, needs=tuple(dict.fromkeys(filter(None, missing))))
 
 
-def _join_parts(
-    place: Path, kinds: Mapping[str, _FilePart], gaps: bool
-) -> Iterator[tuple[str, Files] | Unmatched]:
-    """The stem and files of each frame, and the files that lack a partner."""
-    first, *others = kinds
-    needed = [field for field in others if not kinds[field].optional]
-    absent = [path for field in needed if not (path := kinds[field].path(place)).is_dir()]
-    if absent:
-        yield Unmatched(path=place, why=f"has no {absent[0]}; add it")
-        return
-    files: dict[str, dict[str, Path]] = {}
-    for field, kind in kinds.items():
-        files[field], unreadable = kind.files(place)
-        yield from unreadable
-
-    def alone(field: str, other: str, *, spare: bool) -> Iterator[Unmatched]:
-        for stem, path in files[field].items():
-            if stem not in files[other]:
-                why = f"has no partner {stem}.* in {kinds[other].path(place)}; add or remove one"
-                yield Unmatched(path=path, why=why, spare=spare)
-
-    for field in needed:
-        yield from alone(first, field, spare=gaps)
-    for stem in files[first]:
-        if all(stem in files[field] for field in needed):
-            yield stem, {field: of[stem] for field, of in files.items() if stem in of}
-    for field in others:
-        yield from alone(field, first, spare=True)
+def _part(place: Path, text: str) -> Part:
+    """The part of a place in the first of its folders, or videos, that exists."""
+    folders, _, names = text.rpartition("/")
+    parts = [Part(place / folder, names) for folder in folders.split("|")]
+    return next((part for part in parts if part.folder.is_dir() or part.video), parts[0])

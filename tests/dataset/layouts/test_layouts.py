@@ -73,15 +73,15 @@ def test_a_listing_has_the_files_of_no_frame(tmp_path: Path) -> None:
     touch(tmp_path / "rgb/c.png", tmp_path / "sparse/d.png", tmp_path / "gt/e.exr")
     touch(tmp_path / "calib/f.txt", tmp_path / "rgb/.hidden.png", tmp_path / "rgb/notes.txt")
     touch(tmp_path / "rgb/a.jpg")
-    layout, listing = list_frames(tmp_path)
+    layout, frames, unmatched = list_frames(tmp_path)
     assert layout == "pairs"
-    assert [frame.name for frame in listing.frames] == ["b"]
-    assert [str(lost).replace(f"{tmp_path}/", "") for lost in listing.broken] == [
+    assert [frame.name for frame in frames] == ["b"]
+    alone = ("sparse/a.png", "sparse/d.png", "gt/a.exr", "gt/e.exr", "calib/a.json", "calib/f.txt")
+    assert [str(lost).replace(f"{tmp_path}/", "") for lost in unmatched] == [
         "rgb/a.png and a.jpg are one frame; keep one",
         "rgb/c.png has no partner c.* in sparse; add or remove one",
+        *(f"{f} has no partner {Path(f).stem}.* in rgb; add or remove one" for f in alone),
     ]
-    spare = ["a.png", "d.png", "a.exr", "e.exr", "a.json", "f.txt"]
-    assert [lost.path.name for lost in listing.spare] == spare
 
 
 def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
@@ -152,14 +152,14 @@ def test_a_raw_drive_has_its_calibration_and_the_annotated_depth(
     gt = tmp_path / "data_depth_annotated" / "val" / DRIVE / "proj_depth/groundtruth/image_02"
     packet = tmp_path / "2011_09_26" / DRIVE / "oxts/data/0000000005.txt"
     touch(gt / "0000000005.png", packet)
-    layout, listing = list_frames(tmp_path / start)
+    layout, frames, unmatched = list_frames(tmp_path / start)
     assert layout == "kitti-raw"
-    assert [frame.name for frame in listing.frames] == TREES["kitti-raw"][1]
-    assert {frame.calib for frame in listing.frames} == {tmp_path / "2011_09_26"}
-    assert [frame.camera for frame in listing.frames] == [2, 2, 3, 3]
-    assert [frame.gt for frame in listing.frames] == [gt / "0000000005.png", None, None, None]
-    assert [frame.oxts for frame in listing.frames] == [packet, None, packet, None]
-    assert [lost.path.name for lost in listing.spare] == ["0000000007.png"]
+    assert [frame.name for frame in frames] == TREES["kitti-raw"][1]
+    assert {frame.calib for frame in frames} == {tmp_path / "2011_09_26"}
+    assert [frame.camera for frame in frames] == [2, 2, 3, 3]
+    assert [frame.gt for frame in frames] == [gt / "0000000005.png", None, None, None]
+    assert [frame.oxts for frame in frames] == [packet, None, packet, None]
+    assert [lost.path.name for lost in unmatched] == ["0000000007.png"]
 
 
 def test_the_odometrys_training_sequences_have_poses_by_frame_number(
@@ -205,14 +205,14 @@ def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> Non
     with (tmp_path / "rgb.txt").open("a") as file:
         file.write("1.04 rgb/1.04.png\n")  # nearest to the depth of 1.033 s
     (tmp_path / "groundtruth.txt").write_text("1 5 0 0 0 0 0 1\n1.02 7 0 0 0 0 0 1\n")
-    _, listing = list_frames(tmp_path)
-    assert [frame.gt for frame in listing.frames] == [
+    _, frames, unmatched = list_frames(tmp_path)
+    assert [frame.gt for frame in frames] == [
         tmp_path / "depth/1.015.png",
         tmp_path / "depth/1.030.png",
     ]
     # 1.033 s is after the last pose
-    assert [(f.gt_scale, f.pose) for f in listing.frames] == [(5000, at_x(5)), (5000, None)]
-    assert [lost.path.name for lost in listing.spare] == ["1.04.png", "2.png"]
+    assert [(f.gt_scale, f.pose) for f in frames] == [(5000, at_x(5)), (5000, None)]
+    assert [lost.path.name for lost in unmatched] == ["1.04.png", "2.png"]
 
 
 def test_tum_pairs_files_two_hundredths_of_a_second_apart_and_no_further(tmp_path: Path) -> None:
@@ -348,10 +348,10 @@ def test_a_manifest_names_masks_and_ground_truth_of_another_size(tmp_path: Path)
 def test_the_parent_of_data_sets_of_one_layout_has_their_frames(tmp_path: Path) -> None:
     for scene in ("chess", "fire"):
         tree(tmp_path / scene, "seq-01/frame-000000.{color,depth}.png")
-    layout, listing = list_frames(tmp_path)
+    layout, frames, _ = list_frames(tmp_path)
     assert layout == "7scenes"
     names = [f"{scene}/seq-01_frame-000000" for scene in ("chess", "fire")]
-    assert [frame.name for frame in listing.frames] == names
+    assert [frame.name for frame in frames] == names
     tree(tmp_path / "mine", "{rgb,sparse}/a.png")
     with pytest.raises(InputError, match=r"several layouts \(7scenes, pairs\); give"):
         list_frames(tmp_path)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.dataset.frame_files import FrameFiles, name_problem
+from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.data_sets import read_frames
@@ -63,7 +64,6 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("image,sparse\nlost.png,s.png\n", "lost.png does not exist; correct line 2 of "),
         ("image,depth\ni.png,s.png\n", "'depth' is not one of"),
         ("image,camera\ni.png,left\n", "line 2"),
         ("image\ni.png\ni.png\n", "line 3: a second frame 'i'"),
@@ -83,6 +83,13 @@ def test_a_line_of_a_manifest_that_means_nothing_is_named(
         read_frames(tmp_path / "m.csv")
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_of_a_manifest_is_named_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text("image\n\nlost.png\n")
+    _, _, (lost,) = list_frames(tmp_path / "m.csv")
+    assert lost.path == tmp_path / "lost.png"
+    assert "line 3" in str(lost)
 
 
 def test_frames_of_one_stem_are_named_by_their_folders(tmp_path: Path) -> None:
