@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     Image = NDArray[np.float32]
+    Counts = NDArray[np.float64]
 
 DELTA_THRESHOLDS = (1.25, 1.25**2, 1.25**3)
 """Thresholds of δ1 to δ3 (Eigen et al. 2014). The paper's KITTI rows use 1.01^k."""
@@ -310,16 +311,13 @@ def boundary_f1(predicted: Image, truth: Image) -> float:
     Returns:
         0 without any boundary, NaN without any pair of known neighbours.
     """
+    import numpy as np
+
     sides = ((0, 1), (0, -1), (1, 0), (-1, 0))
-    counts = [_boundary_counts(predicted, truth, side, 0) for side in sides]
-    if not any(pairs for pairs, _ in counts):
-        return math.nan
-    scores = []
-    for of_sides in zip(*(of_ratio for _, of_ratio in counts), strict=True):
-        recall = sum(both / max(true, 1) for both, _, true in of_sides) / 4
-        precision = sum(both / max(own, 1) for both, own, _ in of_sides) / 4
-        scores.append(2 * recall * precision / (recall + precision) if recall + precision else 0.0)
-    return _weigh(scores, _RATIOS)
+    both, own, true = _boundary_counts(predicted, truth, sides, margin=0)
+    recall = (both / np.maximum(true, 1)).sum(axis=0) / 4
+    precision = (both / np.maximum(own, 1)).sum(axis=0) / 4
+    return _weigh(2 * recall * precision, recall + precision, _RATIOS)
 
 
 def boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
@@ -336,80 +334,73 @@ def boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
     """
     span = range(-radius, radius + 1)
     disc = [(down, right) for down in span for right in span if down**2 + right**2 <= radius**2]
-    counts = [_boundary_counts(predicted, truth, offset, radius) for offset in disc]
-    if not any(pairs for pairs, _ in counts):
-        return math.nan
-    scores = []
-    for of_disc in zip(*(of_ratio for _, of_ratio in counts), strict=True):
-        both, own, true = (sum(column) for column in zip(*of_disc, strict=True))
-        scores.append(2 * both / (own + true) if own + true else 0.0)
-    return _weigh(scores, [ratio - 1 for ratio in _RATIOS])
-
-
-def _weigh(scores: Sequence[float], weights: Sequence[float]) -> float:
-    total = sum(weight * score for weight, score in zip(weights, scores, strict=True))
-    return total / sum(weights)
+    counts = _boundary_counts(predicted, truth, disc, margin=radius)
+    both, own, true = (each.sum(axis=0) for each in counts)
+    return _weigh(2 * both, own + true, [ratio - 1 for ratio in _RATIOS])
 
 
 def _boundary_counts(
-    predicted: Image, truth: Image, offset: tuple[int, int], margin: int
-) -> tuple[int, list[tuple[int, int, int]]]:
-    """How many pixels have a neighbour that is farther, for one place of the neighbour.
+    predicted: Image, truth: Image, offsets: Sequence[tuple[int, int]], *, margin: int
+) -> Counts:
+    """How many pixels have a neighbour that is farther.
 
     Args:
         predicted: (H, W) metres, 0 where unknown.
         truth: (H, W) metres, 0 where unknown.
-        offset: Rows and columns from the pixel to its neighbour.
+        offsets: Rows and columns from the pixel to each of N neighbours.
         margin: Width of the border whose pixels are neighbours alone.
 
     Returns:
-        The number of pairs of known true depth; and of each ratio how many pairs are farther by it
-        in both, in the prediction, and in the truth.
+        (3, N, ratios) pairs of known true depth that are farther by the ratio in both, in the
+        prediction, and in the truth; NaN without any such pair.
     """
     import numpy as np
 
-    # the pixels, and their neighbours
-    windows = []
-    for step, side in zip(offset, truth.shape, strict=True):
-        start, stop = max(margin, -step), side - max(margin, step)
-        windows.append((slice(start, stop), slice(start + step, stop + step)))
-    (rows, other_rows), (columns, other_columns) = windows
-    known = (truth[rows, columns] > 0) & (truth[other_rows, other_columns] > 0)
-    # by which factor the neighbours are farther
-    factors = []
-    for image in (predicted, truth):
-        own, other = (
-            image[part][known].astype(np.float64)
-            for part in ((rows, columns), (other_rows, other_columns))
-        )
-        has_both = (own > 0) & (other > 0)
-        factors.append(np.divide(other, own, out=np.zeros_like(own), where=has_both))
-    of_ratios = []
-    for ratio in _RATIOS:
-        is_own, is_true = (factor > ratio for factor in factors)
-        both, alone, true = (int(each.sum()) for each in (is_own & is_true, is_own, is_true))
-        of_ratios.append((both, alone, true))
-    return int(np.count_nonzero(known)), of_ratios
+    counts, pairs = np.zeros((3, len(offsets), len(_RATIOS))), 0
+    for number, offset in enumerate(offsets):
+        # the pixels and their neighbours
+        windows = []
+        for step, side in zip(offset, truth.shape, strict=True):
+            start, stop = max(margin, -step), side - max(margin, step)
+            windows.append((slice(start, stop), slice(start + step, stop + step)))
+        here, there = zip(*windows, strict=True)
+        known = (truth[here] > 0) & (truth[there] > 0)
+        pairs += int(np.count_nonzero(known))
+        # by which factor the neighbours are farther
+        factors = []
+        for image in (predicted, truth):
+            own, other = (image[part][known].astype(np.float64) for part in (here, there))
+            has_both = (own > 0) & (other > 0)
+            factors.append(np.divide(other, own, out=np.zeros_like(own), where=has_both))
+        for place, ratio in enumerate(_RATIOS):
+            is_own, is_true = (factor > ratio for factor in factors)
+            found = (is_own & is_true, is_own, is_true)
+            counts[:, number, place] = [np.count_nonzero(each) for each in found]
+    return counts if pairs else counts * math.nan
 
 
-ON_REQUEST = (
-    Measure(
-        key="boundary_f1",
-        title="boundary F1",
-        better="higher",
-        formula=boundary_f1,
-    ),
-    *(
-        Measure(
-            key=f"boundary_f1_{radius}px",
-            title=f"boundary F1, {radius} px",
-            better="higher",
-            formula=partial(boundary_f1_within, radius=radius),
-        )
-        for radius in (1, 2, 3)
-    ),
-)
-TABLE = {measure.key: measure for measure in ON_REQUEST}
+def _weigh(hits: Counts, of: Counts, weights: Sequence[float]) -> float:
+    """The weighted mean of hits / of, which is 0 where there is nothing."""
+    shares = zip(weights, hits.tolist(), of.tolist(), strict=True)
+    total = sum(weight * (hit / each if each else 0.0) for weight, hit, each in shares)
+    return total / sum(weights)
+
+
+TABLE = {
+    measure.key: measure
+    for measure in (
+        Measure(key="boundary_f1", title="boundary F1", better="higher", formula=boundary_f1),
+        *(
+            Measure(
+                key=f"boundary_f1_{radius}px",
+                title=f"boundary F1, {radius} px",
+                better="higher",
+                formula=partial(boundary_f1_within, radius=radius),
+            )
+            for radius in (1, 2, 3)
+        ),
+    )
+}
 """The measures that are computed on request alone."""
 
 

@@ -28,7 +28,7 @@ _OUTPUT = ("--csv", "--latex", "--columns", "--html", "--overwrite", "--json")
     ),
     groups={
         "Protocol": (EvalRequest,),
-        "Input": ("--pred-scale", "--gt-scale"),
+        "Input": ("--pred-scale", "--gt-scale", "--gt-range"),
         "Output": _OUTPUT,
     },
 )

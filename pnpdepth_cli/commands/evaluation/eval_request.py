@@ -86,6 +86,9 @@ class EvalRequest:
 
     pred_scale: float | None = option(None, "Integer predictions hold metres × S.", metavar="S")
     gt_scale: float | None = option(None, "Integer ground truth holds metres × S.", metavar="S")
+    gt_range: bool = option(
+        False, "Ground truth is the distance from the camera, not depth z; needs the camera."
+    )
 
     def __post_init__(self) -> None:
         for flag, scale in (("--pred-scale", self.pred_scale), ("--gt-scale", self.gt_scale)):

@@ -20,6 +20,7 @@ from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.core.metrics import error_sums, measures_of
 from pnpdepth_cli.dataset.arrays import apply_masks, depth_of, read_image
+from pnpdepth_cli.dataset.frame_camera import camera_of_file
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
@@ -29,7 +30,7 @@ from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.measures import OF_SIGMA, Formula
 from pnpdepth_cli.points import METRES, in_frame
-from pnpdepth_cli.protocols import Protocol
+from pnpdepth_cli.sensors.lens import rays_of_image
 from pnpdepth_cli.sensors.pixels import pixel_index
 from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
 from pnpdepth_cli.stages import AFTER, GT
@@ -177,9 +178,15 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
     values = apply_masks(values, frame.masks)
     values, notes = plausible_map(values, reading, "gt", "--gt-scale", scale)
     gt = np.ascontiguousarray(frame.part.apply(values))
+    if request.gt_range:
+        gt = _depth_of_distances(gt, pair, (values.shape[0], values.shape[1]))
+        reading = reading._replace(source=f"{reading.source}, distances")
     # The pixels that are scored.
     given = _given_points(pair, gt, required=rules.exclude_sparse)
-    scored = _scored_mask(gt, rules)
+    scored = np.zeros(gt.shape, bool)
+    scored[crop_window(rules.crop, gt.shape)] = True
+    highest = math.inf if rules.max_depth is None else rules.max_depth
+    scored &= (gt > rules.min_depth) & (gt < highest)
     if given is not None and rules.exclude_sparse:
         scored &= ~given
     # The prediction is fitted to those.
@@ -237,6 +244,24 @@ def _read(path: Path, scale: float | None, request: EvalRequest) -> tuple[Depth,
     return values, image.reading._replace(assumed=assumed)
 
 
+def _depth_of_distances(gt: Depth, pair: FramePair, whole: tuple[int, int]) -> Depth:
+    """Depth z of distances from the camera of the data set, else of the prediction's record."""
+    files, size, camera = pair.files, (gt.shape[0], gt.shape[1]), None
+    record = None if pair.result is None else pair.result.record
+    if files.calib is not None:
+        found, _ = camera_of_file(files.calib, files.camera, whole, files.image_file)
+        camera = files.part.camera_in_crop(found, whole)
+    elif pair.result is not None and record is not None and record.size == size[::-1]:
+        camera, _ = pair.result.camera_and_pose
+    if camera is None:
+        raise InputError(
+            f"--gt-range needs the camera of frame {files.name}, which neither the data set nor the"
+            " record beside the prediction has; add the column calib to a list"
+        )
+    rays = rays_of_image(camera, size)
+    return known_metres(gt / np.sqrt(1 + (rays**2).sum(axis=2)))
+
+
 def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
     """(H, W) true at the network's sparse points; None where they are not known or unusable.
 
@@ -280,18 +305,8 @@ def image_of(pair: FramePair, size: Size) -> Depth | None:
     """
     if pair.files.image is None:
         return None
-    rgb = read_image(pair.files.image)
-    if rgb.shape[:2] != size:
-        rgb = pair.files.part.apply(rgb)
+    rgb = pair.files.part.apply(read_image(pair.files.image))
     return rgb if rgb.shape[:2] == size else None
-
-
-def _scored_mask(gt: Depth, rules: Protocol) -> Mask:
-    """(H, W) true where the protocol scores known ground truth."""
-    scored = np.zeros(gt.shape, bool)
-    scored[crop_window(rules.crop, gt.shape)] = True
-    highest = math.inf if rules.max_depth is None else rules.max_depth
-    return scored & (gt > rules.min_depth) & (gt < highest)
 
 
 def crop_window(crop: str, size: Size) -> tuple[slice, slice]:

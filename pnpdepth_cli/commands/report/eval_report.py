@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.eval_tables import means_table
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
 from pnpdepth_cli.commands.evaluation.kitti_devkit import fill_background
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.commands.evaluation.scoring import image_of, load_frame, scores_of
+from pnpdepth_cli.commands.evaluation.scoring import FILES, image_of, load_frame, scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, PnpDepthError
@@ -52,31 +54,12 @@ def write_eval_report(
     Raises:
         OutputError: If the report cannot be written; then the folder is as it was before.
     """
-    columns = _columns(evaluation, keys)
-    frames = zip(evaluation.pairs, evaluation.frames, strict=True)
-    scored = [(pair, frame) for pair, frame in frames if frame.status == "done"]
-
-    def entries(images: Path) -> Iterator[dict[str, Any]]:
-        drawn = in_order(lambda each: _entry(*each, evaluation, columns, images), scored, THREADS)
-        for done, entry in enumerate(drawn, start=1):
-            yield entry
-            on_frame(done, len(scored))
-
-    write_report(folder, {"command": "eval"}, _head(evaluation, keys, columns), entries)
-
-
-def _columns(evaluation: Evaluation, keys: Sequence[str] | None) -> list[Measure]:
-    measures = choose_measures(evaluation.measures, keys)
-    chosen = measures if keys is None else [replace(each, main=True) for each in measures]
-    return [*chosen, replace(COVERAGE, main=True)]
-
-
-def _head(evaluation: Evaluation, keys: Sequence[str] | None, columns: list[Measure]) -> Head:
-    request = evaluation.request
-    frames = evaluation.frames
-    without = [(frame.name, frame.message or "") for frame in frames if frame.status != "done"]
+    # The columns of the frames, and what stands above them.
+    request, measures = evaluation.request, choose_measures(evaluation.measures, keys)
+    columns = [replace(each, main=each.main or keys is not None) for each in measures]
+    columns.append(replace(COVERAGE, main=True))
     fill = " (filled in)" if request.is_devkit else ""
-    return Head(
+    head = Head(
         kind="Depth evaluation",
         title=str(request.prediction),
         facts=[
@@ -87,54 +70,58 @@ def _head(evaluation: Evaluation, keys: Sequence[str] | None, columns: list[Meas
         notes=evaluation.notes,
         tables=[means_table(evaluation, keys)],
         without_title=f"Not scored: {evaluation.describe_unscored()}",
-        without=without,
+        without=[(f.name, f.message or "") for f in evaluation.frames if f.status != "done"],
         columns=columns,
-        sort_by=columns[0].key,
         labels={
             "first": f"Prediction{fill}", "second": "Ground truth", "map": "Error",
             "image": "Image",
         },
         map_colours=hex_colours(signed_bar("error", 9)),
     )  # fmt: skip
+    # The frames, one after the other.
+    frames = zip(evaluation.pairs, evaluation.frames, strict=True)
+    scored = [(pair, frame) for pair, frame in frames if frame.status == "done"]
+
+    def entries(images: Path) -> Iterator[dict[str, Any]]:
+        drawn = in_order(lambda each: _entry(*each, request, columns, images), scored, THREADS)
+        for done, entry in enumerate(drawn, start=1):
+            yield entry
+            on_frame(done, len(scored))
+
+    write_report(folder, {"command": "eval"}, head, entries)
 
 
 def _entry(
     pair: FramePair,
     frame: FrameRecord,
-    evaluation: Evaluation,
+    request: EvalRequest,
     columns: list[Measure],
     images: Path,
 ) -> dict[str, Any]:
+    """The page's entry of a frame, whose images are written."""
     scores = scores_of(frame)
-    pixels, known, given = (scores.get(count) for count in ("pixels", "known", "given"))
-    notes = [f"Scored: {pixels:,} of {known:,} pixels of the ground truth."]
-    if given:
-        notes.append(f"{given:,} of them were given to the network as sparse depth.")
-    notes += [f"Prediction: {frame.inputs['prediction'].path}", f"Ground truth: {pair.files.gt}"]
+    notes = [f"Scored: {scores['pixels']:,} of {scores['known']:,} pixels of the ground truth."]
+    if scores["given"]:
+        notes.append(f"{scores['given']:,} of them were given to the network as sparse depth.")
+    prediction, gt = (frame.inputs[name].path for name in FILES[:2])
+    notes += [f"Prediction: {prediction}", f"Ground truth: {gt}"]
     try:
-        drawn = _draw(pair, evaluation, images)
+        drawn = _draw(pair, request, images)
     except InputError as error:  # the file has changed since it was scored
         notes.append(str(error))
         drawn = {"key": None}
-    return {
-        "name": frame.name,
-        "values": [scores.get(measure.key) for measure in columns],
-        "notes": notes,
-        "tag": "",
-        **drawn,
-    }
+    values = [scores.get(measure.key) for measure in columns]
+    return {"name": frame.name, "values": values, "notes": notes, "tag": "", **drawn}
 
 
-def _draw(pair: FramePair, evaluation: Evaluation, images: Path) -> dict[str, Any]:
+def _draw(pair: FramePair, request: EvalRequest, images: Path) -> dict[str, Any]:
     """Writes the images of a frame and returns the page's entry of them."""
-    loaded = load_frame(pair, evaluation.request)
-    gt, depth = loaded.gt, loaded.depth
-    if evaluation.request.is_devkit:
+    loaded = load_frame(pair, request)
+    gt, depth, image = loaded.gt, loaded.depth, None
+    if request.is_devkit:
         depth = np.maximum(fill_background(depth), np.float32(0))
-    try:
+    with suppress(PnpDepthError):
         image = image_of(pair, gt.shape)
-    except PnpDepthError:
-        image = None
     errors, strongest_m = error_map(depth, gt, None if image is None else grey_of(image))
     scale = depth_scale(depth, gt)
     views = {"first": scale.paint(depth), "second": scale.paint(gt), "map": errors}
