@@ -196,6 +196,7 @@ MEASURES = OpenList(
 
 # The method
 UNKNOWN = ("keep", "zero")  # depth that no points support, in the depth file
+POSE_KINDS = ("camera-to-world", "world-to-camera", "opengl")  # what rows of poses are
 METHODS = ("fused", "alone", "paper")  # without and with the included network; the paper's
 SCHEDULES = ("constant", "linear")  # of the step size over the updates
 ALIGNMENTS = ("none", "median", "scale", "affine", "auto")  # of the output with the points

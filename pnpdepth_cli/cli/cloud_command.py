@@ -30,6 +30,7 @@ from pnpdepth_cli.cli.progress import progress_bar
     help="Camera poses of a folder's files: TUM rows are joined by time, KITTI rows by"
     " order, transforms.json by name.  [default: the records']",
 )
+@options.pose_kind
 @options.depth_scale
 @click.option("--max-depth", type=float, default=math.inf, metavar="M", help="Drop farther pixels.")
 @click.option(

@@ -59,6 +59,8 @@ class CloudRequest:
     poses: Path | None = None
     """Poses of the depth files, in their order. None: those of the records, if they have any. With
     poses, the cloud is in the world's coordinates."""
+    pose_kind: str | None = None
+    """What `poses` are, as `poses_of_frames` takes it."""
     depth_scale: float | None = None
     """Integer depth files hold metres × this."""
     max_depth: float = math.inf
@@ -134,6 +136,8 @@ def _check(request: CloudRequest) -> None:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
     if request.calib is not None and request.fov_deg is not None:
         raise UsageError("--calib and --fov both give the camera; leave one out")
+    if request.pose_kind is not None and request.poses is None:
+        raise UsageError("--pose-kind is for --poses")
     if request.image is not None and request.depth.is_dir():
         raise UsageError("--image is for one depth file; records name the images of a folder")
     if request.voxel is not None and not 0 < request.voxel < math.inf:
@@ -143,7 +147,8 @@ def _check(request: CloudRequest) -> None:
 def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -> list[Pose | None]:
     """The pose of each frame: of the file that is given, which adds a note, else of the records."""
     if request.poses is not None:
-        rows, how = poses_of_frames(request.poses, [frame.name for frame in frames])
+        names = [frame.name for frame in frames]
+        rows, how = poses_of_frames(request.poses, names, request.pose_kind)
         notes.append(f"poses: {request.poses}, {how}")
         return list(rows)
     poses = [frame.camera_and_pose[1] for frame in frames]

@@ -53,7 +53,9 @@ def read_poses(path: Path) -> Floats:
     return np.stack([pose for _, _, pose in _rows(path)])
 
 
-def poses_of_frames(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
+def poses_of_frames(
+    path: Path, names: Sequence[str], kind: str | None = None
+) -> tuple[Floats, str]:
     """Returns the poses (N, 3, 4) of the frames of these names, and how they were read.
 
     Those of a `transforms.json` are joined by the names of its images. Else, names that are times
@@ -61,20 +63,33 @@ def poses_of_frames(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
     trajectories. Else there is a row for each frame, in their order; or, with more rows than
     frames, the number in a name is the number of its row from 0.
 
+    Args:
+        path: A file of rows, or a transforms.json.
+        names: Names of the frames.
+        kind: What the file's poses are, one of `choices.POSE_KINDS`. None: "opengl" of a
+            transforms.json, else "camera-to-world".
+
     Raises:
         FileFormatError: A row has other numbers, or its rotation is none.
         InputError: The rows do not fit the frames.
     """
     if path.suffix.lower() == ".json":
-        return _poses_of_nerfstudio(path, names), (
-            "joined by name; from camera to world, turned from axes y up and z back (OpenGL)"
-        )
-    poses, how = _poses_of_rows(path, names)
+        poses, how = _poses_of_nerfstudio(path, names), "joined by name"
+        kind = kind or "opengl"
+    else:
+        poses, how = _poses_of_rows(path, names)
+    if kind == "opengl":
+        turned = poses * (1, -1, -1, 1)
+        return turned, f"{how}; taken as from camera to world, of axes y up and z back (OpenGL)"
+    if kind == "world-to-camera":
+        turns = poses[:, :, :3].transpose(0, 2, 1)
+        poses = np.concatenate([turns, -turns @ poses[:, :, 3:]], axis=2)
+        return poses, f"{how}; taken as from world to camera, of axes x right, y down, z forward"
     return poses, f"{how}; taken as from camera to world, of axes x right, y down, z forward"
 
 
 def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
-    """The poses (N, 3, 4) of the frames of these names in a transforms.json."""
+    """The matrices (N, 3, 4) of the frames of these names in a transforms.json."""
     content = read_json(path)
     try:
         entries = [(each["file_path"], each["transform_matrix"]) for each in content["frames"]]
@@ -94,7 +109,7 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
                 raise ValueError(f"the pose of {name} is no rotation")
     except (LookupError, TypeError, ValueError) as error:
         raise FileFormatError(f"{path} is no transforms.json ({one_line(error)})") from error
-    return poses * (1, -1, -1, 1)
+    return poses
 
 
 def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:

@@ -85,6 +85,21 @@ def test_poses_of_nerfstudio_have_axes_up_and_back(tmp_path: Path) -> None:
             poses_of_frames(path, ["a"])
 
 
+def test_poses_of_other_kinds_are_the_same_cameras(tmp_path: Path) -> None:
+    """A camera at (1, 2, 3), turned by a quarter about z, as each kind writes it."""
+    path = tmp_path / "poses.txt"
+    rows = {
+        "camera-to-world": "0 -1 0 1 1 0 0 2 0 0 1 3",
+        "world-to-camera": "0 1 0 -2 -1 0 0 1 0 0 1 -3",  # x of the world is -y of the camera
+        "opengl": "0 1 0 1 1 0 0 2 0 0 -1 3",  # its y and z axes are the negative ones
+    }
+    for kind, row in rows.items():
+        path.write_text(row)
+        (pose,), how = poses_of_frames(path, ["a"], kind)
+        assert pose.tolist() == [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
+        assert {"world-to-camera": "from world", "opengl": "OpenGL"}.get(kind, "from camera") in how
+
+
 def test_poses_that_fit_no_frames_are_refused(tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text(kitti_row(1) + kitti_row(2))
     with pytest.raises(InputError):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from pnpdepth_cli.choices import LAYOUTS, PROTOCOLS
+from pnpdepth_cli.choices import LAYOUTS, POSE_KINDS, PROTOCOLS
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import UsageError
@@ -83,8 +83,16 @@ class SequenceOptions:
         " transforms.json by name.  [default: the layout's or poses.txt, else estimated]",
         metavar="FILE",
     )
+    pose_kind: str | None = option(
+        None,
+        "Kind of the poses of --poses; OpenGL's axes are y up and z back."
+        "  [default: opengl of transforms.json, else camera-to-world]",
+        choices=POSE_KINDS,
+    )
 
     def __post_init__(self) -> None:
+        if self.pose_kind is not None and self.poses is None:
+            raise UsageError("--pose-kind is for --poses")
         if self.poses is not None and not self.accumulate:
             raise UsageError("--poses is for --accumulate; give --accumulate 2, say")
 

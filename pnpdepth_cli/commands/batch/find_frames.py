@@ -129,7 +129,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     # Neighbours, of all frames.
     if sequence.accumulate:
         poses = sequence.poses or _poses_beside(source, frames)
-        frames = with_neighbours(frames, sequence.accumulate, poses)
+        frames = with_neighbours(frames, sequence.accumulate, poses, sequence.pose_kind)
     # The part of the frames that this run refines.
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]

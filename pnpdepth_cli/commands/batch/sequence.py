@@ -32,7 +32,7 @@ def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
 
 
 def with_neighbours(
-    frames: Sequence[FrameFiles], reach: int, poses: Path | None
+    frames: Sequence[FrameFiles], reach: int, poses: Path | None, kind: str | None = None
 ) -> list[FrameFiles]:
     """Returns the frames, each with those at most `reach` before and after it in its sequence.
 
@@ -41,13 +41,14 @@ def with_neighbours(
         reach: Number of frames to each side.
         poses: A file of `poses_of_frames`. None: the frames' own poses; where a frame has
             none, the motion is to be estimated.
+        kind: What the poses of the file are, as `poses_of_frames` takes it.
 
     Raises:
         InputError: The file has another number of poses.
         UsageError: A frame has no points, or its points are those of all images already;
             or neither its pose nor its image is known.
     """
-    known, result = _poses(frames, poses), list(frames)
+    known, result = _poses(frames, poses, kind), list(frames)
     for sequence in sequences_of(frames).values():
         for number, index in enumerate(sequence):
             near = range(max(0, number - reach), min(len(sequence), number + reach + 1))
@@ -91,10 +92,12 @@ def _neighbour(
     return Neighbour(files=other, motion=motion, poses=source, apart=apart)
 
 
-def _poses(frames: Sequence[FrameFiles], path: Path | None) -> list[KnownPose | None]:
+def _poses(
+    frames: Sequence[FrameFiles], path: Path | None, kind: str | None
+) -> list[KnownPose | None]:
     """The pose of each frame; None where it is unknown."""
     if path is not None:
-        rows, how = poses_of_frames(path, [frame.name for frame in frames])
+        rows, how = poses_of_frames(path, [frame.name for frame in frames], kind)
         return [(row, f"{path}, {how}") for row in rows]
     poses = [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
     for sequence in sequences_of(frames).values():
