@@ -11,10 +11,11 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
+import msgspec
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
@@ -42,49 +43,97 @@ _PICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
 _MAX_SIDE = 1 << 16  # pixels
 _LARGEST_NUMBER = 1e6  # in a config.json; no network has more of any part
 _PLAIN_ATTENTION = ("eager", "sdpa")
-_IMAGENET = {"image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
+
+_Side = Annotated[int, msgspec.Meta(ge=1, le=_MAX_SIDE)]
+_Sides = _Side | Annotated[float, msgspec.Meta(ge=1 / _MAX_SIDE, lt=1)] | None
+"""Pixels; or their reciprocal, as ZoeDepth's folders have 1/32."""
+_Number = Annotated[float, msgspec.Meta(ge=-_LARGEST_NUMBER, le=_LARGEST_NUMBER)]
+_Positive = Annotated[float, msgspec.Meta(gt=0, le=_LARGEST_NUMBER)]
+
+_Kind = TypeVar("_Kind")
+
+
+class _Processing(msgspec.Struct, frozen=True):
+    """What a preprocessor_config.json says of the image."""
+
+    do_resize: bool | None = True
+    size: _Side | dict[str, _Side | None] | None = None
+    keep_aspect_ratio: bool | None = False
+    size_divisor: _Sides = None
+    ensure_multiple_of: _Sides = None
+    do_rescale: bool | None = True
+    rescale_factor: _Positive = 1 / 255
+    do_normalize: bool | None = None
+    image_mean: tuple[_Number, _Number, _Number] | None = None
+    image_std: tuple[_Positive, _Positive, _Positive] | None = None
+
+    def size_policy(self, of: int) -> Fixed | Near | None:
+        """How images are resized, to multiples of a number at least; None if it is not said."""
+        if not self.do_resize or self.size_divisor is not None:
+            return Near(of=max(of, _pixels(self.size_divisor)))
+        sides = self.size if isinstance(self.size, dict) else {"shortest_edge": self.size}
+        height, width = (
+            sides.get(side) or sides.get("shortest_edge") for side in ("height", "width")
+        )
+        if height is None or width is None:
+            return None
+        if not self.keep_aspect_ratio:
+            return Fixed(height, width)
+        multiple = max(of, _pixels(self.ensure_multiple_of))
+        return Near(of=multiple, height=height, width=width)
+
+    def normalisation(self) -> Normalisation:
+        """The same of an image in 0…1."""
+        # An image that is not rescaled is in 0…255: a standard deviation of 1/255 does the same.
+        unit = self.rescale_factor * 255 if self.do_rescale else 255.0
+        asked = self.image_mean is not None if self.do_normalize is None else self.do_normalize
+        if not asked:
+            return Normalisation(std=(1 / unit, 1 / unit, 1 / unit))
+        m0, m1, m2 = self.image_mean or (0.5, 0.5, 0.5)
+        s0, s1, s2 = self.image_std or (0.5, 0.5, 0.5)
+        return Normalisation(
+            mean=(m0 / unit, m1 / unit, m2 / unit), std=(s0 / unit, s1 / unit, s2 / unit)
+        )
+
+
+def _pixels(side: float | None) -> int:
+    """A number of pixels; 1 if there is none."""
+    if side is None:
+        return 1
+    return round(1 / side) if isinstance(side, float) else side
+
+
+def _resized(height: int, width: int, **more: Any) -> _Processing:
+    size: dict[str, int | None] = {"height": height, "width": width}
+    return _Processing(size=size, keep_aspect_ratio=True, do_normalize=True, **more)
 
 
 @dataclass(frozen=True)
 class _Family:
-    """What the networks of one model type predict, and how their image is prepared.
+    """What the networks of one model type predict.
 
-    of: what sides of images are multiples of. size, keeps_aspect, statistics: as transformers
-    prepares the image by default.
+    of: what sides of images are multiples of. usual: how transformers prepares the image.
     """
 
     kind: OutputKind
     scale: OutputScale
+    usual: _Processing
     of: int = 1
-    size: tuple[int, int] | None = None
-    keeps_aspect: bool = True
-    statistics: Mapping[str, Any] = field(default_factory=dict)
-
-    def processing(self) -> Mapping[str, Any]:
-        """Returns the settings that a preprocessor_config.json would have."""
-        if self.size is None:
-            return {"size_divisor": self.of}
-        size = dict(zip(("height", "width"), self.size, strict=True))
-        return {
-            "size": size,
-            "keep_aspect_ratio": self.keeps_aspect,
-            "do_normalize": True,
-            **self.statistics,
-        }
 
 
 PROMPT_SIZE = (192, 256)
 """Rows and columns of the depth that Prompt Depth Anything was trained with, a phone's LiDAR."""
 
+_IMAGENET = {"image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
 _FAMILIES = {
-    "depth_anything": _Family("inverse", "affine", 14, (518, 518), statistics=_IMAGENET),
-    "prompt_depth_anything": _Family("depth", "metric", 14, (756, 756), statistics=_IMAGENET),
+    "depth_anything": _Family("inverse", "affine", _resized(518, 518, **_IMAGENET), 14),
+    "prompt_depth_anything": _Family("depth", "metric", _resized(756, 756, **_IMAGENET), 14),
     # Intel's DPT give inverse depth, Meta's on DINOv2 give depth; their configurations do not say.
-    "dpt": _Family("unknown", "affine", 16, (384, 384), keeps_aspect=False),
-    "zoedepth": _Family("depth", "metric", 32, (384, 512)),
-    "glpn": _Family("depth", "metric", 32),
+    "dpt": _Family("unknown", "affine", _Processing(size=384, do_normalize=True), 16),
+    "zoedepth": _Family("depth", "metric", _resized(384, 512), 32),
+    "glpn": _Family("depth", "metric", _Processing(size_divisor=32), 32),
     # Inverse depth for a canonical camera: a factor away from metres.
-    "depth_pro": _Family("inverse", "scale", size=(1536, 1536), keeps_aspect=False),
+    "depth_pro": _Family("inverse", "scale", _Processing(size=1536, do_normalize=True)),
 }
 
 
@@ -100,7 +149,7 @@ def hf_definition(folder: Path) -> ModelDefinition:
         CheckpointError: Its weights are missing, or are pickles.
     """
     # The type of network, which must be known.
-    config = _json(folder / "config.json", "it says which network this is")
+    config = _read(folder / "config.json", dict[str, Any])
     kind = config.get("model_type")
     if not isinstance(kind, str) or kind not in _FAMILIES:
         raise ModelError(
@@ -113,24 +162,23 @@ def hf_definition(folder: Path) -> ModelDefinition:
     if config.get("depth_estimation_type") == "metric":
         family = replace(family, kind="depth", scale="metric")
     # How images are prepared, as stated or as usual for the type.
-    if (folder / "preprocessor_config.json").is_file():
-        processing = _json(folder / "preprocessor_config.json", "it says how images are prepared")
-    else:
-        processing = family.processing()
-        size = "×".join(map(str, family.size or ("its own",)))
-        mean = "ImageNet's mean and deviation" if family.statistics else "rgb in −1…1"
-        assumed = (
-            f"{folder.name} has no preprocessor_config.json; assumed, as usual for {kind}: size"
-            f" {size}, {mean if family.size else 'rgb in 0…1'}"
-        )
+    file, processing = folder / "preprocessor_config.json", family.usual
+    if file.is_file():
+        processing = _read(file, _Processing)
+    size, normalisation = processing.size_policy(family.of), processing.normalisation()
+    if size is None:
+        raise ModelError(f"{file}: it says no size")
+    if not file.is_file():
+        assumed = f"{folder.name} has no {file.name}; assumed, as usual for {kind}: {size}"
+        assumed = f"{assumed}, {normalisation}"
     # The definition, whose network is built when it is needed.
     weights, prompted = _weights(folder), kind == "prompt_depth_anything"
     return ModelDefinition(
         name=folder.resolve().name,
         summary=f"Hugging Face {kind}",
         input_kind="rgb+sparse" if prompted else "rgb",
-        size=_size(processing, family.of, folder),
-        normalisation=_normalisation(processing, folder),
+        size=size,
+        normalisation=normalisation,
         output_kind=family.kind,
         output_scale=family.scale,
         build=lambda: _build(folder),
@@ -175,21 +223,19 @@ def _with_prompt(rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...
     return rgb, linear(points.resized(*PROMPT_SIZE))[None, None].to(sparse)
 
 
-def _json(file: Path, why: str) -> Mapping[str, Any]:
+def _read(file: Path, kind: type[_Kind]) -> _Kind:
+    """The settings in a JSON file of the folder."""
     if not file.is_file():
         raise ModelError(
-            f"{file.parent} is not a Hugging Face folder: {file.name} is missing, and {why};"
-            " take it from the network's page"
+            f"{file.parent} is not a Hugging Face folder: {file.name} is missing; take it from the"
+            " network's page"
         )
     size = file.stat().st_size
     check_claim(f"{file} has {size:,} bytes", size, _MOST_JSON_BYTES, error=ModelError)
     try:
-        settings = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ModelError(f"{file} is not JSON: {describe(error)[:160]}") from None
-    if not isinstance(settings, dict):
-        raise ModelError(f"{file} holds no settings")
-    return settings
+        return msgspec.convert(json.loads(file.read_bytes()), kind)
+    except (msgspec.ValidationError, ValueError, OverflowError, RecursionError) as error:
+        raise ModelError(f"{file}: {describe(error)[:160]}") from None
 
 
 def _weights(folder: Path) -> Path:
@@ -197,7 +243,7 @@ def _weights(folder: Path) -> Path:
     if single.is_file():
         return single
     if index.is_file():
-        parts = _json(index, "it names the files of weights").get("weight_map")
+        parts = _read(index, dict[str, Any]).get("weight_map")
         for name in parts.values() if isinstance(parts, Mapping) else [parts]:
             file = folder / str(name)
             if file.parent != folder or file.suffix != single.suffix or not file.is_file():
@@ -209,60 +255,6 @@ def _weights(folder: Path) -> Path:
             f" {_WEIGHTS[0]} by save_pretrained"
         )
     raise CheckpointError(f"{folder} has no {_WEIGHTS[0]}")
-
-
-def _size(processing: Mapping[str, Any], of: int, folder: Path) -> Fixed | Near:
-    if not processing.get("do_resize", True) or "size_divisor" in processing:
-        return Near(of=max(of, _side(processing, "size_divisor", folder)))
-    size = processing.get("size")
-    if isinstance(size, Mapping):
-        height = size.get("height") or size.get("shortest_edge")
-        width = size.get("width") or size.get("shortest_edge")
-    else:
-        height = width = size
-    if not all(isinstance(side, int) and 1 <= side <= _MAX_SIDE for side in (height, width)):
-        raise _wrong(folder, f"size must be a height and a width, got {str(size)[:60]}")
-    assert isinstance(height, int)
-    assert isinstance(width, int)
-    if not processing.get("keep_aspect_ratio", False):
-        return Fixed(height, width)
-    return Near(
-        of=max(of, _side(processing, "ensure_multiple_of", folder)), height=height, width=width
-    )
-
-
-def _side(processing: Mapping[str, Any], key: str, folder: Path) -> int:
-    """A number of pixels; 1 if there is none."""
-    value = processing.get(key) or 1
-    if isinstance(value, float) and 1 / _MAX_SIDE <= value < 1:  # as ZoeDepth's folders have 1/32
-        value = round(1 / value)
-    if not isinstance(value, int) or not 1 <= value <= _MAX_SIDE:
-        raise _wrong(folder, f"{key} must be a number of pixels, got {str(value)[:60]!r}")
-    return value
-
-
-def _normalisation(processing: Mapping[str, Any], folder: Path) -> Normalisation:
-    # An image that is not rescaled is in 0…255: a standard deviation of 1/255 does the same.
-    factor = processing.get("rescale_factor", 1 / 255)
-    mean, std = processing.get("image_mean", (0.5,) * 3), processing.get("image_std", (0.5,) * 3)
-    try:
-        unit = float(factor) * 255 if processing.get("do_rescale", True) else 255.0
-        if not processing.get("do_normalize", "image_mean" in processing):
-            return Normalisation(std=(1 / unit, 1 / unit, 1 / unit))
-        (m0, m1, m2), (s0, s1, s2) = mean, std
-        return Normalisation(
-            mean=(m0 / unit, m1 / unit, m2 / unit), std=(s0 / unit, s1 / unit, s2 / unit)
-        )
-    except (TypeError, ValueError, ArithmeticError, ModelError):
-        raise _wrong(
-            folder,
-            f"rescale_factor {str(factor)[:60]}, image_mean {str(mean)[:60]} and image_std"
-            f" {str(std)[:60]} are not a number and three numbers each, the first and last above 0",
-        ) from None
-
-
-def _wrong(folder: Path, fact: str) -> ModelError:
-    return ModelError(f"{folder / 'preprocessor_config.json'}: {fact}")
 
 
 def _build(folder: Path) -> nn.Module:

@@ -151,13 +151,10 @@ def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
     (folder / "pytorch_model.bin").unlink()
     with pytest.raises(CheckpointError):
         hf_definition(folder)
-    for text, message in (
-        ('{"model_type": "bert"}', "'bert' are not known"),
-        ("{", "is not JSON"),
-        ('{"a":' + "[" * 100_000 + "]" * 100_000 + "}", "is not JSON"),
-    ):
+    nested = '{"a":' + "[" * 100_000 + "]" * 100_000 + "}"
+    for text in ('{"model_type": "bert"}', "{", "[]", nested):
         (folder / "config.json").write_text(text)
-        with pytest.raises(ModelError, match=message):
+        with pytest.raises(ModelError, match=str(folder)):
             hf_definition(folder)
     (folder / "config.json").unlink()
     with pytest.raises(ModelError):

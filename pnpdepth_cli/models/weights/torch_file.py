@@ -13,13 +13,12 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pnpdepth_cli.budget import check_claim
-from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.weights.pickle_reader import (
     CONTENT_ERRORS,
     MAX_NAME,
@@ -46,41 +45,40 @@ _DTYPES: dict[str, torch.dtype] = {
 def read_torch_file(path: Path) -> tuple[Any, list[str]]:
     """Returns the content of a torch file, and the functions and classes that its pickle names.
 
-    The content is tensors in plain containers, and a `StandIn` for all else; no name was run. A
-    broken file raises whatever its parts do.
+    The content is tensors in plain containers, the state dict of each whole module, and a `StandIn`
+    for all else; no name was run. A broken file raises whatever its parts do.
     """
     if zipfile.is_zipfile(path):
-        return _read_archive(path)
-    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
-        return _read_row_of_pickles(content)
+        content, names = _read_archive(path)
+    else:
+        with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as mapped:
+            content, names = _read_row_of_pickles(mapped)
+    if isinstance(content, Mapping):
+        content = {key: _with_state(value) for key, value in content.items()}
+    return _with_state(content), names
 
 
-def is_module(value: Any) -> TypeGuard[StandIn]:
-    """Returns True for a stand-in of a torch module."""
+def _with_state(value: Any) -> Any:
+    """The state dict of a whole pickled module, as the module itself would have given it."""
+    return dict(_walk(value, "", itertools.count())) if _is_module(value) else value
+
+
+def _is_module(value: Any) -> bool:
     is_state = isinstance(value, StandIn) and isinstance(value.state, Mapping)
     return is_state and "_parameters" in value.state
-
-
-def module_state(module: StandIn) -> dict[str, Tensor]:
-    """Returns the state dict of a whole pickled module, as the module itself would have given it.
-
-    Raises:
-        CheckpointError: Its modules contain each other.
-    """
-    return dict(_walk(module, "", itertools.count()))
 
 
 def _walk(module: StandIn, prefix: str, visited: Iterator[int]) -> Iterator[tuple[str, Tensor]]:
     endless = next(visited) > _MAX_MODULES or prefix.count(".") > _MAX_DEPTH
     if endless or len(prefix) > MAX_NAME:
-        raise CheckpointError("the checkpoint's modules contain each other without end")
+        raise BrokenFileError("its modules contain each other without end")
     fleeting = module.state.get("_non_persistent_buffers_set")
     # Not a set, in which other elements may take for ever to hash.
     left_out = [n for n in fleeting if isinstance(n, str)] if isinstance(fleeting, list) else []
     for kind in ("_parameters", "_buffers", "_modules"):
         entries = module.state.get(kind)
         for name, value in entries.items() if isinstance(entries, Mapping) else ():
-            if kind == "_modules" and is_module(value):
+            if kind == "_modules" and _is_module(value):
                 yield from _walk(value, f"{prefix}{name}.", visited)
             elif kind != "_modules" and isinstance(value, Tensor) and name not in left_out:
                 yield f"{prefix}{name}", value
