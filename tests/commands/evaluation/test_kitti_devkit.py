@@ -1,13 +1,11 @@
-"""The development kit's figures: by hand, by plain loops, and as its own program printed them."""
+"""The development kit's figures: filled in by plain loops, and as its own program printed them."""
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -44,40 +42,6 @@ def filled_by_loops(depth: np.ndarray) -> np.ndarray:
     return out
 
 
-def errors_by_loops(predicted: np.ndarray, gt: np.ndarray) -> dict[str, float]:
-    """The nine errors in single precision, added up down each column, column after column."""
-    predicted = filled_by_loops(predicted)
-    sums = {measure.key: F(0) for measure in DEVKIT_MEASURES}
-    log_sum, count = F(0), 0
-    height, width = gt.shape
-    for u in range(width):
-        for v in range(height):
-            g, p = gt[v, u], predicted[v, u]
-            if g <= 0:
-                continue
-            error = abs(g - p)
-            inverse = F(abs(1.0 / float(g) - 1.0 / float(p)))
-            log_p = F(math.log(p)) if p > 0 else F(math.nan)
-            log_error = F(math.log(g)) - log_p
-            sums["mae"] += error
-            sums["rmse"] += error * error
-            sums["inverse_mae"] += inverse
-            sums["inverse_rmse"] += inverse * inverse
-            sums["log_mae"] += abs(log_error)
-            sums["log_rmse"] += log_error * log_error
-            sums["abs_relative"] += error / g
-            sums["squared_relative"] += error * error / (g * g)
-            log_sum += log_error
-            count += 1
-    n = F(count)
-    errors = {key: value / n for key, value in sums.items()}
-    with np.errstate(invalid="ignore"):
-        errors["scale_invariant_log"] = np.sqrt(errors["log_rmse"] - log_sum * log_sum / (n * n))
-    for key in ("rmse", "inverse_rmse", "log_rmse"):
-        errors[key] = np.sqrt(errors[key])
-    return {key: float(value) for key, value in errors.items()}
-
-
 def codes(least: int) -> st.SearchStrategy[np.ndarray]:
     """Small images of KITTI's depth codes, many of them unknown."""
     some = st.one_of(st.just(0), st.integers(0, 3), st.integers(least, 20_000))
@@ -92,17 +56,6 @@ def metres(stored: np.ndarray) -> np.ndarray:
 def test_what_is_missing_is_filled_as_by_the_loops_of_the_definition(stored: np.ndarray) -> None:
     depth = metres(stored)
     np.testing.assert_array_equal(fill_background(depth), filled_by_loops(depth))
-
-
-@given(codes(1), codes(1))
-def test_the_errors_are_those_of_the_loops_digit_for_digit(
-    predicted: np.ndarray, gt: np.ndarray
-) -> None:
-    gt[0, 0] = 256
-    errors = devkit_errors(metres(predicted), metres(gt))
-    assert errors == pytest.approx(
-        errors_by_loops(metres(predicted), metres(gt)), rel=0, abs=0, nan_ok=True
-    )
 
 
 def test_the_figures_are_those_of_the_official_program() -> None:

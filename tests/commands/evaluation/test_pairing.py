@@ -95,15 +95,16 @@ def test_files_are_matched_by_name_and_what_is_left_is_reported(
 
 
 REFUSED = [
-    (["a.npy", "a.png"], ["a.png"], "out", "gt", InputError, "are one frame; keep one"),
-    (["a_depth.png", "a.depth.png"], ["a.png"], "out", "gt", InputError, "are one frame; keep"),
+    (["a.npy", "a.png"], ["a.png"], "out", "gt", InputError, "one frame"),
+    (["a_depth.png", "a.depth.png"], ["a.png"], "out", "gt", InputError, "one frame"),
     (["a.png"], [], "out", "gt", InputError, "gt holds no depth file"),
-    (["a.png"], ["a.png"], "out/b.png", "gt/a.png", InputError, "b.png: no such file or folder"),
-    (["1.png"], ["0001.png"], "out", "gt", InputError,
-     "file: predictions are 1; ground truth is 0001"),
-    (["a.png"], ["a.png"], "out/a.png", "gt", UsageError, "two files, two folders"),
-    (["a.png"], ["a.png"], "out", "gt/a.png", UsageError, "two files, two folders"),
-]  # fmt: skip
+    (["a.png"], ["a.png"], "out/b.png", "gt/a.png", InputError, "b.png"),
+    (["1.png"], ["0001.png"], "out", "gt", InputError, "are 1; ground truth is 0001"),
+    (["a.png"], ["a.png"], "out/a.png", "gt", UsageError, "two files"),
+    (["a.png"], ["a.png"], "out", "gt/a.png", UsageError, "two files"),
+    (["a.png"], ["a.png"], "out/a.png", "list.csv", UsageError, "two files"),
+    (["a.png"], ["a.png"], "out", "list.csv", InputError, "'manifest'"),  # without ground truth
+]
 
 
 @pytest.mark.parametrize(("predictions", "truths", "first", "second", "error", "message"), REFUSED)
@@ -117,6 +118,8 @@ def test_what_cannot_be_matched_is_refused(
     message: str,
 ) -> None:
     folders(tmp_path, predictions, truths)
+    touch(tmp_path / "a.png")
+    (tmp_path / "list.csv").write_text("image,sparse,name\na.png,out/a.png,a")
     with pytest.raises(error, match=message):
         pair_frames(tmp_path / first, tmp_path / second)
 

@@ -64,7 +64,7 @@ def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path, figures: li
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
 
 
-def test_runs_that_vary_nothing_or_different_options_have_no_plot(tmp_path: Path) -> None:
+def test_runs_that_do_not_vary_the_same_options_have_no_plot(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     one, two = batch(tmp_path, 0.5, lr="1%"), batch(tmp_path, 0.5, loss="l2")
     with pytest.raises(UsageError, match="same options"):
@@ -72,22 +72,18 @@ def test_runs_that_vary_nothing_or_different_options_have_no_plot(tmp_path: Path
     assert not (tmp_path / "p.png").exists()
 
 
-def test_a_plot_of_no_known_format_or_without_matplotlib_is_wrong_usage(
+def test_a_plot_needs_a_known_format_matplotlib_and_leave_to_replace_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    pytest.importorskip("matplotlib")
     comparison = compare([batch(tmp_path, 0.5, lr="1%"), batch(tmp_path, 0.5, lr="3%")])
     with pytest.raises(UsageError, match=r"\.svg"):
         plot_comparison(comparison, tmp_path / "p.jpg")
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(UsageError, match="plot"):
-        plot_comparison(comparison, tmp_path / "p.png")
-
-
-def test_a_plot_is_replaced_only_where_that_is_asked_for(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    comparison = compare([batch(tmp_path, 0.5, lr="1%"), batch(tmp_path, 0.5, lr="3%")])
     (tmp_path / "p.pdf").touch()
     with pytest.raises(OutputError):
         plot_comparison(comparison, tmp_path / "p.pdf")
     plot_comparison(comparison, tmp_path / "p.pdf", overwrite=True)
     assert (tmp_path / "p.pdf").read_bytes().startswith(b"%PDF")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(UsageError, match="plot"):
+        plot_comparison(comparison, tmp_path / "p.png")

@@ -20,12 +20,10 @@ WHERE = RNG.random(GT.shape) < 0.7
 
 
 def test_without_scaling_disparity_becomes_depth_and_nothing_else() -> None:
-    disparity = (1 / GT).astype(np.float32)
-    disparity[0, 0] = 0
+    disparity = np.where(WHERE, 1 / GT, 0).astype(np.float32)
     depth, fit = scale_prediction(disparity, GT, "disparity", "none")
     assert fit is None
-    assert depth[0, 0] == 0
-    assert depth[1:] == pytest.approx(GT[1:], rel=1e-6)
+    assert depth == pytest.approx(np.where(WHERE, GT, 0), rel=1e-6)
 
 
 def test_median_is_that_of_monodepth2_and_empty_predictions_stay_empty() -> None:
