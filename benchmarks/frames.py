@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.batch.running import registering
+from pnpdepth_cli.commands.batch.running import spread
 from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.frame import Frame, Register, tensor_of
@@ -144,7 +144,7 @@ def registered(
         points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
         known.append(evidence(frame.rgb, points))
     if how == "set":
-        found = [estimate_registration(registering(known, 0))] * len(frames)
+        found = [estimate_registration([known[i] for i in spread(len(known))])] * len(frames)
     else:
         found = [estimate_registration([each]) for each in known]
     return [replace(frame, register=one) for frame, one in zip(frames, found, strict=True)]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import find_frames, task_of
+from pnpdepth_cli.commands.batch.find_frames import find_frames, request_of
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.scoring import scores_of
@@ -86,9 +86,7 @@ BY_HAND: dict[str, tuple[Callable[[Path], None], int, int, int]] = {
 def inputs_of(root: Path, protocol: str) -> list[Frame]:
     refine = RefineRequest()
     request = BatchRequest(source=root, output=root / "out", refine=refine, protocol=protocol)
-    return [
-        read_requested(task_of(request, frame).request) for frame in find_frames(request).chosen
-    ]
+    return [read_requested(request_of(request, frame)) for frame in find_frames(request).chosen]
 
 
 LARGE = pytest.param("omni-dc-eth3d", marks=pytest.mark.slow)
@@ -104,7 +102,7 @@ def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_p
         source=root, output=tmp_path / "out", refine=RefineRequest(), protocol=name
     )
     chosen = find_frames(request).chosen
-    read = [read_requested(task_of(request, frame).request) for frame in chosen]
+    read = [read_requested(request_of(request, frame)) for frame in chosen]
     assert [len(each.points) for each in read] == [points] * frames
     for frame, each in zip(chosen, read, strict=True):
         assert each.gt is not None

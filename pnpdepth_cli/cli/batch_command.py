@@ -18,12 +18,7 @@ from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.progress import BatchProgress, progress_bar
 from pnpdepth_cli.cli.streams import INTERRUPTED, say
 from pnpdepth_cli.cli.vary import Combination, combinations_of
-from pnpdepth_cli.commands.batch.batch_request import (
-    BatchRequest,
-    ClusterOptions,
-    FrameSelection,
-    SequenceOptions,
-)
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine_request import (
     HoldOut,
     NetworkChoice,
@@ -50,14 +45,16 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
         }
     ),
     groups={
-        "Frames": ("--sample", FrameSelection, "--shard"),
-        "Sequences": (SequenceOptions, "--adapt"),
+        "Frames": (
+            *("--sample", "--layout", "--protocol", "--frames", "--every", "--limit", "--shard"),
+        ),
+        "Sequences": ("--accumulate", "--poses", "--pose-kind", "--adapt"),
         "Input": (ScanOptions, ReadOptions),
         "Network": (NetworkChoice,),
         "Method": (Settings, HoldOut),
         "Study": ("--vary",),
         "Output": ("--output", OutputOptions, BatchRequest),
-        "Cluster": (ClusterOptions,),
+        "Cluster": ("--ray",),
     },
 )
 @click.argument("source", type=options.FILE, metavar="FOLDER|LIST|BAG")
@@ -67,7 +64,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
-@options.options_of_groups(BatchRequest, SequenceOptions, ClusterOptions)
+@options.options_of_groups(BatchRequest)
 @click.option(
     "--vary",
     multiple=True,
@@ -129,8 +126,6 @@ def _request_of(values: dict[str, Any], combination: Combination) -> BatchReques
     from pnpdepth_cli.commands.batch.find_frames import unpack
 
     own = options.take_options(BatchRequest, values)
-    own["cluster"] = ClusterOptions(**options.take_options(ClusterOptions, values))
-    own["sequence"] = SequenceOptions(**options.take_options(SequenceOptions, values))
     own |= {name: values.pop(name) for name in ("source", "output")}
     text = values.pop("sample")
     sample = None if text is None else parse_sample(text)
@@ -154,19 +149,20 @@ def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSumma
     with progress_bar("batch", "frame", stays=True) as show:
         progress = BatchProgress(show)
         try:
-            outcome = run_batch(request, progress, pressed)
+            summary = run_batch(request, progress, pressed)
         except StorageError as error:
             raise StorageError(f"{error}; run the same command to continue") from error
         except KeyboardInterrupt:
             say("stopped; run the same command to continue")
             raise click.exceptions.Exit(INTERRUPTED) from None
-    print_batch(outcome.summary)
+    print_batch(summary)
     if request.html is not None:
         say(f"wrote {request.html / 'index.html'}")
-    if outcome.stopped:
+    stopped = progress.done < progress.to_do
+    if stopped:
         count = f"{progress.done:,} of {progress.to_do:,} frames"
         say(f"stopped after {count}; run the same command to continue")
-    return outcome.summary, outcome.stopped
+    return summary, stopped
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.commands.batch.batch_request import SequenceOptions
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine_request import (
     HoldOut,
     NetworkChoice,
@@ -110,7 +110,7 @@ models = click.option(
 )
 checkpoint = click_option(_declared(NetworkChoice, "checkpoint"))
 depth_scale = click_option(_declared(ReadOptions, "depth_scale"))
-pose_kind = click_option(_declared(SequenceOptions, "pose_kind"))
+pose_kind = click_option(_declared(BatchRequest, "pose_kind"))
 seed = click_option(_declared(Settings, "seed"))
 overwrite = click_option(_declared(OutputOptions, "overwrite"))
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")

@@ -11,6 +11,7 @@ from pnpdepth_cli.cli.progress import progress_bar
 from pnpdepth_cli.cli.streams import print_json
 from pnpdepth_cli.commands.refinement.refine_request import HoldOut, NetworkChoice, OutputOptions
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
+from pnpdepth_cli.errors import DivergedError
 from pnpdepth_cli.settings import Settings
 
 
@@ -82,10 +83,10 @@ def refine(as_json: bool, **values: Any) -> None:
         def show_update(done: int, of: int, loss: float) -> None:
             show(done, of, f"loss {loss:.4g}")
 
-        outcome = refine_image(request, on_iteration=show_update)
+        record = refine_image(request, on_iteration=show_update)
     if as_json:
-        print_json(outcome.record.to_json())
+        print_json(record.to_json())
     else:
-        print_refinement(outcome.record)
-    if outcome.diverged is not None:
-        raise outcome.diverged
+        print_refinement(record)
+    if record.status == "diverged":
+        raise DivergedError(record.message or "")

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.run_batch import BatchOutcome, run_batch
+from pnpdepth_cli.commands.batch.run_batch import run_batch
+from pnpdepth_cli.commands.batch.summary import BatchSummary
 from pnpdepth_cli.commands.refinement.refine_image import refine_image
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
@@ -82,7 +83,7 @@ def batch(
     stopped: Any = lambda: False,
     refine: dict[str, Any] | None = None,
     **changes: Any,
-) -> BatchOutcome:
+) -> BatchSummary:
     """A batch of the folder into its out/."""
     fields: dict[str, Any] = {
         "source": root,

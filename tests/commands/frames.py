@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 
-from pnpdepth_cli.commands.refinement.refine_image import RefineOutcome, refine_image
+from pnpdepth_cli.commands.refinement.refine_image import refine_image
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import write_depth
 
 NETWORK = """
@@ -76,8 +77,8 @@ def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDis
     return FrameOnDisk(folder, image, sparse, gt, model, checkpoint, depth)
 
 
-def run(frame: FrameOnDisk, **changes: Any) -> RefineOutcome:
-    """What `pnpdepth refine` gives of the frame, with these changes of the request.
+def run(frame: FrameOnDisk, **changes: Any) -> FrameRecord:
+    """The record of `pnpdepth refine` of the frame, with these changes of the request.
 
     The method is the network's own refinement; `propagate=None` gives the default method.
     """

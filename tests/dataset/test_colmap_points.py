@@ -49,7 +49,7 @@ def change(project: Path, file: str, old: str, new: str) -> None:
 
 def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> FrameRecord:
     files = {"image": project / "images" / "a.png", "sparse": project / "sparse" / "0"}
-    return run(frame, **(files | changes)).record
+    return run(frame, **(files | changes))
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.inf, np.nan])

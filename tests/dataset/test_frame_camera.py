@@ -33,7 +33,7 @@ def camera_of(record: FrameRecord) -> CameraRecord:
 def test_a_calibration_beside_a_depth_map_is_that_of_the_camera(frame: FrameOnDisk) -> None:
     calib = frame.folder / "k.txt"
     calib.write_text(f"{CALIB}distortion: [-0.1, 0, 0, 0]\n")
-    record = run(frame, scan=ScanOptions(calib=calib)).record
+    record = run(frame, scan=ScanOptions(calib=calib))
     assert camera_of(record).intrinsics == [[50, 0, 30], [0, 50, 20], [0, 0, 1]]
     assert camera_of(record).distortion == [-0.1, 0, 0, 0]
     calib.write_text(f"{CALIB}size: [64, 48]\n")
@@ -45,7 +45,7 @@ def test_kittis_camera_is_known_without_a_calibration_of_the_scanner(frame: Fram
     write_calibrations(frame.folder / "calib", size=frame.depth.shape)
     (frame.folder / "calib/calib_velo_to_cam.txt").unlink()
     calib = frame.folder / "calib/calib_cam_to_cam.txt"
-    record = run(frame, scan=ScanOptions(calib=calib)).record
+    record = run(frame, scan=ScanOptions(calib=calib))
     assert camera_of(record).intrinsics[0][0] == 60
 
 
@@ -55,7 +55,7 @@ def test_exif_is_used_where_nothing_else_gives_the_camera_of_a_view(frame: Frame
     exif[0x8769] = {0xA405: 26}
     photo = frame.folder / "img.jpg"
     image.save(photo, exif=exif)
-    record = run(replace(frame, image=photo), view_3d=True).record
+    record = run(replace(frame, image=photo), view_3d=True)
     assert " 26 mm" in camera_of(record).source
     assert any("no distortion (EXIF" in note for note in record.notes)
 
@@ -63,7 +63,7 @@ def test_exif_is_used_where_nothing_else_gives_the_camera_of_a_view(frame: Frame
 def test_a_colmap_model_gives_camera_and_pose(tmp_path: Path) -> None:
     frame = frame_on_disk(tmp_path, HEIGHT, WIDTH)
     write_text_model(tmp_path / "sparse", names=("x.png", "img.png"), camera="SIMPLE_RADIAL")
-    record = run(frame, sparse=tmp_path / "sparse").record
+    record = run(frame, sparse=tmp_path / "sparse")
     assert camera_of(record).distortion == [-0.1, 0, 0, 0]
     assert camera_of(record).pose == [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0]]
 
@@ -71,7 +71,7 @@ def test_a_colmap_model_gives_camera_and_pose(tmp_path: Path) -> None:
 def test_a_scan_gives_the_camera_of_its_calibration(tmp_path: Path) -> None:
     frame, scan = frame_on_disk(tmp_path), scan_on_disk(tmp_path)
     changes = {"image": scan.image, "sparse": scan.scan, "scan": ScanOptions(calib=scan.calib)}
-    record = run(frame, **changes).record
+    record = run(frame, **changes)
     assert camera_of(record).intrinsics == [[FOCAL_PX, 0, 31.5], [0, FOCAL_PX, 23.5], [0, 0, 1]]
 
 
@@ -79,7 +79,7 @@ def test_the_camera_of_a_part_sees_the_same_directions(tmp_path: Path) -> None:
     part = FramePart(halved=True, crop=(20, 30), anchor="bottom")
     frame, calib = frame_on_disk(tmp_path, 60, 80), tmp_path / "k.txt"
     calib.write_text(CALIB)
-    record = run(frame, part=part, scan=ScanOptions(calib=calib)).record
+    record = run(frame, part=part, scan=ScanOptions(calib=calib))
     camera, _ = camera_of(record).read()
     whole, _ = camera_of_file(calib, None, (60, 80))
     xy = np.array([[33.0, 41.0], [50.0, 47.0]])

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import Task, task_of
-from pnpdepth_cli.commands.batch.records import settings_of
+from pnpdepth_cli.commands.batch.find_frames import input_files, request_of
+from pnpdepth_cli.commands.batch.records import Records
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import DivergedError, InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
@@ -31,12 +32,11 @@ MOST_FRAMES = 64
 
 
 def with_adapted_weights(
-    request: BatchRequest,
-    model: dict[str, Any],
+    records: Records,
     sequence: str,
     frames: Sequence[FrameFiles],
     say: Callable[[str], None],
-    stopped: Callable[[], bool] | None = None,
+    stopped: Callable[[], bool],
 ) -> BatchRequest:
     """Returns the request for the frames of a sequence, with adapted weights where they help.
 
@@ -44,31 +44,29 @@ def with_adapted_weights(
     of the frames that they learnt from are the same.
 
     Args:
-        request: The batch.
-        model: Identity of the network, as `model_identity` gives it.
+        records: The results of the batch.
         sequence: Name of the sequence.
         frames: Frames of the sequence.
         say: Receives what was decided.
-        stopped: True ends the adaptation by KeyboardInterrupt. None uses only weights that exist.
+        stopped: True ends the adaptation by KeyboardInterrupt.
 
     Raises:
         UsageError: The network takes no points.
     """
+    request = records.request
     name = re.sub(r"[^\w.-]+", "_", sequence) or "frames"
     if name != sequence:
         name += f"-{hashlib.sha256(sequence.encode()).hexdigest()[:8]}"
     spread = np.linspace(0, len(frames) - 1, min(len(frames), MOST_FRAMES)).round().astype(int)
-    tasks = [task_of(request, frames[index]) for index in spread]
+    lessons = [request_of(request, frames[index]) for index in spread]
     folder = request.output / "adapted"
     weights, file = folder / f"{name}.safetensors", folder / f"{name}.json"
     try:
-        digest = _digest(settings_of(request.refine, model), tasks)
+        # What was learnt before, or is now.
+        digest = _digest(records.settings, lessons)
         record = read_json(file) if file.exists() else {}
-        known = record.get("digest") == digest and (record.get("why") or weights.exists())
-        if not known:
-            if stopped is None:
-                return request
-            why = _learn(request, tasks, weights, say, stopped)
+        if record.get("digest") != digest or not (record.get("why") or weights.exists()):
+            why = _learn(lessons, weights, say, stopped)
             record = {"digest": digest, "why": why}
             make_folder(folder)
             write_json(file, record)
@@ -82,8 +80,7 @@ def with_adapted_weights(
 
 
 def _learn(
-    request: BatchRequest,
-    tasks: Sequence[Task],
+    lessons: Sequence[RefineRequest],
     weights: Path,
     say: Callable[[str], None],
     stopped: Callable[[], bool],
@@ -100,20 +97,20 @@ def _learn(
             raise KeyboardInterrupt
 
     def frames() -> Iterator[tuple[str, Frame]]:
-        for task in tasks:
+        for each in lessons:
             check()
-            yield task.name, read_requested(task.request)
+            yield each.files.name, read_requested(each)
 
     # Too little to learn from.
-    first = read_requested(tasks[0].request)
-    if why := too_little(len(tasks), first):
+    first = read_requested(lessons[0])
+    if why := too_little(len(lessons), first):
         return why
     # The network learns, and is written if it is better.
-    choice = request.refine.network
+    choice = lessons[0].network
     network = load_network(choice.model, choice.checkpoint, choice.device)
     network = resolve_definition(network, first.registered())
     try:
-        learnt = learn(network, frames(), seed=request.refine.method.seed, on_step=check)
+        learnt = learn(network, frames(), seed=lessons[0].method.seed, on_step=check)
     except UsageError as error:
         raise UsageError(
             "--adapt needs a network that takes points, such as compact, as the first --model"
@@ -139,8 +136,8 @@ def _write(path: Path, network: Network, learnt: Learnt) -> None:
         save_file(copies, file)
 
 
-def _digest(settings: dict[str, Any], tasks: Sequence[Task]) -> str:
+def _digest(settings: dict[str, Any], lessons: Sequence[RefineRequest]) -> str:
     """The SHA-256 of the settings and files that the weights are learnt from."""
-    files = [{part: fingerprint(p).sha256 for part, p in task.inputs.items()} for task in tasks]
+    files = [{part: fingerprint(p).sha256 for part, p in input_files(each)} for each in lessons]
     text = json.dumps([settings, files], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

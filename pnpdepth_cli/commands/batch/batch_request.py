@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS, POSE_KINDS, PROTOCOLS
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
@@ -29,9 +28,19 @@ def parse_shard(text: str) -> tuple[int, int]:
     raise UsageError(f"--shard must be I/N with I from 1 to N, such as 1/4, got {text}")
 
 
+def parse_address(text: str) -> str:
+    """Returns the address of a cluster. Raises UsageError for a text that is none."""
+    if text in (LOCAL, "auto") or _ADDRESS.fullmatch(text):
+        return text
+    raise UsageError(
+        f"{text!r} is no address of a Ray cluster; give --ray=auto, --ray=HOST:PORT, or --ray as"
+        " the last option for this machine"
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
-class FrameSelection:
-    """Which frames of a data set are taken, and how each is refined."""
+class BatchRequest:
+    """Which frames to refine, and how."""
 
     source: Path
     """A folder or a list of frames."""
@@ -51,80 +60,6 @@ class FrameSelection:
     )
     every: int = option(1, "Only every N-th of these.", metavar="N", least=1, show_default=True)
     limit: int | None = option(None, "Only the first N of these.", metavar="N", least=1)
-
-    @property
-    def reading(self) -> ReadOptions:
-        """How the files of every frame are read, with the points that the protocol has."""
-        reading = self.refine.reading
-        if self.protocol is None:
-            return reading
-        protocol = find_protocol(self.protocol)
-        reading = replace(reading, foreground=protocol.foreground)
-        if reading.sample is not None or protocol.sample is None:
-            return reading
-        sample = parse_sample(protocol.sample)
-        return replace(reading, sample=sample, sample_seed=protocol.seed)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SequenceOptions:
-    """What a frame takes over from its neighbours."""
-
-    accumulate: int = option(
-        0,
-        "Add the points of the N frames before and after, moved by the camera's poses or, without"
-        " poses, by its motion as estimated from the images.",
-        metavar="N",
-        least=0,
-    )
-    poses: Path | None = option(
-        None,
-        "Camera poses of the frames: TUM rows are joined by time, KITTI rows by order,"
-        " transforms.json by name.  [default: the layout's or poses.txt, else estimated]",
-        metavar="FILE",
-    )
-    pose_kind: str | None = option(
-        None,
-        "Kind of the poses of --poses; OpenGL's axes are y up and z back."
-        "  [default: opengl of transforms.json, else camera-to-world]",
-        choices=POSE_KINDS,
-    )
-
-    def __post_init__(self) -> None:
-        if self.pose_kind is not None and self.poses is None:
-            raise UsageError("--pose-kind is for --poses")
-        if self.poses is not None and not self.accumulate:
-            raise UsageError("--poses is for --accumulate; give --accumulate 2, say")
-
-
-def parse_address(text: str) -> str:
-    """Returns the address of a cluster. Raises UsageError for a text that is none."""
-    if text in (LOCAL, "auto") or _ADDRESS.fullmatch(text):
-        return text
-    raise UsageError(
-        f"{text!r} is no address of a Ray cluster; give --ray=auto, --ray=HOST:PORT, or --ray as"
-        " the last option for this machine"
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClusterOptions:
-    """Where frames are computed, if not in this process."""
-
-    ray: str | None = option(
-        None,
-        "Run on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT. Without an address, on all"
-        " devices of this machine. Needs the extra ray.",
-        metavar="[ADDRESS]",
-        parse=parse_address,
-        value_if_bare=LOCAL,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class BatchRequest(FrameSelection):
-    """Which frames to refine, and how."""
-
     html: Path | None = option(
         None,
         "Write an HTML report: every frame before and after, the worst first.",
@@ -150,58 +85,56 @@ class BatchRequest(FrameSelection):
         " more); its frames are refined with them if they are better. The network must take"
         " points.",
     )
-    sequence: SequenceOptions = field(default_factory=SequenceOptions)
+    accumulate: int = option(
+        0,
+        "Add the points of the N frames before and after, moved by the camera's poses or, without"
+        " poses, by its motion as estimated from the images.",
+        metavar="N",
+        least=0,
+    )
+    poses: Path | None = option(
+        None,
+        "Camera poses of the frames: TUM rows are joined by time, KITTI rows by order,"
+        " transforms.json by name.  [default: the layout's or poses.txt, else estimated]",
+        metavar="FILE",
+    )
+    pose_kind: str | None = option(
+        None,
+        "Kind of the poses of --poses; OpenGL's axes are y up and z back."
+        "  [default: opengl of transforms.json, else camera-to-world]",
+        choices=POSE_KINDS,
+    )
+    ray: str | None = option(
+        None,
+        "Run on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT. Without an address, on all"
+        " devices of this machine. Needs the extra ray.",
+        metavar="[ADDRESS]",
+        parse=parse_address,
+        value_if_bare=LOCAL,
+    )
     varied: Mapping[str, str] = field(default_factory=dict)
     """Options that a study varies, and their values here, as the user wrote them."""
-    cluster: ClusterOptions = field(default_factory=ClusterOptions)
 
     def __post_init__(self) -> None:
         if self.adapt and self.shard is not None:
             raise UsageError("--adapt does not go with --shard; weights are learnt in one process")
         if self.html_3d and self.html is None:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
+        if self.pose_kind is not None and self.poses is None:
+            raise UsageError("--pose-kind is for --poses")
+        if self.poses is not None and not self.accumulate:
+            raise UsageError("--poses is for --accumulate; give --accumulate 2, say")
         choose_measures(MEASURES, self.columns)
 
-
-class RayWorkers(NamedTuple):
-    """The workers that a command asks for."""
-
-    address: str
-    """Address of the cluster, or LOCAL."""
-    device: str
-    """Kind of device that every worker computes on: cpu or cuda."""
-    indices: tuple[int, ...]
-    """Which GPUs of this machine; empty for all."""
-
     @property
-    def each(self) -> str:
-        """What a worker has, in words."""
-        return "one GPU" if self.device == "cuda" else "one CPU core"
-
-
-def ray_workers_of(device: str, options: ClusterOptions) -> RayWorkers | None:
-    """Returns the workers asked for; None for this process alone.
-
-    Args:
-        device: Device as the user names it: one, several with commas, or "all".
-        options: Options of the cluster.
-
-    Raises:
-        UsageError: The devices cannot be spread over.
-    """
-    names = device.split(",")
-    if options.ray is None and len(names) == 1 and device != "all":
-        return None
-    kinds = {"cuda" if name == "all" else name.partition(":")[0] for name in names}
-    kind = kinds.pop()
-    if kinds or kind not in ("cpu", "cuda"):
-        raise UsageError(f"device {device!r}: workers run on cpu, cuda, cuda:0,cuda:1 or all")
-    indices = tuple(int(name[5:]) for name in names if name[5:].isdecimal() and kind == "cuda")
-    if len(names) > 1 and len(set(indices)) < len(names):
-        raise UsageError(f"device {device!r}: name each GPU once, such as cuda:0,cuda:1")
-    address = options.ray or LOCAL
-    if indices and address != LOCAL:
-        raise UsageError(
-            f"device {device!r}: GPUs of a cluster have no numbers; take --device cuda"
-        )
-    return RayWorkers(address, kind, indices)
+    def reading(self) -> ReadOptions:
+        """How the files of every frame are read, with the points that the protocol has."""
+        reading = self.refine.reading
+        if self.protocol is None:
+            return reading
+        protocol = find_protocol(self.protocol)
+        reading = replace(reading, foreground=protocol.foreground)
+        if reading.sample is not None or protocol.sample is None:
+            return reading
+        sample = parse_sample(protocol.sample)
+        return replace(reading, sample=sample, sample_seed=protocol.seed)

@@ -1,4 +1,4 @@
-"""Finds the frames of a batch, and the request, inputs and outputs of each. Imports no torch."""
+"""Finds the frames of a batch, and how each is refined, from which files. Imports no torch."""
 
 from __future__ import annotations
 
@@ -9,22 +9,18 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatch, fnmatchcase
 from pathlib import Path
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest, FrameSelection
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.sequence import with_neighbours
-from pnpdepth_cli.commands.batch.summary import CSV, JSON
-from pnpdepth_cli.commands.refinement.output_files import Outputs, outputs_in
+from pnpdepth_cli.commands.refinement.output_files import outputs_in
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
-    RawDepth,
-    Source,
     Unmatched,
     file_of,
     name_problem,
 )
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
-from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.atomic import LOCKS
 from pnpdepth_cli.io.bags import is_bag
@@ -33,6 +29,7 @@ from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.poses import POSES_FILE
 from pnpdepth_cli.protocols import find_protocol
 
+CSV, JSON = "summary.csv", "summary.json"
 _IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"
 
 
@@ -48,32 +45,6 @@ class BatchFrames:
     refused: Sequence[tuple[FrameFiles, str]]
     """Frames whose results would have no files of their own, and why."""
     unmatched: tuple[Unmatched, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """One frame to refine."""
-
-    request: RefineRequest
-    """What is asked for, with the frame's files."""
-    inputs: dict[str, Path]
-    """The files that are read for it, by their part."""
-    outputs: Outputs
-
-    @property
-    def name(self) -> str:
-        """The name of the frame."""
-        return self.request.files.name
-
-    @property
-    def group(self) -> str | None:
-        """The sequence that the data set says it belongs to."""
-        return self.request.files.group
-
-    @property
-    def record(self) -> Path:
-        """The record of the results, which is the last file that is written."""
-        return self.outputs["record"]
 
 
 def unpack(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
@@ -104,7 +75,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         OutputError: If the output is a file, or holds the frames.
     """
     # The output must be a folder beside the frames.
-    source, output, sequence = request.source, request.output, request.sequence
+    source, output = request.source, request.output
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
     if source.is_dir() and _is_inside(source, output):
@@ -127,9 +98,11 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             " draws so many points from the ground truth"
         )
     # Neighbours, of all frames.
-    if sequence.accumulate:
-        poses = sequence.poses or _poses_beside(source, frames)
-        frames = with_neighbours(frames, sequence.accumulate, poses, sequence.pose_kind)
+    if request.accumulate:
+        poses, beside = request.poses, source / POSES_FILE  # as `pnpdepth frames` writes it
+        if poses is None and not any(f.pose or f.oxts for f in frames) and beside.is_file():
+            poses = beside
+        frames = with_neighbours(frames, request.accumulate, poses, request.pose_kind)
     # The part of the frames that this run refines.
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
@@ -146,29 +119,17 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     )
 
 
-def _poses_beside(source: Path, frames: Sequence[FrameFiles]) -> Path | None:
-    """The poses that `pnpdepth frames` wrote beside frames without poses of their own."""
-    path = source / POSES_FILE
-    known = any(frame.pose or frame.oxts for frame in frames)
-    return path if path.is_file() and not known else None
-
-
-def task_of(request: FrameSelection, frame: FrameFiles) -> Task:
-    """Returns the frame's task; options of the user go before what the data set states."""
-    reading, refine = request.reading, request.refine
+def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
+    """Returns how a frame is refined; options of the user go before what the data set states."""
     files = _files_to_read(request, frame)
     neighbours = (
         replace(each, files=_files_to_read(request, each.files)) for each in frame.neighbours
     )
     files = replace(files, neighbours=tuple(neighbours))
-    return Task(
-        request=replace(refine, files=files, reading=reading),
-        inputs=dict(_input_files(files, reading)),
-        outputs=outputs_in(request.output, frame.name, refine),
-    )
+    return replace(request.refine, files=files, reading=request.reading)
 
 
-def _files_to_read(request: FrameSelection, frame: FrameFiles) -> FrameFiles:
+def _files_to_read(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
     """The files of a frame that are read for it, without its neighbours."""
     files = replace(frame, neighbours=())
     if request.protocol is not None:
@@ -176,22 +137,9 @@ def _files_to_read(request: FrameSelection, frame: FrameFiles) -> FrameFiles:
     if request.reading.sample is None:
         return files
     # points are sampled from the ground truth, else from the projected scan
-    gt = frame.sparse if frame.gt is None and _is_scan_file(frame.sparse) else frame.gt
-    return replace(files, sparse=None, gt=gt)
-
-
-def _reads_scan(files: FrameFiles, scan: ScanOptions) -> bool:
-    """Whether one of them is a scan that is projected, which needs the scanner's pose."""
-    suffix = "" if files.sparse is None else files.sparse.suffix.lower()
-    return (
-        _is_scan_file(files.gt)
-        or _is_scan_file(files.sparse)
-        or (suffix in (".npy", ".csv", ".txt") and scan.over(files).calib is not None)
-    )
-
-
-def _is_scan_file(source: Source | RawDepth | None) -> bool:
-    return isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES
+    scan = frame.sparse
+    is_scan = scan is not None and scan.suffix.lower() in SCAN_ONLY_SUFFIXES
+    return replace(files, sparse=None, gt=scan if frame.gt is None and is_scan else frame.gt)
 
 
 def source_files(frame: FrameFiles) -> list[Path]:
@@ -200,7 +148,10 @@ def source_files(frame: FrameFiles) -> list[Path]:
     return [file_of(part) for part in parts if part is not None]
 
 
-def _input_files(files: FrameFiles, reading: ReadOptions) -> Iterator[tuple[str, Path]]:
+def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
+    """Yields the files that are read for a frame, with their part."""
+    files, scan = request.files, request.reading.scan
+    # The frame's own.
     parts = [("image", files.image), ("sparse", files.sparse), ("gt", files.gt)]
     parts += [("sparse mask", files.sparse_mask)] if files.sparse is not None else []
     for part, source in parts:
@@ -209,18 +160,20 @@ def _input_files(files: FrameFiles, reading: ReadOptions) -> Iterator[tuple[str,
             yield from ((f"sparse {file.name}", file) for file in model_files(path))
         elif path is not None:
             yield part, path
+    # The points of its neighbours, and the images by which a motion is estimated.
     for each in files.neighbours:
         points, image = each.files.sparse or each.files.gt, each.files.image
         if points is not None:
             path = file_of(points)
             yield f"sparse of {path.stem}", path
-            if each.motion is None and image is not None:  # the motion is estimated
+            if each.motion is None and image is not None:
                 yield f"image of {path.stem}", file_of(image)
+    # Masks, and what calibrates the camera.
     if files.gt is not None:
         yield from ((f"mask {number}", path) for number, path in enumerate(files.masks))
-    calib, extrinsics = reading.scan.over(files).calib, reading.scan.extrinsics
-    if _reads_scan(files, reading.scan) and extrinsics is not None:
-        yield "extrinsics", extrinsics
+    if scan.extrinsics is not None:
+        yield "extrinsics", scan.extrinsics
+    calib = scan.over(files).calib
     if calib is not None and calib.is_dir():
         yield from ((f"calib {path.name}", path) for path in sorted(calib.glob("calib_*.txt")))
     elif calib is not None:
@@ -231,19 +184,12 @@ def _outside(
     output: Path, frames: Sequence[FrameFiles]
 ) -> tuple[list[FrameFiles], list[Unmatched]]:
     """The frames without a file in the output folder, and the files of the others there."""
-    if not output.exists():
-        return list(frames), []
-    folder, kept, ignored = output.resolve(), list[FrameFiles](), list[Unmatched]()
-    is_inside = functools.cache(lambda parent: parent.resolve().is_relative_to(folder))
-    for frame in frames:
-        path = next((path for path in source_files(frame) if is_inside(path.parent)), None)
-        if path is None:
-            kept.append(frame)
-        else:
-            ignored.append(Unmatched(path=path, why=_IN_OUTPUT))
+    is_inside = functools.cache(lambda parent: _is_inside(parent, output))
+    inside = [next((p for p in source_files(f) if is_inside(p.parent)), None) for f in frames]
+    kept = [frame for frame, path in zip(frames, inside, strict=True) if path is None]
     if frames and not kept:
         raise _holds_the_frames(output)
-    return kept, ignored
+    return kept, [Unmatched(path=path, why=_IN_OUTPUT) for path in inside if path is not None]
 
 
 def _with_own_files(

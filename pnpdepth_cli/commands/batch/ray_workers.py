@@ -11,21 +11,20 @@ from contextlib import ExitStack, contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import max_pixels_given, set_max_pixels
-from pnpdepth_cli.commands.batch.batch_request import LOCAL, BatchRequest, RayWorkers
-from pnpdepth_cli.commands.batch.find_frames import task_of
+from pnpdepth_cli.commands.batch.batch_request import LOCAL
+from pnpdepth_cli.commands.batch.find_frames import request_of
 from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
+from pnpdepth_cli.errors import ClusterError, UsageError
 from pnpdepth_cli.io.atomic import LOCKS
 from pnpdepth_cli.io.file_bytes import one_line
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.commands.batch.running import References
     from pnpdepth_cli.frames.method import Method
 
 _CONNECT_S = 5.0
@@ -41,14 +40,57 @@ _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless")
 
 
+class RayWorkers(NamedTuple):
+    """The workers that a command asks for."""
+
+    address: str
+    """Address of the cluster, or LOCAL."""
+    device: str
+    """Kind of device that every worker computes on: cpu or cuda."""
+    indices: tuple[int, ...]
+    """Which GPUs of this machine; empty for all."""
+
+    @property
+    def each(self) -> str:
+        """What a worker has, in words."""
+        return "one GPU" if self.device == "cuda" else "one CPU core"
+
+
+def ray_workers_of(device: str, ray: str | None) -> RayWorkers | None:
+    """Returns the workers asked for; None for this process alone.
+
+    Args:
+        device: Device as the user names it: one, several with commas, or "all".
+        ray: Address of the cluster, or LOCAL. None: none is asked for.
+
+    Raises:
+        UsageError: The devices cannot be spread over.
+    """
+    names = device.split(",")
+    if ray is None and len(names) == 1 and device != "all":
+        return None
+    kinds = {"cuda" if name == "all" else name.partition(":")[0] for name in names}
+    kind = kinds.pop()
+    if kinds or kind not in ("cpu", "cuda"):
+        raise UsageError(f"device {device!r}: workers run on cpu, cuda, cuda:0,cuda:1 or all")
+    indices = tuple(int(name[5:]) for name in names if name[5:].isdecimal() and kind == "cuda")
+    if len(names) > 1 and len(set(indices)) < len(names):
+        raise UsageError(f"device {device!r}: name each GPU once, such as cuda:0,cuda:1")
+    address = ray or LOCAL
+    if indices and address != LOCAL:
+        raise UsageError(
+            f"device {device!r}: GPUs of a cluster have no numbers; take --device cuda"
+        )
+    return RayWorkers(address, kind, indices)
+
+
 class Worker:
     """Refines frames in a process of the cluster; a Ray actor."""
 
     def __init__(
         self,
-        request: BatchRequest,
-        references: References,
-        model: dict[str, Any],
+        records: Records,
+        deciding: Sequence[FrameFiles],
         versions: Mapping[str, str],
         shared: Sequence[Path],
         folder: Path,
@@ -65,9 +107,8 @@ class Worker:
         torch.set_num_threads(threads)
         cv2.setNumThreads(threads)
         set_max_pixels(max_pixels)
-        self._request, self._references = request, references
+        self._records, self._deciding = records, deciding
         self._versions, self._shared = versions, shared
-        self._records = Records(request.output, model)
         self._open = ExitStack()  # until the process ends
         self._method: Method | None = None
         self._notes: list[str] = []
@@ -80,16 +121,13 @@ class Worker:
         self, frames: Sequence[FrameFiles], settings_worked: bool
     ) -> tuple[list[FrameRecord], list[str]]:
         """Returns the records of the frames, and notes, after their results are written."""
-        from pnpdepth_cli.commands.batch.running import open_method, refine_tasks
+        from pnpdepth_cli.commands.batch.running import open_method, refine_frames
 
-        request = self._request
+        own = self._records
         if self._method is None:
-            opened = open_method(request, self._references, self._notes.append)
+            opened = open_method(own.request, self._deciding, self._notes.append)
             self._method = self._open.enter_context(opened)
-        tasks = (task_of(request, frame) for frame in frames)
-        records = list(
-            refine_tasks(tasks, self._method, self._records, settings_worked=settings_worked)
-        )
+        records = list(refine_frames(frames, self._method, own, settings_worked=settings_worked))
         notes, self._notes = self._notes, []
         return records, notes
 
@@ -118,9 +156,8 @@ def check_node(versions: Mapping[str, str], shared: Sequence[Path]) -> None:
 
 
 def refine_on_workers(
-    request: BatchRequest,
     workers: RayWorkers,
-    references: References,
+    deciding: Sequence[FrameFiles],
     to_do: Sequence[FrameFiles],
     records: Records,
     *,
@@ -130,22 +167,21 @@ def refine_on_workers(
 ) -> Iterator[FrameRecord]:
     """Refines and writes the frames on Ray workers; yields the records as they are done.
 
-    Arguments and errors are those of `refine_tasks`, with ClusterError if the cluster cannot be
-    used.
+    Arguments and errors are those of `refine_frames` and `open_method`, with ClusterError if the
+    cluster cannot be used.
     """
+    request = records.request
     locks = [path.absolute() for path in request.output.glob(LOCKS)]
-    shared = [request.source, *locks]
     with connect_workers(workers) as (ray, count, resources):
         say(f"Ray workers: starting {count:,}, each with {workers.each}")
         options = {"scheduling_strategy": "SPREAD", "max_restarts": _RESTARTS, **resources}
-        actor, model = ray.remote(Worker).options(**options), records.model
-        job = request, references, model, software(), shared, Path.cwd(), max_pixels_given()
-        threads = resources["num_cpus"]
-        actors = [actor.remote(*job, threads) for _ in range(count)]
+        actor, shared = ray.remote(Worker).options(**options), [request.source, *locks]
+        job = records, deciding, software(), shared, Path.cwd(), max_pixels_given()
+        actors = [actor.remote(*job, resources["num_cpus"]) for _ in range(count)]
         try:
             yield from refine_on_actors(
                 ray, actors, to_do, worked=settings_worked,
-                lost=lambda frame, why: records.fail(task_of(request, frame), why), say=say,
+                lost=lambda frame, why: records.fail(request_of(request, frame), why), say=say,
                 stopped=stopped,
             )  # fmt: skip
         finally:
@@ -167,46 +203,45 @@ def refine_on_actors(
 ) -> Iterator[FrameRecord]:
     """Hands out frames, a call at a time for each worker; yields the records as they are done.
 
-    The frames of a worker that dies go to any worker again, one by one, and each `_RETRIES`
+    Until a frame is refined, only one worker gets any, as an error of the settings ends the batch
+    then. The frames of a worker that dies go to any worker again, one by one, and each `_RETRIES`
     times; then `lost` gives its record from the frame and the reason. `worked` says whether
     a frame was refined with these settings before.
     """
     size = max(1, min(_FRAMES_OF_A_CALL, len(to_do) // (4 * len(actors))))
     waiting = deque((to_do[i : i + size], 0) for i in range(0, len(to_do), size))
-    idle, said = list[Any](), set[str]()
-    # a call's actor, its frames (none: the actor starts), their deaths, and `worked` at its start
-    running = dict[Any, tuple[Any, Sequence[FrameFiles], int, bool]]()
+    # The actor, the frames (none: it starts) and their deaths of each call.
+    idle, running = list[Any](), dict[Any, tuple[Any, Sequence[FrameFiles], int]]()
+    said = set[str]()
 
     def start(actor: Any) -> None:
-        running[actor.ready.options(max_task_retries=-1).remote()] = actor, (), 0, worked
+        running[actor.ready.options(max_task_retries=-1).remote()] = actor, (), 0
 
     for actor in actors:
         start(actor)
     while True:
-        over = stopped() or not waiting
-        if idle and not over:
+        # The next call, if there is one.
+        over, busy = stopped() or not waiting, any(frames for _, frames, _ in running.values())
+        if idle and not over and (worked or not busy):
             (frames, deaths), actor = waiting.popleft(), idle.pop()
-            running[actor.refine.remote(frames, worked)] = actor, frames, deaths, worked
+            running[actor.refine.remote(frames, worked)] = actor, frames, deaths
             continue
-        busy = any(frames for _, frames, _, _ in running.values())
         if over and not busy:
             return
+        # The end of any call.
         ended, _ = ray.wait(list(running), timeout=None if busy else _NO_WORKER_S)
         if not ended:
             raise ClusterError(
                 f"no worker has started for {_NO_WORKER_S:.0f} s; check the cluster with `ray"
                 " status`, and run the same command to continue"
             )
-        actor, frames, deaths, worked_before = running.pop(ended[0])
+        actor, frames, deaths = running.pop(ended[0])
         try:
             records, notes = ray.get(ended[0]) or ([], [])
         except ray.exceptions.RayTaskError as error:
-            of_settings = isinstance(error.cause, ModelError) or type(error.cause) is UsageError
-            if worked_before or not (frames and of_settings and worked):
-                raise error.cause if isinstance(error.cause, Exception) else error from None
-            waiting.append((frames, deaths))  # of one frame: others worked meanwhile
-            records, notes = [], []
+            raise error.cause if isinstance(error.cause, Exception) else error from None
         except ray.exceptions.RayError as error:
+            # A worker died.
             reason, deaths = reason_of(error), deaths + (len(frames) == 1)
             if not frames:
                 raise ClusterError(f"a worker died {_RESTARTS} times: {reason}") from None
@@ -218,9 +253,10 @@ def refine_on_actors(
                 waiting.extend(([frame], deaths) for frame in frames)
             continue
         idle.append(actor)
-        for note in sorted({*notes} - said, key=notes.index):
-            said.add(note)
-            say(note)
+        for note in dict.fromkeys(notes):
+            if note not in said:
+                say(note)
+        said |= {*notes}
         worked |= any(record.status != "failed" for record in records)
         yield from records
 
@@ -245,14 +281,11 @@ def connect_workers(workers: RayWorkers) -> Iterator[tuple[ModuleType, int, dict
         import ray
     except ImportError:
         raise UsageError("--ray needs Ray: pip install 'pnpdepth[ray]'") from None
-    ours = not ray.is_initialized()
-    if ours:
-        _connect(ray, workers)
+    _connect(ray, workers)
     try:
         yield ray, *_plan(ray, workers)
     finally:
-        if ours:
-            ray.shutdown()
+        ray.shutdown()
 
 
 def _connect(ray: ModuleType, workers: RayWorkers) -> None:

@@ -10,116 +10,79 @@ import functools
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import Task, task_of
+from pnpdepth_cli.commands.batch.find_frames import input_files, request_of
 from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested, write_refined
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.stopwatch import Stopwatch
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.errors import (
-    InputError,
-    ModelError,
-    PnpDepthError,
-    StorageError,
-    UsageError,
-)
+from pnpdepth_cli.errors import InputError, ModelError, PnpDepthError, StorageError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.file_bytes import Fingerprint, fingerprint
 
-Item = TypeVar("Item")
-REGISTERING = 16
+DECIDING = 16
 """Number of frames that decide together how images are moved to the points."""
 
 
-def read_task(task: Task, known: dict[str, Fingerprint] | None = None) -> Frame:
-    """Returns the contents of a frame's files.
+def deciding_frames(request: BatchRequest, frames: Sequence[FrameFiles]) -> list[FrameFiles]:
+    """Returns the frames that decide for all, so that every run and shard decides the same.
 
-    Args:
-        task: The frame.
-        known: Gets the fingerprints of the files, by part.
-
-    Raises:
-        PnpDepthError: The errors of `read_frame`.
+    They are spread from the first one that can be read to the last. None can be read: none.
     """
-    if known is not None:
-        known |= {part: fingerprint(path) for part, path in task.inputs.items()}
-    return read_requested(task.request)
+    readable = (n for n, frame in enumerate(frames) if _readable(request, frame) is not None)
+    first = next(readable, None)
+    if first is None:
+        return []
+    return [frames[first + number] for number in spread(len(frames) - first)]
 
 
-class References(NamedTuple):
-    """The frames that decide for all frames of a batch."""
-
-    first: FrameFiles
-    """The first one that can be read."""
-    others: Sequence[FrameFiles]
-    """More frames, for input ranges where the network states none."""
-    registering: Sequence[FrameFiles]
-    """Frames that decide how images are moved to the points."""
-
-
-def references_of(request: BatchRequest, frames: Sequence[FrameFiles]) -> References | None:
-    """Returns the frames that decide, of all frames, so that every run and shard decides the same.
-
-    Returns:
-        None if no frame can be read.
-    """
-    for number, frame in enumerate(frames):
-        if _readable(task_of(request, frame)) is not None:
-            others = reference_frames(frames, number)
-            return References(frame, others, registering(frames, number))
-    return None
-
-
-def reference_frames(frames: Sequence[Item], first: int) -> list[Item]:
-    """Returns the frames behind the first readable one that decide input ranges with it."""
-    count = len(frames) - first - 1
-    return [frames[first + 1 + i] for i in sorted({count // 2, count - 1})] if count else []
-
-
-def registering(frames: Sequence[Item], first: int) -> list[Item]:
-    """Returns the frames, the first readable one among them, that decide the registration."""
-    count = len(frames) - first
-    chosen = {first + i * (count - 1) // (REGISTERING - 1) for i in range(REGISTERING)}
-    return [frames[i] for i in sorted(chosen)]
+def spread(count: int) -> list[int]:
+    """Returns at most `DECIDING` numbers from 0 to count - 1, with both among them."""
+    return sorted({i * (count - 1) // (DECIDING - 1) for i in range(DECIDING)})
 
 
 @contextmanager
 def open_method(
-    request: BatchRequest, references: References, say: Callable[[str], None]
-) -> Iterator[Method]:
-    """Yields the network, resolved on the frames that decide, open for any number of frames.
+    request: BatchRequest, deciding: Sequence[FrameFiles], say: Callable[[str], None]
+) -> Iterator[Method | None]:
+    """Yields the method, resolved on the frames that decide, open for any number of frames.
 
     Args:
         request: The batch.
-        references: Frames that decide, from `references_of`.
+        deciding: The frames of `deciding_frames`. Without any, there is no method.
         say: Receives what was decided.
     """
-    # The first frame that can be read.
-    task = task_of(request, references.first)
-    first = read_task(task)
+    if not deciding:
+        yield None
+        return
+    # The first frame.
+    first_request = request_of(request, deciding[0])
+    first = read_requested(first_request)
     for note in first.notes:
-        say(f"{task.name}: {note}")
+        say(f"{deciding[0].name}: {note}")
 
-    # The method, resolved on it and on others, if need be.
+    # The method, resolved on it and, where a network states no input range, on two others.
     def readable(frames: Iterable[FrameFiles]) -> Iterator[Frame]:
-        read = (_readable(task_of(request, frame)) for frame in frames)
+        read = (_readable(request, frame) for frame in frames)
         return (frame for frame in read if frame is not None)
 
-    others = functools.cache(lambda: [*readable(references.others)])
-    method = load_method(task.request, first, others)
+    behind = deciding[1:]
+    two = [behind[i] for i in sorted({len(behind) // 2, len(behind) - 1})] if behind else []
+    others = functools.cache(lambda: [*readable(two)])
+    method = load_method(first_request, first, others)
     for note in method.network.notes:
         say(note)
     # The registration that all images share.
     if first.register == "auto":
-        method.share_registration(readable(references.registering))
+        method.share_registration(readable(deciding))
         for (height, width), registration in method.registrations.items():
             if registration is not None:
                 say(
@@ -140,45 +103,43 @@ def open_method(
         yield method
 
 
-def _readable(task: Task) -> Frame | None:
+def _readable(request: BatchRequest, frame: FrameFiles) -> Frame | None:
     """The frame's contents; None if it cannot be read, which is reported later.
 
     UsageError if an option is wrong, for all frames.
     """
     try:
-        return read_task(task)
+        return read_requested(request_of(request, frame))
     except UsageError:
         raise
     except Exception:
         return None
 
 
-@dataclass(kw_only=True)
-class FrameInMemory:
-    """A frame on its way through the network."""
+@dataclass(frozen=True, kw_only=True)
+class ReadFrame:
+    """A frame that was read, or the error that occurred."""
 
-    task: Task
-    inputs: Frame | None = None
-    fingerprints: dict[str, Fingerprint] = field(default_factory=dict)
-    watch: Stopwatch = field(default_factory=Stopwatch)
-    result: Refined | Exception | None = None
-    """An error that occurred while it was read or refined. None before."""
+    request: RefineRequest
+    frame: Frame | Exception
+    inputs: dict[str, Fingerprint]
+    watch: Stopwatch
 
 
-def refine_tasks(
-    tasks: Iterable[Task],
-    method: Method,
+def refine_frames(
+    frames: Iterable[FrameFiles],
+    method: Method | None,
     records: Records,
     *,
     settings_worked: bool,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Generator[FrameRecord, None, None]:
-    """Refines and writes each task; yields the record of each, in their order.
+    """Refines and writes each frame; yields the record of each, in their order.
 
     Args:
-        tasks: The frames to refine.
-        method: The method, open.
-        records: Writes the results.
+        frames: The frames to refine.
+        method: The method, open. None if no frame of the batch could be read.
+        records: The results.
         settings_worked: True if a frame was refined with these settings before.
         stopped: True if no further frame is to be begun.
 
@@ -188,76 +149,70 @@ def refine_tasks(
         UsageError: For an error of the settings before any frame was refined.
     """
 
-    def refine(reading: Iterable[FrameInMemory]) -> Iterator[FrameInMemory]:
-        worked = settings_worked
-        for frame in reading:
+    def refine(reading: Iterable[ReadFrame]) -> Iterator[tuple[ReadFrame, Refined | Exception]]:
+        worked = settings_worked or method is None
+        for read in reading:
             if stopped():
                 return
-            _refine(frame, method)
-            worked |= isinstance(frame.result, Refined)
+            result = _refine(read, method)
+            worked |= isinstance(result, Refined)
             fatal = StorageError if worked else (StorageError, ModelError, UsageError)
-            if isinstance(frame.result, fatal):
-                raise frame.result
-            yield frame
+            if isinstance(result, fatal):
+                raise result
+            yield read, result
 
-    def write(frame: FrameInMemory) -> FrameRecord:
-        return _write(frame, method, records)
+    def write(frame: tuple[ReadFrame, Refined | Exception]) -> FrameRecord:
+        return _write(*frame, method, records)
 
     with (
-        closing(in_order(_read, tasks, THREADS)) as reading,
+        closing(in_order(functools.partial(_read, records), frames, THREADS)) as reading,
         closing(in_order(write, refine(reading), THREADS)) as done,
     ):
         yield from done
 
 
-def fail_unreadable(tasks: Iterable[Task], records: Records) -> Iterator[FrameRecord]:
-    """Writes for each task why it cannot be read; yields the records."""
-    for task in tasks:
-        result = _read(task).result
-        later = InputError("no frame could be read when the batch began; run it again")
-        yield records.fail(task, _message(result if isinstance(result, Exception) else later))
-
-
-def _refine(frame: FrameInMemory, method: Method) -> None:
-    """Sets the result of a frame that was read."""
-    if frame.inputs is None:
-        return
-    with frame.watch("refine"):
-        try:
-            frame.result = method.refine(frame.inputs)
-        except Exception as error:  # concerns this frame only
-            frame.result = error
-
-
-def _read(task: Task) -> FrameInMemory:
-    frame = FrameInMemory(task=task)
+def _read(records: Records, files: FrameFiles) -> ReadFrame:
+    request, watch = request_of(records.request, files), Stopwatch()
+    inputs: dict[str, Fingerprint] = {}
+    frame: Frame | Exception
     try:
-        with frame.watch("read"):
-            frame.inputs = read_task(task, frame.fingerprints)
+        with watch("read"):
+            inputs |= {part: fingerprint(path) for part, path in input_files(request)}
+            frame = read_requested(request)
     except Exception as error:  # concerns this frame only
-        frame.result = error
-    return frame
+        frame = error
+    return ReadFrame(request=request, frame=frame, inputs=inputs, watch=watch)
 
 
-def _write(frame: FrameInMemory, method: Method, records: Records) -> FrameRecord:
-    """Writes a frame's results, or why there are none; returns the record."""
-    inputs, result = frame.inputs, frame.result
-    if isinstance(result, Refined) and inputs is not None:
-        refined = result
+def _refine(read: ReadFrame, method: Method | None) -> Refined | Exception:
+    if isinstance(read.frame, Exception):
+        return read.frame
+    if method is None:
+        return InputError("no frame could be read when the batch began; run it again")
+    with read.watch("refine"):
         try:
-            return records.write(
-                frame.task,
-                frame.fingerprints,
-                lambda outputs: write_refined(
-                    frame.task.request, outputs, method, inputs, refined, frame.watch
-                ),
-            )
+            return method.refine(read.frame)
+        except Exception as error:  # concerns this frame only
+            return error
+
+
+def _write(
+    read: ReadFrame, result: Refined | Exception, method: Method | None, records: Records
+) -> FrameRecord:
+    """Writes a frame's results, or why there are none; returns the record."""
+    request, frame = read.request, read.frame
+    if isinstance(result, Refined) and isinstance(frame, Frame) and method is not None:
+        try:
+            return write_refined(
+                request, records.outputs_of(request.files), method, frame, result, read.watch,
+                batch=records.state(request, read.inputs), folder=records.request.output,
+            )  # fmt: skip
         except StorageError:
             raise
         except Exception as error:
             result = error
     assert isinstance(result, Exception)
-    return records.fail(frame.task, _message(result))
+    return records.fail(request, _message(result))
 
 
 def _message(error: Exception) -> str:

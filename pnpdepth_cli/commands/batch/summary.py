@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
+import tempfile
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.find_frames import CSV, JSON, BatchFrames
 from pnpdepth_cli.commands.statistics import find_clusters
 from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
@@ -21,8 +25,7 @@ from pnpdepth_cli.measures import COVERAGE, MEASURES, FrameMeans
 from pnpdepth_cli.stages import AFTER, BASES, GT
 
 # a file name that is no UTF-8 has surrogates; JSON escapes them so
-TEXT: Any = {"encoding": "utf-8", "errors": "backslashreplace", "newline": "\n"}
-CSV, JSON = "summary.csv", "summary.json"
+_TEXT: Any = {"encoding": "utf-8", "errors": "backslashreplace", "newline": "\n"}
 
 _MEASURED = (*(measure.key for measure in MEASURES), COVERAGE.key)
 _MAIN = tuple(measure.key for measure in MEASURES if measure.main)
@@ -77,24 +80,19 @@ class BatchSummary:
     """What frames take over from their neighbours."""
 
 
-class Tally:
-    """Counts records and adds up their errors; the records are not kept."""
+class _Totals:
+    """What is counted and added up of records, which are not kept."""
 
     def __init__(self) -> None:
-        self.counts: Counter[str] = Counter(
+        self.counts = Counter(
             dict.fromkeys(("done", "diverged", "failed", "with_warnings", "compared", "worse"), 0)
         )
-        self.unsure: dict[str, None] = {}
-        """What was guessed of the network and may be wrong, each once."""
-        self._warnings: dict[str, Warned] = {}  # by the text without its numbers
-        self._units: set[str] = set()
-        self._weights: defaultdict[str, list[float]] = defaultdict(list)
-        # names, groups and main errors of the frames with ground truth
-        self._names: list[str] = []
-        self._groups: list[str | None] = []
-        self._scores: list[list[float | None]] = []
-        # by basis and stage
-        self._errors: defaultdict[tuple[str, str], FrameMeans] = defaultdict(FrameMeans)
+        self.units, self.unsure = set[str](), dict[str, None]()
+        self.warnings = dict[str, Warned]()  # by the text without its numbers
+        self.weights = defaultdict[str, list[float]](list)
+        self.errors = defaultdict[tuple[str, str], FrameMeans](FrameMeans)  # by basis and stage
+        self.with_truth = list[tuple[str, str | None, list[float | None]]]()
+        """Name, sequence and main errors of each frame with ground truth."""
 
     def add(self, record: FrameRecord) -> None:
         """Adds a record."""
@@ -103,84 +101,140 @@ class Tally:
             return
         self.counts["with_warnings"] += bool(record.warnings)
         for note in record.warnings:
-            warned = self._warnings.setdefault(_NUMBER.sub("", note), Warned(note=note))
+            warned = self.warnings.setdefault(_NUMBER.sub("", note), Warned(note=note))
             warned.frames += 1
             warned.first += [record.name] if len(warned.first) < _NAMED else []
         self.unsure |= dict.fromkeys(n for n in record.notes if ", unsure (" in n)
-        self._units.add(record.unit)
+        self.units.add(record.unit)
         for basis, stages in record.errors.items():
             for stage, scores in stages.items():
-                self._errors[basis, stage].add({k: v for k, v in scores.items() if k in _MEASURED})
+                self.errors[basis, stage].add({k: v for k, v in scores.items() if k in _MEASURED})
         for name, weight in record.weights.items():
-            self._weights[name].append(weight)
+            self.weights[name].append(weight)
         if GT in record.errors:
-            self._names.append(record.name)
-            self._groups.append(record.group)
-            self._scores.append([record.errors[GT][AFTER].get(key) for key in _MAIN])
+            main = [record.errors[GT][AFTER].get(key) for key in _MAIN]
+            self.with_truth.append((record.name, record.group, main))
         if (worse := record.worse_than_linear) is not None:
             self.counts.update(compared=1, worse=int(worse))
 
-    @property
-    def warnings(self) -> list[Warned]:
-        """The kinds of warnings."""
-        return list(self._warnings.values())
 
-    @property
-    def unit(self) -> str:
-        """The unit of all depths."""
-        return " and ".join(sorted(self._units)) or "m"
-
-    def notes(self) -> list[str]:
-        """Returns how many of the frames with ground truth count as independent."""
-        by_name = groups_by_name(self._names)
-        groups = [own or name for own, name in zip(self._groups, by_name, strict=True)]
-        if len(groups) < 2:
-            return []
-        return find_clusters(groups, np.array(self._scores, np.float64)).notes()
-
-    def errors(self) -> dict[str, dict[str, Scores]]:
-        """Returns the means of the errors by basis and stage, with the number of frames."""
-        means: dict[str, dict[str, Scores]] = {}
-        for (basis, stage), errors in self._errors.items():
-            means.setdefault(basis, {})[stage] = {"frames": errors.frames, **errors.means()}
-        return means
-
-    @property
-    def weights(self) -> dict[str, dict[str, float]]:
-        """Mean, least and largest weight of each expert of the default method, by name."""
-        return {
-            name: {"mean": sum(all_) / len(all_), "least": min(all_), "largest": max(all_)}
-            for name, all_ in self._weights.items()
-        }
-
-
-def write_summaries(
-    folder: Path,
-    summary: BatchSummary,
-    lines: IO[str],
-    records: Callable[[], Iterable[FrameRecord]],
-) -> None:
-    """Writes `summary.json`, the summary with the records as its list `frames`, and `summary.csv`.
+def summarise(
+    request: BatchRequest,
+    found: BatchFrames,
+    settings: dict[str, Any],
+    records: Iterable[FrameRecord],
+) -> BatchSummary:
+    """Returns the summary of a batch.
 
     Args:
-        folder: The folder of the results.
-        summary: Summary of all frames.
-        lines: A file opened as TEXT, with a record in each line as JSON.
-        records: Function that gives the same records.
+        request: The batch.
+        found: Its frames.
+        settings: What decides the results.
+        records: The record of each frame that has one.
     """
+    # The records, one by one.
+    totals = _Totals()
+    for record in records:
+        totals.add(record)
+    errors: dict[str, dict[str, Scores]] = {}
+    for (basis, stage), means in totals.errors.items():
+        errors.setdefault(basis, {})[stage] = {"frames": means.frames, **means.means()}
+    # What is said of all of them.
+    frames = len(found.frames) + len(found.refused)
+    ended = sum(totals.counts[kind] for kind in ("done", "diverged", "failed"))
+    return BatchSummary(
+        source=str(request.source),
+        output=str(request.output),
+        layout=found.layout,
+        fixed_by=request.refine.method.fixed_by,
+        settings=settings,
+        counts={"frames": frames, **totals.counts, "pending": frames - ended},
+        unit=" and ".join(sorted(totals.units)) or "m",
+        columns=request.columns,
+        notes=_notes(totals.with_truth),
+        errors=errors,
+        weights={
+            name: {"mean": sum(all_) / len(all_), "least": min(all_), "largest": max(all_)}
+            for name, all_ in totals.weights.items()
+        },
+        warnings=list(totals.warnings.values()),
+        unsure=list(totals.unsure),
+        unmatched=[str(each) for each in found.unmatched],
+        varied=dict(request.varied),
+        sequence={
+            "accumulate": request.accumulate,
+            "poses": str(request.poses) if request.poses else None,
+        },
+    )
+
+
+def _notes(frames: Sequence[tuple[str, str | None, list[float | None]]]) -> list[str]:
+    """How many frames count as independent, given the name, sequence and errors of each."""
+    if len(frames) < 2:
+        return []
+    by_name = groups_by_name([name for name, *_ in frames])
+    groups = [own or name for (_, own, _), name in zip(frames, by_name, strict=True)]
+    return find_clusters(groups, np.array([errors for *_, errors in frames], np.float64)).notes()
+
+
+def write_summary(
+    request: BatchRequest,
+    found: BatchFrames,
+    settings: dict[str, Any],
+    known: Iterable[FrameRecord],
+) -> BatchSummary:
+    """Writes `summary.json`, with the records as its list `frames`, `summary.csv` and the report.
+
+    Arguments are those of `summarise`; frames that were refused need no record.
+    """
+    refused = (
+        FrameRecord(name=frame.name, group=frame.group, status="failed", message=why)
+        for frame, why in found.refused
+    )
+    with tempfile.TemporaryFile("w+", dir=request.output, **_TEXT) as file:
+        # The records, each a line of a file, as they may be too many for the memory.
+        def kept() -> Iterator[FrameRecord]:
+            for record in itertools.chain(refused, known):
+                line = json.dumps(record.to_json(), ensure_ascii=False, allow_nan=False)
+                file.write(f"{line}\n")
+                yield record
+
+        def lines() -> Iterator[str]:
+            file.seek(0)
+            return (line.removesuffix("\n") for line in file)
+
+        def records() -> Iterator[FrameRecord]:
+            return (FrameRecord.from_json(json.loads(line), request.output) for line in lines())
+
+        # What is made of them.
+        summary = summarise(request, found, settings, kept())
+        _write_json(request.output / JSON, summary, lines())
+        _write_csv(request.output / CSV, summary, records())
+        if request.html is not None:
+            from pnpdepth_cli.commands.report.batch_report import write_batch_report
+
+            write_batch_report(request, request.html, summary, records)
+    return summary
+
+
+def _write_json(path: Path, summary: BatchSummary, lines: Iterable[str]) -> None:
+    """Writes the summary, with these lines as its list `frames`."""
     text = json.dumps(plain(asdict(summary)), indent=2, ensure_ascii=False, allow_nan=False)
-    with atomic_path(folder / JSON) as path, path.open("w", **TEXT) as file:
+    with atomic_path(path) as temporary, temporary.open("w", **_TEXT) as file:
         file.write(text.removesuffix("\n}") + ',\n  "frames": [')
-        lines.seek(0)
         for number, line in enumerate(lines):
-            file.write(f"{',' if number else ''}\n    {line.removesuffix(chr(10))}")
+            file.write(f"{',' if number else ''}\n    {line}")
         file.write("\n  ]\n}\n")
+
+
+def _write_csv(path: Path, summary: BatchSummary, records: Iterable[FrameRecord]) -> None:
+    """Writes a row for each record."""
     measured = list(_error_columns(summary.errors, summary.columns))
-    with atomic_path(folder / CSV) as path, path.open("w", **TEXT) as file:
-        header = ["name", "status", "message", "points", "held_out_points", "improved_fraction"]
-        header += [name for name, *_ in measured]
-        header += ["warnings", *(f"seconds_{stage}" for stage in _RUN_STAGES)]
-        write_csv(file, header, (list(_cells(record, measured)) for record in records()))
+    header = ["name", "status", "message", "points", "held_out_points", "improved_fraction"]
+    header += [name for name, *_ in measured]
+    header += ["warnings", *(f"seconds_{stage}" for stage in _RUN_STAGES)]
+    with atomic_path(path) as temporary, temporary.open("w", **_TEXT) as file:
+        write_csv(file, header, (list(_cells(record, measured)) for record in records))
 
 
 def _error_columns(

@@ -8,6 +8,7 @@ from pathlib import Path
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.io.atomic import cannot_write
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 
 _FILE_SUFFIXES = {
@@ -25,26 +26,42 @@ IMAGES = frozenset({"preview", "improvement", "sigma_preview"})
 
 def outputs_in(folder: Path, name: str, request: RefineRequest) -> dict[str, Path]:
     """Returns the files of a result in a folder; slashes in the name are subfolders."""
-    options, sigma = request.outputs, request.hold_out.uncertainty
-    endings = {
-        "depth": f"_depth.{options.format}",
-        "sigma": f"_sigma.{options.format}" if sigma else "",
-        "sigma_preview": "_sigma_preview.png" if sigma else "",
-        "valid": "_valid.png" if sigma else "",  # mask of the pixels whose depth is valid
+    without = set() if request.hold_out.uncertainty else {"sigma", "sigma_preview", "valid"}
+    without |= set() if request.outputs.view_3d else {"view"}
+    endings = _endings(f".{request.outputs.format}")
+    return {kind: folder / f"{name}{end}" for kind, end in endings.items() if kind not in without}
+
+
+def _endings(suffix: str) -> dict[str, str]:
+    """The ends of the names of all files of a result, by kind."""
+    return {
+        "depth": f"_depth{suffix}",
+        "sigma": f"_sigma{suffix}",
+        "sigma_preview": "_sigma_preview.png",
+        "valid": "_valid.png",  # mask of the pixels whose depth is valid
         "preview": "_preview.png",
         "improvement": "_improvement.png",
-        "view": "_view.json" if options.view_3d else "",  # 3D view for a report
+        "view": "_view.json",  # 3D view for a report
         "record": ".json",
     }
-    return {kind: folder / f"{name}{ending}" for kind, ending in endings.items() if ending}
 
 
-def stale_outputs(folder: Path, name: str, planned: Mapping[str, Path]) -> list[Path]:
-    """Returns the files that a run with other options has left beside a result."""
-    endings = [f"_{kind}{suffix}" for kind in ("depth", "sigma") for suffix in DEPTH_SUFFIXES]
-    endings += ["_sigma_preview.png", "_valid.png", "_preview.png", "_improvement.png"]
-    paths = (folder / f"{name}{ending}" for ending in (*endings, "_view.json"))
-    return [path for path in paths if path not in planned.values() and path.is_file()]
+def remove_outdated(outputs: Outputs) -> None:
+    """Removes the record of an earlier result, and its files that are not written again.
+
+    The record goes first, so that none names files of two runs.
+    """
+    record = outputs.get("record")
+    if record is None:
+        return
+    endings = (end for suffix in DEPTH_SUFFIXES for end in _endings(suffix).values())
+    files = dict.fromkeys(record.with_name(record.stem + end) for end in endings)
+    for path in (record, *(path for path in files if path not in outputs.values())):
+        try:
+            if path.is_file():
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise cannot_write(path, error) from error
 
 
 def plan_outputs(request: RefineRequest) -> dict[str, Path]:

@@ -20,7 +20,6 @@ from pnpdepth_cli.completion.interpolation import in_hull
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refined import Refined
-from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.depth import metres, write_depth
 from pnpdepth_cli.io.figure import depth_scale
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
@@ -129,7 +128,6 @@ def write_outputs(
     """
     # The image as it was refined.
     image = replace(inputs, register=frame.registration).registered().image
-    make_folder(outputs["depth"].parent)
     # Depth, its standard deviation, and where it is valid.
     write_depth(outputs["depth"], frame.after, scale=output_scale(inputs))
     if frame.sigma is not None and "sigma" in outputs:

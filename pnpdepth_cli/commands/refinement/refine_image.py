@@ -2,42 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
 
+import numpy as np
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.error_tables import names_of_depths
-from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs, stale_outputs
+from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs, remove_outdated
 from pnpdepth_cli.commands.refinement.outputs import within_range, without_unknown, write_outputs
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
-from pnpdepth_cli.commands.refinement.refined_record import record_of
-from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb
-from pnpdepth_cli.dataset.frame_record import FrameRecord
+from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
+from pnpdepth_cli.completion.baselines import Baseline
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.dataset.frame_record import (
+    BatchState,
+    CameraRecord,
+    FrameRecord,
+    MethodRecord,
+    ModelRecord,
+    PointsRecord,
+    Scores,
+)
 from pnpdepth_cli.dataset.read_frame import read_frame
-from pnpdepth_cli.errors import DivergedError
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.refined import Refined
-from pnpdepth_cli.frames.resolve import with_input_range
-from pnpdepth_cli.io.atomic import all_or_none
-from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.frames.resolve import normalisation_name, with_input_range
+from pnpdepth_cli.io.atomic import all_or_none, make_folder
+from pnpdepth_cli.io.file_bytes import fingerprint
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION
 
-
-class RefineOutcome(NamedTuple):
-    """A refined frame on disk: what its record holds, the files that were written, and why the
-    refinement stopped early, if it did."""
-
-    record: FrameRecord
-    outputs: Outputs
-    diverged: DivergedError | None
+Stages = dict[str, Scores]
 
 
 def refine_image(
     request: RefineRequest,
     *,
     on_iteration: Callable[[int, int, float], None] = lambda done, of, loss: None,
-) -> RefineOutcome:
-    """Refines one frame, writes its depth and companions, and returns what was done.
+) -> FrameRecord:
+    """Refines one frame, writes its depth and companions, and returns its record.
 
     Args:
         request: Files, network and settings of the refinement.
@@ -104,30 +116,190 @@ def write_refined(
     inputs: Frame,
     frame: Refined,
     watch: Stopwatch,
-) -> RefineOutcome:
-    """Scores the refined frame and writes it with its record.
+    *,
+    batch: BatchState | None = None,
+    folder: Path | None = None,
+) -> FrameRecord:
+    """Scores the refined frame and writes it in place of an earlier result, its record last.
 
     The record is the same from run to run, except `seconds` and `peak_memory_mb`.
+
+    Args:
+        request: How the frame was refined.
+        outputs: The files to write, by kind.
+        method: The method that refined it.
+        inputs: The frame as it was read.
+        frame: The refined frame.
+        watch: Gets the time of writing.
+        batch: What the record keeps for the batch that the frame is of.
+        folder: Output folder of that batch, which the record's paths start from.
     """
     frame = within_range(outputs, inputs, without_unknown(request, inputs, frame))
-    record = record_of(request, method, inputs, frame)
-    stale = []
-    if "record" in outputs:
-        record_path = outputs["record"]
-        stale = stale_outputs(record_path.parent, record_path.stem, outputs)
+    record = _record_of(request, method, inputs, frame)
+    make_folder(outputs["depth"].parent, below=folder)
+    remove_outdated(outputs)
     with all_or_none(outputs.values()):
         with watch("write"):
             improved, figures = write_outputs(outputs, inputs, frame, names_of_depths(record))
         record = replace(
             record,
+            batch=batch,
             improved_fraction=improved,
             figures=figures,
-            outputs={kind: str(path) for kind, path in outputs.items()},
+            outputs={
+                kind: path.relative_to(folder).as_posix() if folder else str(path)
+                for kind, path in outputs.items()
+            },
             seconds=watch.seconds,
             peak_memory_mb=peak_memory_mb(method.network.device),
         )
         if "record" in outputs:
             record.write(outputs["record"])
-    for path in stale:  # of a run with other options
-        path.unlink(missing_ok=True)
-    return RefineOutcome(record=record, outputs=outputs, diverged=frame.diverged)
+    return record
+
+
+def _record_of(
+    request: RefineRequest, method: Method, frame: Frame, refined: Refined
+) -> FrameRecord:
+    """The record of a refined frame, without its outputs and times."""
+    # What the frame is called, and what the networks say.
+    network, files = method.network, request.files
+    first = files.image_file or files.sparse
+    of_networks = [note for member in method.members for note in member.network.notes]
+    own_used = len(frame.own) - len(refined.held_out)
+    # Status, files, method, settings, points and errors, in the order of the record.
+    return FrameRecord(
+        name=files.name or (first.stem if first else ""),
+        group=files.group,
+        status="diverged" if refined.diverged else "done",
+        message=str(refined.diverged) if refined.diverged else None,
+        versions=versions(),
+        unit=frame.unit,
+        inputs=dict(frame.sources),
+        neighbours=list(frame.neighbours),
+        camera=CameraRecord.of(frame.camera, frame.pose) if frame.camera else None,
+        model=_model_record(network, request.network.model),
+        method=MethodRecord(
+            kind="default" if method.is_default else "fixed",
+            reason=method.asked.fixed_by or "default",
+            networks=[member.network.definition.name for member in method.members],
+        ),
+        settings={
+            "method": method.asked.method,
+            "layer": method.own.layer,
+            **asdict(method.settings),
+            "seed": method.asked.seed,
+            "step": refined.refinement.step,
+            "propagate": "gp" if method.is_default else method.settings.propagate,
+            "output_kind": network.definition.output_kind,
+            "normalise": normalisation_name(network.definition),
+            "holdout": request.hold_out.holdout,
+            "precision": network.precision,
+            "device": str(network.device),
+        },
+        registration=asdict(refined.registration) if refined.registration else None,
+        alignment=asdict(refined.alignment) if refined.alignment else None,
+        size=(frame.size[1], frame.size[0]),
+        points=PointsRecord(
+            used=len(refined.used),
+            held_out=len(refined.held_out),
+            nearest=float(frame.own.depth.min()),
+            farthest=float(frame.own.depth.max()),
+            moved=len(refined.used) - own_used if frame.neighbours else None,
+        ),
+        weights=dict(refined.weights),
+        loss=list(refined.losses),
+        errors=_errors_of(refined, frame, with_baselines=request.hold_out.baselines),
+        notes=[note for note in (*frame.notes, *of_networks, *refined.notes) if note],
+    )
+
+
+def _model_record(network: Network, spec: str) -> ModelRecord:
+    """What a record keeps of a network; `spec` is what the user called it."""
+    checkpoint = network.checkpoint
+    return ModelRecord(
+        name=network.definition.name,
+        spec=spec,
+        checkpoint=str(checkpoint) if checkpoint else None,
+        checkpoint_sha256=fingerprint(checkpoint).sha256 if checkpoint else None,
+    )
+
+
+def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[str, Stages]:
+    """The errors of each stage, and of linear interpolation of all points, by basis.
+
+    With baselines, these are stages as well. A basis without such pixels or points is left out.
+    """
+    maps = {BEFORE: refined.before, AFTER: refined.after}
+    beside: dict[str, DepthMap] = {}
+    if frame.gt is not None or len(refined.held_out):
+        beside[LINEAR] = linear(frame.points).numpy()
+    errors = {
+        GT: _against_truth(frame, refined, maps, beside, with_baselines=with_baselines),
+        HELD_OUT: _at_points(refined.held_out, maps | beside),
+        VALIDATION: _at_validation_points(refined, with_baselines=with_baselines),
+        USED: _at_points(refined.used, maps),
+    }
+    return {basis: stages for basis, stages in errors.items() if stages}
+
+
+def _against_truth(
+    frame: Frame,
+    refined: Refined,
+    maps: dict[str, DepthMap],
+    beside: dict[str, DepthMap],
+    *,
+    with_baselines: bool,
+) -> Stages:
+    """Scores of the result, and those of all others on the pixels where the result is known."""
+    gt = frame.gt
+    if gt is None:
+        return {}
+    if with_baselines:
+        before, given = torch.from_numpy(refined.before), frame.points
+        depths = _each_baseline(lambda baseline: baseline.depth(given, before))
+        beside = beside | {name: d.numpy() for name, d in depths if name != LINEAR}
+    known = np.where(refined.after > 0, gt, np.float32(0))
+    stages = {name: depth for name, depth in refined.stages.items() if name != BEFORE}
+    return {
+        name: _scores(depth, gt if name == AFTER else known)
+        for name, depth in (maps | stages | beside).items()
+    }
+
+
+def _each_baseline(predict: Callable[[Baseline], Tensor]) -> Iterator[tuple[str, Tensor]]:
+    """The prediction of each baseline that does not fail on the frame."""
+    for name, baseline in BASELINES.items():
+        with suppress(ModelError):  # such as a line through points that are all equally far
+            yield name, predict(baseline)
+
+
+def _scores(depth: DepthMap, gt: DepthMap) -> Scores:
+    """The errors of depth (H, W) against ground truth (H, W)."""
+    return score(torch.from_numpy(depth), torch.from_numpy(gt)).to_json()
+
+
+def _at_points(points: SparsePoints, maps: dict[str, DepthMap]) -> Stages:
+    """The errors of depth maps (H, W) at points of the same image, where both are known."""
+    stages: Stages = {}
+    for name, depth in maps.items():
+        predicted = points.sample(torch.from_numpy(depth))
+        error = (predicted - points.depth)[predicted > 0].double()
+        if not len(error):
+            continue
+        mae, rmse = float(error.abs().mean()), float(error.square().mean().sqrt())
+        stages[name] = {"mae": mae, "rmse": rmse, "points": len(error)}
+    return stages if AFTER in stages and BEFORE in stages else {}
+
+
+def _at_validation_points(refined: Refined, *, with_baselines: bool) -> Stages:
+    """The MAE of each stage, predicted without the validation points."""
+    validation = refined.validation
+    if validation is None:
+        return {}
+    predicted, count = dict(validation.predicted), len(validation.points)
+    if with_baselines:
+        xy, kept, network = validation.points.xy, validation.kept, validation.network
+        others = _each_baseline(lambda baseline: baseline.at(xy, kept, network))
+        predicted |= {name: at for name, at in others if name not in predicted}
+    return {name: {"mae": validation.error(at), "points": count} for name, at in predicted.items()}

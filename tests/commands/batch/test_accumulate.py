@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest, SequenceOptions
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
@@ -28,8 +28,8 @@ DRIVE = Path(__file__).parents[3] / "samples/drive"
 
 def accumulating(root: Path, **changes: Any) -> list[str]:
     """The names of the frames that are done."""
-    sequence = SequenceOptions(accumulate=1, poses=root / "poses.txt")
-    return done(root, **{"sequence": sequence, "refine": {"iterations": 2}} | changes)
+    poses = root / "poses.txt"
+    return done(root, **{"accumulate": 1, "poses": poses, "refine": {"iterations": 2}} | changes)
 
 
 def record_of(root: Path, name: str) -> Any:
@@ -137,7 +137,7 @@ def rendered_drive(root: Path) -> Path:
 
 
 def without_poses(root: Path, **changes: Any) -> list[str]:
-    return accumulating(root, limit=1, sequence=SequenceOptions(accumulate=1), **changes)
+    return accumulating(root, limit=1, poses=None, **changes)
 
 
 def test_without_poses_the_motion_is_estimated_and_recorded(tmp_path: Path) -> None:
@@ -177,7 +177,7 @@ def test_a_frame_is_done_again_when_the_image_of_its_motion_changes(tmp_path: Pa
 def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: Path) -> None:
     root, listener = drive_on_disk(tmp_path, frames=2), RecordingListener()
     poses = (root / "poses.txt").rename(root / "kept.txt")
-    accumulating(root, listener=listener, sequence=SequenceOptions(accumulate=1))
+    accumulating(root, listener=listener, poses=None)
     poses.rename(root / "poses.txt")
     shutil.rmtree(root / "calib")
     accumulating(root, listener=listener)
@@ -201,7 +201,7 @@ def test_poses_that_lie_beside_the_frames_are_used(tmp_path: Path) -> None:
         source=tmp_path / "drive",
         output=tmp_path / "out",
         refine=RefineRequest(),
-        sequence=SequenceOptions(accumulate=1),
+        accumulate=1,
     )
     (first, *_) = find_frames(request).frames[0].neighbours
     assert first.motion is not None

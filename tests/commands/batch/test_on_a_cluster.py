@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.batch import ray_workers
-from pnpdepth_cli.commands.batch.batch_request import ClusterOptions
 from pnpdepth_cli.commands.batch.records import remove_all_leftovers
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import ClusterError
@@ -92,13 +91,13 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
         cluster.remove_node(lost, allow_graceful=False)
 
     listener = Doing(2, lose_a_node)
-    outcome = batch(root, listener, cluster=ClusterOptions(ray=cluster.address))
+    result = batch(root, listener, ray=cluster.address)
     cluster.add_node(num_cpus=1, node_ip_address="127.0.0.5")
     assert not half_written.exists()
     cluster.wait_for_nodes(timeout=120)  # until the lost one counts as dead
     assert sorted(listener.names) == list(NAMES)
     assert different(root) == []
-    assert outcome.summary.counts["done"] == len(NAMES)
+    assert result.counts["done"] == len(NAMES)
 
 
 def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
@@ -110,7 +109,7 @@ def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
     start = "    def forward(self, rgb):\n"
     model.write_text(model.read_text().replace(start, start + DEADLY))
     listener = RecordingListener()
-    batch(root, listener, cluster=ClusterOptions(ray=cluster.address))
+    batch(root, listener, ray=cluster.address)
     records = {record.name: record for record in listener.records}
     assert len(records) == len(listener.records) == 6
     bad = records.pop("bad")
@@ -122,26 +121,24 @@ def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
 def test_what_is_wrong_with_a_cluster_is_an_error(
     cluster: Any, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = ClusterOptions(ray=cluster.address)
     with pytest.raises(ClusterError, match="for 0 Ray workers with one GPU each, and 1 asked"):
-        batch(root, cluster=options, refine={"device": "cuda"})
+        batch(root, ray=cluster.address, refine={"device": "cuda"})
     with monkeypatch.context() as changed:
         changed.setattr(ray_workers, "software", lambda: {"torch": "1.0"})
         with pytest.raises(
             ClusterError, match=r"has torch .* and the driver has 1\.0; install the"
         ):
-            batch(root, cluster=options)
+            batch(root, ray=cluster.address)
     assert not results(root / "out")
 
 
 def test_a_stopped_batch_ends_with_the_frames_that_are_begun(cluster: Any, root: Path) -> None:
     listener = RecordingListener()
-    outcome = batch(
+    batch(
         root,
         listener,
         stopped=lambda: bool(listener.records),
-        cluster=ClusterOptions(ray=cluster.address),
+        ray=cluster.address,
     )
-    assert outcome.stopped
     assert 1 <= len(listener.records) < len(NAMES)
     assert {path.stem for path in (root / "out").glob("f*.json")} == set(listener.names)

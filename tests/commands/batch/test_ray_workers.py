@@ -11,15 +11,11 @@ from typing import Any
 
 import pytest
 
-from pnpdepth_cli.commands.batch.batch_request import (
-    LOCAL,
-    ClusterOptions,
-    parse_address,
-    ray_workers_of,
-)
+from pnpdepth_cli.commands.batch.batch_request import LOCAL, parse_address
 from pnpdepth_cli.commands.batch.ray_workers import (
     check_node,
     connect_workers,
+    ray_workers_of,
     reason_of,
     refine_on_actors,
     software,
@@ -160,7 +156,7 @@ def test_the_death_of_a_worker_is_one_line_of_what_ray_says() -> None:
 
 
 def connect(address: str) -> None:
-    workers = ray_workers_of("cpu", ClusterOptions(ray=address))
+    workers = ray_workers_of("cpu", address)
     assert workers is not None
     with connect_workers(workers):
         raise AssertionError("there is no cluster")
@@ -191,23 +187,23 @@ def test_addresses_of_clusters_and_what_is_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("device", "options", "expected"),
+    ("device", "ray", "expected"),
     [
-        ("cuda:1", {}, None),
-        ("cuda:0,cuda:2", {}, (LOCAL, "cuda", (0, 2))),
-        ("all", {}, (LOCAL, "cuda", ())),
-        ("cpu", {"ray": "auto"}, ("auto", "cpu", ())),
-        ("cuda:0,cuda:0", {}, "name each GPU once"),
-        ("cuda,cuda", {}, "name each GPU once"),
-        ("cpu,cuda:0", {}, "workers run on cpu, cuda"),
-        ("mps,mps", {}, "workers run on cpu, cuda"),
-        ("cuda:0,cuda:1", {"ray": "auto"}, "take --device cuda"),
+        ("cuda:1", None, None),
+        ("cuda:0,cuda:2", None, (LOCAL, "cuda", (0, 2))),
+        ("all", None, (LOCAL, "cuda", ())),
+        ("cpu", "auto", ("auto", "cpu", ())),
+        ("cuda:0,cuda:0", None, "name each GPU once"),
+        ("cuda,cuda", None, "name each GPU once"),
+        ("cpu,cuda:0", None, "workers run on cpu, cuda"),
+        ("mps,mps", None, "workers run on cpu, cuda"),
+        ("cuda:0,cuda:1", "auto", "take --device cuda"),
     ],
 )
-def test_which_devices_are_workers(device: str, options: dict[str, Any], expected: Any) -> None:
+def test_which_devices_are_workers(device: str, ray: str | None, expected: Any) -> None:
     if isinstance(expected, str):
         with pytest.raises(UsageError, match=expected):
-            ray_workers_of(device, ClusterOptions(**options))
+            ray_workers_of(device, ray)
         return
-    workers = ray_workers_of(device, ClusterOptions(**options))
+    workers = ray_workers_of(device, ray)
     assert (workers and (workers.address, workers.device, workers.indices)) == expected

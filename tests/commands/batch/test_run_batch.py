@@ -6,7 +6,8 @@ import os
 import shutil
 import threading
 import weakref
-from dataclasses import asdict, replace
+from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.cli.printing import print_batch
 from pnpdepth_cli.commands.batch import running as batch_running
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.batch.run_batch import run_batch
-from pnpdepth_cli.commands.batch.summary import Tally
+from pnpdepth_cli.commands.batch.summary import BatchSummary, summarise
 from pnpdepth_cli.commands.refinement.refine_image import read_requested
 from pnpdepth_cli.commands.report.batch_report import write_batch_report
 from pnpdepth_cli.commands.results import result_frames
@@ -54,6 +56,11 @@ def root(tmp_path: Path) -> Path:
 def summary(root: Path) -> dict[str, Any]:
     content: dict[str, Any] = json.loads((root / "out" / "summary.json").read_text())
     return content
+
+
+def summary_of(root: Path, records: Iterable[FrameRecord]) -> BatchSummary:
+    request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
+    return summarise(request, find_frames(request), {}, records)
 
 
 def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> None:
@@ -136,7 +143,7 @@ def test_a_bad_frame_is_reported_counted_skipped_and_done_when_it_is_mended(root
     good = (root / "rgb/b.png").read_bytes()
     (root / "rgb/b.png").write_bytes(good[:200])
     listener = RecordingListener()
-    counts = batch(root, listener).summary.counts
+    counts = batch(root, listener).counts
     assert (counts["done"], counts["failed"], counts["pending"]) == (3, 1, 0)
     assert [record.status for record in listener.records] == ["done", "failed", "done", "done"]
     assert "b.png: PNG" in (listener.records[1].message or "")
@@ -146,7 +153,7 @@ def test_a_bad_frame_is_reported_counted_skipped_and_done_when_it_is_mended(root
     assert summary(root)["counts"]["failed"] == 0
     for bad, name in enumerate(NAMES, start=1):  # the first one, and even all
         (root / f"sparse/{name}.png").write_bytes(b"no depth")
-        counts = batch(root, refine={"iterations": 0}).summary.counts
+        counts = batch(root, refine={"iterations": 0}).counts
         assert (counts["done"], counts["failed"]) == (4 - bad, bad)
 
 
@@ -157,7 +164,7 @@ def test_a_divergence_keeps_the_last_good_depth_and_is_counted(root: Path) -> No
     assert formula in text
     exponential = "torch.exp(self.decode(self.middle(self.encode(rgb))))"
     model.write_text(text.replace(formula, exponential))
-    assert batch(root, refine={"lr": "1e4"}).summary.counts["diverged"] == 4
+    assert batch(root, refine={"lr": "1e4"}).counts["diverged"] == 4
     assert (read_depth(root / "out/a_depth.png").values > 0).all()
     assert done(root, refine={"lr": "1e4"}) == []
 
@@ -170,7 +177,7 @@ def test_a_network_that_fails_on_one_frame_only_fails_there(root: Path) -> None:
     check = "        assert rgb.shape[2] < rgb.shape[3]\n        return"
     model.write_text(model.read_text().replace("        return", check, 1))
     for _ in range(2):  # the second run has nothing but this frame to do
-        counts = batch(root, refine={"depth_scale": 1000}).summary.counts
+        counts = batch(root, refine={"depth_scale": 1000}).counts
         assert (counts["done"], counts["failed"]) == (4, 1)
 
 
@@ -269,7 +276,7 @@ def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
         refine=refinement(root, uncertainty=True, iterations=0),
     )
     listener = RecordingListener()
-    counts = run_batch(request, listener).summary.counts
+    counts = run_batch(request, listener).counts
     assert listener.names == ["ok", "fin\u00e9"]
     assert sum(f"{why}; rename it" in line for line in listener.messages) == 1
     assert (counts["frames"], counts["done"], counts["failed"], counts["pending"]) == (3, 2, 1, 0)
@@ -291,8 +298,8 @@ def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: P
     assert parts == [["a", "d"], ["b"], ["c"]]
     counts = summary(root)["counts"]
     assert (counts["done"], counts["failed"], counts["pending"]) == (3, 1, 0)
-    outcome = batch(root, limit=3, shard=(2, 2), output=root / "few")
-    assert outcome.summary.counts["pending"] == 3
+    result = batch(root, limit=3, shard=(2, 2), output=root / "few")
+    assert result.counts["pending"] == 3
     assert [path.name for path in (root / "few").glob("*_depth.png")] == ["b_depth.png"]
 
 
@@ -306,10 +313,10 @@ def test_frames_are_chosen_by_name_then_by_step_then_by_number(root: Path) -> No
 
 def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path) -> None:
     batch(root, limit=2, refine={"holdout": 0.2, "baselines": True})
-    outcome = batch(root, refine={"holdout": 0.2, "baselines": True})
+    result = batch(root, refine={"holdout": 0.2, "baselines": True})
     content = summary(root)
     rows = content.pop("frames")
-    assert content == plain(asdict(outcome.summary))
+    assert content == plain(asdict(result))
     assert [row["name"] for row in rows] == list(NAMES)
     assert content["errors"].keys() == {"ground_truth", "held_out", "validation", "used"}
     for basis, stages in content["errors"].items():
@@ -330,34 +337,29 @@ def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path
     assert float(table[1]["validation_mae_linear"]) == errors["validation"]["linear"]["mae"]
 
 
-def test_the_summary_has_the_mean_and_the_range_of_each_weight() -> None:
-    tally = Tally()
-    for weight in (0.1, 0.4, 0.1):
-        tally.add(FrameRecord(weights={"net": weight, "other": 1 - weight}))
-    weights = tally.weights
+def test_the_summary_has_the_mean_and_the_range_of_each_weight(root: Path) -> None:
+    records = [FrameRecord(weights={"net": w, "other": 1 - w}) for w in (0.1, 0.4, 0.1)]
+    weights = summary_of(root, records).weights
     assert weights["net"] == {"mean": pytest.approx(0.2), "least": 0.1, "largest": 0.4}
     assert list(weights) == ["net", "other"]
 
 
-def test_the_summary_says_that_frames_of_one_sequence_are_not_independent_as_compare_does() -> None:
+def test_the_summary_says_that_frames_of_one_sequence_are_not_independent_as_compare_does(
+    root: Path,
+) -> None:
     after: Scores = {"rmse": 1.0, "mae": 1.0, "mre": 0.1, "delta1": 0.9}
     errors: dict[str, dict[str, Scores]] = {"ground_truth": {"before": {}, "after": after}}
-    tally = Tally()
-    for number in range(6):
-        tally.add(FrameRecord(name=f"{'ab'[number % 2]}/{number:04}", errors=errors))
-    (note,) = tally.notes()
-    assert note == (
+    records = [FrameRecord(name=f"{'ab'[n % 2]}/{n:04}", errors=errors) for n in range(6)]
+    assert summary_of(root, records).notes == [
         "frames of one sequence are not independent: 6 frames count as 2 groups of frames"
-    )
-    alone = Tally()
-    alone.add(FrameRecord(name="a/0000", errors=errors))
-    assert alone.notes() == []
+    ]
+    assert summary_of(root, records[:1]).notes == []
 
 
 def test_columns_choose_the_measures_of_the_tables_of_a_batch(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    print_batch(batch(root, columns=("delta1", "mae"), limit=1).summary)
+    print_batch(batch(root, columns=("delta1", "mae"), limit=1))
     text = capsys.readouterr().err
     assert text.index("δ1") < text.index("MAE")
     assert "RMSE" not in text
@@ -384,12 +386,11 @@ def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left
     root: Path,
 ) -> None:
     stops = iter([False, False, True])
-    outcome = batch(root, stopped=lambda: next(stops))
-    assert outcome.stopped
+    result = batch(root, stopped=lambda: next(stops))
     (root / "out" / "deep").mkdir()
     for folder in ("out", "out/deep"):
         (root / folder / ".0123456789ab").write_bytes(b"half")
-    assert outcome.summary.counts["pending"] == 2
+    assert result.counts["pending"] == 2
     listener = RecordingListener()
     batch(root, listener)
     assert listener.names == ["c", "d"]
@@ -409,8 +410,8 @@ def test_frames_without_sparse_depth_need_to_be_sampled(root: Path, tmp_path: Pa
     batch(kitchen, refine={"sample": SamplePattern(kind="uniform", count=50)})
     record = json.loads((kitchen / "out/frame-a.json").read_text())
     assert record["points"]["used"] == record["inputs"]["sparse"]["sampled"]["count"] == 50
-    outcome = batch(kitchen, refine={"sample": SamplePattern(kind="uniform", count=10**6)})
-    assert outcome.summary.counts["failed"] == 4
+    result = batch(kitchen, refine={"sample": SamplePattern(kind="uniform", count=10**6)})
+    assert result.counts["failed"] == 4
 
 
 def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
@@ -486,32 +487,30 @@ def test_reading_and_writing_go_on_while_the_network_runs(
             second_is_refined.set()
         return refine(self, inputs)
 
-    def writing(*arguments: Any) -> Any:
+    def writing(*arguments: Any, **named: Any) -> Any:
         assert second_is_refined.wait(60), "the second frame waits until the first is written"
-        return write(*arguments)
+        return write(*arguments, **named)
 
     monkeypatch.setattr(batch_running, "read_requested", reading)
     monkeypatch.setattr(batch_running, "write_refined", writing)
     monkeypatch.setattr(Method, "refine", refining)
     monkeypatch.setattr(batch_running, "THREADS", 1)
-    assert batch(root).summary.counts["done"] == 4
+    assert batch(root).counts["done"] == 4
 
 
 def test_a_plain_prediction_without_scores_ends_no_batch(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    outcome = batch(root, html=tmp_path / "report", refine={"baselines": True}, limit=2)
-    print_batch(outcome.summary)
+    html, refine = tmp_path / "report", {"baselines": True}
+    print_batch(batch(root, html=html, refine=refine, limit=2))
     assert "against every simple baseline" in capsys.readouterr().err
     assert "against every simple baseline" in (tmp_path / "report/index.html").read_text()
     records = [FrameRecord.read(root / f"out/{name}.json") for name in NAMES[:2]]
-    tally = Tally()
     for record in records:
         # what a record holds where no pixel of the plain prediction can be scored
         before = record.errors["ground_truth"]["before"]
         before |= dict.fromkeys(before) | {"pixels": 0}
-        tally.add(record)
-    means = replace(outcome.summary, errors=tally.errors())
+    means = summary_of(root, records)
     assert means.errors["ground_truth"]["before"]["rmse"] is None
     assert (means.errors["ground_truth"]["after"]["rmse"] or 0) > 0
     print_batch(means)
@@ -529,7 +528,7 @@ def test_an_unsure_guess_of_the_input_range_is_repeated_at_the_end(root: Path) -
         record = json.loads(path.read_text())
         path.write_text(json.dumps(record | {"notes": [*record["notes"], note]}))
     listener = RecordingListener()
-    assert batch(root, listener, limit=2).summary.unsure == [note]
+    assert batch(root, listener, limit=2).unsure == [note]
     assert listener.messages[-1] == f"warning: {note}"
 
 
@@ -553,13 +552,12 @@ def test_results_are_in_the_order_of_their_numbers(root: Path, tmp_path: Path) -
 def test_warnings_are_printed_once_a_kind_with_the_frames(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tally = Tally()
-    for name, count in (("a", 7), ("b", 1200), ("c", 3), ("d", 5)):
-        note = f"warning: {count:,} of 9,000 pixels clipped"
-        tally.add(FrameRecord(name=name, notes=[note]))
-    (warned,) = tally.warnings
+    counts = {"a": 7, "b": 1200, "c": 3, "d": 5}
+    notes = {name: [f"warning: {n:,} of 9,000 pixels clipped"] for name, n in counts.items()}
+    summary = summary_of(root, [FrameRecord(name=name, notes=notes[name]) for name in notes])
+    (warned,) = summary.warnings
     assert (warned.frames, warned.first) == (4, ["a", "b", "c"])
-    print_batch(replace(batch(root).summary, warnings=tally.warnings))
+    print_batch(summary)
     assert "warning in 4 frames (a, b, c, …): 7 of 9,000 pixels" in capsys.readouterr().err
 
 

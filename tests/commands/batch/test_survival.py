@@ -59,6 +59,6 @@ def test_a_second_run_on_the_same_folder_is_refused_and_other_shards_are_not(
             batch(root, inner, shard=(2, 2))
 
     outer = Beside()
-    counts = batch(root, outer, shard=(1, 2)).summary.counts
+    counts = batch(root, outer, shard=(1, 2)).counts
     assert (outer.names, inner.names) == (["a"], ["b"])
     assert counts["done"] == 2

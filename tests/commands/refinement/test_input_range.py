@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.commands.batch.running import reference_frames, registering
+from pnpdepth_cli.commands.batch.running import spread
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames import resolve
 from pnpdepth_cli.frames.frame import Frame
@@ -114,14 +114,9 @@ def test_a_batch_compares_input_ranges_on_three_frames(tmp_path: Path, seen: Cou
     assert "mean of 3 frames" in notes
 
 
-def test_the_frames_that_decide_are_spread_from_the_first_readable_one_to_the_last() -> None:
-    numbers: list[Any] = list(range(40))
-    assert reference_frames(numbers, 3) == [22, 39]
-    assert [reference_frames(numbers[:n], 3) for n in (4, 5, 6)] == [[], [4], [4 + 1]]
-    assert registering(numbers, 3) == [
-        *(3, 5, 7, 10, 12, 15, 17, 19, 22, 24, 27, 29, 31, 34, 36, 39)
-    ]
-    assert registering(numbers[:6], 3) == [3, 4, 5]
+def test_the_frames_that_decide_are_spread_from_the_first_to_the_last() -> None:
+    assert spread(37) == [0, 2, 4, 7, 9, 12, 14, 16, 19, 21, 24, 26, 28, 31, 33, 36]
+    assert [spread(count) for count in (1, 3)] == [[0], [0, 1, 2]]
 
 
 def test_a_single_frame_decides_alone(tmp_path: Path, seen: Counter[str]) -> None:

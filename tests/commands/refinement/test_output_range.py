@@ -73,7 +73,7 @@ def test_a_refinement_beyond_the_format_is_written_with_a_note(tmp_path: Path) -
     frame = frame_on_disk(tmp_path)
     text = frame.model.read_text()
     frame.model.write_text(text.replace("2 + 3 *", "400 + 3 *"))
-    record = run(frame, iterations=0).record
+    record = run(frame, iterations=0)
     assert any("pixels clipped to 65.5 m" in note for note in record.notes)
     assert read_depth(tmp_path / "out" / "img_depth.png").values.max() == np.float32(65.534)
     assert json.loads((tmp_path / "out" / "img.json").read_text())["notes"] == record.notes

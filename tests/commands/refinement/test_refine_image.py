@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pnpdepth_cli.commands.refinement.refined_record import _at_points
+from pnpdepth_cli.commands.refinement.refine_image import _at_points
 from pnpdepth_cli.dataset.frame_record import FrameRecord, PointsRecord
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import (
@@ -56,7 +56,7 @@ def test_refinement_lowers_the_error_and_the_scores_are_those_of_the_file(
     frame: FrameOnDisk,
 ) -> None:
     asked = {"gt": frame.gt, "iterations": 40, "lr": "20%", "update": "adam", "format": "npy"}
-    record = run(frame, **asked).record
+    record = run(frame, **asked)
     for basis in ("used", "ground_truth"):
         assert change_of(record, basis) < 0.8
     first, *updated = record.loss
@@ -90,7 +90,7 @@ def test_ground_truth_whose_assumed_scale_is_another_one_in_use_stops_and_names_
 
 
 def test_ground_truth_that_no_two_scales_explain_is_warned_of(frame: FrameOnDisk) -> None:
-    record = run(frame, gt=frame.gt, gt_scale=500.0, iterations=0).record
+    record = run(frame, gt=frame.gt, gt_scale=500.0, iterations=0)
     assert noted(record, "warning: the ground truth is 2 times the sparse depth")
 
 
@@ -99,7 +99,7 @@ def test_a_point_beyond_everything_is_dropped_with_a_note(frame: FrameOnDisk) ->
     rows, columns = np.nonzero(depth)
     depth[rows[0], columns[0]] = 1e30
     write_depth(frame.folder / "far.npy", depth)
-    record = run(frame, sparse=frame.folder / "far.npy", iterations=0).record
+    record = run(frame, sparse=frame.folder / "far.npy", iterations=0)
     assert points_of(record).used == len(rows) - 1
     assert noted(record, "dropped 1 of 60 points more than 1,000 times")
 
@@ -116,7 +116,7 @@ def test_no_iterations_give_the_networks_own_prediction_bit_for_bit(frame: Frame
 
 def test_held_out_points_are_a_seeded_share_that_the_loss_never_sees(frame: FrameOnDisk) -> None:
     first, again, other = (
-        run(frame, holdout=0.25, seed=seed, output=frame.folder / name, gt=frame.gt).record
+        run(frame, holdout=0.25, seed=seed, output=frame.folder / name, gt=frame.gt)
         for name, seed in (("a", 1), ("b", 1), ("c", 2))
     )
     assert (points_of(first).held_out, points_of(first).used) == (15, 45)
@@ -152,9 +152,9 @@ def test_of_a_result_that_cannot_be_written_whole_nothing_stays(
 
 
 def test_the_record_has_every_setting_that_changes_the_depth(frame: FrameOnDisk) -> None:
-    plain = run(frame, iterations=0).record.settings
+    plain = run(frame, iterations=0).settings
     for name, value in (("propagate", "gp"), ("normalise", "bytes")):
-        other = run(frame, iterations=0, overwrite=True, **{name: value}).record.settings
+        other = run(frame, iterations=0, overwrite=True, **{name: value}).settings
         assert {key for key in other if other[key] != plain[key]} == {name}
         assert other[name] == value
 
@@ -165,7 +165,7 @@ def test_sparse_depth_of_another_size_is_moved_if_it_shows_the_same_view(
     half, part = frame.folder / "half.npy", frame.folder / "part.npy"
     write_depth(half, frame.depth[::2, ::2])
     write_depth(part, frame.depth[:, :40])
-    record = run(frame, sparse=half).record
+    record = run(frame, sparse=half)
     assert points_of(record).used == 23 * 31
     assert any("31×23" in note and "62×46" in note for note in record.notes)
     with pytest.raises(SizeError, match=r"40×46"):
@@ -177,7 +177,7 @@ def test_a_point_between_pixels_is_enough_and_points_outside_are_counted(
 ) -> None:
     points = frame.folder / "points.csv"
     points.write_text("x,y,depth\n30.25,20.5,2.0\n500,2,3\n")
-    record = run(frame, sparse=points, iterations=20).record
+    record = run(frame, sparse=points, iterations=20)
     assert points_of(record).used == 1
     assert noted(record, "1 points outside the image")
     assert change_of(record, "used") < 1
@@ -197,7 +197,7 @@ def test_the_networks_crop_leaves_the_rest_unknown_and_refuses_points_only_there
     model = frame.folder / "cropped.py"
     text = frame.model.read_text().replace("Multiple(4)", "Fixed(32, 32, fit='crop')")
     model.write_text(text.replace("Multiple,", "Fixed,"))
-    record = run(frame, model=str(model), output=frame.folder / "d.npy", gt=frame.gt).record
+    record = run(frame, model=str(model), output=frame.folder / "d.npy", gt=frame.gt)
     known = np.load(frame.folder / "d.npy") > 0
     assert (known == ((np.arange(62) >= 8) & (np.arange(62) < 54))).all()
     scored = np.count_nonzero(known & (read_depth(frame.gt).values > 0))

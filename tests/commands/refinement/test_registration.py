@@ -40,7 +40,7 @@ def write_frame(folder: Path, seed: int, count: int) -> dict[str, Path]:
 def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) -> FrameRecord:
     """The record of the frame, refined with these options."""
     files: dict[str, Any] = write_frame(folder, 0, count)
-    return run(own, **files | {"output": folder / "out", "overwrite": True} | options).record
+    return run(own, **files | {"output": folder / "out", "overwrite": True} | options)
 
 
 def test_an_unregistered_image_is_moved_and_the_record_says_so(

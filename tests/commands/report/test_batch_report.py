@@ -164,7 +164,7 @@ def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
 
 
 def test_a_frame_without_depth_at_any_point_has_no_figures(root: Path, report: Path) -> None:
-    summary = batch(root).summary
+    summary = batch(root)
     records = [FrameRecord.read(root / f"out/{name}.json") for name in NAMES]
     records[1] = replace(records[1], errors={})
     request = BatchRequest(source=root, output=root / "out", html=report, refine=refinement(root))

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest, SequenceOptions
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames, unpack
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.sparse import bag_frames
@@ -92,7 +92,7 @@ def test_a_batch_of_a_bag_accumulates_with_its_poses(tmp_path: Path) -> None:
         source=bag,
         output=tmp_path / "out",
         refine=RefineRequest(),
-        sequence=SequenceOptions(accumulate=1),
+        accumulate=1,
     )
     (neighbour,) = find_frames(unpack(request, lambda text: None)).frames[0].neighbours
     assert neighbour.poses.startswith(str(tmp_path / "out_frames/poses.txt"))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import task_of
+from pnpdepth_cli.commands.batch.find_frames import request_of
 from pnpdepth_cli.commands.refinement.refine_image import read_requested
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.arrays import apply_masks, move_depth
@@ -266,7 +266,7 @@ def inputs_of(frame: FrameFiles, root: Path) -> Frame:
     pattern = None if frame.sparse is not None else parse_sample("20")
     refine = RefineRequest.from_fields(sample=pattern)
     request = BatchRequest(source=root, output=root / "out", refine=refine)
-    return read_requested(task_of(request, frame).request)
+    return read_requested(request_of(request, frame))
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
