@@ -11,7 +11,6 @@ import numpy as np
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_options import ReadOptions
-from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.rgb import read_focal_length
@@ -23,7 +22,7 @@ _OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre gi
 def camera_of_frame(
     files: FrameFiles,
     options: ReadOptions,
-    sparse: SparseDepth,
+    known: Camera | None,
     size: tuple[int, int],
     *,
     needs_camera: bool,
@@ -35,7 +34,7 @@ def camera_of_frame(
     Args:
         files: The files of the frame.
         options: Options of reading, such as the calibration.
-        sparse: The sparse depth, with the camera of the whole image if it came with one.
+        known: The camera of the whole image that came with the sparse depth. None: it had none.
         size: (H, W) of the whole image.
         needs_camera: Whether it must be known; only then it is taken from EXIF.
 
@@ -44,7 +43,7 @@ def camera_of_frame(
         SizeError: The calibration is of another image.
     """
     image, scan = files.image_file, options.scan.over(files)
-    known, notes = sparse.camera, list[str]()
+    notes = list[str]()
     if known is None and scan.calib is not None:
         known, notes = camera_of_file(scan.calib, scan.camera, size, image)
     if known is None and needs_camera:

@@ -21,12 +21,11 @@ from pnpdepth_cli.dataset.frame_files import (
     Source,
     file_of,
 )
-from pnpdepth_cli.dataset.map_points import depth_of_distances, read_map_points
 from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
-from pnpdepth_cli.dataset.sparse_depth import SparseDepth
+from pnpdepth_cli.dataset.sparse_depth import SparseDepth, depth_of_distances, read_map_points
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord, Sampling
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
@@ -85,7 +84,9 @@ def read_frame(
     compared = [] if truth is None else _compare(files, truth, sparse, given)
     size = size or (given.size if truth is None else truth.size)
     # The camera, and with it the points of neighbouring frames.
-    camera, of_camera = camera_of_frame(files, options, sparse, size, needs_camera=needs_camera)
+    camera, of_camera = camera_of_frame(
+        files, options, sparse.camera, size, needs_camera=needs_camera
+    )
     used, held_out = _hold_out(given, holdout, seed)
     points, neighbours, lost = read_neighbours(
         files, used, camera, lambda other: _points_of(other, options, size, seed)

@@ -6,17 +6,24 @@ import itertools
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.dataset.plausible import scan_returns
+from pnpdepth_cli.commands.sparse.bag_sensors import (
+    Say,
+    Sensors,
+    clock_offset,
+    first_times,
+    measurement,
+    sensors_of,
+    stream,
+)
 from pnpdepth_cli.dataset.scan_points import choose_camera
 from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
@@ -28,7 +35,6 @@ from pnpdepth_cli.io.bags import (
     TRANSFORMS,
     Bag,
     check_topics,
-    choose_topic,
     open_bag,
 )
 from pnpdepth_cli.io.bags.messages import (
@@ -36,42 +42,26 @@ from pnpdepth_cli.io.bags.messages import (
     camera_info_topic,
     camera_of_bag,
     camera_trajectory,
-    cloud_points,
-    depth_image,
     frame_of,
     image_file,
-    is_depth,
     nearest_pairs,
     poses_topics,
-    seconds_of,
     static_pose,
 )
 from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.io.poses import POSES_FILE, Trajectory
+from pnpdepth_cli.io.poses import POSES_FILE
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan, write_points
 from pnpdepth_cli.io.text_files import plain, read_json, write_json
-from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.pixels import describe_dropped
 
 RECORD = "frames.json"
+_NOT_IN_RECORD = ("output", "overwrite")
 _FOLDERS = ("rgb", "sparse")
 _COMPARED_FRAMES = 5
-_KINDS = {"images": True, "points": False}
-_DELAYS = 20
-"""Number of messages of each topic whose delay is measured."""
-
-_SLOWEST_S = 1.0
-"""A larger difference of delays is that of two clocks."""
-
 _LONGEST_GAP_S = 0.5
 """Longest time between two poses that one is interpolated from."""
-
-_SAME_K = 0.05
-"""Relative difference of intrinsics of one camera, which a driver may have calibrated twice."""
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,16 +91,9 @@ class FramesRequest:
     def identity(self) -> dict[str, Any]:
         """Returns the beginning of the record, which is the same for the same frames."""
         paths = sorted(self.bag.iterdir()) if self.bag.is_dir() else [self.bag]
-        return {
-            "command": "frames",
-            "bag": str(self.bag),
-            "bag_files": {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths},
-            "topics": list(self.topics),
-            "tolerance": self.tolerance,
-            "clock_offset": self.clock_offset,
-            "between": self.between,
-            "every": self.every,
-        }
+        stated = {name: value for name, value in vars(self).items() if name not in _NOT_IN_RECORD}
+        files = {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths}
+        return {"command": "frames", **stated, "bag": str(self.bag), "bag_files": files}
 
 
 def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
@@ -123,70 +106,41 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         UsageError: Topics are ambiguous.
         OutputError: The folder holds files that may not be replaced.
     """
-    folder, wanted, tolerance = request.output, request.topics, request.tolerance
-    # A folder of its own, or of an earlier run.
-    ours = (folder / RECORD).is_file()
-    if ours and not request.overwrite:
-        raise OutputError(f"{folder} holds the frames of a bag; --overwrite replaces them")
-    if folder.is_file() or (not ours and folder.is_dir() and any(folder.iterdir())):
-        raise OutputError(f"{folder} exists, and holds no frames of a bag; name another with -o")
+    _check_output(request)
     with open_bag(request.bag) as bag:
-        check_topics(bag, wanted, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES, *TRANSFORMS))
         # The topics, and what their clocks differ by.
-        sensors = _sensors(bag, wanted, say)
-        topics = sensors.images, sensors.points
-        say(f"topics: images of {topics[0]}, points of {topics[1]}")
+        check_topics(bag, request.topics, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES, *TRANSFORMS))
+        sensors = sensors_of(bag, request.topics, say)
+        say(f"topics: images of {sensors.images}, points of {sensors.points}")
         _clear(request)
-        lost, times, poses = 0, list[float](), None
-        first, last = request.between or (0, math.inf)
-        numbers = itertools.count()
-        dropped = Counter[str]()
-        frames = "", ""
         offset = request.clock_offset
         if offset is None:
-            offset = _clock_offset(bag, topics, say)
-        # Each image with the scan nearest in time.
-        for image, scan in nearest_pairs(_stream(bag, *topics, offset), tolerance):
-            if scan is None:
-                lost += 1
-                continue
-            if (number := next(numbers)) > last:
-                break
-            if number < first or (number - first) % request.every:
-                continue
-            try:
-                values, counts = _measurement(sensors, scan.message)
-            except NoPointsError:
-                lost += 1
-                continue
-            dropped.update(counts)
-            frames = frames if times else (frame_of(image.message), frame_of(scan.message))
-            _write_frame(request.output, sensors, image, values)
-            times.append(image.time_s)
+            offset = clock_offset(bag, sensors, say)
+        # The frames.
+        written = _write_pairs(request, bag, sensors, offset)
+        if written.dropped:
+            say(f"points: dropped {describe_dropped(written.dropped)}")
+        if written.lost:
+            within = f"{request.tolerance:g} s"
+            say(f"warning: {written.lost:,} images have no scan with points within {within}")
+        if not written.times:
+            raise InputError(
+                f"{bag.path}: no image of {sensors.images} has a scan of {sensors.points} within"
+                f" {request.tolerance:g} s; {first_times(bag, sensors)}; if their clocks differ,"
+                " give --clock-offset, else a larger --tolerance"
+            )
         # Calibration and poses.
-        if dropped:
-            say(f"points: dropped {describe_dropped(dropped)}")
-        if times:
-            camera = _write_calibration(request, bag, sensors, frames, say)
-            poses = _write_poses(request, bag, camera, times, say)
-    # What a person should know.
-    if lost:
-        say(f"warning: {lost:,} images have no scan with points within {tolerance:g} s")
-    if not times:
-        raise InputError(
-            f"{request.bag}: no image of {topics[0]} has a scan of {topics[1]} within"
-            f" {tolerance:g} s; {_first_times(request.bag, topics)}; if their clocks differ, give"
-            " --clock-offset, else a larger --tolerance"
-        )
+        camera = _write_calibration(request, bag, sensors, say)
+        poses = _write_poses(request, bag, camera, written.times, say)
     # The record, which is complete now.
     record = request.identity() | {
-        "image_topic": topics[0],
-        "points_topic": topics[1],
+        "image_topic": sensors.images,
+        "points_topic": sensors.points,
         "seconds_added_to_points": offset,
         "complete": True,
-        "frames": len(times),
+        "frames": len(written.times),
         "poses": poses,
-        "images_without_scan": lost,
+        "images_without_scan": written.lost,
     }
     write_json(request.output / RECORD, record)
     return record
@@ -201,6 +155,16 @@ def has_frames(request: FramesRequest) -> bool:
     return all(record.get(name) == value for name, value in identity.items())
 
 
+def _check_output(request: FramesRequest) -> None:
+    """Raises OutputError unless the folder is new, or of an earlier run and to be replaced."""
+    folder = request.output
+    ours = (folder / RECORD).is_file()
+    if ours and not request.overwrite:
+        raise OutputError(f"{folder} holds the frames of a bag; --overwrite replaces them")
+    if folder.is_file() or (not ours and folder.is_dir() and any(folder.iterdir())):
+        raise OutputError(f"{folder} exists, and holds no frames of a bag; name another with -o")
+
+
 def _clear(request: FramesRequest) -> None:
     """Removes the frames that were written before, and records that these are incomplete."""
     for name in _FOLDERS:
@@ -212,134 +176,42 @@ def _clear(request: FramesRequest) -> None:
     write_json(request.output / RECORD, request.identity() | {"complete": False})
 
 
-def _stream(
-    bag: Bag, images: str, points: str, offset: float = 0.0
-) -> Iterator[tuple[bool, Stamped]]:
-    """Yields whether it is an image, and the message; `offset` is added to times of points."""
-    for topic, logged_ns, message in bag.messages([images, points]):
-        is_image = topic == images
-        time_s = seconds_of(message, logged_ns) + (0.0 if is_image else offset)
-        yield is_image, Stamped(time_s, message)
+class _Written(NamedTuple):
+    """What was written."""
+
+    times: list[float]
+    """Time of each image, seconds."""
+    lost: int
+    """Number of images without a scan."""
+    dropped: Counter[str]
 
 
-def _clock_offset(bag: Bag, topics: tuple[str, str], say: Say) -> float:
-    """Seconds to add to the times of points: 0, or the difference of two clocks if it is large.
-
-    One clock times the log of both topics. So their delays from stamp to log differ by the offset,
-    and by how long each message took, which is less than a second.
-    """
-    delays: dict[str, list[float]] = {topic: [] for topic in topics}
-    for topic, logged_ns, message in bag.messages(topics):
-        delays[topic].append(1e-9 * logged_ns - seconds_of(message, logged_ns))
-        if min(map(len, delays.values())) >= _DELAYS or len(delays[topic]) >= 10 * _DELAYS:
+def _write_pairs(request: FramesRequest, bag: Bag, sensors: Sensors, offset: float) -> _Written:
+    """Writes each image that is asked for with the scan nearest in time."""
+    lost, times, dropped = 0, list[float](), Counter[str]()
+    first, last = request.between or (0, math.inf)
+    numbers = itertools.count()
+    for image, scan in nearest_pairs(stream(bag, sensors, offset), request.tolerance):
+        if scan is None:
+            lost += 1
+            continue
+        if (number := next(numbers)) > last:
             break
-    if not all(delays.values()):
-        return 0.0
-    of_images, of_points = (float(np.median(delays[topic])) for topic in topics)
-    offset = round(of_points - of_images, 6)
-    if abs(offset) <= _SLOWEST_S:
-        return 0.0
-    say(
-        f"warning: by the times of the log, {topics[0]} and {topics[1]} have two clocks;"
-        f" {offset:+.3f} s are added to the times of points (--clock-offset gives another number)"
-    )
-    return offset
-
-
-def _first_times(path: Path, topics: tuple[str, str]) -> str:
-    """When the images and the points begin, for a person."""
-    first = dict[bool, float]()
-    with open_bag(path) as bag:
-        for is_image, each in _stream(bag, *topics):
-            first.setdefault(is_image, each.time_s)
-            if len(first) == 2:
-                break
-    times = [f"{name} begin at {first[key]:.3f} s" for name, key in _KINDS.items() if key in first]
-    return ", ".join(times) or "there is none"
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Sensors:
-    """Which topics hold images and depth."""
-
-    images: str
-    points: str
-    is_depth: bool
-    """Whether the points are depth images."""
-    depth_camera: Camera | None = None
-    """Camera of the depth images. None: that of the images, or the points are clouds."""
-
-    @property
-    def is_map(self) -> bool:
-        """Whether the points are depth images of the images' own camera."""
-        return self.is_depth and self.depth_camera is None
-
-
-def _sensors(bag: Bag, wanted: Sequence[str], say: Say) -> _Sensors:
-    """The topics that are named, or the only ones; clouds rather than depth images.
-
-    Of several depth images, those with the images' frame_id are taken.
-    """
-    # Topics of images hold colours or depth, which the first message tells.
-    topics = bag.topics(IMAGES)
-    found = {name: next(bag.messages([name]), None) for name in topics}
-    first = {name: message[2] for name, message in found.items() if message is not None}
-    counts = {name: topics[name] for name in first}
-    depths = {name: count for name, count in counts.items() if is_depth(first[name], name)}
-    colours = {name: count for name, count in counts.items() if name not in depths}
-    # Points are clouds, unless depth images are named or alone.
-    images, clouds = choose_topic(bag, wanted, colours, "images"), bag.topics(CLOUDS)
-    if not depths or (clouds and not set(wanted) & set(depths)):
-        points = choose_topic(bag, wanted, clouds, f"points ({CLOUDS[0]} or depth images)")
-        return _Sensors(images=images, points=points, is_depth=False)
-    # Depth images with the colours' frame_id are preferred.
-    frame = frame_of(first[images])
-    registered = {name: count for name, count in depths.items() if frame_of(first[name]) == frame}
-    usable = depths if set(wanted) & set(depths) else registered or depths
-    points = choose_topic(bag, wanted, usable, "depth images")
-    same = _Sensors(images=images, points=points, is_depth=True)
-    # They may be of a camera of their own.
-    infos = camera_info_topic(bag, images), camera_info_topic(bag, points)
-    of_images, of_depth = (None if info is None else camera_of_bag(bag, info) for info in infos)
-    if of_depth is None or infos[0] == infos[1]:
-        if points not in registered and of_depth is None:
-            say(f"warning: {points} has no camera_info; its pixels are taken for the images'")
-        return same
-    if points in registered and of_images is not None:
-        own, other = of_images[0].camera, of_depth[0].camera
-        if own.size == other.size and np.allclose(own.intrinsics, other.intrinsics, rtol=_SAME_K):
-            return same
-        say(
-            f"{points} is of another camera than {images}, but has its frame_id: no offset is known"
-        )
-    return replace(same, depth_camera=of_depth[0].camera)
-
-
-def _measurement(sensors: _Sensors, message: Any) -> tuple[NDArray[np.float32], dict[str, int]]:
-    """A depth image (H, W) of the images' camera, or points (N, 3); and counts of what is none.
-
-    Raises:
-        NoPointsError: Nothing was measured.
-    """
-    topic = sensors.points
-    if not sensors.is_depth:
-        cloud = cloud_points(message, topic)
-    else:
-        depth = depth_image(message, topic)
-        if not depth.any():
-            raise NoPointsError(f"{topic}: a depth image without depth")
-        if sensors.depth_camera is None:
-            return depth, {}
-        rows, columns = np.nonzero(depth)
-        xy = np.column_stack([columns, rows]).astype(np.float64)
-        cloud = unproject(sensors.depth_camera, xy, depth[rows, columns]).astype(np.float32)
-    # the unit is left to what reads the frames
-    points, counts, _ = scan_returns(topic, cloud, scale=1.0)
-    return points, counts
+        if number < first or (number - first) % request.every:
+            continue
+        try:
+            values, counts = measurement(sensors, scan.message)
+        except NoPointsError:
+            lost += 1
+            continue
+        dropped.update(counts)
+        _write_frame(request.output, sensors, image, values)
+        times.append(image.time_s)
+    return _Written(times, lost, dropped)
 
 
 def _write_frame(
-    folder: Path, sensors: _Sensors, image: Stamped, values: NDArray[np.float32]
+    folder: Path, sensors: Sensors, image: Stamped, values: NDArray[np.float32]
 ) -> None:
     """Writes rgb/NAME and sparse/NAME; the name is the image's time."""
     name = f"{image.time_s:.6f}".replace(".", "_")
@@ -353,30 +225,25 @@ def _write_frame(
         write_points(sparse.with_suffix(".ply"), values)
 
 
-def _write_calibration(
-    request: FramesRequest, bag: Bag, sensors: _Sensors, frames: tuple[str, str], say: Say
-) -> str:
-    """Writes calib.txt as far as there is a calibration; returns the frame_id of the camera.
-
-    `frames` are the frame_ids in the headers of an image and a scan.
-    """
+def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: Say) -> str:
+    """Writes calib.txt as far as there is a calibration; returns the frame_id of the camera."""
     # The camera, from camera_info.
-    image_topic = sensors.images
-    topic = camera_info_topic(bag, image_topic)
+    topic = camera_info_topic(bag, sensors.images)
     of_bag = None if topic is None else camera_of_bag(bag, topic)
-    names = (of_bag[1] if of_bag else "") or frames[0], frames[1]
+    topics = sensors.images, sensors.points
+    camera, points = (frame_of(next(bag.messages([each]))[2]) for each in topics)
     if of_bag is None:
-        say(f"warning: {bag.path} has no camera_info of {image_topic}; refine with --calib")
-        return frames[0]
-    calibration, source = of_bag[0], str(topic)
+        say(f"warning: {bag.path} has no camera_info of {sensors.images}; refine with --calib")
+        return camera
+    calibration, source, camera = of_bag[0], str(topic), of_bag[1] or camera
     # The pose of the scanner, from static transforms.
-    scanner = None if calibration.scanner else static_pose(bag, *names)
+    scanner = None if calibration.scanner else static_pose(bag, camera, points)
     if scanner is not None:
-        source += f", and /tf_static from {names[0]} to {names[1]}"
+        source += f", and /tf_static from {camera} to {points}"
         calibration = replace(calibration, scanner=scanner)
     if calibration.scanner is None and not sensors.is_map:
         say(
-            f"warning: {bag.path} has no static transform from {names[0]} to {names[1]}; refine"
+            f"warning: {bag.path} has no static transform from {camera} to {points}; refine"
             " with --extrinsics FILE"
         )
     else:
@@ -384,11 +251,11 @@ def _write_calibration(
     # Whether the images are rectified.
     if calibration.rectified:
         pairs = () if sensors.is_map else _some_frames(request.output)
-        calibration, note = choose_camera(calibration, pairs, image_topic)
+        calibration, note = choose_camera(calibration, pairs, sensors.images)
         say(note)
     with atomic_path(request.output / "calib.txt") as temporary:
         temporary.write_text(_calibration_text(calibration))
-    return names[0]
+    return camera
 
 
 def _some_frames(
@@ -430,7 +297,11 @@ def _write_poses(
     if trajectory is None:
         say(f"warning: no transforms tie the camera's frame {camera} to the poses of {topic}")
         return None
-    rows = [row for time_s in times if (row := _row(trajectory, time_s)) is not None]
+    rows = list[str]()
+    for time_s in times:
+        if (pose := trajectory.at(time_s, _LONGEST_GAP_S)) is not None:
+            numbers = (*pose[:, 3], *Rotation.from_matrix(pose[:, :3]).as_quat())
+            rows.append(" ".join(map(str, [f"{time_s:.6f}", *numbers])) + "\n")
     if len(rows) < len(times):
         say(
             f"warning: {len(times) - len(rows):,} of {len(times):,} images have no pose in {topic}"
@@ -441,11 +312,3 @@ def _write_poses(
         temporary.write_text("".join(rows))
     say(f"poses: of {topic}")
     return topic
-
-
-def _row(trajectory: Trajectory, time_s: float) -> str | None:
-    pose = trajectory.at(time_s, _LONGEST_GAP_S)
-    if pose is None:
-        return None
-    quaternion = Rotation.from_matrix(pose[:, :3]).as_quat()
-    return " ".join(map(str, [f"{time_s:.6f}", *pose[:, 3], *quaternion])) + "\n"

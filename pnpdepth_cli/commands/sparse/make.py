@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
+from pnpdepth_cli.dataset.arrays import record_of
 from pnpdepth_cli.dataset.frame_camera import check_size
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_options import ScanOptions
@@ -20,7 +21,6 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import describe_range, read_depth
-from pnpdepth_cli.io.file_bytes import sha256_of
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.sparse_files import SPARSE_SUFFIXES, write_sparse
@@ -69,7 +69,7 @@ class SparseTarget:
         points: Points,
         settings: dict[str, Any],
         *,
-        inputs: Mapping[str, Path | FileRecord | None],
+        inputs: Mapping[str, FileRecord],
         notes: Sequence[str],
         rgb: NDArray[np.float32] | None = None,
     ) -> dict[str, Any]:
@@ -79,7 +79,7 @@ class SparseTarget:
             command: Name of the command that made the points.
             points: The sparse depth.
             settings: Settings of the command; kept in a PNG or CSV too.
-            inputs: Files by their part, or what a record keeps of them.
+            inputs: What a record keeps of each file, by its part.
             notes: Lines for a person.
             rgb: (H, W, 3) in 0..1, the image of the overlay. None: there is none.
         """
@@ -94,7 +94,7 @@ class SparseTarget:
         # The record.
         record = {
             **provenance,
-            "inputs": {name: _record(part).to_json() for name, part in inputs.items() if part},
+            "inputs": {name: part.to_json() for name, part in inputs.items()},
             "points": {
                 "count": len(points),
                 "fraction_of_pixels": len(points) / image.size,
@@ -112,12 +112,6 @@ class SparseTarget:
         }
         write_json(self.record, record)
         return record
-
-
-def _record(part: Path | FileRecord) -> FileRecord:
-    if isinstance(part, FileRecord):
-        return part
-    return FileRecord(path=str(part), sha256=sha256_of(part))
 
 
 def project_scan(
@@ -141,10 +135,14 @@ def project_scan(
     rgb = read_rgb(image).values
     size = (rgb.shape[0], rgb.shape[1])
     projected = read_scan_points(scan, options, size, image, scale=scale)
-    settings = plain(asdict(options))
-    inputs: dict[str, Path | FileRecord | None] = {"image": image, "scan": projected.record}
-    notes = projected.notes
-    return target.write("project", projected.points, settings, inputs=inputs, notes=notes, rgb=rgb)
+    return target.write(
+        "project",
+        projected.points,
+        plain(asdict(options)),
+        inputs={"image": record_of(image), "scan": projected.record},
+        notes=projected.notes,
+        rgb=rgb,
+    )
 
 
 def sample_depth(
@@ -154,7 +152,7 @@ def sample_depth(
     *,
     image: Path | None = None,
     seed: int = 0,
-    **reading: Any,
+    scale: float | None = None,
 ) -> dict[str, Any]:
     """Writes points of a dense depth map, and returns the record.
 
@@ -164,10 +162,10 @@ def sample_depth(
         pattern: Pattern of the pixels that are sampled.
         image: Image whose features `features` samples.
         seed: Random seed of the pattern.
-        **reading: Options of `read_depth`.
+        scale: Codes per metre of an integer map.
     """
     target.check((depth, image))
-    dense, notes = _dense(depth, **reading)
+    dense, notes = _dense(depth, scale)
     rgb = None if image is None else read_rgb(image).values
     points = sample_points(dense, pattern, seed, image=rgb)
     wanted = pattern.wanted(int(np.count_nonzero(dense)))
@@ -175,7 +173,9 @@ def sample_depth(
         notes.append(f"warning: the image has {len(points):,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
     settings = {"pattern": asdict(pattern), "seed": seed}
-    inputs = {"depth": depth, "image": image}
+    inputs = {"depth": record_of(depth)}
+    if image is not None:
+        inputs["image"] = record_of(image)
     return target.write("sample", points, settings, inputs=inputs, notes=notes)
 
 
@@ -186,7 +186,7 @@ def simulate_scan(
     calib: Path,
     *,
     seed: int = 0,
-    **reading: Any,
+    scale: float | None = None,
 ) -> dict[str, Any]:
     """Writes the points of a sensor at the camera's place in a dense depth map; returns the record.
 
@@ -196,21 +196,21 @@ def simulate_scan(
         sensor: The scanner.
         calib: Calibration of the camera.
         seed: Random seed of all noise.
-        **reading: Options of `read_depth`.
+        scale: Codes per metre of an integer map.
     """
     target.check((depth, calib))
-    dense, notes = _dense(depth, **reading)
+    dense, notes = _dense(depth, scale)
     calibration = read_calibration(calib)
     notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
     points = simulate_lidar(dense, calibration.camera, sensor, seed)
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{sensor.name}, seed {seed}'))}")
     settings = {"sensor": plain(asdict(sensor)), "seed": seed}
     read_as = FileRecord(path=str(calib), read_as=calibration.camera.source)
-    inputs: dict[str, Path | FileRecord | None] = {"depth": depth, "calibration": read_as}
+    inputs = {"depth": record_of(depth), "calibration": read_as}
     return target.write("simulate", points, settings, inputs=inputs, notes=notes)
 
 
-def _dense(path: Path, scale: float | None = None) -> tuple[NDArray[np.float32], list[str]]:
+def _dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[str]]:
     """The dense depth (H, W), and lines for a person."""
     dense = read_depth(path, scale=scale)
     values, notes = plausible_map(dense.values, dense.reading, "depth", "--depth-scale", scale)
