@@ -198,7 +198,9 @@ class _Lesson:
         arguments = tuple(each.clone() for each in self.frame.arguments_for(shown))
         with wrap_user_errors("the network's forward"):
             output = functional_call(module, values, arguments)
-        return checked_loss(_LOSS)(asked.sample(reader(output)), asked.depth)
+        predicted = asked.sample(reader(output))
+        known = predicted.isfinite()  # unknown where the network says so, such as in the sky
+        return checked_loss(_LOSS)(predicted[known], asked.depth[known])
 
 
 def _weights_that_learn(network: Network) -> dict[str, Tensor]:

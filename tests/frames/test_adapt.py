@@ -173,3 +173,29 @@ def test_a_loss_that_is_not_finite_ends_the_learning(
     monkeypatch.setattr(adapt, "LR", 1e30)
     with pytest.raises(pnp.DivergedError, match="not finite after"):
         adapt.learn(network, named(range(8)))
+
+
+class NoSky(torch.nn.Module):
+    """Depth that is infinite in the upper quarter."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = torch.nn.Conv2d(4, 1, 3, 1, 1)
+
+    def forward(self, rgb: torch.Tensor, sparse: torch.Tensor) -> torch.Tensor:
+        depth = 3 + self.layer(torch.cat([rgb, sparse], dim=1))
+        sky = torch.arange(depth.shape[-2])[:, None] < depth.shape[-2] // 4
+        return torch.where(sky, torch.inf, depth)
+
+
+def test_points_where_the_network_is_infinite_teach_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(adapt, "STEPS", 12)
+    definition = pnp.ModelDefinition(
+        name="no-sky", input_kind="rgb+sparse", size=pnp.Multiple(4), build=NoSky, complete=True
+    )
+    network = pnp.load_network(NoSky(), definition=definition)
+    learnt = adapt.learn(network, named(range(8)))
+    assert np.isfinite(learnt.before).all()
+    assert learnt.after.mean() < learnt.before.mean()

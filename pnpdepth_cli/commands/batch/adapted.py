@@ -59,6 +59,7 @@ def with_adapted_weights(
         name += f"-{hashlib.sha256(sequence.encode()).hexdigest()[:8]}"
     spread = np.linspace(0, len(frames) - 1, min(len(frames), MOST_FRAMES)).round().astype(int)
     lessons = [request_of(request, frames[index]) for index in spread]
+    named = f"{sequence}: " if sequence else ""
     folder = request.output / "adapted"
     weights, file = folder / f"{name}.safetensors", folder / f"{name}.json"
     try:
@@ -73,9 +74,9 @@ def with_adapted_weights(
     except (InputError, DivergedError) as error:
         record = {"why": str(error)}
     if record["why"]:
-        say(f"adapt: {sequence}: the network's own weights are used: {record['why']}")
+        say(f"adapt: {named}the network's own weights are used: {record['why']}")
         return request
-    say(f"adapt: {sequence}: {len(frames):,} frames are refined with {weights}")
+    say(f"adapt: {named}{len(frames):,} frames are refined with {weights}")
     return replace(request, refine=request.refine.with_fields(checkpoint=weights))
 
 
