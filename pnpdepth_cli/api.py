@@ -13,9 +13,8 @@ from pnpdepth_cli.core.metrics import Scores
 from pnpdepth_cli.core.metrics import score as score_tensors
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.frames.frame import Registration
-from pnpdepth_cli.frames.from_arrays import Unit, in_metres
 from pnpdepth_cli.frames.refined import Refined
-from pnpdepth_cli.frames.refiner import Refiner
+from pnpdepth_cli.frames.refiner import Refiner, Unit, in_metres
 from pnpdepth_cli.measures import DELTA_THRESHOLDS
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.definition import ModelDefinition, assume_definition

@@ -16,7 +16,7 @@ from torch import nn
 
 import pnpdepth_cli as pnp
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.frames.from_arrays import frame_of_arrays
+from pnpdepth_cli.frames.refiner import frame_of_arrays
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 

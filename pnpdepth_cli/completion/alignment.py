@@ -67,7 +67,7 @@ class Alignment:
 
     def beyond(self, x: Tensor) -> float:
         """Returns the fraction of the values that `depth` clamps."""
-        line = self.scale * x + self.shift
+        line = self.scale * x.cpu() + self.shift
         near, far = (float(to_space(torch.tensor(b), self.space)) for b in self.bounds)
         return float(((line < min(near, far)) | (line > max(near, far))).double().mean())
 
@@ -102,7 +102,7 @@ def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -
         NoPointsError: There are too few points.
         ModelError: The numbers do not vary, or are not finite.
     """
-    x, d = x.detach().double().cpu(), points.depth.detach().double().cpu()
+    x, d = x.detach().cpu().double(), points.depth.detach().cpu().double()
     good = x.isfinite()
     if not bool(good.any()):
         raise ModelError("the network's output is not finite at any sparse point; nothing to align")

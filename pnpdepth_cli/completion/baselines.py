@@ -2,7 +2,7 @@
 
 `pnpdepth_cli.choices.BASELINES` lists the names. "local" aligns a network's depth locally. A global
 alignment reads the network's numbers as a·x + b everywhere. Here a and b are fitted around
-each pixel, to its nearest points (`completion.local_lines`).
+each pixel, to its nearest points (`completion.propagation`).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from pnpdepth_cli.completion.interpolation import (
     morphological,
     nearest,
 )
-from pnpdepth_cli.completion.local_lines import local_lines
 from pnpdepth_cli.completion.outliers import inlier_weights
+from pnpdepth_cli.completion.propagation import local_lines
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 

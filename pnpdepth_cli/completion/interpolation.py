@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -57,14 +56,14 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
     points = distinct(points)
     pixels = _queries(points, xy)
     dense = torch.full((len(pixels),), torch.nan, dtype=torch.float64)
-    triangles = _triangles(points.xy.double().cpu().numpy())
+    triangles = _triangles(_bytes_of(points))
     if triangles is not None:
-        value = to_space(points.depth.double().cpu(), space)
+        value = to_space(points.depth.cpu().double(), space)
         within = LinearNDInterpolator(triangles, value.numpy())
         dense = from_space(torch.from_numpy(within(pixels.numpy())), space)
     outside = dense.isnan()
     _, number = nearest_points(points, pixels[outside], 1)
-    dense[outside] = points.depth.double().cpu()[number[:, 0]]
+    dense[outside] = points.depth.cpu().double()[number[:, 0]]
     return _reshape(dense, points, xy)
 
 
@@ -73,7 +72,7 @@ def in_hull(points: SparsePoints) -> Tensor:
     pixels = pixels_of(points.size)
     inside = torch.ones(len(pixels), dtype=torch.bool)
     try:
-        planes = ConvexHull(points.xy.double().cpu().numpy()).equations
+        planes = ConvexHull(points.xy.cpu().double().numpy()).equations
     except QhullError:  # fewer than three points, or all on one line
         return torch.zeros(points.size, dtype=torch.bool, device=points.depth.device)
     for x, y, offset in planes.tolist():
@@ -88,7 +87,7 @@ def inverse_distance(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
     nearest points only.
     """
     points = distinct(points)
-    value = points.depth.double().cpu().log()
+    value = points.depth.cpu().double().log()
     pixels, means = _queries(points, xy), []
     for some in torch.split(pixels, _IDW_PIXELS):
         distance, number = nearest_points(points, some, min(_IDW_NEIGHBOURS, len(points)))
@@ -159,7 +158,7 @@ def distinct(points: SparsePoints) -> SparsePoints:
 
 def _queries(points: SparsePoints, xy: Tensor | None) -> Tensor:
     """(M, 2) float64: the coordinates, or those of every pixel of the frame."""
-    return pixels_of(points.size) if xy is None else xy.double().cpu()
+    return pixels_of(points.size) if xy is None else xy.cpu().double()
 
 
 def pixels_of(size: tuple[int, int]) -> Tensor:
@@ -177,58 +176,46 @@ def _reshape(values: Tensor, points: SparsePoints, xy: Tensor | None) -> Tensor:
 def nearest_points(points: SparsePoints, xy: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Returns distance in pixels and number, (M, count) each, of the points nearest to xy (M, 2).
 
-    The nearest point comes first.
+    The nearest point comes first. The results are shared with other calls and must not be changed.
     """
-    distance, number = _nearest(points.xy.double().cpu().numpy(), xy.numpy(), count)
+    find = _nearest if len(points) + len(xy) <= _MOST_REMEMBERED else _nearest.__wrapped__
+    distance, number = find(_bytes_of(points), xy.numpy().tobytes(), count)
     return torch.from_numpy(distance), torch.from_numpy(number)
 
 
-def remember(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Returns a decorator that remembers a function's last `maxsize` results, by its arguments.
-
-    Arguments are float64 arrays (N, 2), which the function gets read-only, and whole numbers.
-    Results are shared between calls and must not be changed. Many candidates are compared on the
-    same points, and each asks for their neighbours and triangles.
-    """
-
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.lru_cache(maxsize)
-        def call_once(*keys: bytes | int) -> Any:
-            return function(
-                *(k if isinstance(k, int) else np.frombuffer(k).reshape(-1, 2) for k in keys)
-            )
-
-        @functools.wraps(function)
-        def call(*args: Any) -> Any:
-            if sum(len(arg) for arg in args if not isinstance(arg, int)) > _MOST_REMEMBERED:
-                return function(*args)
-            return call_once(*(arg if isinstance(arg, int) else arg.tobytes() for arg in args))
-
-        return call
-
-    return decorate
+# The default method asks several times for the same neighbours and triangles, which are remembered
+# by the bytes of coordinates (N, 2) float64.
 
 
-@remember(8)
-def _nearest(points: NDArray[np.float64], xy: NDArray[np.float64], count: int) -> Any:
-    """Distances and numbers of the points (N, 2) nearest to xy (M, 2)."""
-    among = np.arange(1, count + 1)
-    many = len(xy) * count > _WORTH_THREADS
-    return _tree(points).query(xy, among, workers=-1 if many else 1)
+@functools.lru_cache(8)
+def _nearest(points: bytes, xy: bytes, count: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Distances and numbers of the points nearest to xy."""
+    many = len(xy) // 16 * count > _WORTH_THREADS
+    among, workers = np.arange(1, count + 1), -1 if many else 1
+    distance, number = _tree(points).query(_coordinates(xy), among, workers=workers)
+    return distance, number
 
 
-@remember(2)
-def _tree(points: NDArray[np.float64]) -> cKDTree:
-    return cKDTree(points)
+@functools.lru_cache(2)
+def _tree(points: bytes) -> cKDTree:
+    return cKDTree(_coordinates(points))
 
 
-@remember(2)
-def _triangles(points: NDArray[np.float64]) -> Delaunay | None:
+@functools.lru_cache(2)
+def _triangles(points: bytes) -> Delaunay | None:
     """The points' triangulation; None if there is no triangle."""
     try:
-        return Delaunay(points)
+        return Delaunay(_coordinates(points))
     except QhullError:  # fewer than three points, or all on one line
         return None
+
+
+def _bytes_of(points: SparsePoints) -> bytes:
+    return points.xy.cpu().double().numpy().tobytes()
+
+
+def _coordinates(values: bytes) -> NDArray[np.float64]:
+    return np.frombuffer(values).reshape(-1, 2)
 
 
 def _dilate(value: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -27,8 +27,8 @@ from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame, is_dense
-from pnpdepth_cli.frames.open_network import encoding_once
-from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
+from pnpdepth_cli.frames.fuse import FEW_POINTS
+from pnpdepth_cli.frames.open_network import PreparedFrame, encoding_once, prepare
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
@@ -45,9 +45,6 @@ LEAST_FRAMES = 8
 """Least number of frames of a sequence; fewer teach too little."""
 SIGNIFICANT = 0.05
 """Level of the one-sided paired t test over the frames for validation."""
-MIN_POINTS_FOR_OUTLIERS = 50
-"""Fewer points have no outliers: each may be all that is seen of an object."""
-
 _LOSS = "log"
 
 Weights = Mapping[str, Tensor]
@@ -170,7 +167,7 @@ class _Lesson:
         points = prepared.points
         if len(points) < 2:
             raise NoPointsError(f"{name}: {len(points)} points; hiding some needs 2")
-        if len(points) >= MIN_POINTS_FOR_OUTLIERS:
+        if len(points) >= FEW_POINTS:
             outlying = outliers(torch.ones(points.size), points.tensors(), None)
             points = points.select(~outlying.to(points.xy.device))
         return cls(frame=prepared, points=points)
@@ -183,7 +180,7 @@ class _Lesson:
         divided anew: halves that complement each other make steps that agree more.
         """
         network = self.frame.network
-        reader = self.frame.depth_reader(network.definition.default_alignment)
+        reader = AlignedDepth(network, self.frame.points, network.definition.default_alignment)
         halves = _halves(len(self.points), generator)
         with encoding_once(network, {}):
             yield lambda weights: self._loss(weights, next(halves), reader)

@@ -107,7 +107,7 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> tuple[Frame, Predictio
 
 def _propagate(depth: Tensor, frame: Frame, split: Split) -> Tensor:
     """Depth (H, W) with its residual at the points propagated."""
-    return propagate(depth, frame.points, frame.rgb, kind=split.propagation).depth
+    return propagate(depth, frame.points, frame.rgb, kind=split.propagation)
 
 
 def _with_shares(depth: Tensor, own: Mapping[str, Tensor], shares: Mapping[str, float]) -> Tensor:

@@ -12,7 +12,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration, evidence
 from pnpdepth_cli.completion.interpolation import linear
@@ -187,17 +186,12 @@ def refine_fixed(
     network.cut()
     own = network.refine(frame, on_iteration=on_iteration)
     kind = network.member.settings.propagate
-    depth = _propagate(own.after, frame, kind)
+    depth = propagate(own.after, frame.points, frame.rgb, kind=kind)
     split = split_frame(frame, depth, seed) if validated else None
     validation = None
     if split is not None and len(split.points):
         validation = _validation(network, split, kind)
     return make_refined(frame, own, depth, used=frame.points, validation=validation)
-
-
-def _propagate(depth: Tensor, frame: Frame, kind: str) -> Tensor:
-    """Depth (H, W) with its residual at the points propagated; "none" keeps it."""
-    return depth if kind == "none" else propagate(depth, frame.points, frame.rgb, kind=kind).depth
 
 
 def _validation(network: OpenNetwork, split: Split, kind: str) -> Validation | None:
@@ -215,6 +209,6 @@ def _validation(network: OpenNetwork, split: Split, kind: str) -> Validation | N
         predicted={
             BEFORE: points.sample(again.before),
             LINEAR: linear(kept.points, points.xy),
-            AFTER: points.sample(_propagate(again.after, kept, kind)),
+            AFTER: points.sample(propagate(again.after, kept.points, kept.rgb, kind=kind)),
         },
     )

@@ -1,7 +1,8 @@
 """Networks that stay cut from frame to frame and compute nothing twice for one image.
 
 For one image and several sets of points, the front of a network that takes the image alone runs
-once, and so does the image encoder that a definition names.
+once, and so does the image encoder that a definition names. `prepare` makes a frame the network's
+input; `Member` is a network as the method uses it.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import OnIteration, Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
-from pnpdepth_cli.errors import DivergedError
+from pnpdepth_cli.errors import DivergedError, NoPointsError
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.prepare import PreparedFrame, prepare
 from pnpdepth_cli.frames.refined import Prediction
 from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
 
@@ -56,6 +58,34 @@ class Member:
     def weighs_points(self) -> bool:
         """Whether it finds out itself which points are wrong."""
         return self.network.definition.weighs_points
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedFrame:
+    """A frame as the network takes it."""
+
+    network: Network
+    map: FrameMap  # from pixels of the image to those of the network
+    image: Tensor | None  # None if the network takes none
+    arguments: tuple[Tensor, ...]
+    points: SparsePoints
+    """The points that the network sees, in its pixels and on its device, without outliers."""
+    prior: Tensor | None = None
+    """(1, 1, h, w) metres, 0 = unknown: the dense prior in the network's pixels. None without."""
+    intrinsics: Tensor | None = None
+    """(1, 3, 3): the camera matrix in the network's pixels. None where it is unknown."""
+
+    def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
+        """Returns the arguments of the network for some of the points; the image is the same."""
+        return self.network.arguments_of(self.image, points, self.prior, self.intrinsics)
+
+    def to_image(self, depth: Tensor) -> Tensor:
+        """Returns depth (1, 1, h, w) of the network's pixels as (H, W) of the image.
+
+        0 where it is unknown.
+        """
+        image = self.map.depth_to_image(depth).cpu()
+        return torch.where(image.isfinite() & (image > 0), image, 0.0).float()
 
 
 class OpenNetwork:
@@ -116,8 +146,12 @@ class OpenNetwork:
             # The frame is made the network's input, and its output is read as metres.
             prepared = prepare(network, frame)
             if not len(prepared.points):
-                raise prepared.no_points_error()
-            reader = prepared.depth_reader(settings.align)
+                raise NoPointsError(
+                    f"none of the {len(frame.points)} sparse points lies inside the part of the"
+                    f" image that network {self.member.name!r} sees (rows and columns"
+                    f" {prepared.map.crop})"
+                )
+            reader = AlignedDepth(network, prepared.points, settings.align)
             try:
                 # Without updates one pass of the whole network is enough.
                 if not (updates and settings.iterations):
@@ -179,6 +213,35 @@ class OpenNetwork:
         loss_of = checked_loss(self.member.settings.loss)
         loss = loss_of(at_points[known], prepared.points.depth[known])
         return Refinement(before=depth, after=depth, losses=(float(loss),), step=0.0)
+
+
+def prepare(network: Network, frame: Frame) -> PreparedFrame:
+    """Returns the frame as the network takes it; `points` may be empty.
+
+    Raises:
+        UsageError: The network needs an image or intrinsics, and the frame has none.
+        ModelError: The definition does not make arguments of it.
+    """
+    to_network = FrameMap.fit(network.definition.size, *frame.size)
+    points = to_network.points_to_network(frame.points)
+    given = points
+    if frame.outliers is not None and network.definition.weighs_points:
+        given = points.joined(to_network.points_to_network(frame.outliers))
+    image = network.image_of(to_network, None if frame.rgb is None else frame.rgb[None])
+    prior = None
+    if frame.prior is not None and network.definition.takes_prior:
+        prior = to_network.prior_to_network(frame.prior[None, None]).to(network.device)
+    camera = frame.camera
+    intrinsics = None if camera is None else to_network.intrinsics_to_network(camera)
+    return PreparedFrame(
+        network=network,
+        map=to_network,
+        image=image,
+        arguments=network.arguments_of(image, given, prior, intrinsics),
+        points=points.tensors(network.device),
+        prior=prior,
+        intrinsics=intrinsics,
+    )
 
 
 @contextmanager

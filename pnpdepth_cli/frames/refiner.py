@@ -1,4 +1,4 @@
-"""The class of the Python API: frames of arrays, refined with networks that stay open."""
+"""The door of the Python API: arrays of a user as frames, refined with networks that stay open."""
 
 from __future__ import annotations
 
@@ -6,19 +6,40 @@ import threading
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any, Literal
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from pnpdepth_cli.errors import DivergedError, UsageError
+from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
-from pnpdepth_cli.frames.frame import Frame, Registration, registration_to_make
-from pnpdepth_cli.frames.from_arrays import Unit, frame_of_arrays
+from pnpdepth_cli.frames.frame import (
+    Frame,
+    Register,
+    Registration,
+    registration_to_make,
+    tensor_of,
+)
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import resolve_definition
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
+
+FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
+"""Value of white by the type of an image's integers."""
+
+Unit = Literal["m", "mm"]
+UNITS = {"m": 1.0, "mm": 1000.0}
+"""How many of each unit of depth make a metre."""
+
+FARTHEST_MEDIAN_M = 200.0
+"""No frame has half of its depths farther than this; a larger median is in another unit."""
+
+_CHANNELS = (1, 3, 4)  # grey, RGB, RGBA
+_OVERSHOOT = 2.0
+"""An image in 0..1 that was resized may exceed 1, but not this; one in 0..255 does."""
 
 Pair = tuple[ArrayLike | None, ArrayLike | SparsePoints]
 """An image and its sparse depth; see `Refiner.refine`."""
@@ -157,3 +178,137 @@ class Refiner:
                 own = ""
                 self._stack.enter_context(weights_in_place(network, learnt.weights))
         return replace(network, notes=(*network.notes, f"adapt: {own}{why}"))
+
+
+def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[np.float32]:
+    """Returns depth as float32 metres; not finite or <= 0 is unknown.
+
+    Args:
+        depth: Depth in an array of any shape.
+        what: Name of the depth in messages.
+        unit: Unit of the depth; needed for integers, and for depth that is too large for metres.
+
+    Raises:
+        InputError: The unit is needed.
+        UsageError: There is no such unit.
+    """
+    values = _numbers(depth, what)
+    if unit is not None:
+        if unit not in UNITS:
+            raise UsageError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
+        return (values / UNITS[unit]).astype(np.float32)
+    known = values[np.isfinite(values) & (values > 0)]
+    if values.dtype.kind in "iu":
+        fact = f"of {values.dtype}"
+    elif known.size and np.median(known) > FARTHEST_MEDIAN_M:
+        fact = f"{np.median(known):,.0f} in the median, which is too far for metres"
+    else:
+        return values.astype(np.float32)
+    raise InputError(f'{what} is {fact}; give its unit, such as unit="mm" or unit="m"')
+
+
+def _numbers(values: ArrayLike, what: str) -> NDArray[Any]:
+    """An array of real numbers. Raises InputError if the values are none."""
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError, RuntimeError) as error:  # ragged rows, a tensor on a GPU
+        raise InputError(f"{what} cannot be made an array: {error}") from None
+    if array.dtype.kind not in "buif":
+        raise InputError(f"{what} must be an array of numbers, not {type(values).__name__}")
+    return array
+
+
+def frame_of_arrays(
+    image: ArrayLike | None,
+    sparse: ArrayLike | SparsePoints,
+    register: Register = None,
+    unit: Unit | None = None,
+) -> Frame:
+    """Returns the frame of an image and its sparse depth; see `Refiner.refine`.
+
+    Raises:
+        InputError: Image or points cannot be used.
+    """
+    rgb = None if image is None else _rgb(image)
+    size = None if rgb is None else (rgb.shape[0], rgb.shape[1])
+    points, unknown = _points(sparse, size, unit)
+    points = points.resized(*size) if size else points
+    inside = points.cropped(0, 0, *points.size)
+    if not len(inside):
+        raise NoPointsError(f"none of the {len(points)} sparse points lies in the image")
+    lost = {"outside the image": len(points) - len(inside), "without a depth above 0": unknown}
+    return Frame(
+        rgb=None if rgb is None else tensor_of(rgb),
+        points=inside,
+        register=register,
+        one_view=register is None,
+        notes=tuple(f"sparse: {n:,} points {why} are not used" for why, n in lost.items() if n),
+    )
+
+
+def _rgb(image: ArrayLike) -> NDArray[np.float32]:
+    values = _numbers(image, "an image")
+    shape = values.shape
+    if values.ndim == 4 and shape[0] == 1:
+        values = values[0]
+    if values.ndim == 2:
+        values = values[:, :, None]
+    if values.ndim == 3 and values.shape[2] not in _CHANNELS and values.shape[0] in _CHANNELS:
+        values = values.transpose(1, 2, 0)
+    if values.ndim != 3 or values.shape[2] not in _CHANNELS or not values.size:
+        raise InputError(
+            "an image has shape (H, W), (H, W, C) or (C, H, W) with 1, 3 or 4 channels, not"
+            f" {shape}"
+        )
+    values = values[:, :, :3].repeat(3 if values.shape[2] == 1 else 1, axis=2)
+    if values.dtype in FULL_SCALE and (values.dtype == np.uint8 or values.max() > 255):
+        return (values / FULL_SCALE[values.dtype]).astype(np.float32)
+    if values.min() >= 0 and _OVERSHOOT < values.max() <= 255:
+        return (values / 255).astype(np.float32)
+    if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
+        raise InputError(
+            f"an image is uint8, uint16, or in 0..1 or 0..255; this one is {values.dtype} in"
+            f" {values.min()}..{values.max()}"
+        )
+    return values.astype(np.float32)
+
+
+def _points(
+    sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None, unit: Unit | None
+) -> tuple[SparsePoints, int]:
+    """The points, and how many rows have no depth.
+
+    Points of a map have the map's size, rows of x, y and depth the image's.
+    """
+    unknown = 0
+    if isinstance(sparse, SparsePoints):
+        return sparse.tensors(), unknown
+    # Axes of length 1, such as a batch's, go.
+    values = _numbers(sparse, "sparse depth")
+    shape = values.shape
+    if values.ndim in (3, 4):
+        values = values.reshape([side for side in shape if side != 1])
+    if values.ndim != 2:
+        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {shape}")
+    # Three columns are rows of x, y and depth, unless the image is as narrow as that.
+    if values.shape[1] == 3 and values.shape != size:
+        if size is None:
+            raise SizeError("rows of x, y and depth need an image for the size of the frame")
+        column = in_metres(values[:, 2], "the sparse depth", unit)
+        known = np.isfinite(values).all(axis=1) & (column > 0)
+        xy, depth = values[known, :2].astype(np.float32), column[known]
+        unknown = int(np.count_nonzero(~known))
+    else:
+        # Anything else is a depth map, of which the known pixels are points.
+        if size is not None and values.shape != size:
+            raise SizeError(f"the sparse depth map is {values.shape} but the image is {size}")
+        size, values = (
+            (values.shape[0], values.shape[1]),
+            in_metres(values, "the sparse depth", unit),
+        )
+        rows, columns = np.nonzero(np.isfinite(values) & (values > 0))
+        xy = np.stack([columns, rows], axis=1).astype(np.float32)
+        depth = values[rows, columns]
+    if not len(depth):
+        raise NoPointsError("the sparse depth has no value above 0")
+    return SparsePoints(xy=xy, depth=depth, size=size).tensors(), unknown

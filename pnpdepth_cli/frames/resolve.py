@@ -12,8 +12,7 @@ from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error
 from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.open_network import Member
-from pnpdepth_cli.frames.prepare import prepare
+from pnpdepth_cli.frames.open_network import Member, prepare
 from pnpdepth_cli.models.cut_layers import default_layer
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,

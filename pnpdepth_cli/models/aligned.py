@@ -65,7 +65,7 @@ class AlignedDepth:
 
     def _unknown_notes(self, raw: Tensor, seen: Tensor) -> tuple[str, ...]:
         """Where the network says nothing, such as of the sky, and how many points lie there."""
-        unknown, lost = float(raw.isnan().double().mean()), int((~seen).sum())
+        unknown, lost = float(raw.isnan().cpu().double().mean()), int((~seen).sum())
         if not unknown:
             return ()
         note = (
@@ -104,7 +104,7 @@ class AlignedDepth:
 
     def _misfit_of_median(self) -> float:
         """What `Alignment.misfit` is for the median depth of the points everywhere."""
-        log_depth = self._points.depth.double().log()
+        log_depth = self._points.depth.cpu().double().log()
         return float((log_depth - log_depth.median()).abs().clamp(max=1.0).mean())
 
     def _plain_notes(self, at_points: Tensor) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.from_arrays import frame_of_arrays
+from pnpdepth_cli.frames.refiner import frame_of_arrays
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.samplers import SamplePattern
 

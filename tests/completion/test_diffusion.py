@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.diffusion import EDGE_DEPTH, STIFFNESS, diffuse
+from pnpdepth_cli.completion.propagation import EDGE_DEPTH, STIFFNESS, diffuse
 from pnpdepth_cli.completion.residual_field import ResidualField, features_of
 from pnpdepth_cli.points import SparsePoints
 

@@ -7,8 +7,8 @@ import torch
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import BEYOND, align_prediction, from_space, to_space
 from pnpdepth_cli.completion.baselines import align_locally
-from pnpdepth_cli.completion.local_lines import RIDGE
 from pnpdepth_cli.completion.outliers import inlier_weights
+from pnpdepth_cli.completion.propagation import RIDGE
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene_depth
 

@@ -30,7 +30,7 @@ def test_a_prediction_that_drifts_is_put_right_with_and_without_an_image(
     if flat == "prediction":
         prediction, rgb = torch.full(SIZE, 2.0), torch.full((3, *SIZE), 0.5)
     points = random_points(gt, max(count, 100) if flat == "prediction" else count)
-    depth = propagate(prediction, points, None if flat == "image" else rgb, kind=kind).depth
+    depth = propagate(prediction, points, None if flat == "image" else rgb, kind=kind)
     assert depth.dtype == torch.float32
     assert bool((depth > 0).all())
     assert mean_log_error(depth, gt) < 0.5 * mean_log_error(prediction, gt)
@@ -43,12 +43,12 @@ def test_one_point_moves_all_by_its_factor_and_nothing_left_leaves_the_predictio
     kind: str,
 ) -> None:
     gt, rgb, prediction = scene()
-    exact = propagate(gt, random_points(gt, 50), rgb, kind=kind).depth
+    exact = propagate(gt, random_points(gt, 50), rgb, kind=kind)
     assert torch.allclose(exact, gt, rtol=1e-6)
-    moved = propagate(gt / 1.5, random_points(gt, 1), rgb, kind=kind).depth
+    moved = propagate(gt / 1.5, random_points(gt, 1), rgb, kind=kind)
     assert torch.allclose(moved, gt / 1.5 if kind == "none" else gt, rtol=0.01)
     if kind == "none":
-        same = propagate(prediction, random_points(gt, 9), rgb, kind=kind).depth
+        same = propagate(prediction, random_points(gt, 9), rgb, kind=kind)
         assert torch.equal(same, prediction)
 
 
@@ -58,7 +58,7 @@ def test_few_points_bring_no_depth_beyond_what_they_say(kind: str, count: int) -
     gt, rgb, prediction = scene()
     points = random_points(gt, count)
     propagated = propagate(prediction, points, rgb, kind=kind)
-    factor, ratio = propagated.depth / prediction, points.depth / points.sample(prediction)
+    factor, ratio = propagated / prediction, points.depth / points.sample(prediction)
     assert float(factor.min()) >= float(ratio.min()) * (1 - 1e-5)
     assert float(factor.max()) <= float(ratio.max()) * (1 + 1e-5)
 
@@ -69,23 +69,23 @@ def test_outliers_do_not_propagate(kind: str, count: int) -> None:
     gt, rgb, prediction = scene()
     points = random_points(gt, count)
     clean, disturbed = (
-        mean_log_error(propagate(prediction, p, rgb, kind=kind).depth, gt)
+        mean_log_error(propagate(prediction, p, rgb, kind=kind), gt)
         for p in (points, spoiled(points))
     )
     assert disturbed < 1.5 * clean + 0.01
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_an_unknown_prediction_stays_unknown_and_its_points_have_no_effect(kind: str) -> None:
     gt, rgb, prediction = scene()
     points = random_points(gt, 40)
     unknown = prediction.clone()
     unknown[:, :20] = 0
     unknown[0, 30], unknown[0, 31] = torch.inf, torch.nan
-    depth = propagate(unknown, points, rgb, kind=kind).depth
+    depth = propagate(unknown, points, rgb, kind=kind)
     known = unknown.isfinite() & (unknown > 0)
     assert torch.equal(depth != 0, known)
-    as_it_is = propagate(unknown, points, rgb, kind="none").depth
+    as_it_is = propagate(unknown, points, rgb, kind="none")
     assert torch.equal(as_it_is, torch.where(known, unknown, 0))
     beside, inside = torch.tensor([[[19.5, 9.0], [20.0, 9.0]], [[20.5, 9.0], [63.0, 9.0]]])
     assert not bool((propagate_at(unknown, points, rgb, beside, kind=kind) > 0)[0])
@@ -93,7 +93,7 @@ def test_an_unknown_prediction_stays_unknown_and_its_points_have_no_effect(kind:
     lying = SparsePoints(
         xy=points.xy, depth=torch.where(points.xy[:, 0] < 20, 99.0, points.depth), size=SIZE
     )
-    assert torch.equal(propagate(unknown, lying, rgb, kind=kind).depth, depth)
+    assert torch.equal(propagate(unknown, lying, rgb, kind=kind), depth)
 
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
@@ -103,16 +103,16 @@ def test_points_outside_the_frame_and_farther_ones_at_one_pixel_have_no_effect(k
     xy = torch.cat([points.xy, torch.tensor([[-9.0, 5.0], [70.0, 5.0]]), points.xy[:3]])
     depth = torch.cat([points.depth, torch.tensor([30.0, 0.1]), 2 * points.depth[:3]])
     more = SparsePoints(xy=xy, depth=depth, size=SIZE)
-    result, again = (propagate(prediction, p, rgb, kind=kind).depth for p in (points, more))
+    result, again = (propagate(prediction, p, rgb, kind=kind) for p in (points, more))
     assert torch.equal(result, again)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_depth_at_positions_equals_the_dense_depth(kind: str) -> None:
     gt, rgb, prediction = scene()
     points = random_points(gt, 40)
     positions = torch.tensor([[3.0, 4.0], [63.0, 47.0], [20.0, 30.0]])
     queries = SparsePoints(xy=positions, depth=torch.ones(3), size=SIZE)
-    depth = propagate(prediction, points, rgb, kind=kind).depth
+    depth = propagate(prediction, points, rgb, kind=kind)
     at_positions = propagate_at(prediction, points, rgb, positions, kind=kind)
     assert torch.allclose(at_positions, queries.sample(depth), rtol=1e-4)

@@ -497,6 +497,34 @@ class Native(nn.Module):
         return self.head(self.after(self.native(self.cut(self.enter(x))))).abs() + 1
 
 
+class Catches(nn.Module):
+    """A part that takes another way after any exception, in a part that does so too."""
+
+    class Inner(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.cut, self.other = conv(4, 4), conv(4, 4, 1)
+
+        def forward(self, x: Tensor) -> Tensor:
+            try:
+                return self.cut(x).relu()
+            except Exception:
+                return self.other(x)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.enter, self.inner, self.plain = conv(3, 4), self.Inner(), nn.Sequential(conv(4, 4))
+        self.head = conv(4, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.enter(x)
+        try:
+            x = self.inner(x)
+        except Exception:
+            x = -x
+        return self.head(self.plain(x) + x).abs() + 1
+
+
 class UNetTail(nn.Module):
     def __init__(self) -> None:
         super().__init__()
@@ -530,6 +558,7 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "checkpointed": Checkpointed,
     "half inference": HalfInference,
     "native": Native,
+    "catches": Catches,
     "wrapped": wrapped_network,
 }
 

@@ -16,7 +16,7 @@ from scipy.stats import ttest_rel
 import pnpdepth_cli as pnp
 from pnpdepth_cli.frames import adapt
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.prepare import prepare
+from pnpdepth_cli.frames.open_network import prepare
 from tests.frames.scenes import frame_in_memory
 
 SETTINGS = pnp.Settings(iterations=0)

@@ -112,7 +112,7 @@ def test_a_network_alone_is_aligned_updated_and_propagated() -> None:
     result = refined(frame, member(Brightness, settings=UPDATES))
     assert list(result.stages) == ["before", "updated", "propagated"]
     updated = torch.from_numpy(result.stages["updated"])
-    expected = propagate(updated, frame.points, frame.rgb, kind="gp").depth
+    expected = propagate(updated, frame.points, frame.rgb, kind="gp")
     assert np.allclose(result.after, expected.numpy(), rtol=1e-5)
     assert np.array_equal(result.after, result.stages["propagated"])
     assert np.array_equal(result.before, result.stages["before"])
@@ -125,7 +125,7 @@ def test_the_residual_of_scan_lines_is_propagated_by_lines_through_the_nearest_p
     frame = with_gt(scan_frame())
     result = refined(frame, member(Brightness, settings=UPDATES))
     updated = torch.from_numpy(result.stages["updated"])
-    expected = propagate(updated, result.used, frame.rgb, kind="local").depth
+    expected = propagate(updated, result.used, frame.rgb, kind="local")
     assert np.allclose(result.after, expected.numpy(), rtol=1e-5)
 
 
@@ -144,7 +144,7 @@ def test_the_dense_depth_is_fused_by_the_weights_that_the_result_names() -> None
             linear(frame.points),
         ]
     fused = weighted_mean(list(zip(depths, result.weights.values(), strict=True)))
-    expected = propagate(fused, frame.points, frame.rgb, kind="gp").depth
+    expected = propagate(fused, frame.points, frame.rgb, kind="gp")
     assert np.allclose(result.after, expected.numpy(), rtol=1e-4)
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.prepare import prepare
+from pnpdepth_cli.frames.open_network import prepare
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints

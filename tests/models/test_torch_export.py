@@ -21,7 +21,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError, UsageError
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.prepare import prepare
+from pnpdepth_cli.frames.open_network import prepare
 from pnpdepth_cli.models.definition import Fixed, Multiple
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.registry import find_definition

@@ -26,10 +26,11 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
 from pnpdepth_cli.core.split.recorder import Recorder
-from pnpdepth_cli.core.split.replay import CutReached, Interception, Replay
+from pnpdepth_cli.core.split.replay import Interception, Replay
 from pnpdepth_cli.core.split.tensors import NetworkState
 from pnpdepth_cli.core.split.watch import Watch
 from pnpdepth_cli.core.user_code import wrap_user_errors
+from pnpdepth_cli.errors import PnpDepthError
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -122,12 +123,9 @@ class Split:
 
     def _replay_front(self, replay: Replay, arguments: Sequence[Any]) -> None:
         replay.next_frame(arguments)
-        try:
-            self._run(replay)
-        except CutReached:
-            return
-        ran = {call.module for call in replay.recording.calls}
-        raise self._cut.never_ran(ran, replay.calls[self._cut.module])
+        if not self._run_front(replay):
+            ran = {call.module for call in replay.recording.calls}
+            raise self._cut.never_ran(ran, replay.calls[self._cut.module])
 
     def _record_front(self, arguments: Sequence[Any]) -> Replay:
         assert self._interception is not None
@@ -139,14 +137,21 @@ class Split:
             )
             recorder = Recorder(self._cut, watch, replay, self._uncacheable)
             uncacheable = len(self._uncacheable)
-            try:
-                self._run(replay, recorder)
-            except CutReached:
-                if len(self._uncacheable) > uncacheable:
-                    continue  # once more, to cache what lies inside those
-                recorder.finish_front(promised_static=self._promised_static)
-                return replay
-            raise self._cut.never_ran(recorder.ran, replay.calls[self._cut.module])
+            if not self._run_front(replay, recorder):
+                raise self._cut.never_ran(recorder.ran, replay.calls[self._cut.module])
+            if len(self._uncacheable) > uncacheable:
+                continue  # once more, to cache what lies inside those
+            recorder.finish_front(promised_static=self._promised_static)
+            return replay
+
+    def _run_front(self, replay: Replay, recorder: Recorder | None = None) -> bool:
+        """Runs the network up to the cut, and returns whether it came there."""
+        try:
+            self._run(replay, recorder)
+        except PnpDepthError:
+            if not replay.has_front:
+                raise
+        return replay.has_front
 
     def _record_rear(self, replay: Replay) -> Any:
         assert self._interception is not None

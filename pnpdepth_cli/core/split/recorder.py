@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
-from pnpdepth_cli.core.split.replay import CutReached, RecordedCall, Recording, Replay, shapes_of
+from pnpdepth_cli.core.split.replay import RecordedCall, Recording, Replay, shapes_of
 from pnpdepth_cli.core.split.tensors import SavedTensors, tensors_in
 from pnpdepth_cli.core.split.watch import Watch
 
@@ -72,6 +72,8 @@ class Recorder:
             output = run()
         finally:
             tried, self._inside_one = self._inside_one, outer
+        if self._replay.has_front:  # the network has caught the end of the front
+            return output
         if (
             self.watch.can_stand_for(since, inputs, output)
             and module not in self._cut.around_hooks
@@ -88,7 +90,7 @@ class Recorder:
             path, z0 = self._cut.choose(output)
             self._replay.z0 = z0
             self._replay.recording = Recording(cut=index, path=path)
-            raise CutReached
+            raise self._replay.end_of_front()
         return output
 
     def finish_front(self, *, promised_static: bool) -> None:

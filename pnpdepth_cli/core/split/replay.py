@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
 from pnpdepth_cli.core.split.tensors import SavedTensors, map_tensors, tensors_in
+from pnpdepth_cli.errors import PnpDepthError
 
 if TYPE_CHECKING:
     from pnpdepth_cli.core.split.recorder import Recorder
@@ -133,8 +134,8 @@ def shapes_of(arguments: Sequence[Any]) -> Any:
     return tensors, repr(map_tensors(tuple(arguments), lambda _, t: t.new_empty(0)))
 
 
-class CutReached(BaseException):
-    """Ends the front's pass at the cut; no Exception, so that networks do not catch it."""
+class CutReached(PnpDepthError):
+    """Ends the front's pass at the cut. A network that catches it gets it at the next submodule."""
 
 
 class Replay:
@@ -165,10 +166,21 @@ class Replay:
         self.arguments = SavedTensors(_copies(arguments), self.arguments.copied)
         self.outputs, self.z0, self.z = [None] * len(self.recording.calls), None, None
 
+    @property
+    def has_front(self) -> bool:
+        """Whether the front of the frame at hand has run, and no rear yet."""
+        return self.z0 is not None and self.z is None
+
+    def end_of_front(self) -> CutReached:
+        """Returns the exception that ends the front's pass."""
+        return CutReached(f"layer {self._cut.layer!r} was reached, where the network is cut")
+
     def handle(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
         """Returns the output of a call in a pass: saved, with z in it, or of the submodule."""
         if self._fills:
             return run()
+        if self.has_front:
+            raise self.end_of_front()
         if self.recorder is not None:
             run = functools.partial(self.recorder.run, module, inputs, run)
         index = self.recording.index(module, self.calls[module])
@@ -181,7 +193,7 @@ class Replay:
         output = self._saved_output(index, run)
         if is_cut:
             self.z0 = dict(tensors_in(output))[self.recording.path].detach()
-            raise CutReached
+            raise self.end_of_front()
         return output
 
     def handle_outside(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:

@@ -36,6 +36,7 @@ NO_CUT = {
     "vit": {"encoder.blocks", *(f"encoder.blocks.{i}.attention.out_proj" for i in range(3))},
     "in place": {"flat"},
     "side effects": {"hide"},
+    "catches": {"inner.other"},
     "direct": {"enter.parametrizations", "spectral.parametrizations"},
     "scripted": {"enter.0", "enter.1"},
 }
