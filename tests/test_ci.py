@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -39,32 +36,11 @@ def steps() -> list[str]:
     return commands
 
 
-def pytest_commands() -> list[list[str]]:
-    """The arguments of each call of pytest in .ci/run and of the README command for the tests."""
-    text = SCRIPT + (ROOT / "README.md").read_text(encoding="utf-8")
-    return [
-        shlex.split(call) for call in re.findall(r"/pytest ([^|\n]*?)(?: 2>&1.*)?$", text, re.M)
-    ]
-
-
 def test_the_workflow_runs_every_part_of_the_script_and_nothing_else() -> None:
     words = [command.split() for command in steps()]
     assert {command[0] for command in words} == {".ci/run"}
     assert {part for command in words for part in command[1:]} == parts()
-
-
-def test_every_part_is_a_function_of_the_script() -> None:
     assert set(re.findall(r"^part_(\w+)\(\)", SCRIPT, re.MULTILINE)) == parts()
-
-
-def test_the_script_refuses_an_unknown_part() -> None:
-    if not shutil.which("bash"):
-        pytest.skip("needs bash")
-    done = subprocess.run(
-        ["bash", str(ROOT / ".ci" / "run"), "test"], capture_output=True, text=True
-    )
-    assert done.returncode == 2
-    assert parts() <= set(done.stdout.split())
 
 
 def test_the_workflow_takes_the_oldest_and_the_newest_python_of_the_classifiers() -> None:
@@ -85,14 +61,3 @@ def test_the_extras_that_the_script_installs_exist_and_bring_the_programs_that_i
     called = set(re.findall(r"^ *\$bin/(\w+)", SCRIPT, re.MULTILINE)) - {"pip", "python", "pytest"}
     programs = {re.split(r"[>=\[-]", need)[0] for name in ("dev", "docs") for need in extras[name]}
     assert called <= programs
-
-
-def test_the_marks_and_options_that_pytest_is_given_exist(pytestconfig: pytest.Config) -> None:
-    marks = {line.split(":")[0] for line in pytestconfig.getini("markers")}
-    assert len(pytest_commands()) >= 4
-    for arguments in pytest_commands():
-        for option, value in zip(arguments, [*arguments[1:], ""], strict=True):
-            if option == "-m":
-                assert value in marks
-            elif option.startswith("--"):
-                pytestconfig.getoption(option)  # raises if there is none

@@ -90,11 +90,13 @@ def test_the_line_of_the_documentation_completes_commands_and_options_in_bash() 
     assert done.stdout.split() == ["cloud", "--uncertainty"]
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, built from a copy of the sources."""
+@pytest.mark.slow
+def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(tmp_path: Path) -> None:
+    # The wheel, built from a copy of the sources.
     pytest.importorskip("build", reason="needs build")
-    source = tmp_path_factory.mktemp("wheel")
+    source, installed, empty = (tmp_path / name for name in ("source", "installed", "empty"))
+    source.mkdir()
+    empty.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     for name in ("pnpdepth_cli", "model_zoo_defs"):
@@ -102,41 +104,33 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", "dist"]
     done = subprocess.run(build, cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    (built,) = (source / "dist").glob("*.whl")
-    return built
-
-
-@pytest.mark.slow
-def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(
-    wheel: Path, tmp_path: Path
-) -> None:
+    (wheel,) = (source / "dist").glob("*.whl")
     assert wheel.stat().st_size < 12e6
     names = zipfile.ZipFile(wheel).namelist()
     assert "model_zoo_defs/weights/compact.safetensors" in names
     assert not [name for name in names if "training" in name or name.startswith("tests")]
-    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
-    empty = tmp_path / "empty"
-    empty.mkdir()
+    zipfile.ZipFile(wheel).extractall(installed)
+
+    # It refines by its own files, and says which weights it has not.
     sample = ROOT / "samples" / "indoor"
-    files = [str(sample / "rgb.png"), "--sparse", str(sample / "sparse.png")]
     code = (
         "import pnpdepth_cli; print(pnpdepth_cli.__file__)\n"
         "from pnpdepth_cli.cli.main import main; main()"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, "refine", *files, "-o", "out"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path / "installed")},
-        cwd=empty, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    command = [sys.executable, "-c", code, "refine", str(sample / "rgb.png"), "--sparse"]
+    command += [str(sample / "sparse.png"), "-o"]
+    environment = {**os.environ, "PYTHONPATH": str(installed)}
+
+    def refine(*more: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [*command, *more], env=environment, cwd=empty, capture_output=True, text=True,
+            check=False,
+        )  # fmt: skip
+
+    done = refine("out")
     assert done.returncode == 0, done.stderr
-    assert Path(done.stdout.splitlines()[0]).is_relative_to(tmp_path / "installed")
-    depth, truth = (
-        read_depth(path).values for path in (empty / "out/rgb_depth.png", sample / "gt.png")
-    )
-    assert pnp.score(depth, truth).mae < 0.2
-    done = subprocess.run(
-        [sys.executable, "-c", code, "refine", *files, "-o", "other", "--model", "eigen-tiny"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path / "installed")},
-        cwd=empty, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    assert Path(done.stdout.splitlines()[0]).is_relative_to(installed)
+    files = (empty / "out/rgb_depth.png", sample / "gt.png")
+    assert pnp.score(*(read_depth(path).values for path in files)).mae < 0.2
+    done = refine("other", "--model", "eigen-tiny")
     assert (done.returncode, "eigen-tiny.safetensors" in done.stderr) == (4, True)

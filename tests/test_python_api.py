@@ -120,75 +120,57 @@ def test_integers_are_scaled_images_by_their_type_and_depth_by_its_unit(
 
 
 @pytest.mark.parametrize(
-    ("depth", "fact"),
+    "depth",
     [
-        (np.full((4, 4), 3, np.uint16), "the sparse depth is of uint16; give its unit"),
-        (np.array([[1, 2, 3], [0, 1, 2]]), "the sparse depth is of int64; give its unit"),
-        (np.full((4, 4), 3471.0), "3,471 in the median, which is too far for metres; give"),
+        np.full((4, 4), 3, np.uint16),
+        np.array([[1, 2, 3], [0, 1, 2]]),
+        np.full((4, 4), 3471.0),  # too far for metres in the median
     ],
 )
 def test_depth_that_may_be_in_another_unit_needs_one(
-    depth: NDArray[Any], fact: str, network: pnp.Network
+    depth: NDArray[Any], network: pnp.Network
 ) -> None:
-    image = np.zeros((4, 4, 3))
-    with pytest.raises(pnp.InputError, match=fact) as caught:
-        pnp.refine(network, image, depth)
-    assert "\n" not in str(caught.value)
+    with pytest.raises(pnp.InputError, match="the sparse depth"):
+        pnp.refine(network, np.zeros((4, 4, 3)), depth)
     with pytest.raises(pnp.UsageError, match="unit must be one of m, mm, got 'cm'"):
-        pnp.refine(network, image, depth, unit="cm")  # type: ignore[arg-type]
-    if depth.shape == (4, 4):
-        with pytest.raises(pnp.InputError, match="the ground truth is"):
-            pnp.score(np.ones((4, 4)), depth)
+        pnp.refine(network, np.zeros((4, 4, 3)), depth, unit="cm")  # type: ignore[arg-type]
+    with pytest.raises(pnp.InputError, match="the ground truth"):
+        pnp.score(np.ones(depth.shape), depth)
 
 
 @pytest.mark.parametrize(
     ("image", "sparse", "error", "message"),
     [
-        (np.zeros((6, 6, 2)), np.ones((6, 6)), pnp.InputError, r"\(C, H, W\) with 1, 3 or 4"),
-        (np.full((4, 4, 3), 1.5), np.ones((4, 4)), pnp.InputError, "0..1 or 0..255; this one is"),
-        ("photo.png", np.ones((4, 4)), pnp.InputError, "array of numbers, not str"),
-        (np.zeros((4, 4, 3)), [[1, 2], [3]], pnp.InputError, "cannot be made an array"),
-        (np.zeros((4, 4, 3)), np.ones((5, 4)), pnp.SizeError, "but the image is"),
-        (np.zeros((4, 4, 3)), np.zeros((4, 4)), pnp.NoPointsError, "no value above 0"),
-        (np.zeros((4, 4, 3)), np.array([[9.0, 9, 1]]), pnp.NoPointsError, "lies in the image"),
-        (None, np.ones((5, 3)), pnp.SizeError, "need an image"),
+        (np.zeros((6, 6, 2)), np.ones((6, 6)), pnp.InputError, "image"),
+        (np.full((4, 4, 3), 1.5), np.ones((4, 4)), pnp.InputError, "image"),
+        ("photo.png", np.ones((4, 4)), pnp.InputError, "image"),
+        (np.zeros((4, 4, 3)), [[1, 2], [3]], pnp.InputError, "sparse"),
+        (np.zeros((4, 4, 3)), np.ones((5, 4)), pnp.SizeError, "image"),
+        (np.zeros((4, 4, 3)), np.zeros((4, 4)), pnp.NoPointsError, "sparse"),
+        (np.zeros((4, 4, 3)), np.array([[9.0, 9, 1]]), pnp.NoPointsError, "image"),
+        (None, np.ones((5, 3)), pnp.SizeError, "image"),
     ],
 )
 def test_arrays_that_cannot_be_used_are_named(
-    image: NDArray[np.float64] | None,
-    sparse: NDArray[np.float64],
-    error: type[pnp.PnpDepthError],
-    message: str,
-    network: pnp.Network,
+    image: Any, sparse: Any, error: type[pnp.PnpDepthError], message: str, network: pnp.Network
 ) -> None:
     with pytest.raises(error, match=message):
         pnp.refine(network, image, sparse)
 
 
-@pytest.mark.parametrize(
-    "form",
-    [
-        lambda rgb: np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)]),
-        lambda rgb: rgb.transpose(2, 0, 1),
-        lambda rgb: rgb.transpose(2, 0, 1)[None],
-        lambda rgb: rgb.astype(np.float32),
-        lambda rgb: torch.from_numpy(rgb),
-        lambda rgb: rgb[:, :, 0],
-    ],
-    ids=["RGBA", "CHW", "NCHW", "float 0..255", "tensor", "grey"],
-)
-def test_every_unambiguous_form_of_an_image_is_read_alike(
-    form: Callable[[NDArray[Any]], Any],
-) -> None:
+def test_every_unambiguous_form_of_an_image_is_read_alike() -> None:
     grey = np.random.default_rng(0).integers(0, 256, (6, 8, 1), np.uint8)
     grey[0, 0] = 0  # the darkest belongs to 0..255 too
     rgb = grey.repeat(3, axis=2)
-    rows = [[1.0, 2, 3]]
-    expected = frame_of_arrays(rgb, rows).rgb
-    given = frame_of_arrays(form(rgb), rows).rgb
+    with_alpha = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+    channels_first = rgb.transpose(2, 0, 1)
+    floats, tensor = rgb.astype(np.float32), torch.from_numpy(rgb)
+    expected = frame_of_arrays(rgb, [[1.0, 2, 3]]).rgb
     assert expected is not None
-    assert given is not None
-    assert torch.equal(given, expected)
+    for form in (with_alpha, channels_first, channels_first[None], floats, tensor, grey[:, :, 0]):
+        given = frame_of_arrays(form, [[1.0, 2, 3]]).rgb
+        assert given is not None
+        assert torch.equal(given, expected)
     depth = np.zeros((6, 8, 1))
     depth[2, 1] = 3
     for sparse in (depth, depth[None], depth[None, ..., 0], depth[..., 0]):
@@ -234,20 +216,17 @@ def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    "wrong",
     [
-        (lambda: pnp.load_network(3), "spec must be a name, a path or a module, not int"),  # type: ignore[arg-type]
-        (lambda: pnp.Refiner("compact"), "must be from load_network"),  # type: ignore[arg-type]
-        (lambda: pnp.Refiner([]), "must be from load_network"),
-        (lambda: pnp.Settings(iterations=-1), "iterations must be a whole number >= 0"),
-        (lambda: LOSSES["no_such.py"], "loss file no_such.py cannot be run: FileNotFoundError"),
+        lambda: pnp.load_network(3),  # type: ignore[arg-type]
+        lambda: pnp.Refiner("compact"),  # type: ignore[arg-type]
+        lambda: pnp.Refiner([]),
+        lambda: pnp.Settings(iterations=-1),
+        lambda: LOSSES["no_such.py"],
     ],
 )
-def test_wrong_arguments_are_usage_errors(wrong: Callable[[], Any], message: str) -> None:
-    with pytest.raises(pnp.UsageError, match=message):
+def test_wrong_arguments_are_usage_errors(wrong: Callable[[], Any]) -> None:
+    with pytest.raises(pnp.UsageError):
         wrong()
-
-
-def test_scores_of_different_shapes_are_refused() -> None:
     with pytest.raises(pnp.SizeError, match=r"\(2, 2\) but ground truth is \(2, 3\)"):
         pnp.score(np.ones((2, 2)), np.ones((2, 3)))

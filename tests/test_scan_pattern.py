@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pnpdepth_cli.scan_pattern import _median_gap, scan_lines, scan_pattern
+from pnpdepth_cli.scan_pattern import scan_lines, scan_pattern
 
 SIZE = (120, 300)
 
@@ -27,10 +27,8 @@ def test_spacings_are_those_to_the_next_point_in_a_row_or_beside_it() -> None:
     turned = scan_pattern(np.column_stack([y.ravel(), x.ravel()]), SIZE[::-1])
     assert (turned.along_px, turned.across_px) == (5.0, 3.0)
     assert not turned.has_scan_lines
-
-
-def test_the_last_column_of_a_row_is_not_the_first_of_the_next() -> None:
-    assert _median_gap(np.array([2, 0, 1]), np.array([0, 1, 1])) == 1
+    # the last column of a row is not beside the first of the next
+    assert scan_pattern(np.array([[2, 0], [0, 1], [1, 1]]), (2, 3)).along_px == 1
 
 
 @pytest.mark.parametrize("gap", [4, 7])
@@ -42,12 +40,9 @@ def test_each_point_has_its_own_line_from_the_top(gap: int) -> None:
     np.testing.assert_array_equal(got, line[order])
 
 
-@pytest.mark.parametrize("count", [10, 400, 9000])
-def test_random_points_have_no_scan_lines(count: int) -> None:
-    xy = np.random.default_rng(0).uniform(0, 1, (count, 2)) * [299, 119]
-    assert scan_lines(xy, SIZE) is None
-
-
-def test_a_few_lines_are_no_scan() -> None:
+def test_random_points_and_a_few_lines_are_no_scan() -> None:
+    for count in (10, 400, 9000):
+        xy = np.random.default_rng(0).uniform(0, 1, (count, 2)) * [299, 119]
+        assert scan_lines(xy, SIZE) is None
     xy, line = lines_of_points(4)
     assert scan_lines(xy[line < 8], SIZE) is None

@@ -61,7 +61,7 @@ def test_a_value_that_refinement_could_not_use_is_refused_by_its_name(
         Settings(**{field: value})
 
 
-@pytest.mark.parametrize("lr", ["x%", "", "0%", "3 %", "3%", "0.5", 0.1, 1, True])
+@pytest.mark.parametrize("lr", ["x%", "", "0%", "3 %", "3%", "0.5", 0.1, 1, np.float32(0.5)])
 def test_those_steps_are_taken_that_refinement_takes(lr: Any) -> None:
     try:
         step = step_size(lr, torch.arange(8.0))
@@ -70,8 +70,4 @@ def test_those_steps_are_taken_that_refinement_takes(lr: Any) -> None:
             Settings(lr=lr)
     else:
         assert step_size(Settings(lr=lr).lr, torch.arange(8.0)) == step
-
-
-def test_numbers_of_numpy_are_as_good_and_a_step_has_one_spelling() -> None:
-    assert Settings(lr=np.float32(0.5), iterations=np.int32(3)).iterations == 3  # type: ignore[arg-type]
-    assert Settings(lr="1e-2") == Settings(lr=0.01)
+        assert Settings(lr="1e-2") == Settings(lr=0.01)

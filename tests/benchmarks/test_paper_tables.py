@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from benchmarks.paper_figures import ROWS, PaperRow
 from benchmarks.paper_report import bars_of, markdown
-from benchmarks.paper_sets import ROOMS, FrameSet, TableFrame, rendered, scan_of, shared
+from benchmarks.paper_sets import ROOMS, FrameSet, TableFrame, rendered
 from benchmarks.paper_tables import entries_of, scores_of, table_of
 
 LENS = np.array([721.3, 721.3, 455.5, 36.4], np.float32)
@@ -34,14 +33,6 @@ def test_all_depths_are_scored_on_the_same_pixels() -> None:
     assert coverage == pytest.approx(2 / 3)
 
 
-def test_the_scan_of_a_wall_lies_on_it_in_lines() -> None:
-    wall = np.full((228, 912), 20.0, np.float32)
-    scan = scan_of(wall, LENS, seed=0)
-    known = scan > 0
-    assert 0.02 < known.mean() < 0.1
-    assert np.abs(scan[known] - 20).max() < 0.2
-
-
 def test_rendered_frames_come_from_the_cache_and_end_at_the_kinects_range(tmp_path: Path) -> None:
     depth = np.full((4, 228, 304), 3.0, np.float32)
     depth[:, :, :100] = 11.0
@@ -57,19 +48,6 @@ def test_rendered_frames_come_from_the_cache_and_end_at_the_kinects_range(tmp_pa
     assert frames[0].rgb.max() == np.float32(0.2)
     assert set(np.unique(frames[0].gt)) == {0, 3}
     assert frames[0].scan is None
-
-
-def test_the_same_number_of_points_of_a_frame_is_the_same_points() -> None:
-    depth = np.full((48, 64), 3.0, np.float32)
-    frame = TableFrame(rgb=np.zeros((48, 64, 3), np.float32), gt=depth, pool=depth)
-    first, second, other = (frame.points(100, seed) for seed in (7, 7, 8))
-    assert torch.equal(first.xy, second.xy)
-    assert not torch.equal(first.xy, other.xy)
-
-
-def test_real_frames_at_hand_are_cut_as_the_paper_cuts_them(shared_data: Path) -> None:
-    sizes = {one.name: next(one.frames()).gt.shape for one in shared(shared_data, 1)}
-    assert sizes == {"7scenes": (228, 304), "icl_nuim": (228, 304), "kitti_dc": (375, 1242)}
 
 
 def test_the_table_has_a_row_for_each_network_that_takes_the_points(tmp_path: Path) -> None:

@@ -16,15 +16,12 @@ from pnpdepth_cli.cli.progress import BatchProgress, progress_bar
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.batches import add_frame
 
-PROGRAM = [sys.executable, "-c", "from pnpdepth_cli.cli.main import main; main()"]
+FAILED = FrameRecord(name="x", status="failed", message="bad")
 
 
-def arguments(*more: str, source: str = "drive") -> list[str]:
-    model = [] if "--model" in more else ["--model", "drive/net/my_net.py"]
-    return [
-        "batch", source, "-o", "out", *model,
-        "--checkpoint", "drive/net/my_net.safetensors", "--propagate", "none", *more,
-    ]  # fmt: skip
+def arguments(*more: str) -> list[str]:
+    network = ["--model", "drive/net/my_net.py", "--checkpoint", "drive/net/my_net.safetensors"]
+    return ["batch", "drive", "-o", "out", *network, "--propagate", "none", *more]
 
 
 def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
@@ -37,21 +34,14 @@ def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
     err = capsys.readouterr().err
     (line,) = [line for line in err.splitlines() if line.startswith("failed")]
     assert line.startswith("failed: b\\nb\\x1b: drive/rgb/b\\nb\\x1b.png is empty")
-    assert err.splitlines()[-1].startswith(
-        "pnpdepth: 1 failed of 2 frames; the reasons are in out/summary.csv"
-    )
+    assert "out/summary.csv" in err.splitlines()[-1]
     assert "\x1b" not in err
 
 
-def test_a_report_that_cannot_be_written_is_wrong_usage(root: Path) -> None:
-    Path("file").write_text("mine")
-    assert run(arguments("--html", "file/report")) == 2
-
-
-def test_ray_without_an_address_is_this_machine(
+def test_ray_without_an_address_is_this_machine_and_is_imported_only_to_run(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)  # it would be imported only to run
+    monkeypatch.setitem(sys.modules, "ray", None)
     assert run(arguments()) == 0
     assert run(arguments("--ray")) == 0
     assert run(arguments("--ray", "--seed", "1")) == 2
@@ -60,29 +50,21 @@ def test_ray_without_an_address_is_this_machine(
 def test_a_run_with_nothing_to_do_needs_no_torch(root: Path) -> None:
     assert run(arguments()) == 0
     code = (
-        "import sys\n"
-        "from pnpdepth_cli.cli.main import main\n"
-        "try:\n    main(sys.argv[1:])\n"
-        "except SystemExit as stop:\n    assert not stop.code, stop.code\n"
-        "assert 'torch' not in sys.modules\n"
+        "import sys\nfrom pnpdepth_cli.cli.main import run\n"
+        "sys.exit(run(sys.argv[1:]) or 'torch' in sys.modules)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments()], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert "all of them done already" in done.stderr
+    assert subprocess.run([sys.executable, "-c", code, *arguments()], check=False).returncode == 0
 
 
 @pytest.mark.slow
-def test_ctrl_c_finishes_the_frame_prints_how_to_continue_and_exits_130(
-    root: Path, tmp_path: Path
-) -> None:
+def test_ctrl_c_finishes_the_frame_prints_how_to_continue_and_exits_130(root: Path) -> None:
     for name in "cd":
         add_frame(root, name)
     slow = root / "net/my_net.py"
     text = slow.read_text().replace("        return 2", "        time.sleep(0.1)\n        return 2")
     slow.write_text("import time\n" + text)
-    with subprocess.Popen([*PROGRAM, *arguments()], stderr=subprocess.PIPE, text=True) as running:
+    program = [sys.executable, "-m", "pnpdepth_cli", *arguments()]
+    with subprocess.Popen(program, stderr=subprocess.PIPE, text=True) as running:
         until = time.monotonic() + 60
         while not list(Path("out").glob("*.json")):
             assert time.monotonic() < until
@@ -90,7 +72,6 @@ def test_ctrl_c_finishes_the_frame_prints_how_to_continue_and_exits_130(
         running.send_signal(signal.SIGINT)
         _, err = running.communicate(timeout=60)
     assert running.returncode == 130
-    assert "finishing the current frame" in err
     assert "of 4 frames; run the same command to continue" in err.splitlines()[-1]
     assert "Traceback" not in err
     depths = {path.name[0] for path in Path("out").glob("*_depth.png")}
@@ -110,9 +91,6 @@ def test_the_second_ctrl_c_interrupts_and_the_old_handling_comes_back() -> None:
     assert signal.getsignal(signal.SIGINT) == before
 
 
-FAILED = FrameRecord(name="x", status="failed", message="bad")
-
-
 def test_without_a_terminal_there_is_a_line_a_minute(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -124,11 +102,11 @@ def test_without_a_terminal_there_is_a_line_a_minute(
         for number in range(300):
             now += 1.0
             display.frame(FAILED if number == 10 else FrameRecord(name="y"))
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "failed: x: bad"
-    assert "60/600 [01:00<09:00" in lines[1]
-    assert "1 failed" in lines[1]
-    assert len(lines) == 1 + 5
+    failed, first, *others = capsys.readouterr().err.splitlines()
+    assert failed == "failed: x: bad"
+    assert "60/600 [01:00<09:00" in first
+    assert "1 failed" in first
+    assert len(others) == 4
 
 
 def test_on_a_terminal_there_is_a_bar(

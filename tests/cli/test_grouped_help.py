@@ -15,6 +15,17 @@ from pnpdepth_cli.cli.main import cli
 GROUPED = ("refine", "batch", "eval")
 
 
+MOST_OPTIONS = {"refine": 30, "batch": 45}
+MOST_IN_ALL = 150
+MOST_COMMON = 12
+
+
+def options_of(command: click.Command) -> list[click.Option]:
+    """The options of a command itself, without those that print help."""
+    found = (each for each in command.params if isinstance(each, click.Option))
+    return [each for each in found if long_name(each) not in ("--help", "--help-all")]
+
+
 def help_of(*arguments: str) -> str:
     result = CliRunner().invoke(cli, arguments, terminal_width=80, prog_name="pnpdepth")
     assert result.exit_code == 0, result.output
@@ -28,20 +39,17 @@ def command(name: str) -> GroupedCommand:
 
 
 @pytest.mark.parametrize("name", GROUPED)
-def test_every_option_has_a_group_and_only_one(name: str) -> None:
+def test_every_option_has_one_group_of_the_longer_help_and_those_that_matter_are_common(
+    name: str,
+) -> None:
     grouped = command(name)
-    names = [option for options in grouped.groups.values() for option in options]
-    assert len(names) == len(set(names))
-    assert {long_name(each) for each in options_of(grouped)} <= set(names)
-
-
-@pytest.mark.parametrize("name", GROUPED)
-def test_all_options_are_in_the_longer_help(name: str) -> None:
-    grouped = command(name)
-    shown = help_of(name, "--help-all")
-    for parameter in grouped.params:
-        if isinstance(parameter, click.Option) and not parameter.hidden:
-            assert f" {long_name(parameter)}" in shown
+    shown = help_of(name, "--help-all").split()
+    members = [option for options in grouped.groups.values() for option in options]
+    names = {long_name(each) for each in options_of(grouped)}
+    assert len(members) == len(set(members))
+    assert names <= {*members} & {*shown}
+    assert grouped.common <= names
+    assert len(grouped.common) <= MOST_COMMON
 
 
 def test_the_longer_help_is_printed_before_anything_is_checked() -> None:
@@ -73,30 +81,11 @@ def test_every_default_that_is_a_number_or_a_name_is_in_the_help() -> None:
     assert silent == []
 
 
-MOST_OPTIONS = {"refine": 30, "batch": 45}
-MOST_IN_ALL = 150
-MOST_COMMON = 12
-
-
-def options_of(command: click.Command) -> list[click.Option]:
-    """The options of a command itself, without those that print help."""
-    found = (each for each in command.params if isinstance(each, click.Option))
-    return [each for each in found if long_name(each) not in ("--help", "--help-all")]
-
-
 def test_no_command_has_too_many_options() -> None:
     counts = {each.name: len(options_of(each)) for each in commands_of(cli)}
     for name, most in MOST_OPTIONS.items():
         assert counts[name] <= most
     assert sum(counts.values()) + len(options_of(cli)) <= MOST_IN_ALL
-
-
-@pytest.mark.parametrize("name", GROUPED)
-def test_the_short_help_shows_the_options_that_matter(name: str) -> None:
-    grouped = command(name)
-    names = {long_name(option) for option in options_of(grouped)}
-    assert grouped.common <= names
-    assert len(grouped.common) <= MOST_COMMON
 
 
 def test_no_option_holds_others_in_its_value() -> None:

@@ -19,27 +19,19 @@ from pnpdepth_cli.settings import PAPER, Settings, options_of
 from tests.core.networks import UNet
 
 METHOD = Settings()
-STRANGER = ModelDefinition(
-    name="stranger", input_kind="rgb", size=Multiple(8), build=UNet, defaults=UNTUNED_DEFAULTS
-)
+PLAIN = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=UNet)
+STRANGER = replace(PLAIN, defaults=UNTUNED_DEFAULTS)
 
 
-def test_without_a_word_the_settings_are_the_networks() -> None:
+def test_settings_are_the_users_then_the_networks_then_the_papers() -> None:
+    assert resolve_settings(PLAIN, METHOD) == PAPER.closed()
     settings = resolve_settings(STRANGER, METHOD)
     for name in ("iterations", "lr", "loss", "update", "schedule", "blur"):
         assert getattr(settings, name) == getattr(UNTUNED_DEFAULTS, name)
-    plain = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=UNet)
-    assert resolve_settings(plain, METHOD) == PAPER.closed()
-
-
-def test_the_users_options_override_the_definition_and_another_update_its_step() -> None:
+    # another update rule than the network's resets its step
     settings = resolve_settings(STRANGER, replace(METHOD, update="sign"))
     assert (settings.lr, settings.schedule, settings.blur) == (0.01, "constant", 0)
-    for name in ("iterations", "loss"):
-        assert getattr(settings, name) == getattr(UNTUNED_DEFAULTS, name)
-    asked = replace(
-        METHOD, update="adam", lr="2%", schedule="linear", blur=0.0, iterations=3
-    )  # fmt: skip
+    asked = replace(METHOD, update="adam", lr="2%", schedule="linear", blur=0.0, iterations=3)
     settings = resolve_settings(STRANGER, asked)
     assert {name: getattr(settings, name) for name in asked.given()} == asked.given()
 

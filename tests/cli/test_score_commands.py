@@ -35,11 +35,12 @@ def frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """out/ and gt/ of six frames, one with a strange name; the work goes on beside them."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
+    for folder in ("out", "gt"):
+        Path(folder).mkdir()
     for name in ("a", "b ü_1", "c\nd", "e", "f", "g"):
         truth = rng.uniform(1, 9, (6, 8)).astype(np.float32)
-        for folder, depth in (("out", truth * 1.1), ("better", truth * 1.05), ("gt", truth)):
-            Path(folder).mkdir(exist_ok=True)
-            write_depth(Path(folder) / f"{name}.npy", depth.astype(np.float32))
+        write_depth(Path("out", f"{name}.npy"), truth * np.float32(1.1))
+        write_depth(Path("gt", f"{name}.npy"), truth)
     return tmp_path
 
 
@@ -54,25 +55,31 @@ def test_json_is_the_whole_result_with_every_option(
     assert scores_of(record["frames"][0])["factor"] == pytest.approx(1 / 1.1)
 
 
-def test_csv_has_a_line_for_each_frame_also_those_without_score(frames: Path) -> None:
+def test_csv_has_a_line_for_each_frame_and_replaces_nothing_unasked(frames: Path) -> None:
     Path("out/a.npy").unlink()
     assert code_of("eval", "out", "gt", "--csv", "scores.csv") == 7
     text = Path("scores.csv").read_bytes().decode()
     a, b, c, *_ = csv.DictReader(io.StringIO(text, newline=""))
-    assert (a["name"], a["rmse"], a["coverage"], a["error"]) == (
-        "a", "", "0.0", "there is no prediction",
-    )  # fmt: skip
+    assert (a["name"], a["rmse"], a["coverage"]) == ("a", "", "0.0")
+    assert a["error"]
     assert c["name"] == "c\nd"
     assert float(b["mre"]) == pytest.approx(0.1, rel=1e-5)
+    Path("scores.csv").write_text("mine")
+    assert code_of("eval", "out", "gt", "--csv", "scores.csv") == 2
+    assert Path("scores.csv").read_text() == "mine"
+    assert code_of("eval", "out", "gt", "--csv", "scores.csv", "--overwrite") == 7
+    before = Path("gt/e.npy").read_bytes()
+    assert code_of("eval", "out/e.npy", "gt/e.npy", "--csv", "gt/e.npy", "--overwrite") == 2
+    assert Path("gt/e.npy").read_bytes() == before
+    assert code_of("eval", "out", "gt", "--csv", "nowhere/s.csv") == 2
 
 
 def test_columns_choose_measures_and_latex_has_no_thousands_separators(
     frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ("--protocol", "kitti", "--columns", "delta1,rmse")
-    for folder in ("out", "gt"):
-        for path in Path(folder).glob("*.npy"):
-            np.save(path, 10 * np.load(path))
+    for path in frames.glob("*/*.npy"):
+        np.save(path, 10 * np.load(path))
     assert code_of("eval", "out", "gt", *options, "--latex", "-") == 0
     first, second = (line.split(" & ") for line in capsys.readouterr().out.splitlines()[5:7])
     assert (first[0], first[1]) == (r"$\delta$1 $\uparrow$", r"100.00\%")
@@ -90,21 +97,7 @@ def test_tables_carry_a_scale_that_was_assumed(
     cv2.imwrite("gt.png", np.full((2, 3), 512, np.uint16))
     np.save("two.npy", np.full((2, 3), 2, np.float32))
     assert code_of("eval", "two.npy", "gt.png", "--latex", "-") == 0
-    assert "; gt: 16-bit PNG ÷ 256, assumed" in capsys.readouterr().out.splitlines()[0]
-
-
-def test_files_are_not_overwritten_unasked_and_inputs_never(
-    frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("s.csv").write_text("mine")
-    assert code_of("eval", "out", "gt", "--csv", "s.csv") == 2
-    assert "--overwrite replaces it" in capsys.readouterr().err
-    assert Path("s.csv").read_text() == "mine"
-    assert code_of("eval", "out", "gt", "--csv", "s.csv", "--overwrite") == 0
-    before = Path("gt/a.npy").read_bytes()
-    assert code_of("eval", "out/a.npy", "gt/a.npy", "--csv", "gt/a.npy", "--overwrite") == 2
-    assert Path("gt/a.npy").read_bytes() == before
-    assert code_of("eval", "out", "gt", "--csv", "nowhere/s.csv") == 2
+    assert "16-bit PNG ÷ 256, assumed" in capsys.readouterr().out.splitlines()[0]
 
 
 def test_four_runs_fit_into_120_columns(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -114,34 +107,29 @@ def test_four_runs_fit_into_120_columns(frames: Path, capsys: pytest.CaptureFixt
     for name in runs:
         Path(name).write_text(text)
     assert code_of("compare", *runs, "--columns", ",".join(m.key for m in MEASURES)) == 0
-    out = capsys.readouterr().out
-    rows = [line for line in out.splitlines() if "↓" in line or "↑" in line]
-    assert len(rows) == 4 * len(MEASURES)
-    assert max(map(len, out.splitlines())) <= 120
-    assert all("…" in row and "long name at K = 20" in row for row in rows)
+    lines = capsys.readouterr().out.splitlines()
+    assert len([line for line in lines if "↓" in line or "↑" in line]) == 4 * len(MEASURES)
+    assert max(map(len, lines)) <= 120
 
 
 def test_a_refinement_scores_the_same_when_its_files_are_evaluated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    frame = frame_on_disk(tmp_path)
-    out = tmp_path / "out"
-    assert code_of(
-        "refine", frame.image, "--sparse", frame.sparse, "--gt", frame.gt, "-o", out,
-        "--model", frame.model, "--checkpoint", frame.checkpoint,
-    ) == 0  # fmt: skip
+    frame, out = frame_on_disk(tmp_path), tmp_path / "out"
+    network = ("--model", frame.model, "--checkpoint", frame.checkpoint)
+    files = (frame.image, "--sparse", frame.sparse, "--gt", frame.gt, "-o", out)
+    assert code_of("refine", *files, *network) == 0
     capsys.readouterr()
     (tmp_path / "gt").mkdir()
     (tmp_path / "gt" / "img.png").write_bytes(frame.gt.read_bytes())
     assert code_of("eval", out, tmp_path / "gt", "--json") == 0
-    text, err = capsys.readouterr()
-    record, refined = json.loads(text), json.loads((out / "img.json").read_text())
-    code = 1 / 1000  # the depth was written as whole millimetres
-    assert record["mean"]["mae"] == pytest.approx(scores_of(refined)["mae"], abs=code)
+    record = json.loads(capsys.readouterr().out)
+    refined = json.loads((out / "img.json").read_text())
+    # the depth was written as whole millimetres
+    assert record["mean"]["mae"] == pytest.approx(scores_of(refined)["mae"], abs=1 / 1000)
     (scored,) = record["frames"]
     assert scored["inputs"]["image"]["path"] == str(frame.image)
     assert scores_of(scored)["given"] == 60
-    assert "60 of the scored pixels (2.10%) have a point of the sparse input" in err
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="file names are Unicode there")
@@ -150,27 +138,16 @@ def test_a_name_that_is_no_utf_8_is_scored_and_printed(
 ) -> None:
     for folder in ("out", "gt"):
         Path(folder, "a.npy").rename(Path(folder, os.fsdecode(b"\xff.npy")))
-    for form in ("--json", "--csv", "--latex"):
-        arguments = ["eval", "out", "gt", form, *(["-"] if form != "--json" else [])]
-        assert code_of(*arguments) == 0
-    assert code_of("eval", "out", "gt") == 0
-    out = capfdbinary.readouterr().out
-    assert b"\\udcff" in out
-    assert rb"c\nd" in out
+    for form in ("--json", "--csv -", "--latex -", "--columns rmse"):
+        assert code_of("eval", "out", "gt", *form.split()) == 0
+    assert b"\\udcff" in capfdbinary.readouterr().out
 
 
-def test_an_evaluation_replaces_a_report_only_if_asked(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_evaluation_replaces_a_report_only_if_asked(root: Path) -> None:
     arguments = ("eval", "drive/gt", "drive/gt", "--html")
     assert code_of(*arguments, "scores") == 0
     before = Path("scores/index.html").stat().st_mtime_ns
-    capsys.readouterr()
     assert code_of(*arguments, "scores") == 2
-    assert capsys.readouterr().err == (
-        "pnpdepth: scores is not empty; --overwrite replaces the report in it, or name another"
-        " folder\n"
-    )
     assert Path("scores/index.html").stat().st_mtime_ns == before
     assert code_of(*arguments, "drive/net/my_net.py/report") == 2
     assert code_of(*arguments, "scores", "--overwrite") == 0

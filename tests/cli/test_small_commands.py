@@ -12,7 +12,6 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from pnpdepth_cli.cli.export_command import export
 from pnpdepth_cli.cli.main import cli, run
 from pnpdepth_cli.commands import doctor
 from pnpdepth_cli.io.depth import write_depth
@@ -43,20 +42,13 @@ def test_exported_frames_are_counted_and_warnings_go_to_stderr(
     assert json.loads((tmp_path / "dense" / "export_colmap.json").read_text())["frames"] == 3
 
 
-def test_every_export_is_explained_in_the_help() -> None:
-    text = CliRunner().invoke(cli, ["export", "--help"]).stdout
-    for name in next(each for each in export.params if each.name == "to").type.choices:  # type: ignore[attr-defined]
-        assert f"  {name} " in text
-
-
 def test_networks_are_listed_with_and_without_the_subcommand(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     for arguments in (["models", "list"], ["models"]):
         assert run(arguments) == 0
         out = capsys.readouterr().out
-        assert "sparse2dense-kitti" in out
-        assert "sparse2dense-tiny" in out
+        assert {"sparse2dense-kitti", "sparse2dense-tiny"} <= set(out.split())
     assert run(["models", "--check", "net.onnx"]) == 2
 
 
