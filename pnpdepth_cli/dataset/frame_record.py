@@ -6,6 +6,7 @@ one a frame. Means, tables, reports and comparisons read nothing else.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +22,9 @@ from pnpdepth_cli.io.file_bytes import Fingerprint, one_line
 from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.stages import AFTER, GT, HELD_OUT, LINEAR, VALIDATION
+
+_CONVERTING = threading.Lock()
+"""msgspec learns the types at the first record, and crashes if two threads have a first one."""
 
 Pose = NDArray[np.float64]
 """(3, 4) x_world = pose · (x, 1), in the unit of the depth."""
@@ -210,7 +214,8 @@ class FrameRecord:
         import msgspec
 
         try:
-            return msgspec.convert(entry, cls)
+            with _CONVERTING:
+                return msgspec.convert(entry, cls)
         except (msgspec.ValidationError, OverflowError) as error:
             raise FileFormatError(
                 f"{source} is no record of a frame as this version writes it"
