@@ -9,8 +9,7 @@ from __future__ import annotations
 import filecmp
 import itertools
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -84,7 +83,7 @@ class ExportFrame:
         if self.is_in(folder):
             return
         if isinstance(self.image, Path):
-            with new_file(self.image_in(folder)) as temporary:
+            with atomic_path(self.image_in(folder)) as temporary:
                 shutil.copyfile(self.image, temporary)
         else:
             pixels = np.rint(255 * read_image(self.image)).astype(np.uint8)
@@ -113,23 +112,16 @@ class Export:
     needs_pose: bool
     files: Callable[[Path, Sequence[ExportFrame]], list[Path]]
     write: Callable[[Path, Sequence[ExportFrame], Callable[[], None]], list[str]]
-    """Writes them, calls the function after each frame, and returns notes. Raises PnpDepthError."""
+    """Writes them, calls the function after each frame, and returns notes. Raises PnpDepthError.
+    The folders of the files are there."""
     unit: Callable[[Sequence[ExportFrame]], str] = unit_of_model
-
-
-@contextmanager
-def new_file(path: Path) -> Iterator[Path]:
-    """Yields a temporary file that becomes the path, whose folder is created."""
-    make_folder(path.parent)
-    with atomic_path(path) as temporary:
-        yield temporary
 
 
 def save_png(path: Path, pixels: NDArray[np.uint16] | NDArray[np.uint8]) -> None:
     """Writes pixels (H, W) or (H, W, 3)."""
     from PIL import Image
 
-    with new_file(path) as temporary:
+    with atomic_path(path) as temporary:
         Image.fromarray(pixels).save(temporary, "PNG")
 
 
@@ -181,7 +173,8 @@ def export_results(
         if path.exists() and not overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another folder")
     # The record begins, and all files are written or none.
-    make_folder(output)
+    for folder in {path.parent for path in written}:
+        make_folder(folder)
     record: dict[str, Any] = {
         "command": "export",
         "version": __version__,

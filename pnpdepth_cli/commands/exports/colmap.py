@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note, new_file
+from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note
+from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.sensors.point_cloud import depth_normals
 
 
@@ -33,7 +34,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         _write_map(_map(folder, frame, "depth"), depth[..., None] / frame.unit_scale)
         done()
     for listed in _files(folder, frames)[2 * len(frames) :]:
-        with new_file(listed) as temporary:
+        with atomic_path(listed) as temporary:
             text = "".join(f"{frame.image_name}\n" for frame in frames)
             temporary.write_text(text, encoding="utf-8", newline="\n")
     return distortion_note(frames, "COLMAP's fusion")
@@ -42,7 +43,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
 def _write_map(path: Path, values: NDArray[np.floating]) -> None:
     """Writes an (H, W, C) map."""
     height, width, channels = values.shape
-    with new_file(path) as temporary, temporary.open("wb") as file:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(f"{width}&{height}&{channels}&".encode())
         file.write(np.ascontiguousarray(values.transpose(2, 0, 1)).astype("<f4").tobytes())
 

@@ -20,15 +20,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.commands.exports import (
-    Export,
-    ExportFrame,
-    distortion_note,
-    new_file,
-    save_png,
-)
+from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note, save_png
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.atomic import make_folder
+from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colmap_model import MODEL_PARTS, model_files
 from pnpdepth_cli.io.text_files import write_json
 
@@ -79,7 +73,6 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         frame.copy_image(folder)
         done()
     # What the program reads the codes with.
-    make_folder(_parameters(folder).parent)
     parameters = {"scale": float(scale), "offset": 0.0}
     write_json(_parameters(folder), {frame.stem: parameters for frame in frames})
     notes = [f"depth: {clipped:,} of {pixels:,} pixels are nearer than 1/{scale:.4g}, and clipped"]
@@ -123,7 +116,7 @@ def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
             index = len(lines["points3D"])
             lines["points3D"].append(f"{index} {place} {red} {green} {blue} 0\n")
     for part, text in lines.items():
-        with new_file(folder / f"{part}.txt") as temporary:
+        with atomic_path(folder / f"{part}.txt") as temporary:
             temporary.write_text("".join(text), encoding="utf-8", newline="\n")
 
 

@@ -17,7 +17,6 @@ import numpy as np
 
 from pnpdepth_cli.commands.exports import Export, ExportFrame
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.scans import write_cloud
@@ -63,9 +62,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         depth *= np.float32(factor)
         fits = np.rint(depth * _CODES_PER_UNIT) <= LARGEST_CODE
         clipped += int((~fits).sum())
-        path = _depth_image(folder, frame)
-        make_folder(path.parent)
-        write_depth(path, np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
+        write_depth(_depth_image(folder, frame), np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
         frame.copy_image(folder)
         done()
     write_cloud(folder / _START, start)
