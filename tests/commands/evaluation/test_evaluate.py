@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +56,6 @@ def test_each_image_counts_alike(two: Path) -> None:
 
 
 def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path) -> None:
-    assert scored(two).describe_unscored() == ""
     depth_file(two / "gt" / "c.npy", [[1, 1]])
     result = scored(two)
     assert [frame.name for frame in result.frames if is_missing(frame)] == ["c"]
@@ -223,23 +221,24 @@ def test_scored_pixels_with_a_sparse_point_are_counted_and_can_be_excluded(
     tmp_path: Path,
 ) -> None:
     gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
-    points = np.zeros_like(gt)
-    points[0, :4] = gt[0, :4]
+    points = np.where(np.arange(100).reshape(10, 10) < 5, gt, 0)
     prediction = np.where(points > 0, points, gt + 1)
-    points[2, 0], prediction[2, 0] = gt[2, 0], 0  # not scored
+    prediction[0, 4] = 0  # not scored
     depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", prediction)
-    sparse = depth_file(tmp_path / "sparse.npy", points)
-    FrameRecord(inputs={"sparse": FileRecord(path=str(sparse))}).write(tmp_path / "out" / "a.json")
+    sparse, record = depth_file(tmp_path / "sparse.npy", points), tmp_path / "out" / "a.json"
+    FrameRecord(inputs={"sparse": FileRecord(path=str(sparse))}).write(record)
     (note,) = (n for n in scored(tmp_path).notes if "sparse input" in n)
-    assert note.startswith("4 of the scored pixels (4.04%) have a point of the sparse input")
+    assert note.startswith("4 of the scored pixels (4.04%)")
     without = scored(tmp_path, exclude_sparse=True)
-    assert scores_of(without.frames[0])["known"] == 95
-    assert without.mean["mae"] == pytest.approx(1)
+    assert (scores_of(without.frames[0])["known"], without.mean["mae"]) == (95, pytest.approx(1))
     assert not [n for n in without.notes if "sparse input" in n]
-    (tmp_path / "out" / "a.json").unlink()
-    with pytest.raises(InputError, match="has no sparse depth file to exclude"):
-        scored(tmp_path, exclude_sparse=True)
+    sparse.write_bytes(b"spoilt")
+    for _ in range(2):  # points that cannot be read, then none that are named
+        assert scores_of(scored(tmp_path).frames[0])["given"] is None
+        with pytest.raises(InputError, match="no frame could be scored"):
+            scored(tmp_path, exclude_sparse=True)
+        record.unlink(missing_ok=True)
 
 
 def test_points_that_were_drawn_from_the_ground_truth_are_drawn_again_to_be_excluded(
@@ -247,36 +246,27 @@ def test_points_that_were_drawn_from_the_ground_truth_are_drawn_again_to_be_excl
 ) -> None:
     gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
     drawn = as_depth_image(sample_points(gt, SamplePattern(count=30), 7))
-    depth_file(tmp_path / "gt" / "a.npy", gt)
     depth_file(tmp_path / "out" / "a.npy", np.where(drawn > 0, gt, gt + 1))
-    sampled = Sampling(kind="uniform", count=30, seed=7)
-    sparse = FileRecord(path=str(tmp_path / "gt" / "a.npy"), sampled=sampled)
-    record = FrameRecord(inputs={"sparse": sparse}, size=(10, 10))
-    record.write(tmp_path / "out" / "a.json")
-    assert scores_of(scored(tmp_path).frames[0])["given"] == 30
-    without = scored(tmp_path, exclude_sparse=True)
-    assert (scores_of(without.frames[0])["known"], without.mean["mae"]) == (70, pytest.approx(1))
-    for size in (None, (9, 9)):
-        replace(record, size=size).write(tmp_path / "out" / "a.json")
-        assert scores_of(scored(tmp_path).frames[0])["given"] is None
-
-
-def test_a_sparse_file_that_cannot_be_read_hides_only_how_many_points_were_given(two: Path) -> None:
-    sparse = depth_file(two / "s.npy", [[1, 0]])
-    FrameRecord(inputs={"sparse": FileRecord(path=str(sparse))}).write(two / "out" / "a.json")
-    assert [scores_of(frame)["given"] for frame in scored(two).frames] == [1, None]
-    sparse.write_bytes(b"spoilt")
-    assert [scores_of(frame)["given"] for frame in scored(two).frames] == [None, None]
-    with pytest.raises(InputError, match="no frame could be scored"):
-        scored(two, exclude_sparse=True)
+    path = str(depth_file(tmp_path / "gt" / "a.npy", gt))
+    sampled = FileRecord(path=path, sampled=Sampling(kind="uniform", count=30, seed=7))
+    for size, given in (((10, 10), 30), ((9, 9), None), (None, None)):
+        record = FrameRecord(inputs={"sparse": sampled}, size=size)
+        record.write(tmp_path / "out" / "a.json")
+        assert scores_of(scored(tmp_path).frames[0])["given"] == given
+        if given:
+            without = scored(tmp_path, exclude_sparse=True)
+            assert without.mean["mae"] == pytest.approx(1)
+            assert scores_of(without.frames[0])["known"] == 70
 
 
 def test_a_prediction_in_model_units_is_warned_of_unless_it_is_scaled(two: Path) -> None:
     FrameRecord(unit="model units").write(two / "out" / "a.json")
-    warning = "warning: 1 predictions are in model units, not in metres"
+    warning = "warning: 1 predictions are in model units"
     assert any(note.startswith(warning) for note in scored(two).notes)
     depth_file(two / "out" / "ü b_depth.npy", [[8, 9]])
-    assert not any("model units" in note for note in scored(two, scale_by="median").notes)
+    notes = scored(two, scale_by="median").notes
+    assert not any("model units" in note for note in notes)
+    assert "scale-by median: factor 0.7941 (median of 2 images)" in "; ".join(notes)
 
 
 def test_a_smaller_prediction_is_resized_on_request(tmp_path: Path) -> None:

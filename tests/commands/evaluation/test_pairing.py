@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
-from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.evaluation.pairing import (
     FramePair,
     frame_name,
@@ -154,37 +152,3 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     frames, _ = pair_frames(out, gt)
     inputs = [(files.sparse, files.image) for files, _ in frames]
     assert inputs == [(sparse, image), (None, None), (None, None)]
-
-
-def test_disparities_are_scored_as_monodepth2_does(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    gt = rng.uniform(1, 70, (6, 30, 40)).astype(np.float32)
-    gt[rng.random(gt.shape) < 0.5] = 0
-    disparity = (1 / (np.where(gt > 0, gt, 5) * rng.lognormal(0, 0.2, gt.shape))).astype("f4") / 30
-    for folder, images in (("out", disparity), ("gt", gt)):
-        (tmp_path / folder).mkdir()
-        for number, image in enumerate(images):
-            np.save(tmp_path / folder / f"{number:04}.npy", image)
-    request = EvalRequest(
-        prediction=tmp_path / "out",
-        ground_truth=tmp_path / "gt",
-        protocol="garg",
-        prediction_kind="disparity",
-        scale_by="median",
-    )
-    result = evaluate(request)
-    errors, ratios = [], []
-    for d, g in zip(disparity, gt, strict=True):  # monodepth2's evaluate_depth.py
-        mask = np.zeros(g.shape, bool)
-        mask[int(0.40810811 * 30) : int(0.99189189 * 30), int(0.03594771 * 40) : 38] = True
-        mask &= (g > 1e-3) & (g < 80)
-        p, t = (1 / d)[mask], g[mask]
-        ratios.append(np.median(t) / np.median(p))
-        p = np.clip(p * ratios[-1], 1e-3, 80)
-        errors.append((np.mean(np.abs(t - p) / t), np.sqrt(np.mean((t - p) ** 2))))
-    assert [frame.name for frame in result.frames] == [f"{n:04}" for n in range(6)]
-    assert (result.mean["mre"], result.mean["rmse"]) == pytest.approx(np.mean(errors, axis=0))
-    median = np.median(ratios)
-    spread = f"standard deviation / median {np.std(np.array(ratios) / median):.3f}"
-    factor = f"scale-by median: factor {median:.4g}"
-    assert any(note.startswith(factor) and note.endswith(spread) for note in result.notes)
