@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pnpdepth_cli.errors import SizeError, UsageError
-from pnpdepth_cli.measures import DELTA_THRESHOLDS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -142,11 +141,17 @@ class Protocol:
     """Whether predictions are clipped to these bounds."""
     crop: str = "none"
     """The rectangle of the part that is scored."""
-    thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
+    delta: float = 1.25
+    """δ1 to δ3 count ratios below it, its square and its cube."""
     missing: str = "skip"
     """Empty predictions: "skip", or "min", scored as the lower bound."""
     exclude_sparse: bool = False
     """Whether pixels with a sparse point are not scored."""
+
+    @property
+    def thresholds(self) -> tuple[float, float, float]:
+        """The thresholds of δ1 to δ3."""
+        return self.delta, self.delta**2, self.delta**3
 
 
 # The reference codes (monodepth2's evaluate_depth.py, BTS's eval) clamp predictions with
@@ -162,6 +167,8 @@ _EIGEN = Protocol(
 )
 _NOT_FOUND = "which pixels the paper draws, with which seed, size and bounds, was not found"
 _RESAMPLED = "the paper halves frames by interpolation; here every second pixel is taken"
+
+_EXCLUDED = Protocol(name="", part=WHOLE, seed=0, exclude_sparse=True)
 
 PROTOCOLS = {
     protocol.name: protocol
@@ -211,28 +218,22 @@ PROTOCOLS = {
             note="the paper names no seed of its points, and interpolates images, which are"
             " averaged here; it has other numbers and patterns of points too",
         ),
-        Protocol(
+        replace(
+            _EXCLUDED,
             name="capa-100",
-            part=WHOLE,
             sample="100",
-            seed=0,
-            exclude_sparse=True,
             note=f"100 points on ScanNet and 7-Scenes; {_NOT_FOUND}",
         ),
-        Protocol(
+        replace(
+            _EXCLUDED,
             name="streamtto-rings",
-            part=WHOLE,
             sample="lines:8",
-            seed=0,
-            exclude_sparse=True,
             note=f"the 8 rings are evenly spaced rows of the image here; {_NOT_FOUND}",
         ),
-        Protocol(
+        replace(
+            _EXCLUDED,
             name="streamtto-pixels",
-            part=WHOLE,
             sample="10%",
-            seed=0,
-            exclude_sparse=True,
             note=f"10 % of the pixels with ground truth; {_NOT_FOUND}",
         ),
     )

@@ -17,8 +17,8 @@ from pnpdepth_cli.cli.streams import printable
 from pnpdepth_cli.commands.batch.summary import BatchSummary
 from pnpdepth_cli.commands.error_tables import (
     baselines_table,
+    error_table,
     has_baselines,
-    held_out_table,
     mean_weights_text,
     means_table,
     refinement_table,
@@ -117,7 +117,8 @@ def print_refinement(record: FrameRecord) -> None:
     print_notes(record.notes)
     print_table(refinement_table(record), err=True)
     if is_default and HELD_OUT in errors:
-        print_table(held_out_table(record), err=True)
+        title = "held-out points, which nothing used"
+        print_table(error_table(title, errors, record.unit, bases=[HELD_OUT]), err=True)
     if record.worse_than_linear:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
     if has_baselines(errors):

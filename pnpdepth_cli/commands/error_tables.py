@@ -99,12 +99,6 @@ def refinement_table(record: FrameRecord) -> Table:
     return error_table(title, record.errors, record.unit)
 
 
-def held_out_table(record: FrameRecord) -> Table:
-    """Returns the errors of a record at its held-out points."""
-    title = "held-out points, which nothing used"
-    return error_table(title, record.errors, record.unit, bases=[HELD_OUT])
-
-
 def names_of_depths(record: FrameRecord) -> tuple[str, str]:
     """Returns what the depth before and the depth after of a record are of, in a few words."""
     assert record.method is not None

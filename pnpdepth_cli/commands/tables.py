@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -59,20 +59,11 @@ class Table:
         """The cells as they are shown."""
         return [list(map(_text, self.columns, row)) for row in self.rows]
 
-    def only(self, keys: Sequence[str]) -> Table:
-        """Returns the columns that have these keys or headings, in this order."""
-        names = self._keys
-        places = [names.index(key) for key in keys]
-        return replace(
-            self,
-            columns=[self.columns[place] for place in places],
-            rows=[[row[place] for place in places] for row in self.rows],
-        )
-
     def csv(self) -> str:
         """Returns the cells as they are, below the keys of the measures, as `write_csv` does."""
         buffer = io.StringIO()
-        write_csv(buffer, self._keys, self.rows)
+        keys = [c.key if isinstance(c, Measure) else c for c in self.columns]
+        write_csv(buffer, keys, self.rows)
         return buffer.getvalue()
 
     def latex(self) -> str:
@@ -80,23 +71,12 @@ class Table:
         header, *rows = (
             " & ".join(map(_in_latex, line)) + r" \\" for line in (self.headings, *self.texts)
         )
-        return "\n".join(
-            (
-                f"% {' '.join(self.title.split())}",
-                rf"\begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}",
-                r"\toprule",
-                header,
-                r"\midrule",
-                *rows,
-                r"\bottomrule",
-                r"\end{tabular}",
-                "",
-            )
+        lines = (
+            f"% {' '.join(self.title.split())}",
+            rf"\begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}",
+            *(r"\toprule", header, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", ""),
         )
-
-    @property
-    def _keys(self) -> list[str]:
-        return [c.key if isinstance(c, Measure) else c for c in self.columns]
+        return "\n".join(lines)
 
 
 def _text(column: Measure | str, cell: Any) -> str:

@@ -233,16 +233,13 @@ def _gains(
 
 
 def _check_rules(first: Run, other: Run) -> None:
-    differing = [
-        f"{rule} {first.scoring.get(rule)} and {other.scoring.get(rule)}"
-        for rule in sorted({*first.scoring, *other.scoring})
-        if first.scoring.get(rule) != other.scoring.get(rule)
-    ]
-    if differing:
-        raise InputError(
-            f"{first.path} and {other.path} were scored by different rules"
-            f" ({'; '.join(differing)}); score both by one protocol"
-        )
+    for rule in sorted({*first.scoring, *other.scoring}):
+        own, others = first.scoring.get(rule), other.scoring.get(rule)
+        if own != others:
+            raise InputError(
+                f"{first.path} and {other.path} were scored by different rules ({rule} {own} and"
+                f" {others}); score both by one protocol"
+            )
 
 
 def _names(runs: Sequence[Run]) -> list[str]:

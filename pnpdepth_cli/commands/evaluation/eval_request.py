@@ -20,15 +20,6 @@ _IN_MILLIMETRES = tuple(
 )
 
 
-def parse_thresholds(text: str) -> tuple[float, float, float]:
-    """Returns the thresholds of δ1…δ3: a number and its powers. Raises UsageError for a text."""
-    try:
-        first = float(text)
-        return first, first**2, first**3
-    except (ValueError, OverflowError):
-        raise UsageError(f"--delta {text!r} is no number such as 1.25") from None
-
-
 @dataclass(frozen=True, kw_only=True)
 class EvalRequest:
     """What to score, and how; None leaves what the protocol says.
@@ -45,12 +36,10 @@ class EvalRequest:
         "paper", "Preset of the rules.", choices=choices.PROTOCOLS, show_default=True
     )
     max_depth: float | None = option(None, "Score ground truth below M metres.", metavar="M")
-    thresholds: tuple[float, float, float] | None = option(
+    delta: float | None = option(
         None,
         "Thresholds of δ1…δ3 are D, D², D³. The paper's KITTI rows use 1.01.  [default: 1.25]",
-        flag="--delta",
         metavar="D",
-        parse=parse_thresholds,
     )
     scale_by: str = option(
         "none",
@@ -97,12 +86,12 @@ class EvalRequest:
         low, high = self.rules.min_depth, self.rules.max_depth
         if high is not None and not (math.isfinite(high) and high > low):
             raise UsageError(f"--max-depth must be metres above {low:g}, got {high:g}")
-        if not all(math.isfinite(limit) and limit > 1 for limit in self.rules.thresholds):
+        if not 1 < self.rules.delta < 1000:
             raise UsageError("--delta must be above 1: δ counts ratios below it")
         near, far = self.depth_limits or (1.0, 2.0)
         if not (0 < near < far and math.isfinite(far)):
             raise UsageError(f"--by-depth must be two rising depths in metres: {near:g} {far:g}")
-        if self.is_devkit and (self.thresholds or self.more_measures or self.depth_limits):
+        if self.is_devkit and (self.delta or self.more_measures or self.depth_limits):
             raise UsageError(
                 f"--delta, --measures and --by-depth do not apply to {KITTI_DEVKIT}, which has its"
                 " own measures"
@@ -117,7 +106,7 @@ class EvalRequest:
             own,
             max_depth=own.max_depth if self.max_depth is None else self.max_depth,
             exclude_sparse=own.exclude_sparse or self.exclude_sparse,
-            thresholds=self.thresholds or own.thresholds,
+            delta=own.delta if self.delta is None else self.delta,
         )
 
     @property

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 from pnpdepth_cli.commands.evaluation.compare import ALPHA, PERMUTATIONS, Comparison
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
@@ -53,13 +52,17 @@ def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
 
 def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns the chosen or first measures of each frame, or of the worst of many."""
-    title, found = "Frames", evaluation
-    if len(evaluation.frames) > _FRAMES_SHOWN:
-        found = replace(evaluation, frames=worst(evaluation)[:_FRAMES_SHOWN])
+    title, frames = "Frames", evaluation.frames
+    if len(frames) > _FRAMES_SHOWN:
+        frames = worst(evaluation)[:_FRAMES_SHOWN]
         title = f"The {_FRAMES_SHOWN} worst by RMSE; --csv has all"
-    shown = keys or [measure.key for measure in evaluation.measures[:_FRAME_COLUMNS]]
-    table = frames_table(found, keys).only(["name", *shown, COVERAGE.key])
-    return replace(table, title=title + _without_sparse(evaluation.request.rules.exclude_sparse))
+    measures = choose_measures(evaluation.measures, keys)
+    shown = [*(measures if keys else measures[:_FRAME_COLUMNS]), COVERAGE]
+    return Table(
+        title=title + _without_sparse(evaluation.request.rules.exclude_sparse),
+        columns=["name", *shown],
+        rows=[[frame.name, *(scores_of(frame).get(m.key) for m in shown)] for frame in frames],
+    )
 
 
 def worst(evaluation: Evaluation) -> list[FrameRecord]:

@@ -86,7 +86,7 @@ class Evaluation:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
         # What was scored and how, the results, and the frames.
         request = self.request
-        record = {
+        return dict(plain({
             "command": "eval",
             "versions": versions(),
             "prediction": request.prediction,
@@ -109,9 +109,7 @@ class Evaluation:
             "clusters": {"count": self.clusters.count, "unit": self.clusters.unit},
             "frames": [frame.to_json() for frame in self.frames],
             "notes": self.notes,
-        }
-        result: dict[str, Any] = plain(record)
-        return result
+        }))  # fmt: skip
 
 
 def evaluate(

@@ -43,7 +43,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("papre", {}, "paper, whole"),
     ("eigen", {"max_depth": 0.0}, "--max-depth"),
     ("paper", {"max_depth": float("nan")}, "--max-depth"),
-    ("paper", {"thresholds": (1.0, 1.0, 1.0)}, "--delta"),
+    ("paper", {"delta": 1.0}, "--delta"),
     ("paper", {"gt_scale": 0.0}, "--gt-scale"),
     ("paper", {"pred_scale": float("nan")}, "--pred-scale"),
     ("paper", {"more_measures": ("boundary",)}, "'boundary'"),
@@ -51,7 +51,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     *(
         ("kitti-devkit", changes, "kitti-devkit")
         for changes in (
-            {"thresholds": (1.01, 1.02, 1.03)},
+            {"delta": 1.01},
             {"more_measures": ("boundary_f1",)},
             {"depth_limits": (1.0, 2.0)},
         )

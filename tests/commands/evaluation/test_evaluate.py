@@ -127,7 +127,7 @@ def random_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.nd
 
 @pytest.mark.parametrize(
     "options",
-    [{"protocol": "nyu-eigen"}, {"max_depth": 5.0, "thresholds": (1.25, 1.25**2, 1.25**3)}],
+    [{"protocol": "nyu-eigen"}, {"max_depth": 5.0, "delta": 1.25}],
 )
 def test_a_protocol_is_what_plain_numpy_makes_of_its_definition(
     random_frames: tuple[Path, np.ndarray, np.ndarray], options: dict[str, Any]
