@@ -240,10 +240,7 @@ def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
     is_360 = (folder / _PERSPECTIVE).is_file()
     cameras = folder / (_PERSPECTIVE if is_360 else _RAW_FILES[0])
     if not cameras.is_file():
-        raise InputError(
-            f"{folder} has no {cameras.name}; give the folder with KITTI's {_RAW_FILES[0]} and"
-            f" {_RAW_FILES[1]}, or one calibration file"
-        )
+        raise InputError(f"{folder} has no {cameras.name}; give KITTI's raw folder, or one file")
     # The pose of the scanner; KITTI-360's file maps camera 0 to the scanner.
     scanner = folder / (_FROM_CAMERA_0 if is_360 else _RAW_FILES[1])
     pose = None
@@ -345,10 +342,8 @@ def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
         model = "fisheye"  # of OpenCV
     lens = _LENSES.get(model)
     if lens is None:
-        raise FileFormatError(
-            f"{fields.path}: distortion model {one_line(model)[:30]!r} is not known; known are"
-            f" {', '.join(_LENSES)}"
-        )
+        known, model = ", ".join(_LENSES), one_line(model)[:30]
+        raise FileFormatError(f"{fields.path}: distortion model {model!r} is none of {known}")
     name = fields.first(_DISTORTIONS)
     coefficients = () if name is None else tuple(fields.numbers(name))
     if lens == "radial-tangential" and not any(coefficients):
@@ -368,9 +363,7 @@ def _text(path: Path) -> str:
     if kind_of(data) is None and b"\0" not in data:
         with suppress(UnicodeDecodeError):
             return data.decode("utf-8-sig")
-    raise FileFormatError(
-        f"{path} is not a text file; give a calibration of KITTI, or JSON or text with K, R and t"
-    )
+    raise FileFormatError(f"{path} is not a text file, as every calibration is; give another")
 
 
 def _named_values(path: Path, text: str) -> _Fields:

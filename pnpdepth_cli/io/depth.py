@@ -81,9 +81,7 @@ def load_stored(path: Path) -> DepthFile:
     if kind is not None:
         raise eight_bits(path, kind)
     names = [kind.name for kind in FORMATS.values() if kind.name != "PNG"]
-    raise FileFormatError(
-        f"{path} is not a depth file; give a 16-bit PNG, {', '.join(names[:-1])} or {names[-1]}"
-    )
+    raise FileFormatError(f"{path} is not a depth file; give a 16-bit PNG, {', '.join(names)}")
 
 
 def depth_from_stored(
@@ -134,9 +132,7 @@ def _as_image(path: Path, values: NDArray[Any]) -> NDArray[Any]:
     if len(shape) == 2:
         return values
     listing = "x".join(str(length) for length in shape) or "a single number"
-    raise FileFormatError(
-        f"{path} holds an array of shape {listing}; a depth image is (H, W), save one channel"
-    )
+    raise FileFormatError(f"{path} holds an array of shape {listing}; a depth image is (H, W)")
 
 
 def write_depth(
@@ -157,10 +153,7 @@ def write_depth(
     """
     depth_format = format_of_suffix(path.suffix)
     if depth_format is None:
-        raise OutputError(
-            f"{path}: depth cannot be written as {path.suffix or 'a file without suffix'!r}; "
-            f"use one of {', '.join(DEPTH_SUFFIXES)}"
-        )
+        raise OutputError(f"{path}: the suffix for depth is one of {', '.join(DEPTH_SUFFIXES)}")
     if depth.ndim != 2 or 0 in depth.shape:
         raise SizeError(f"{path}: depth of shape {depth.shape} is no image; give (H, W)")
     values: NDArray[Any] = known_metres(depth)
@@ -175,18 +168,13 @@ def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.
     check_scale(scale)
     codes = np.rint(metres.astype(np.float64) * scale)
     if codes.max() > LARGEST_CODE:
-        raise OutputError(
-            f"{path}: the largest depth, {metres.max():.6g} m, does not fit a 16-bit PNG with "
-            f"{scale:g} codes per metre (at most {LARGEST_CODE / scale:.6g} m); "
-            "write .exr, .npy or .tiff"
-        )
-    lost = (metres > 0) & (codes == 0)
-    if lost.any():
-        raise OutputError(
-            f"{path}: {int(lost.sum()):,} depths down to {metres[lost].min():.3g} m would become "
-            f"0 (unknown) in a 16-bit PNG with {scale:g} codes per metre; write .exr, .npy or .tiff"
-        )
-    return codes.astype(np.uint16)
+        fact = f"the largest depth, {metres.max():.6g} m, does not fit"
+    elif (lost := (metres > 0) & (codes == 0)).any():
+        fact = f"{int(lost.sum()):,} depths down to {metres[lost].min():.3g} m would be unknown"
+    else:
+        return codes.astype(np.uint16)
+    of_16_bits = f"16 bits with {scale:g} codes per metre"
+    raise OutputError(f"{path}: {fact} in {of_16_bits}; write .exr, .npy or .tiff")
 
 
 def describe_range(

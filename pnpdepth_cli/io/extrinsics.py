@@ -46,10 +46,8 @@ def read_extrinsics(path: Path) -> Extrinsics:
         return pose_of_quaternion(path, numbers[:3], numbers[3:])
     if len(numbers) in (12, 16):
         return pose_of_matrix(path, "the matrix", numbers)
-    raise FileFormatError(
-        f"{path} holds {len(numbers)} numbers; extrinsics are 12 or 16 of a matrix by rows, or 7:"
-        " tx ty tz qx qy qz qw"
-    )
+    kinds = "12 or 16 of a matrix by rows, or tx ty tz qx qy qz qw"
+    raise FileFormatError(f"{path} holds {len(numbers)} numbers; extrinsics are {kinds}")
 
 
 def numbers_in(value: Any) -> list[float] | None:
@@ -102,9 +100,7 @@ def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> 
             )
         raise FileFormatError(f"{path}: the {name} is no rotation (R·Rᵀ is off by {off:.2g})")
     if not (np.abs(translation) < _FARTHEST_M).all():
-        raise FileFormatError(
-            f"{path}: a translation of {one_line(translation)} m is none of a sensor; correct it"
-        )
+        raise FileFormatError(f"{path}: a translation of {one_line(translation)} m is of no sensor")
     return Extrinsics(rotation, translation)
 
 
@@ -148,10 +144,8 @@ def _pose_of_fields(path: Path, fields: Any) -> Extrinsics:
         if name is not None:
             return pose_of_matrix(path, str(name), _components(path, fields[name], ""))
         fields = fields.get("transforms", fields.get("transform"))
-    raise FileFormatError(
-        f"{path} holds no extrinsics; give a matrix, tx ty tz qx qy qz qw, or translation and"
-        " rotation"
-    )
+    kinds = "a matrix, tx ty tz qx qy qz qw, or translation and rotation"
+    raise FileFormatError(f"{path} holds no extrinsics; give {kinds}")
 
 
 def _components(path: Path, value: Any, names: str) -> list[float]:

@@ -35,9 +35,9 @@ def read_bytes(path: Path) -> bytes:
     return data
 
 
-def numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
+def numbered_lines(data: bytes) -> Iterator[tuple[int, str]]:
     """Yields the lines of a text that hold more than a comment after #, with their numbers."""
-    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
+    for number, line in enumerate(data.decode("utf-8-sig", "replace").splitlines(), 1):
         text = line.partition("#")[0].strip()
         if text:
             yield number, text

@@ -22,8 +22,8 @@ from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration, read_rigid_motion
 from pnpdepth_cli.io.extrinsics import is_rotation, rotation_of
-from pnpdepth_cli.io.file_bytes import numbered_lines, one_line, read_bytes
-from pnpdepth_cli.io.text_files import read_json
+from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.text_files import read_json, read_rows
 
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 
@@ -50,7 +50,7 @@ def read_poses(path: Path) -> Floats:
         FileFormatError: A row has other numbers, or its rotation is none.
         InputError: The file cannot be read.
     """
-    return np.stack([pose for _, _, pose in _rows(path)])
+    return _rows(path)[1]
 
 
 def poses_of_frames(
@@ -114,52 +114,41 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
 
 def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
     """The poses (N, 3, 4) of the frames of these names in a file of rows, and how they join."""
-    rows = _rows(path)
-    poses = np.stack([pose for _, _, pose in rows])
+    rows, poses = _rows(path)
     ends = [re.search(r"\d+(?:\.\d+)?$", name) for name in names]
-    numbers = [None if end is None else float(end[0]) for end in ends]
-    if None not in numbers and all(len(values) == _TUM_COLUMNS for _, values, _ in rows):
-        times_s, wanted_s = np.array([v[0] for _, v, _ in rows]), np.array(numbers, np.float64)
-        order = np.argsort(times_s)
-        after = np.searchsorted(times_s[order], wanted_s).clip(1, max(1, len(rows) - 1))
+    numbers = np.array([float(end[0]) for end in ends if end is not None])
+    # Names that are times take the row of the nearest time.
+    if len(numbers) == len(names) and rows.shape[1] == _TUM_COLUMNS:
+        order = np.argsort(rows[:, 0])
+        after = np.searchsorted(rows[order, 0], numbers).clip(1, max(1, len(rows) - 1))
         pair = order[np.stack([after - 1, np.minimum(after, len(rows) - 1)])]
-        gaps = np.abs(times_s[pair] - wanted_s)
+        gaps = np.abs(rows[pair, 0] - numbers)
         nearest = np.where(gaps[0] <= gaps[1], *pair)
         if (largest := float(gaps.min(axis=0).max())) <= LONGEST_GAP_S:
             return poses[nearest], f"joined by time, at most {1000 * largest:.0f} ms apart"
+    # Else there is a row for each, or they are numbers of rows.
     if len(rows) == len(names):
         return poses, "row by row, in the order of the frames"
-    indices = [int(number) for number in numbers if number is not None]
-    if len(indices) == len(names) and max(indices) < len(rows):
-        return poses[indices], "the number in a name is that of its row, from 0"
-    raise InputError(
-        f"{path} has {len(rows)} poses for {len(names)} frames; it needs one row for each, in their"
-        " order, or a time that is the frame's name"
-    )
+    if len(numbers) == len(names) and numbers.max() < len(rows):
+        return poses[numbers.astype(int)], "the number in a name is that of its row, from 0"
+    fact = f"{path} has {len(rows)} poses for {len(names)} frames"
+    raise InputError(f"{fact}; give one for each, in their order, or times that are their names")
 
 
-def _rows(path: Path) -> list[tuple[int, Floats, Floats]]:
-    """(line, its numbers, the pose (3, 4)) of each row; at least one."""
-    rows = []
-    for number, line in numbered_lines(path):
-        try:
-            values = np.array(line.split(), np.float64)
-        except ValueError:
-            raise FileFormatError(f"{path}: line {number} is not made of numbers") from None
-        if len(values) == _KITTI_COLUMNS:
-            pose = values.reshape(3, 4)
-        elif len(values) == _TUM_COLUMNS:
-            pose = np.column_stack([rotation_of(np.roll(values[4:], 1)), values[1:4]])
-        else:
-            raise FileFormatError(
-                f"{path}: line {number} has {len(values)} numbers; a pose has 12 (KITTI) or 8 (TUM)"
-            )
+def _rows(path: Path) -> tuple[Floats, Floats]:
+    """The numbers (N, 12 or 8) of the rows and their poses (N, 3, 4); at least one."""
+    rows, _ = read_rows(path, read_bytes(path))
+    if not len(rows) or rows.shape[1] not in (_KITTI_COLUMNS, _TUM_COLUMNS):
+        raise FileFormatError(f"{path} has no rows of 12 numbers (KITTI) or 8 (TUM)")
+    if rows.shape[1] == _KITTI_COLUMNS:
+        poses = rows.reshape(-1, 3, 4)
+    else:
+        turns = np.stack([rotation_of(np.roll(row[4:], 1)) for row in rows])
+        poses = np.concatenate([turns, rows[:, 1:4, None]], axis=2)
+    for number, pose in enumerate(poses, start=1):
         if not np.isfinite(pose).all() or not is_rotation(pose[:, :3]):
-            raise FileFormatError(f"{path}: line {number} holds no rotation")
-        rows.append((number, values, pose))
-    if not rows:
-        raise FileFormatError(f"{path} has no poses")
-    return rows
+            raise FileFormatError(f"{path}: row {number} holds no rotation")
+    return rows, poses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,14 +189,10 @@ def trajectory_of(times_s: Floats, poses: Floats) -> Trajectory:
 
 def read_trajectory(path: Path) -> Trajectory:
     """Returns the trajectory in a file with rows of time, position and quaternion x y z w."""
-    rows = _rows(path)
-    for number, values, _ in rows:
-        if len(values) != _TUM_COLUMNS or not np.isfinite(values[0]):
-            raise FileFormatError(
-                f"{path}: line {number} is not a time, a position and a quaternion x y z w"
-            )
-    times_s = np.array([values[0] for _, values, _ in rows])
-    return trajectory_of(times_s, np.stack([pose for _, _, pose in rows]))
+    rows, poses = _rows(path)
+    if rows.shape[1] != _TUM_COLUMNS or not np.isfinite(rows[:, 0]).all():
+        raise FileFormatError(f"{path} has no rows of time, position and quaternion x y z w")
+    return trajectory_of(rows[:, 0], poses)
 
 
 def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) -> Floats:
@@ -226,14 +211,10 @@ def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) 
 
 
 def _packet(path: Path) -> Floats:
-    words = read_bytes(path).decode("utf-8", "replace").split()
-    try:
-        values = np.array(words, np.float64)
-    except ValueError:
-        values = np.empty(0)
-    if len(values) != _FIELDS or not np.isfinite(values).all() or abs(values[0]) >= 90:
+    rows, _ = read_rows(path, read_bytes(path))
+    if rows.shape != (1, _FIELDS) or not np.isfinite(rows).all() or abs(rows[0, 0]) >= 90:
         raise FileFormatError(f"{path} is no packet of KITTI's inertial system; copy it again")
-    return values
+    return rows[0]
 
 
 def _pose_of_packet(packet: Floats, scale: float) -> Floats:

@@ -95,9 +95,7 @@ def check_report_folder(
     except OSError as error:
         raise cannot_write(folder, error) from error
     if not (empty or overwrite or _is_of(folder, made_of)):
-        raise OutputError(
-            f"{folder} is not empty; --overwrite replaces the report in it, or name another folder"
-        )
+        raise OutputError(f"{folder} is not empty; add --overwrite, or name another folder")
 
 
 def image_key(name: str) -> str:

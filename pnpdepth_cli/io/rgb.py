@@ -65,10 +65,8 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
         return _from_linear_light(path, data)
     if data[4:8] == b"ftyp":
         if data[8:12] in (b"avif", b"avis") or not _reads_heic():
-            raise FileFormatError(
-                f"{path} is a HEIC or AVIF photo; pip install 'pnpdepth[heic]' reads HEIC, or save"
-                f" it as JPEG, such as with ImageMagick: magick {path.name} {path.stem}.jpg"
-            )
+            hint = "pip install 'pnpdepth[heic]' reads HEIC, or save it as JPEG"
+            raise FileFormatError(f"{path} is a HEIC or AVIF photo; {hint}")
         kind = "HEIF"
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF"):
         raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")

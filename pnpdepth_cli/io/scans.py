@@ -23,7 +23,7 @@ from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import damaged, one_line, read_bytes
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.array_files import parse_npy
-from pnpdepth_cli.io.sparse_files import read_rows
+from pnpdepth_cli.io.text_files import read_rows
 
 _FIELD_COUNTS = (3, 4, 5, 6, 7, 8)
 _BIN_SOURCES = {4: "KITTI scan", 5: "nuScenes scan"}
@@ -91,10 +91,8 @@ def read_scan(path: Path) -> ScanFile:
 def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
     fields = _fields_of_bin(path, data)
     if len(data) % (4 * fields):
-        raise FileFormatError(
-            f"{path}: {len(data):,} bytes are not a multiple of {4 * fields} ({fields} float32"
-            " numbers a point); it is cut short, or its points have another number of fields"
-        )
+        fact = f"{len(data):,} bytes are no multiple of {fields} float32 numbers a point"
+        raise FileFormatError(f"{path}: {fact}; it is cut short, or points have other fields")
     points = np.frombuffer(data, "<f4").reshape(-1, fields)
     source = _BIN_SOURCES.get(fields, f"scan of {fields} fields a point")
     return np.ascontiguousarray(points[:, :3], np.float32), source
@@ -117,10 +115,8 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     explained = {count: _explained_variance(features, counted, count) for count in _FIELD_COUNTS}
     most = max(explained.values())
     if most < _LEAST_EXPLAINED:
-        raise FileFormatError(
-            f"{path}: its content does not tell how many numbers a point has"
-            f" ({', '.join(map(str, _FIELD_COUNTS))} are tried); save its x, y, z as NPY (N, 3)"
-        )
+        fact = f"which of {', '.join(map(str, _FIELD_COUNTS))} numbers a point has"
+        raise FileFormatError(f"{path} does not tell {fact}; save its x, y, z as NPY (N, 3)")
     return next(n for n, fraction in explained.items() if fraction >= _AS_MUCH * most)
 
 
@@ -250,10 +246,7 @@ def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
         if words[0] != "property":
             continue
         if len(words) != 3 or words[1] not in _PLY_KINDS:
-            raise FileFormatError(
-                f"{path}: property {' '.join(words[1:])!r} of a vertex is not one number; leave it"
-                " out"
-            )
+            raise FileFormatError(f"{path}: {' '.join(words)!r} of a vertex is not one number")
         columns.append((words[2], _PLY_KINDS[words[1]], 1))
     stored = header[1][1] if len(header[1]) > 1 else ""
     if stored not in _PLY_ORDERS:
@@ -323,9 +316,7 @@ def _table(path: Path, kind: str, number: int, body: bytes, width: int) -> NDArr
 
 def _whole(path: Path, text: str) -> int:
     if not text.isdecimal() or len(text) > _MOST_DIGITS:
-        raise FileFormatError(
-            f"{path}: {one_line(text)[:40]!r} in its header is no count; correct it"
-        )
+        raise FileFormatError(f"{path}: {one_line(text)[:40]!r} in its header is no count")
     return int(text)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,9 @@ from pnpdepth_cli.io.depth import (
     load_stored,
     write_depth,
 )
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import read_bytes
 from pnpdepth_cli.io.formats import KITTI_SCALE, Reading, check_scale, kind_of
+from pnpdepth_cli.io.text_files import PIXELS, read_rows
 from pnpdepth_cli.points import SparsePoints
 
 SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
@@ -33,11 +33,9 @@ _PROVENANCE_KEY = "pnpdepth:made"
 Points = SparsePoints[NDArray[np.float32]]
 
 _TEXT_SUFFIXES = (".csv", ".txt")
-_PIXELS = ["x", "y", "depth"]
 _MOST_COLUMNS = 8  # of a scan; a wider array is a depth map
 _MANY_ROWS = 200  # of so few columns, which no depth map has
 _BELOW_ZERO = 0.1  # of the rows
-_SEPARATOR = re.compile(r"[\s,;]+")
 
 
 def read_sparse(
@@ -87,9 +85,7 @@ def _from_rows(
     path: Path, rows: NDArray[np.floating], source: str, size: tuple[int, int] | None
 ) -> tuple[Points, Reading]:
     if rows.dtype.kind != "f":
-        raise FileFormatError(
-            f"{path}: a point list of {rows.dtype}; save x, y, depth as float metres"
-        )
+        raise FileFormatError(f"{path} is a list of {rows.dtype}; save x, y, depth as floats")
     if rows.shape[1] != 3:
         raise FileFormatError(
             f"{path}: {rows.shape[1]} numbers a row are not x, y and depth; if they are x y z of a"
@@ -120,7 +116,7 @@ def holds_scan(path: Path) -> bool:
     if path.suffix.lower() in _TEXT_SUFFIXES and kind_of(data) is None:
         rows, header = read_rows(path, data)
         if header:
-            return header[:3] != _PIXELS
+            return header[:3] != PIXELS
     else:
         stored = load_stored(path)
         rows = stored.values
@@ -131,45 +127,6 @@ def holds_scan(path: Path) -> bool:
     with np.errstate(invalid="ignore"):
         below = (rows[:, :2] < -0.5).any(axis=1)
     return rows.shape[1] > 3 or bool(np.count_nonzero(below) > _BELOW_ZERO * len(rows))
-
-
-def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
-    """Returns the numbers (N, 3 or more) of lines of text, and the words of a header, if any.
-
-    Raises:
-        FileFormatError: A line is not made of as many numbers as the first.
-    """
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise FileFormatError(
-            f"{path} is not a text file; give lines of x, y and depth in metres"
-        ) from error
-    # The first line may be a header; "#" begins a comment.
-    rows: list[list[float]] = []
-    header: list[str] = []
-    for number, line in enumerate(lines, start=1):
-        text = line.split("#", 1)[0].strip()
-        words = _SEPARATOR.split(text)
-        names = [word.strip('"').lower() for word in words]
-        if not rows and not header and names[:3] in (_PIXELS, ["x", "y", "z"]):
-            header = names
-            continue
-        if not text:
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        # Every row has as many numbers as the first.
-        count = len(rows[0]) if rows else 3
-        if len(row) < 3 or (rows and len(row) != count):
-            raise FileFormatError(
-                f"{path}, line {number}: {one_line(text)[:60]!r} is not {count} numbers,"
-                " x, y and depth; correct it"
-            )
-        rows.append(row)
-    return np.array(rows, dtype=np.float64).reshape(len(rows), -1 if rows else 3), header
 
 
 def write_sparse(

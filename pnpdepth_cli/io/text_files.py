@@ -1,4 +1,4 @@
-"""JSON that is written whole and read strictly, YAML that is not trusted, CSV for spreadsheets."""
+"""JSON that is written whole and read strictly, YAML that is not trusted, rows of numbers, CSV."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import numbered_lines, one_line, read_bytes
 
 _LONGEST_YAML = 1 << 17
 """Characters, parsed in 2 s at most; a calibration has a few thousand, a bag a line per topic."""
@@ -24,6 +25,9 @@ _LONGEST_YAML = 1 << 17
 _OPENCV_HEADER = re.compile(r"\A\s*%YAML:1\.\d\s*$", re.MULTILINE)
 """OpenCV's first line, which YAML itself does not allow."""
 
+PIXELS = ["x", "y", "depth"]
+_HEADERS = (PIXELS, ["x", "y", "z"])
+_SEPARATOR = re.compile(r"[\s,;]+")
 _STARTS_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -119,6 +123,35 @@ def parse_yaml(path: Path, text: str) -> Any:
         return next(yaml.load_all(_OPENCV_HEADER.sub("", text), Loader), None)
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise FileFormatError(f"{path} is not valid YAML ({one_line(error)})") from error
+
+
+def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
+    """Returns the numbers (N, 3 or more) of lines of text, and the words of a header, if any.
+
+    A first line that begins with x y depth or x y z is a header; "#" begins a comment.
+
+    Raises:
+        FileFormatError: A line is not made of as many numbers as the first.
+    """
+    rows: list[list[float]] = []
+    header: list[str] = []
+    for number, text in numbered_lines(data):
+        words = _SEPARATOR.split(text)
+        names = [word.strip('"').lower() for word in words]
+        if not rows and not header and names[:3] in _HEADERS:
+            header = names
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        # Every row has as many numbers as the first.
+        count = len(rows[0]) if rows else max(3, len(row))
+        if len(row) != count:
+            shown = one_line(text)[:60]
+            raise FileFormatError(f"{path}, line {number}: {shown!r} is not {count} numbers")
+        rows.append(row)
+    return np.array(rows, dtype=np.float64).reshape(len(rows), -1 if rows else 3), header
 
 
 def write_csv(file: TextIO, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

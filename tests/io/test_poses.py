@@ -107,20 +107,21 @@ def test_poses_that_fit_no_frames_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text",
     [
-        ("# nothing\n", "has no poses"),
-        ("1 2 3\n", "line 1 has 3 numbers"),
-        ("1 0 0 0 0 1 0 0 0 0 x 0\n", "not made of numbers"),
-        ("2 0 0 0 0 1 0 0 0 0 1 0\n", "no rotation"),
-        ("-1 0 0 0 0 1 0 0 0 0 1 0\n", "no rotation"),
-        ("1 0 0 nan 0 1 0 0 0 0 1 0\n", "no rotation"),
-        ("0 0 0 0 0 0 0 0\n", "line 1"),
+        "# nothing\n",
+        "1 2 3\n",
+        "1 0 0 0 0 1 0 0 0 0 x 0\n",
+        "2 0 0 0 0 1 0 0 0 0 1 0\n",
+        "-1 0 0 0 0 1 0 0 0 0 1 0\n",
+        "1 0 0 nan 0 1 0 0 0 0 1 0\n",
+        "0 0 0 0 0 0 0 0\n",
+        kitti_row(0) + tum_row(0, 0),
     ],
 )
-def test_a_broken_row_is_named(tmp_path: Path, text: str, message: str) -> None:
+def test_a_broken_row_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "p.txt").write_text(text)
-    with pytest.raises(FileFormatError, match=message):
+    with pytest.raises(FileFormatError, match=r"p\.txt"):
         read_poses(tmp_path / "p.txt")
 
 

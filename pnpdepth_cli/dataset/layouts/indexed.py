@@ -101,7 +101,7 @@ def _frames_of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
 def _timed_files(path: Path, count: int) -> list[list[Timed]]:
     """The times and paths of each line: one pair, or those of an image and of its depth."""
     rows = []
-    for number, line in numbered_lines(path):
+    for number, line in numbered_lines(read_bytes(path)):
         words = line.split()
         try:
             row = [(float(words[2 * i]), path.parent / words[2 * i + 1]) for i in range(count)]

