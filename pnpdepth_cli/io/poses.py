@@ -214,7 +214,7 @@ def _packet(path: Path) -> Floats:
     rows, _ = read_rows(path, read_bytes(path))
     if rows.shape != (1, _FIELDS) or not np.isfinite(rows).all() or abs(rows[0, 0]) >= 90:
         raise FileFormatError(f"{path} is no packet of KITTI's inertial system; copy it again")
-    return rows[0]
+    return np.asarray(rows[0])
 
 
 def _pose_of_packet(packet: Floats, scale: float) -> Floats:
