@@ -7,6 +7,8 @@ NYU, sparse depth only. Published checkpoints load; no weights ship.
 
 from __future__ import annotations
 
+from collections import OrderedDict
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -28,44 +30,22 @@ class SoftplusNormalisedConv(NormalisedConv):
         return F.softplus(self.weight_p, beta=10)
 
 
-class TwoConvolutions(nn.Module):
-    """3×3 convolution, batch norm, ReLU, twice."""
-
-    def __init__(self, channels: int, out: int) -> None:
-        super().__init__()
-        self.conv = nn.Sequential(
-            nn.Conv2d(channels, out, 3, padding=1),
-            nn.BatchNorm2d(out),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(out, out, 3, padding=1),
-            nn.BatchNorm2d(out),
-            nn.ReLU(inplace=True),
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.conv(x)  # type: ignore[no-any-return]
+def named(**parts: nn.Module) -> nn.Sequential:
+    """Returns a sequence whose parts have these names, those of the published weights."""
+    return nn.Sequential(OrderedDict(parts))
 
 
-class Inward(nn.Module):
-    """The first two convolutions."""
-
-    def __init__(self, out: int) -> None:
-        super().__init__()
-        self.conv = TwoConvolutions(1, out)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.conv(x)  # type: ignore[no-any-return]
+def two_convolutions(channels: int, out: int) -> nn.Sequential:
+    """Returns 3×3 convolution, batch norm, ReLU, twice."""
+    parts: list[nn.Module] = []
+    for count in (channels, out):
+        parts += [nn.Conv2d(count, out, 3, padding=1), nn.BatchNorm2d(out), nn.ReLU(inplace=True)]
+    return named(conv=nn.Sequential(*parts))
 
 
-class Down(nn.Module):
-    """Half the size, two convolutions."""
-
-    def __init__(self, channels: int, out: int) -> None:
-        super().__init__()
-        self.mpconv = nn.Sequential(nn.MaxPool2d(2), TwoConvolutions(channels, out))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.mpconv(x)  # type: ignore[no-any-return]
+def down(channels: int, out: int) -> nn.Sequential:
+    """Returns a halving of the size and two convolutions."""
+    return named(mpconv=nn.Sequential(nn.MaxPool2d(2), two_convolutions(channels, out)))
 
 
 class Up(nn.Module):
@@ -73,22 +53,11 @@ class Up(nn.Module):
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
-        self.conv = TwoConvolutions(channels, out)
+        self.conv = two_convolutions(channels, out)
 
     def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
         coarse = F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=True)
         return self.conv(torch.cat([fine, coarse], dim=1))  # type: ignore[no-any-return]
-
-
-class Outward(nn.Module):
-    """A 1×1 convolution to one channel."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(channels, 1, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.conv(x)  # type: ignore[no-any-return]
 
 
 class ConfidenceUNet(nn.Module):
@@ -96,14 +65,14 @@ class ConfidenceUNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.inc = Inward(32)
-        self.down1 = Down(32, 32)
-        self.down2 = Down(32, 64)
-        self.down3 = Down(64, 64)
+        self.inc = named(conv=two_convolutions(1, 32))
+        self.down1 = down(32, 32)
+        self.down2 = down(32, 64)
+        self.down3 = down(64, 64)
         self.up2 = Up(128, 64)
         self.up3 = Up(96, 32)
         self.up4 = Up(64, 32)
-        self.outc = Outward(32)
+        self.outc = named(conv=nn.Conv2d(32, 1, 1))
 
     def forward(self, sparse: Tensor) -> Tensor:
         full = self.inc(sparse)

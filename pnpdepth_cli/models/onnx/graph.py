@@ -25,7 +25,6 @@ from pnpdepth_cli.models.onnx import (  # noqa: F401  (each file registers its o
     arithmetic,
     elements,
     layers,
-    resizing,
 )
 from pnpdepth_cli.models.steps import SizeLimit, Step, Steps, Unsupported, Value
 
