@@ -199,19 +199,11 @@ def test_a_far_plane_of_ground_truth_is_neither_scored_nor_sampled(
     assert record["points"]["farthest"] <= truth.max()
 
 
-@pytest.mark.parametrize("far", [1e10, 65504, 10000, 1000])
-def test_a_far_plane_of_sparse_depth_is_no_point(tmp_path: Path, far: float) -> None:
+def test_a_far_plane_of_sparse_depth_is_no_point(tmp_path: Path) -> None:
     sparse = codes_of(STREET / "sparse.png") / 256
-    known = np.count_nonzero(sparse)
-    with_sky = sparse.copy()
-    with_sky[:40, ::7] = far
-    np.save(tmp_path / "a.npy", with_sky.astype(np.float32))
-    frame = read(tmp_path / "a.npy")
-    assert len(frame.points) == np.count_nonzero(sparse[40:]) + np.count_nonzero(
-        np.delete(sparse[:40], np.s_[::7], axis=1)
-    )
-    assert known >= len(frame.points)
-    assert float(frame.points.depth.max()) == pytest.approx(sparse.max())
+    sparse[:40, ::7] = 10000
+    np.save(tmp_path / "a.npy", sparse.astype(np.float32))
+    assert len(read(tmp_path / "a.npy").points) == np.count_nonzero((sparse > 0) & (sparse < 1000))
 
 
 def warnings_of(sparse: Path, image: Path = STREET / "rgb.png", **scan: Any) -> list[str]:

@@ -10,17 +10,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import (
-    _is_upright,
     check_direction,
     read_scan_points,
 )
-from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.io.text_files import read_json
 from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
 
 TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -46,21 +43,6 @@ def test_extrinsics_of_a_file_complete_a_calibration(scene: ScanOnDisk) -> None:
     assert cKDTree(scene.xy).query(read.points.xy)[0].max() < 2e-3
 
 
-def test_projecting_with_extrinsics_records_their_path_and_never_replaces_them(
-    scene: ScanOnDisk,
-) -> None:
-    pose = scene.folder / "pose.json"
-    pose.write_text((scene.folder / "pose.txt").read_text())
-    options = ScanOptions(calib=scene.calib, extrinsics=pose)
-    target = SparseTarget(output=scene.folder / "out.png")
-    record = project_scan(scene.scan, options, target, scene.image)
-    assert record["extrinsics"] == str(pose)
-    assert read_json(scene.folder / "out.json") == record
-    target = SparseTarget(output=scene.folder / "pose.png", overwrite=True)
-    with pytest.raises(OutputError, match=r"pose\.json is an input"):
-        project_scan(scene.scan, options, target, scene.image)
-
-
 def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> None:
     wrong = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "inverse.txt")
     with pytest.raises(UsageError, match=r"put 0 of 150 scan .* give their inverse"):
@@ -83,12 +65,3 @@ def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> 
         assert check_direction(scan, portrait, right, (1242, 375)) == []
         (warning,) = check_direction(scan, camera, right.inverse(), (375, 1242))
         assert "if they map the camera to the scanner, give their inverse" in warning
-
-
-@pytest.mark.parametrize(("turns", "upright"), [(0, True), (1, False), (2, True)])
-def test_a_thin_scan_shows_whether_the_image_is_upright(turns: int, upright: bool) -> None:
-    rays = np.random.default_rng(0).normal(size=(400, 3)) * (1, 1, 0.1)
-    c, s = np.cos(turns * np.pi / 2), np.sin(turns * np.pi / 2)
-    about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    assert _is_upright(rays, about_z @ TURN) is upright
-    assert _is_upright(np.random.default_rng(0).normal(size=(400, 3)), about_z @ TURN) is None

@@ -61,12 +61,6 @@ def test_few_points_that_are_no_numbers_are_dropped_and_many_are_refused() -> No
             scan_returns("a.npy", nothing)
 
 
-def test_a_scan_of_the_right_kind_is_left_as_it_is() -> None:
-    points, dropped, notes = scan_returns("a.npy", SCAN)
-    np.testing.assert_array_equal(points, SCAN)
-    assert (dropped, notes) == ({}, [])
-
-
 def test_a_scan_in_millimetres_names_the_option_that_reads_it() -> None:
     with pytest.raises(InputError, match=r"--depth-scale 1000 \(now 1\) would make it"):
         scan_returns("a.pcd", 1000 * SCAN)

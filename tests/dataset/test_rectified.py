@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rosbags")
 
-from pnpdepth_cli.commands.sparse.bag_frames import _some_frames
 from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
@@ -101,17 +100,6 @@ def test_images_of_a_bag_are_rectified_by_their_topic_or_else_by_their_edges(
     assert calibration.camera.distortion == (() if rectified else tuple(D))
     if rectified:
         assert pixel_error(tmp_path / "frames", RECTIFIED) < 1e-3
-
-
-def test_the_frames_compared_are_few_from_the_first_to_the_last(tmp_path: Path) -> None:
-    for folder in ("rgb", "sparse"):
-        (tmp_path / folder).mkdir()
-    for number in range(20):
-        cv2.imwrite(str(tmp_path / f"rgb/{number:02}.png"), np.full((2, 2), number, np.uint8))
-        np.save(tmp_path / f"sparse/{number:02}.npy", np.full((1, 3), number + 1.0))
-    first, *others, last = (xyz[0, 0] - 1 for _, xyz in _some_frames(tmp_path))
-    assert (first, last) == (0, 19)
-    assert len(others) < 10
 
 
 @pytest.mark.parametrize("to_rectified", [True, False])

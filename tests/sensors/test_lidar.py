@@ -1,31 +1,26 @@
+"""Rotating LiDARs: those of the data sheets and the paper, and what they measure."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, ideal_lidar
+from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, ideal_lidar, simulate_lidar
 
 
-@pytest.mark.parametrize(
-    ("name", "beams", "top", "bottom", "step", "most_m", "noise_m"),
-    [
-        ("vlp-16", 16, 15.0, -15.0, 0.2, 100, 0.03),
-        ("vlp-32c", 32, 15.0, -25.0, 0.2, 200, 0.03),
-        ("hdl-32e", 32, 10.67, -30.67, 0.166, 100, 0.02),
-        ("hdl-64e", 64, 2.0, -24.33, 0.1728, 120, 0.02),
-    ],
-)
-def test_a_sensor_is_that_of_its_data_sheet(
-    name: str, beams: int, top: float, bottom: float, step: float, most_m: float, noise_m: float
-) -> None:
-    sensor, angles = LIDARS[name], np.array(LIDARS[name].elevations_deg)
-    assert len(angles) == beams
-    assert (np.diff(angles) < 0).all()
-    assert (angles[0], angles[-1]) == pytest.approx((top, bottom), abs=0.01)
-    assert (sensor.azimuth_step_deg, sensor.max_range, sensor.range_noise) == (
-        *(step, most_m, noise_m),
-    )
+def test_a_sensor_has_the_beams_of_its_data_sheet_from_the_top() -> None:
+    for name, beams, top, bottom in (
+        ("vlp-16", 16, 15.0, -15.0),
+        ("vlp-32c", 32, 15.0, -25.0),
+        ("hdl-32e", 32, 10.67, -30.67),
+        ("hdl-64e", 64, 2.0, -24.33),
+    ):
+        angles = np.array(LIDARS[name].elevations_deg)
+        assert len(angles) == beams
+        assert (np.diff(angles) < 0).all()
+        assert (angles[0], angles[-1]) == pytest.approx((top, bottom), abs=0.01)
 
 
 def test_the_beams_of_the_vlp_32c_are_those_of_its_manual_in_the_order_of_firing() -> None:
@@ -48,3 +43,39 @@ def test_a_lidar_of_ones_own_has_evenly_spaced_beams_and_no_noise() -> None:
             ideal_lidar(5, top, bottom)
     with pytest.raises(UsageError):
         ideal_lidar(2, 91, 0)
+
+
+K = np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
+CAMERA = Camera(intrinsics=K)
+IDEAL = Lidar(
+    name="ideal", elevations_deg=tuple(range(-14, 15, 2)), azimuth_step_deg=0.2, max_range=100
+)
+
+
+def test_without_noise_every_point_lies_on_the_depth_map() -> None:
+    depth = np.random.default_rng(0).uniform(2, 50, (240, 320)).astype(np.float32)
+    got = simulate_lidar(depth, CAMERA, IDEAL, seed=0)
+    column, row = np.floor(got.xy + 0.5).astype(int).T
+    np.testing.assert_allclose(got.depth, depth[row, column], rtol=1e-6)
+    assert len(got.depth) > 1000
+
+
+def test_unknown_depth_gives_no_points() -> None:
+    with pytest.raises(NoPointsError, match="ideal"):
+        simulate_lidar(np.zeros((240, 320)), CAMERA, IDEAL, seed=0)
+    half = np.full((240, 320), 5.0)
+    half[:, :160] = 0
+    assert simulate_lidar(half, CAMERA, IDEAL, seed=0).xy[:, 0].min() >= 159.5
+
+
+PAPER_PERCENT = {"vlp-16": 5.3, "vlp-32c": 28.8, "hdl-32e": 10.3, "hdl-64e": 18.7}
+
+
+def test_the_papers_sensors_give_about_its_fractions_of_samples() -> None:
+    # SYNTHIA's sequences are 1280×760 with a focal length of 532.74; at 0.4 of that size
+    intrinsics = np.array([[213.1, 0, 255.5], [0, 213.1, 151.5], [0, 0, 1]])
+    synthia = Camera(intrinsics=intrinsics)
+    depth = np.full((304, 512), 10.0)
+    for name, percent in PAPER_PERCENT.items():
+        points = simulate_lidar(depth, synthia, LIDARS[f"paper-{name}"], 0)
+        assert 100 * len(points) / depth.size == pytest.approx(percent, rel=0.1), name

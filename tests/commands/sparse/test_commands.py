@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.spatial import cKDTree
 
 from pnpdepth_cli.commands.sparse.make import (
     SparseTarget,
@@ -19,7 +18,6 @@ from pnpdepth_cli.commands.sparse.make import (
     simulate_scan,
 )
 from pnpdepth_cli.dataset.read_options import ScanOptions
-from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import (
     OutputError,
     PnpDepthError,
@@ -182,28 +180,3 @@ def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(
     )
     ours = cv2.imread(str(tmp_path / "sparse.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(ours, theirs)
-
-
-@pytest.mark.parametrize("camera", range(4))
-def test_kittis_scans_land_where_the_development_kits_formula_puts_them(
-    shared_data: Path, camera: int
-) -> None:
-    folder = shared_data / "kitti_object"
-    scan = np.fromfile(folder / "velodyne" / "000002.bin", "<f4").reshape(-1, 4)
-    calib = folder / "calib" / "000002.txt"
-    lines = (line.partition(":") for line in calib.read_text().splitlines() if line)
-    rows = {name: np.array(values.split(), float) for name, _, values in lines}
-    rectify, velo_to_cam = np.eye(4), np.eye(4)
-    rectify[:3, :3] = rows["R0_rect"].reshape(3, 3)
-    velo_to_cam[:3] = rows["Tr_velo_to_cam"].reshape(3, 4)
-    projection = rows[f"P{camera}"].reshape(3, 4) @ rectify @ velo_to_cam
-    u, v, depth = projection @ np.column_stack([scan[:, :3], np.ones(len(scan))]).T
-    options = ScanOptions(calib=calib, camera=camera, keep_occluded=True)
-    got = read_scan_points(folder / "velodyne" / "000002.bin", options, (375, 1242)).points
-    want = np.column_stack([u / depth, v / depth, depth])  # a pixel's nearest beam is kept
-    far, index = cKDTree(want * [1, 1, 100]).query(np.column_stack([got.xy, got.depth * 100]))
-    assert far.max() < 5e-3
-    assert len(set(index)) == len(got.depth)
-    x, y = u / depth, v / depth
-    inside = (depth > 0) & (x >= -0.5) & (x < 1241.5) & (y >= -0.5) & (y < 374.5)
-    assert len(got.depth) == inside.sum() - got.dropped["behind another in their pixel"]

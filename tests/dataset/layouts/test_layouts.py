@@ -18,7 +18,7 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles, file_of
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.protocols import NYU_PART, ODOMETRY_PART, FramePart, find_protocol
+from pnpdepth_cli.protocols import ODOMETRY_PART, find_protocol
 from tests.colmap_models import write_text_model
 from tests.data_sets import (
     BENCHMARKS,
@@ -387,26 +387,8 @@ def test_an_unknown_folder_names_the_nearest_layout_and_what_it_lacks(
         list_frames(tmp_path)
 
 
-def test_protocols_cut_what_the_paper_says() -> None:
-    rows, columns = np.indices((376, 1241))
-    part = ODOMETRY_PART.apply(np.stack([rows, columns], axis=2))
-    assert part.shape == (228, 912, 2)
-    assert (part[0, 0].tolist(), part[-1, -1].tolist()) == ([148, 164], [375, 1075])
-    rows, columns = np.indices((480, 640))
-    part = NYU_PART.apply(np.stack([rows, columns], axis=2))
-    assert part.shape == (228, 304, 2)
-    assert part[0, 0].tolist() == [13, 17]  # row 6 and column 8 of every second pixel from 1 on
+def test_a_protocol_that_is_none_or_that_a_frame_is_too_small_for_is_refused() -> None:
     with pytest.raises(SizeError, match=r"\b912×228"):
         ODOMETRY_PART.apply(np.zeros((200, 1000)))
-    with pytest.raises(UsageError, match="there are paper, whole"):
+    with pytest.raises(UsageError, match="eigenn"):
         find_protocol("eigenn")
-
-
-@pytest.mark.parametrize("part", [NYU_PART, ODOMETRY_PART])
-def test_pixel_coordinates_move_as_the_image_is_cut(part: FramePart) -> None:
-    rows, columns = np.indices((480, 1240))
-    image = part.apply(np.stack([columns, rows], axis=2))
-    row, column = 100, 200
-    there = part.in_crop(image[row, column][None].astype(np.float32), (480, 1240))
-    # the kept pixel is one quarter of a new one away from its centre where pixels are halved
-    np.testing.assert_allclose(there[0], [column, row], atol=0.26)
