@@ -83,10 +83,13 @@ BY_HAND: dict[str, tuple[Callable[[Path], None], int, int, int]] = {
 }
 
 
-def inputs_of(root: Path, protocol: str) -> list[Frame]:
-    refine = RefineRequest()
-    request = BatchRequest(source=root, output=root / "out", refine=refine, protocol=protocol)
-    return [read_requested(request_of(request, frame)) for frame in find_frames(request).chosen]
+def read_as_batch(root: Path, protocol: str) -> dict[str, Frame]:
+    """The frames of a data set by name, as `batch` reads them."""
+    request = BatchRequest(
+        source=root, output=root / "out", refine=RefineRequest(), protocol=protocol
+    )
+    frames = find_frames(request).chosen
+    return {frame.name: read_requested(request_of(request, frame)) for frame in frames}
 
 
 LARGE = pytest.param("omni-dc-eth3d", marks=pytest.mark.slow)
@@ -98,15 +101,11 @@ def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_p
     maker, frames, points, pixels = BY_HAND[name]
     root = tmp_path / "data"
     maker(root)
-    request = BatchRequest(
-        source=root, output=tmp_path / "out", refine=RefineRequest(), protocol=name
-    )
-    chosen = find_frames(request).chosen
-    read = [read_requested(request_of(request, frame)) for frame in chosen]
-    assert [len(each.points) for each in read] == [points] * frames
-    for frame, each in zip(chosen, read, strict=True):
+    read = read_as_batch(root, name)
+    assert [len(each.points) for each in read.values()] == [points] * frames
+    for frame, each in read.items():
         assert each.gt is not None
-        path = tmp_path / "out" / f"{frame.name}_depth.npy"
+        path = tmp_path / "out" / f"{frame}_depth.npy"
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, np.full(each.gt.shape, 2.0, np.float32))
         height, width = each.gt.shape
@@ -132,14 +131,13 @@ def test_blocks_of_pixels_are_averaged_over_those_with_depth() -> None:
 
 def test_the_points_of_ibims_are_those_that_marigold_dc_draws(tmp_path: Path) -> None:
     ibims(tmp_path)
-    first, second = inputs_of(tmp_path, "marigold-dc-ibims")
     known = np.zeros((480, 640), bool)
     known[:, :320] = True
     pixels = np.argwhere(known)
     np.random.seed(2024)  # as the paper's code draws them
     np.random.shuffle(pixels)
     expected = {(x, y) for y, x in pixels[:1000].tolist()}
-    for each in (first, second):
+    for each in read_as_batch(tmp_path, "marigold-dc-ibims").values():
         assert {(int(x), int(y)) for x, y in each.points.xy.tolist()} == expected
 
 
@@ -151,11 +149,8 @@ def test_points_behind_the_foreground_are_those_of_two_windows() -> None:
     points = SparsePoints(
         xy=np.stack([columns, rows], axis=1).astype(np.float32), depth=values, size=(30, 40)
     )
-    expected = []
     near = (abs(rows[:, None] - rows) <= 3) & (abs(columns[:, None] - columns) <= 3)
     lowest = np.array([values[window].min() for window in near])
-    for window, own in zip(near, values, strict=True):
-        expected.append(own - lowest[window].min() > 1.5)
-    found = behind_foreground(points, 7, 1.5)
-    assert found.tolist() == expected
-    assert 0 < found.sum() < len(values)
+    expected = [own - lowest[window].min() > 1.5 for window, own in zip(near, values, strict=True)]
+    assert behind_foreground(points, 7, 1.5).tolist() == expected
+    assert 0 < sum(expected) < len(values)
