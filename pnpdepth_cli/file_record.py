@@ -44,7 +44,7 @@ class FileRecord:
     extrinsics: str | None = None
     """Path of the pose of the scanner."""
     keep_occluded: bool = False
-    """Whether points of a scan that are hidden by nearer ones were kept."""
+    """Whether points of a scan that are occluded by nearer ones were kept."""
     image: str | None = None
     """Name of the image in a COLMAP model."""
     unit_scale: float | None = None
