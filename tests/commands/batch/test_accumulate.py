@@ -105,15 +105,15 @@ def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
     )
 
 
-def test_a_frame_without_points_cannot_be_accumulated() -> None:
-    frame = FrameFiles(name="a", pose=STILL)
-    with pytest.raises(UsageError, match="not images alone"):
-        with_neighbours([frame, frame], 1, None)
-
-
-def test_frames_without_images_need_poses_to_be_accumulated() -> None:
-    frame = FrameFiles(name="a", sparse=Path("s.png"))
-    with pytest.raises(UsageError, match="--poses"):
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (FrameFiles(name="a", pose=STILL), "not images alone"),
+        (FrameFiles(name="a", sparse=Path("s.png")), "--poses"),
+    ],
+)
+def test_neighbours_need_points_and_images_or_poses(frame: FrameFiles, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
         with_neighbours([frame, frame], 1, None)
 
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from pnpdepth_cli.commands.batch.running import spread
 from pnpdepth_cli.errors import NoPointsError
@@ -19,7 +18,6 @@ from pnpdepth_cli.frames import resolve
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.resolve import NORMALISATIONS, choose_input_range
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.points import SparsePoints
 from tests.commands.batches import batch, pairs_on_disk
 
 
@@ -44,27 +42,6 @@ def test_the_ranges_are_those_of_their_names() -> None:
     for name, (low, high) in {"unit": (0, 1), "symmetric": (-1, 1), "bytes": (0, 255)}.items():
         assert ranges[name].tolist() == [[low] * 3, [high] * 3]
     assert ranges["imagenet"][1].round(3).tolist() == [2.249, 2.429, 2.64]  # as is often printed
-
-
-def test_a_range_in_which_the_network_is_not_finite_has_a_large_error(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    y, x = torch.meshgrid(torch.arange(8.0), torch.arange(8.0), indexing="ij")
-    truth = 2 + x + y
-    xy = torch.stack([x, y], -1).reshape(-1, 2)
-    points = SparsePoints(xy=xy, depth=truth.flatten(), size=(8, 8))
-    rough = truth + torch.sin(3 * x)
-    half_finite = torch.where(y < 4, truth, torch.inf)
-    monkeypatch.setattr(resolve, "prepare", lambda *_: SimpleNamespace(points=points, arguments=()))
-    errors = []
-    for output in (truth, rough, half_finite):
-        network: Any = SimpleNamespace(
-            definition=SimpleNamespace(output_kind="depth"),
-            module=lambda output=output: output[None, None],
-            raw_of=lambda output: output,
-        )
-        errors.append(resolve._mean_alignment_error(network, [None]))  # type: ignore[list-item]
-    assert errors[0] < errors[1] < errors[2]
 
 
 def set_errors(monkeypatch: pytest.MonkeyPatch, error: Callable[[Network, Frame], float]) -> None:

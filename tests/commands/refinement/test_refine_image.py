@@ -10,7 +10,6 @@ import pytest
 import torch
 from PIL import Image
 
-from pnpdepth_cli.commands.refinement.refine_image import _at_points
 from pnpdepth_cli.dataset.frame_record import FrameRecord, PointsRecord
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import (
@@ -26,7 +25,6 @@ from pnpdepth_cli.errors import (
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors.samplers import SamplePattern
 from tests.commands.frames import FrameOnDisk, run
 
@@ -87,11 +85,6 @@ def test_ground_truth_whose_assumed_scale_is_another_one_in_use_stops_and_names_
     assert not (frame.folder / "out").exists()
     if scale > 1:
         run(frame, gt=frame.folder / "codes.png", gt_scale=scale, iterations=0)
-
-
-def test_ground_truth_that_no_two_scales_explain_is_warned_of(frame: FrameOnDisk) -> None:
-    record = run(frame, gt=frame.gt, gt_scale=500.0, iterations=0)
-    assert noted(record, "warning: the ground truth is 2 times the sparse depth")
 
 
 def test_a_point_beyond_everything_is_dropped_with_a_note(frame: FrameOnDisk) -> None:
@@ -183,14 +176,6 @@ def test_a_point_between_pixels_is_enough_and_points_outside_are_counted(
     assert change_of(record, "used") < 1
 
 
-def test_a_list_of_points_with_x_and_y_swapped_is_refused(frame: FrameOnDisk) -> None:
-    points = frame.folder / "points.csv"
-    points.write_text("10,5,2\n20,50,2\n45,61,3\n")  # of an image of 62×46
-    message = r"\b2 of 3 points are outside .* inside 46×62: swap x and y"
-    with pytest.raises(SizeError, match=message):
-        run(frame, sparse=points)
-
-
 def test_the_networks_crop_leaves_the_rest_unknown_and_refuses_points_only_there(
     frame: FrameOnDisk,
 ) -> None:
@@ -248,15 +233,3 @@ def test_a_mistake_gives_one_clear_line_and_writes_nothing(
         run(frame, **changes)
     assert "\n" not in str(caught.value)
     assert files(frame.folder) == before
-
-
-def test_the_error_at_points_is_of_those_with_a_prediction() -> None:
-    points = SparsePoints(
-        xy=torch.tensor([[0.0, 0], [1, 0], [2, 0]]), depth=torch.tensor([5, 1.5, 6]), size=(1, 3)
-    )
-    depth = np.array([[0, 0.5, 9]], np.float32)
-    error = {"points": 2, "mae": 2.0, "rmse": 5**0.5}
-    assert _at_points(points, {"before": depth, "after": depth}) == dict.fromkeys(
-        ("before", "after"), error
-    )
-    assert _at_points(points, {"before": depth, "after": 0 * depth}) == {}

@@ -15,10 +15,9 @@ import pytest
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.report import batch_report as report_batch
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.errors import OutputError, StorageError
+from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.figure import paint_signed
-from pnpdepth_cli.io.report import link_image
 from tests.commands.batches import NAMES, batch, done, pairs_on_disk, refinement
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
 
@@ -203,38 +202,16 @@ def test_another_batchs_report_is_replaced_only_on_request(root: Path, report: P
     assert page_data(report)["title"].endswith("other")
 
 
-def test_a_preview_that_went_missing_costs_one_frame_its_images(root: Path, report: Path) -> None:
+def test_an_image_that_was_deleted_is_not_made_again_and_the_report_does_without(
+    root: Path, report: Path
+) -> None:
     batch(root)
     (root / "out/b_preview.png").unlink()
-    batch(root, limit=1, html=report)
+    assert done(root, html=report) == []
     frames = frames_of(report)
     assert frames["b"]["key"] is None
     assert all(frames[name]["key"] for name in "acd")
     assert frames["b"]["values"]["rmse_change"] is not None
-
-
-def test_a_disk_that_is_full_while_linking_ends_the_run_and_the_next_one_goes_on(
-    root: Path, report: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    linked: list[Path] = []
-
-    def full_at_the_second(source: Path, target: Path) -> None:
-        linked.append(target)
-        if len(linked) == 2:
-            raise StorageError("the disk is full")
-        link_image(source, target)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(report_batch, "link_image", full_at_the_second)
-        with pytest.raises(StorageError):
-            batch(root, html=report)
-    assert not report.exists()
-    (report / ".0123456789ab").mkdir(parents=True)  # of a run that was killed
-    batch(root, html=report)
-    resumed = everything(report)
-    shutil.rmtree(report)
-    batch(root, html=report)
-    assert resumed == everything(report)
 
 
 def test_the_legend_has_the_colours_of_the_improvement_maps(root: Path, report: Path) -> None:
