@@ -56,23 +56,23 @@ TREES = {
 
 
 def image(path: Path, height: int = HEIGHT, width: int = WIDTH) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.full((height, width, 3), 90, np.uint8))
+    _write(path, np.full((height, width, 3), 90, np.uint8))
 
 
 def codes(path: Path, value: int, height: int = HEIGHT, width: int = WIDTH, every: int = 1) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     depth = np.zeros((height, width), np.uint16)
     depth[::every, ::every] = value
-    cv2.imwrite(str(path), depth)
+    _write(path, depth)
 
 
 def mask(path: Path) -> None:
     """The left half is valid."""
+    _write(path, np.where(np.arange(WIDTH) < WIDTH // 2, 255, 0) * np.ones((HEIGHT, 1), np.uint8))
+
+
+def _write(path: Path, pixels: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    valid = np.zeros((HEIGHT, WIDTH), np.uint8)
-    valid[:, : WIDTH // 2] = 255
-    cv2.imwrite(str(path), valid)
+    cv2.imwrite(str(path), pixels)
 
 
 def void(root: Path) -> None:
@@ -125,8 +125,7 @@ def stray_scanner(root: Path, frames: int = 3) -> None:
         codes(root / f"depth/{number:06}.png", 2000, HEIGHT // 2, WIDTH // 2)
         confidence = np.full((HEIGHT // 2, WIDTH // 2), 2, np.uint8)
         confidence[:, : WIDTH // 8] = 0
-        (root / "confidence").mkdir(exist_ok=True)
-        cv2.imwrite(str(root / f"confidence/{number:06}.png"), confidence)
+        _write(root / f"confidence/{number:06}.png", confidence)
     video(root / "rgb.mp4", [20 + 15 * number for number in range(frames)])
     (root / "camera_matrix.csv").write_text(f"30.0, 0.0, {WIDTH / 2}\n0.0, 30.0, 12.0\n0, 0, 1")
     rows = [f"{n / 60}, {n:06}, {n / 10}, 0, 0, 0, 0, 0, 1\n" for n in range(frames)]

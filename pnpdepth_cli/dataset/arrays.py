@@ -50,7 +50,10 @@ def read_image(source: ImageSource) -> NDArray[np.float32]:
         return read_rgb(source).values
     if isinstance(source, VideoFrame):
         return read_video_frame(source.path, source.index)
-    return _rgb_of(source)
+    pixels = _read(source)
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise FileFormatError(f"{source} is {pixels.dtype} of shape {pixels.shape}, not an image")
+    return pixels.astype(np.float32) / np.float32(255)
 
 
 def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.float32]:
@@ -142,14 +145,6 @@ def shape_of(path: Path, name: str) -> tuple[int, ...]:
     """Returns the shape of an array of the file. Raises InputError if it has none."""
     with _open_array(path, name) as array:
         return tuple(array.shape)
-
-
-def _rgb_of(source: Hdf5Array) -> NDArray[np.float32]:
-    """An image (H, W, 3) float32 in 0..1 from an array of bytes. Raises InputError for another."""
-    pixels = _read(source)
-    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise FileFormatError(f"{source} is {pixels.dtype} of shape {pixels.shape}, not an image")
-    return pixels.astype(np.float32) / np.float32(255)
 
 
 def depth_of(source: Hdf5Array | RawDepth) -> NDArray[np.float32]:

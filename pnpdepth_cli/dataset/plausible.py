@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,11 +48,10 @@ _SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, 
 _CORNER, _MANY = 0.75, 50  # of the image's sides that so many points keep within: another size
 _BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of a scan
 
-Mask = NDArray[np.bool_]
-
-
 MAPS, SCANS = (0.02, 1000.0), (0.05, 300.0)
 """The smallest and the largest median, metres, of depth maps and of ranges of scans."""
+
+Mask = NDArray[np.bool_]
 
 
 def scan_returns(
@@ -71,8 +69,6 @@ def scan_returns(
         InputError: The points are implausible in metres.
         NoPointsError: No point is left.
     """
-    if not len(xyz):
-        raise NoPointsError(f"{path} holds no point; give a scan with points")
     counts, keep = dict[str, int](), np.ones(len(xyz), bool)
 
     def drop(mask: Mask, why: str) -> None:
@@ -82,14 +78,15 @@ def scan_returns(
     # beams without return: as no numbers, as zeros, at one place, at the sensor's largest range
     finite = np.isfinite(xyz)
     drop(~finite.any(axis=1), "without return, as they are not finite")
-    range_m = np.linalg.norm(np.where(finite, xyz, 0).astype(np.float64), axis=1)
+    known = np.where(finite, xyz, 0)
+    range_m = np.linalg.norm(known.astype(np.float64), axis=1)
     drop(finite.all(axis=1) & (range_m < _AT_SENSOR_M), "without return, as they are at the sensor")
     drop(_at_one_place(xyz, keep), "without return, as they are at one and the same place")
     plane = np.zeros(len(xyz), bool)
     plane[keep] = _far_plane(range_m[keep])[0]
     drop(plane, "without return, as they are at one range far beyond all others")
     # coordinates that are none
-    odd = ~finite.all(axis=1) | (np.abs(np.where(finite, xyz, 0)) > _FARTHEST_M).any(axis=1)
+    odd = ~finite.all(axis=1) | (np.abs(known) > _FARTHEST_M).any(axis=1)
     if np.count_nonzero(odd & keep) > _BROKEN * len(xyz):
         first = int(np.flatnonzero(odd & keep)[0])
         raise FileFormatError(
@@ -150,15 +147,14 @@ def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list
             f"{total} depths are of the sky or a far plane, at {metres(largest)} {unit}, where 98 %"
             f" of the others are at most {metres(most)} {unit}; taken as unknown"
         ]
-    if len(values) < _FEW:
-        return far, []
-    median = float(np.median(values))
+    median = float(np.median(values)) if len(values) >= _FEW else math.inf
     far = values > _FAR * median
-    return far, [
+    note = (
         f"dropped {np.count_nonzero(far):,} of {len(values):,} points more than {_FAR:,.0f} times"
         f" as far as the median of {metres(median)} {unit}; the farthest was at"
-        f" {metres(float(values.max()))} {unit}"
-    ] * bool(far.any())
+        f" {metres(float(values.max(initial=0)))} {unit}"
+    )
+    return far, [note] if far.any() else []
 
 
 def plausible_map(
@@ -230,8 +226,7 @@ def divisor_to_metres(
     else:
         made = metres(median * now / better)
         advice = f"{option} {better:g} (now {now:g}) would make it {made} m"
-    stated = scale is not None or not (floats or reading.assumed)
-    if stated:
+    if scale is not None or not (floats or reading.assumed):
         return 1.0, [f"warning: {fact}: {advice}"]
     raise InputError(f"{fact}: {advice}, {option} {now:g} keeps it")
 
@@ -258,7 +253,9 @@ def check_same_scale(
     ]
 
 
-def check_pixels(path: Path, xy: NDArray[Any], size: tuple[int, int]) -> tuple[Mask, list[str]]:
+def check_pixels(
+    path: Path, xy: NDArray[np.floating], size: tuple[int, int]
+) -> tuple[Mask, list[str]]:
     """Returns which points (N, 2) of a list lie in an image (H, W), and lines for a person.
 
     Raises:
@@ -294,8 +291,7 @@ def check_pixels(path: Path, xy: NDArray[Any], size: tuple[int, int]) -> tuple[M
     notes = [f"sparse: {outside:,} points outside the image"] if outside else []
     right, down = (xy.max(axis=0) + 1) / (width, height)
     corner = max(right, down) < _CORNER and min(right, down) > 0.9 * max(right, down)
-    at_origin = bool((xy.min(axis=0) < 0.1 * xy.max(axis=0)).all())
-    if len(xy) >= _MANY and corner and at_origin:
+    if len(xy) >= _MANY and corner and (xy.min(axis=0) < 0.1 * xy.max(axis=0)).all():
         notes.append(
             f"warning: all {len(xy):,} points of {path} are in the upper left corner, up to"
             f" {xy[:, 0].max():.0f}, {xy[:, 1].max():.0f} of {width}×{height} pixels; if these are"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.protocols import ForegroundFilter
-from pnpdepth_cli.settings import option, options_of
+from pnpdepth_cli.settings import option
 
 if TYPE_CHECKING:
     from pnpdepth_cli.dataset.frame_files import FrameFiles
@@ -56,13 +56,10 @@ class ScanOptions:
 
             if holds_scan(sparse):
                 return True
-        camera = self.camera if self.calib is None else None
-        if replace(self, calib=None, camera=camera, keep_occluded=False) != ScanOptions():
-            for_maps = ("calib", "keep_occluded")
-            flags = [each.flag for each in options_of(ScanOptions) if each.name not in for_maps]
+        if self.extrinsics is not None or (self.calib is None and self.camera is not None):
             raise UsageError(
-                f"{sparse} is no scan, so {', '.join(flags[:-1])} and {flags[-1]} do not apply; a"
-                " scan needs --calib"
+                f"{sparse} is no scan, so --extrinsics and --camera do not apply; a scan needs"
+                " --calib"
             )
         return False
 
