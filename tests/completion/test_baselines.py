@@ -5,7 +5,6 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.errors import UsageError
 from tests.completion.scenes import random_points
 
 SIZE = (30, 40)
@@ -28,20 +27,6 @@ def test_a_baseline_is_near_the_ground_truth_and_does_not_change_its_arguments(n
     assert all(
         torch.equal(a, b) for a, b in zip(kept, (points.xy, points.depth, prediction), strict=True)
     )
-
-
-@pytest.mark.parametrize(
-    "name", [n for n, baseline in BASELINES.items() if baseline.of_prediction is not None]
-)
-def test_what_aligns_a_prediction_leaves_unknown_what_is_unknown_and_needs_one(name: str) -> None:
-    depth = ground_truth()
-    prediction = depth / 3
-    prediction[:10] = 0
-    dense = BASELINES[name].depth(random_points(depth, 80), prediction)
-    assert bool((dense[:10] == 0).all())
-    assert bool((dense[10:] > 0).all())
-    with pytest.raises(UsageError):
-        BASELINES[name].depth(random_points(depth, 80))
 
 
 @pytest.mark.parametrize(

@@ -59,9 +59,3 @@ def test_it_is_the_least_squares_solution_of_its_equation(xy: list[tuple[float, 
         right.append(0.0)
     expected = np.linalg.lstsq(np.array(lines), np.array(right), rcond=None)[0]
     assert np.allclose(diffuse(residuals).numpy(), expected.reshape(SIZE), atol=1e-3)
-
-
-def test_an_edge_of_the_prediction_stops_it() -> None:
-    dense = diffuse(field([(0.0, 3.0), (7.0, 3.0)], [0.5, -0.5], step()))
-    assert float((dense[:, :4] - 0.5).abs().max()) < 0.05
-    assert float((dense[:, 4:] + 0.5).abs().max()) < 0.05

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -73,14 +72,6 @@ def test_every_pixel_gets_a_depth_among_those_of_the_points(
 
 
 @pytest.mark.parametrize("name", FILLS)
-def test_the_order_of_the_points_does_not_matter(name: str) -> None:
-    points = scattered(200, on_grid=True)
-    order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
-    shuffled = SparsePoints(xy=points.xy[order], depth=points.depth[order], size=points.size)
-    assert torch.equal(FILLS[name](points), FILLS[name](shuffled))
-
-
-@pytest.mark.parametrize("name", FILLS)
 def test_of_points_at_one_position_the_nearest_counts(name: str) -> None:
     points = scattered(30, on_grid=True)
     behind = SparsePoints(xy=points.xy, depth=points.depth + 5, size=points.size)
@@ -103,16 +94,6 @@ def test_points_beyond_the_border_count(name: str) -> None:
     dense = FILLS[name](points_at([(-2.0, 3.0), (12.5, 3.0)], [2.0, 8.0], (6, 10)))
     assert dense[3, 0] < 3
     assert dense[3, 9] > 7
-
-
-@pytest.mark.parametrize("on_grid", [True, False])
-def test_nearest_is_the_nearest_of_all_points(on_grid: bool) -> None:
-    points = scattered(100, on_grid=on_grid)
-    distance = distances(points)
-    dense = nearest(points)
-    # with several points as near, any of them will do
-    as_near = distance <= distance.amin(dim=-1, keepdim=True) + 1e-9
-    assert bool(((points.depth == dense[..., None]) & as_near).any(dim=-1).all())
 
 
 def test_linear_is_what_scipy_gives_inside_the_hull_and_nearest_outside() -> None:
@@ -144,13 +125,6 @@ def test_what_is_linear_in_a_space_is_restored_in_it_between_the_corners(
     at_points = 0.5 + (xy.double() * torch.tensor(slopes).double()).sum(-1)
     points = SparsePoints(xy=xy, depth=from_space(at_points, space).float(), size=size)
     assert torch.allclose(linear(points, space=space), from_space(plane, space).float(), rtol=1e-5)
-
-
-@pytest.mark.parametrize("step", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (3.0, 1.0)])
-def test_linear_of_points_in_a_row_is_the_nearest_point(step: tuple[float, float]) -> None:
-    xy = [(2.0 + i * step[0], 3.0 + i * step[1]) for i in range(5)]
-    points = points_at(xy, [1.0, 2.0, 3.0, 4.0, 5.0], (12, 16))
-    assert torch.equal(linear(points), nearest(points))
 
 
 @pytest.mark.parametrize(
@@ -190,12 +164,3 @@ def test_morphological_lets_what_is_near_grow_over_what_is_far() -> None:
     assert float((filled[20] < 6).sum()) > float((linear(points)[20] < 6).sum())
     assert bool((filled[20, 26:35] < 2.01).all())
     assert bool((filled[:, :18] > 9.9).all())
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_morphological_of_mirrored_points_is_mirrored(axis: int) -> None:
-    points = scattered(300, on_grid=True)
-    xy = points.xy.clone()
-    xy[:, 1 - axis] = points.size[axis] - 1 - xy[:, 1 - axis]
-    mirrored = morphological(replace(points, xy=xy)).flip(axis)
-    assert torch.allclose(mirrored, morphological(points))

@@ -13,14 +13,6 @@ from pnpdepth_cli.completion.residual_field import cielab, features_of
 SIZE = (48, 64)
 
 
-def test_grey_has_no_colour_and_white_is_the_lightest() -> None:
-    grey = torch.linspace(0, 1, 11).expand(3, 1, 11)
-    lightness, *colour = cielab(grey)[:, 0]
-    assert torch.allclose(torch.stack(colour), torch.zeros(2, 11), atol=1e-3)
-    assert float(lightness[-1]) == pytest.approx(100, abs=1e-3)
-    assert bool((lightness[1:] > lightness[:-1]).all())
-
-
 @pytest.mark.parametrize(
     ("rgb", "expected"),
     [((1.0, 0.0, 0.0), (53.24, 80.09, 67.20)), ((0.02, 0.02, 0.02), (1.40, 0, 0))],

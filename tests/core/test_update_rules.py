@@ -1,7 +1,8 @@
-"""U of equation 3, against torch.optim where it has the same rule."""
+"""U of equation 3 against torch.optim, and the size and reach of a step against values by hand."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -13,12 +14,15 @@ from pnpdepth_cli.core import update_rules
 from pnpdepth_cli.core.update_rules import (
     Update,
     adam,
+    blur,
     lbfgs,
     momentum,
     normalised,
     sgd,
-    sign,
+    step_size,
 )
+from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.points import SparsePoints
 
 
 def stepped(update: Update, steps: int = 20, lr: float = 0.1) -> Tensor:
@@ -55,17 +59,6 @@ def test_an_update_is_that_of_torch_optim(
     update: Callable[[], Update], make: Callable[[list[Tensor]], torch.optim.Optimizer]
 ) -> None:
     torch.testing.assert_close(stepped(update()), optimised(make), rtol=1e-5, atol=1e-6)
-
-
-def test_the_sign_of_nothing_is_nothing() -> None:
-    assert sign()(torch.tensor([-3.0, 0.0, -0.0, 1e-30])).tolist() == [-1, 0, 0, 1]
-
-
-@pytest.mark.parametrize("name", UPDATES)
-def test_where_no_gradient_ever_comes_nothing_moves(name: str) -> None:
-    update = UPDATES[name]()
-    for _ in range(4):
-        assert update(torch.tensor([0.0, 5.0]))[0] == 0
 
 
 @pytest.mark.parametrize("name", UPDATES)
@@ -127,3 +120,47 @@ def test_l_bfgs_takes_no_direction_from_a_loss_that_curves_down_and_none_that_is
     assert torch.equal(update(steeper), normalised()(steeper))
     nearly_flat = torch.tensor([1.999, 1.999])
     assert update(nearly_flat).tolist() == pytest.approx([10, 10])
+
+
+def count_of_points(count: int, size: tuple[int, int]) -> SparsePoints:
+    return SparsePoints(xy=torch.zeros(count, 2), depth=torch.ones(count), size=size)
+
+
+def test_a_per_cent_step_is_that_fraction_of_the_standard_deviation_of_z0() -> None:
+    z = torch.tensor([1.0, 3.0, 1.0, 3.0])  # standard deviation 1
+    assert step_size("3%", z) == pytest.approx(0.03)
+    assert step_size(" 3 % ", z * 10) == pytest.approx(0.3)
+    assert step_size(0.01, z) == 0.01
+    assert step_size("0.5", z) == 0.5
+
+
+@pytest.mark.parametrize(
+    "lr", [0, -1, "0%", "-3%", "x", "", "%", "nan", "inf", float("nan"), "3%%"]
+)
+def test_what_is_no_step_is_refused(lr: float | str) -> None:
+    with pytest.raises(UsageError):
+        step_size(lr, torch.ones(2))
+
+
+def test_no_blur_and_a_z_that_is_no_map_leave_the_gradient_itself() -> None:
+    gradient = torch.randn(1, 3, 5, 7)
+    assert blur(gradient, count_of_points(4, (50, 70)), 0.0) is gradient
+    tokens = torch.randn(1, 35, 3)
+    assert blur(tokens, count_of_points(4, (50, 70)), 2.0) is tokens
+
+
+def test_the_reach_is_a_gaussian_of_so_many_spacings_of_the_points() -> None:
+    # 4 points on 40 × 80 pixels are √800 pixels apart; a cell is 4 pixels high and 2 wide
+    gradient = torch.zeros(1, 1, 10, 40)
+    gradient[0, 0, 5, 20] = 1
+    result = blur(gradient, count_of_points(4, (40, 80)), 0.25)[0, 0]
+
+    def weight(cell: int, cells: int, of: int, sigma: float) -> float:
+        """What cell `of` weighs in the mean that `cell` becomes."""
+        weights = [math.exp(-0.5 * ((cell - other) / sigma) ** 2) for other in range(cells)]
+        return weights[of] / sum(weights)
+
+    down, across = 0.25 * math.sqrt(800) / 4, 0.25 * math.sqrt(800) / 2
+    for row, column in ((5, 20), (4, 20), (9, 23), (0, 0), (7, 39)):
+        expected = weight(row, 10, 5, down) * weight(column, 40, 20, across)
+        assert float(result[row, column]) == pytest.approx(expected, rel=1e-4)

@@ -15,7 +15,7 @@ from pnpdepth_cli.core.split import Split as Cut
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames import default, fuse
 from pnpdepth_cli.frames.default import refine_default, without_outliers
-from pnpdepth_cli.frames.frame import Frame, is_dense
+from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.fuse import (
     FEW_POINTS,
     FOLDS,
@@ -30,7 +30,6 @@ from pnpdepth_cli.frames.fuse import (
 )
 from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Prediction, Refined
-from pnpdepth_cli.frames.uncertainty import calibration, relative_shape, with_uncertainty
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
@@ -160,12 +159,6 @@ def test_a_useless_network_has_no_part_which_is_said() -> None:
     assert not [note for note in alone.notes if "no part" in note]
 
 
-def test_a_network_that_explains_the_points_has_a_part_of_which_nothing_is_said() -> None:
-    result = refined(frame_in_memory(100), member(Brightness, settings=ALIGNED), compact())
-    assert result.weights["brightness"] + result.weights["compact with brightness"] > 0.1
-    assert not [note for note in result.notes if "no part" in note]
-
-
 def test_trust_grows_with_what_a_network_explains() -> None:
     frame = frame_in_memory(200)
     split = replace(split_of(frame.points.depth), whole=frame, kept=frame)
@@ -197,18 +190,6 @@ def test_trust_in_a_network_that_takes_points_falls_with_its_error_at_validation
         for off in (0.05, 0.1, 0.15, 0.2, 0.4)
     ]
     assert found == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-4)
-
-
-def test_the_weights_stay_near_the_prior_weights_where_few_points_speak() -> None:
-    def weight(count: int) -> float:
-        depth = torch.full((count,), 2.0)
-        noise = torch.rand(count, generator=torch.Generator().manual_seed(1)) - 0.5
-        good, poor = expert("good", depth * 1.01), expert("poor", depth * (1 + noise))
-        return fit_weights([good, poor], split_of(depth))["good"]
-
-    few, many = weight(4), weight(2000)
-    assert 0.5 <= few < 0.6
-    assert many > 0.9
 
 
 def test_weights_are_those_that_predict_the_validation_points_best_beside_the_prior() -> None:
@@ -335,53 +316,12 @@ def test_a_wrong_track_is_left_out_where_a_network_gave_it_no_weight(weighs: boo
     assert any("outliers: " in note for note in result.notes) == weighs
 
 
-def test_without_validation_the_uncertainty_has_the_typical_scale() -> None:
-    result = refined(frame_in_memory(MIN_POINTS - 1), member(Brightness))
-    got = with_uncertainty(result)
-    depths = (torch.from_numpy(depth) for depth in (result.before, result.after))
-    typical = calibration(torch.empty(0), torch.empty(0), MIN_POINTS - 1)
-    expected = typical * relative_shape(result.used, *depths).numpy() * result.after
-    assert np.array_equal(got.sigma, expected.astype(np.float32))
-    assert "too few points to calibrate it with" in got.notes[-1]
-
-
-CASES = [(60, True, 1), (400, False, 1), (60, False, 0)]
-
-
-@pytest.mark.parametrize(("count", "of_matches", "warnings"), CASES)
-def test_the_limits_of_sigma_are_said_of_matches_and_of_dense_points(
-    count: int, of_matches: bool, warnings: int
-) -> None:
-    result = refined(frame_in_memory(count), member(Brightness))
-    assert is_dense(result.used) == (count == 400)
-    notes = with_uncertainty(result, of_matches=of_matches).notes
-    assert sum("σ" in note for note in notes) == warnings
-
-
-@pytest.mark.parametrize("fold", [0, 1])
-def test_nothing_is_hidden_where_a_fold_is_everything_or_nothing(
-    fold: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fuse, "spatial_folds", lambda p, *_, **__: torch.full((len(p),), fold))
-    split = split_of_frame(60)
-    assert not len(split.points)
-    assert split.kept is split.whole
-
-
 def test_validation_points_are_a_fifth_and_the_others_are_kept() -> None:
     split = split_of_frame(60)
     parts = (split.kept.points, split.points)
     assert [len(part) for part in parts] == [60 - 60 // FOLDS, 60 // FOLDS]
     rows = {tuple(xy) for xy in split.whole.points.xy.tolist()}
     assert {tuple(xy) for part in parts for xy in part.xy.tolist()} == rows
-
-
-def test_of_many_validation_points_a_part_is_predicted_and_none_is_shown(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(fuse, "MOST_VALIDATION_POINTS", 7)
-    split = split_of_frame(60)
-    assert [len(part) for part in (split.kept.points, split.points)] == [48, 7]
 
 
 @pytest.mark.parametrize("count", [1, MIN_POINTS - 1, MIN_POINTS, 7])
@@ -450,18 +390,6 @@ def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:
     bad = torch.arange(len(frame.points)) % 5 == 0
     depth = torch.where(bad, 2.5 * frame.points.depth, frame.points.depth)
     return frame.with_points(replace(frame.points, depth=depth)), bad
-
-
-def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
-    frame, bad = spoiled(frame_in_memory(60))
-    with OpenNetwork(member(Brightness)) as judge:
-        inliers, _ = without_outliers(judge, frame)
-        clean, _ = without_outliers(judge, frame_in_memory(60))
-    assert inliers.outliers is not None
-    assert torch.equal(inliers.outliers.xy, frame.points.xy[bad])
-    assert torch.equal(inliers.points.xy, frame.points.xy[~bad])
-    assert clean.outliers is None
-    assert len(clean.points) == 60
 
 
 @pytest.mark.parametrize("count", [FEW_POINTS - 1, FEW_POINTS])

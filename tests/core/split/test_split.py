@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.cut_point import LayerName
-from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.errors import LayerError, ModelError
 from tests.completion.naive import plain
 from tests.core.networks import (
@@ -24,7 +23,7 @@ from tests.core.networks import (
     Repeated,
     TwoBranches,
     UNet,
-    UNetTail,
+    Updating,
     build,
     conv,
     depth_of,
@@ -70,17 +69,6 @@ def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: s
     assert cannot == NO_CUT.get(name, set())
     assert can > 1
     assert torch.equal(depth_of(plain(network, x)), wholes[0])
-
-
-@pytest.mark.parametrize("layer", ["cut", "head", "enter"])
-def test_an_encoder_under_inference_mode_can_be_left_and_the_decoder_refined(layer: str) -> None:
-    network, x = build("half inference"), image()
-    with Split(network, layer) as split:
-        z = split.front(x).requires_grad_(True)
-        output = split.rear(z)
-        assert torch.equal(output, plain(network, x))
-        output.sum().backward()
-        assert z.grad is not None
 
 
 def test_torch_transformer_layers_with_their_fast_path_come_out_the_same() -> None:
@@ -209,12 +197,6 @@ def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
 )
 def test_a_name_has_its_parts(text: str, name: LayerName) -> None:
     assert LayerName.parse(text) == name
-
-
-@pytest.mark.parametrize("text", ["a#", "a#0", "a#-1", "a#1#2", "a[", "a[]", "a]", "a[0]#2"])
-def test_a_name_of_another_form_is_refused(text: str) -> None:
-    with pytest.raises(LayerError):
-        LayerName.parse(text)
 
 
 def with_an_unused_layer() -> nn.Module:
@@ -378,6 +360,23 @@ class Failing(nn.Module):
         return self.inner(x)
 
 
+def test_a_parameter_that_the_forward_overwrites_is_put_back() -> None:
+    class Clamping(Updating):
+        def forward(self, x: Tensor) -> Tensor:
+            with torch.no_grad():
+                self.head.weight.clamp_(min=0)
+            return super().forward(x)
+
+    torch.manual_seed(0)
+    network = Clamping()
+    before = network.head.weight.detach().clone()
+    with Split(network, "cut") as split, torch.no_grad():
+        z = split.front(image())
+        assert torch.equal(split.rear(z), split.rear(z))
+        assert not torch.equal(network.head.weight, before)
+    assert torch.equal(network.head.weight, before)
+
+
 # ------------------------------------------------------------------ hooks and side effects
 
 
@@ -390,22 +389,3 @@ def test_the_networks_own_hooks_run_in_every_pass() -> None:
         for _ in range(3):
             assert torch.equal(split.rear(z), plain(network, x))
     assert calls.calls == 1 + 3 + 3  # front, rear, plain
-
-
-def test_a_hook_that_changes_an_output_is_obeyed() -> None:
-    network, x = UNetTail(), image(16, 16).mean(1, keepdim=True).expand(1, 4, 16, 16)
-    network.a.register_forward_hook(lambda module, inputs, output: output * 2)
-    network.b.register_forward_pre_hook(lambda module, inputs: (inputs[0] + 1,))
-    for layer in ("a", "b"):
-        with Split(network, layer) as split, torch.no_grad():
-            assert torch.equal(split.rear(split.front(x)), plain(network, x))
-
-
-def test_what_a_rear_gives_is_not_touched_by_the_next() -> None:
-    network, x = build("vit"), image()
-    with Split(network, "encoder.blocks.1[0]") as split, torch.no_grad():
-        z = split.front(x)
-        first = split.rear(z)
-        copies = [tensor.clone() for _, tensor in tensors_in(first)]
-        split.rear(z + 1)
-    assert all(torch.equal(a, b) for a, (_, b) in zip(copies, tensors_in(first), strict=True))

@@ -7,12 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.split.tensors import SavedTensors
-from pnpdepth_cli.core.split.watch import Watch
 from tests.core.networks import Branching, Counting, conv, image
 
 
@@ -99,28 +96,3 @@ def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], 
         assert torch.equal(outputs[0], outputs[2])
         assert torch.equal(outputs[1], outputs[3])
         assert not torch.equal(outputs[0], outputs[1])
-
-
-@pytest.mark.parametrize(
-    "write",
-    [
-        lambda t: t.add_(1),
-        lambda t: t[1:].zero_(),
-        lambda t: torch.add(t, 1, out=t),
-        lambda t: torch._foreach_mul_([t], 2.0),
-        lambda t: F.relu_(t.view(3, 1)),
-        lambda t: t.detach().exp_(),
-        lambda t: t.__setitem__(0, 9.0),
-        lambda t: nn.ReLU(inplace=True)(t),
-        lambda t: t.clamp_(max=0),
-        lambda t: t.data.fill_(4),
-    ],
-)
-def test_every_form_of_writing_is_seen(write: Callable[[Tensor], object]) -> None:
-    tensor = torch.tensor([-1.0, 2.0, 3.0])
-    saved = SavedTensors(tensor)
-    with torch.no_grad(), Watch([saved]):
-        write(tensor)
-    assert saved.copied
-    saved.fresh().zero_()
-    assert torch.equal(saved.value, torch.tensor([-1.0, 2.0, 3.0]))
