@@ -66,26 +66,6 @@ def test_a_full_stdout_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        "sample {gt} --count 5 -o {long}.png",
-        "refine {gt} --sparse {gt} --model {long}.onnx -o a",
-        "batch {long} -o out",
-        "eval {long} {long}",
-    ],
-)
-def test_names_of_5000_characters_are_one_line(
-    arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-    assert run(arguments.format(long="n" * 5000, gt=GT).split()) == 3
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith("pnpdepth: ")
-    assert len(last) < 2100
-
-
-@pytest.mark.parametrize(
     ("error", "code", "line"),
     [
         (MemoryError(), 6, "memory is exhausted"),
