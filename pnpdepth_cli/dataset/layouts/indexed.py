@@ -24,9 +24,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -38,7 +38,7 @@ from pnpdepth_cli.dataset.frame_files import (
     as_pose,
     find_files,
 )
-from pnpdepth_cli.dataset.layouts.layout import Files, Layout, row
+from pnpdepth_cli.dataset.layouts.layout import Layout, row
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.colmap_model import model_files, read_model
 from pnpdepth_cli.io.extrinsics import rotation_of
@@ -180,7 +180,7 @@ def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
 COLMAP = Layout(matches=_colmap_models, frames=_of_colmap, needs=("images", "sparse/*/cameras.*"))
 
 
-def _of_stray_scanner(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+def _of_stray_scanner(place: Path) -> Callable[[FrameFiles], FrameFiles]:
     path, poses = place / _ODOMETRY, dict[int, Pose]()
     lines = read_bytes(path).decode("utf-8", "replace").splitlines()
     for number, line in enumerate(lines[1:], start=2):
@@ -191,22 +191,17 @@ def _of_stray_scanner(place: Path) -> Callable[[Files], Mapping[str, Any]]:
             raise FileFormatError(
                 f"{path}, line {number}: not timestamp, frame, x, y, z, qx, qy, qz, qw"
             ) from None
-    return lambda files: {"pose": poses.get(int(files["sparse"].stem))}
+    return lambda frame: replace(frame, pose=poses.get(int(frame.name)))
 
 
-def _of_record3d(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+def _of_record3d(place: Path) -> Callable[[FrameFiles], FrameFiles]:
     path = place / _METADATA
     try:
         rows = [[float(value) for value in row] for row in read_json(path).get("poses", [])]
-        poses = [_pose(values[4:], values[:4], y_up=True) for values in rows]
+        poses = {n: _pose(row[4:], row[:4], y_up=True) for n, row in enumerate(rows)}
     except (TypeError, ValueError):
         raise FileFormatError(f"{path}: poses are not rows of qx qy qz qw x y z") from None
-
-    def fields_of(files: Files) -> Mapping[str, Any]:
-        number = int(files["image"].stem)
-        return {"pose": poses[number] if number < len(poses) else None}
-
-    return fields_of
+    return lambda frame: replace(frame, pose=poses.get(int(frame.name)))
 
 
 def _pose(position: list[float], xyzw: list[float], y_up: bool = False) -> Pose:

@@ -18,11 +18,12 @@ folder data_depth_annotated/{train,val}/ beside the dates has it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, as_pose
-from pnpdepth_cli.dataset.layouts.layout import Files, Layout, Part, join_parts, row
+from pnpdepth_cli.dataset.layouts.layout import Layout, Part, join_parts, row
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.poses import PACKETS, read_poses
 from pnpdepth_cli.protocols import ODOMETRY_PART
@@ -39,7 +40,7 @@ _AS_PUBLISHED: dict[str, Any] = {
 }
 
 
-def _of_sequence(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+def _of_sequence(place: Path) -> Callable[[FrameFiles], FrameFiles]:
     """The pose; poses belong to frames by number, so a part of a sequence has its own.
 
     Raises:
@@ -48,19 +49,18 @@ def _of_sequence(place: Path) -> Callable[[Files], Mapping[str, Any]]:
     folder = place.absolute()  # the parents of "." are in its absolute path
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():
-        return lambda files: {}
+        return replace
     poses = [as_pose(pose) for pose in read_poses(path)]
 
-    def fields_of(files: Files) -> Mapping[str, Any]:
-        image = files["image"]
-        if not image.stem.isdecimal() or int(image.stem) >= len(poses):
+    def with_pose(frame: FrameFiles) -> FrameFiles:
+        if not frame.name.isdecimal() or int(frame.name) >= len(poses):
             raise InputError(
-                f"{image} has no pose: its sequence's file holds {len(poses):,} poses, by frame"
-                " number"
+                f"{frame.image} has no pose: its sequence's file holds {len(poses):,} poses, by"
+                " frame number"
             )
-        return {"pose": poses[int(image.stem)]}
+        return replace(frame, pose=poses[int(frame.name)])
 
-    return fields_of
+    return with_pose
 
 
 ODOMETRY = row(
@@ -90,9 +90,9 @@ def _calibration_of(drive: Path) -> Path | None:
     return next((p for p in (drive.parent, drive) if (p / _CALIBRATION).is_file()), None)
 
 
-def _of_selection(place: Path) -> Callable[[Files], Mapping[str, Any]]:
-    whole = {"calib": place} if (place / _CALIBRATION).is_file() else {}
-    return lambda files: {} if "calib" in files else whole
+def _of_selection(place: Path) -> Callable[[FrameFiles], FrameFiles]:
+    whole = place if (place / _CALIBRATION).is_file() else None
+    return lambda frame: replace(frame, calib=frame.calib or whole)
 
 
 _SELECTION = row(
@@ -168,8 +168,8 @@ def _frames_of_camera(
         if isinstance(found, Unmatched):
             yield found
         else:
-            name = f"{drive.name}_{found.stem}_{camera}"
-            yield FrameFiles(name=name, camera=int(camera[-1]), **found.fields, **fields)
+            name = f"{drive.name}_{found.name}_{camera}"
+            yield replace(found, name=name, camera=int(camera[-1]), **fields)
 
 
 RAW = Layout(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,17 +83,8 @@ class Part(NamedTuple):
         return {stem: files[stem] for stem in sorted(files, key=natural_order)}, ambiguous
 
 
-class Joined(NamedTuple):
-    """The files of one stem."""
-
-    stem: str
-    files: Files
-    fields: dict[str, Any]
-    """The fields of `FrameFiles` that name them, with masks and frames of videos."""
-
-
-def join_parts(parts: Mapping[str, Part]) -> Iterator[Joined | Unmatched]:
-    """Yields the files of each frame, which the first part has, and those without a partner."""
+def join_parts(parts: Mapping[str, Part]) -> Iterator[FrameFiles | Unmatched]:
+    """Yields the frames, which the first part has, named by their stems; and files of none."""
     # A part may be a video, which has each frame by its number.
     videos = {field: video for field, part in parts.items() if (video := part.video)}
     parts = {field: part for field, part in parts.items() if field not in videos}
@@ -122,11 +113,11 @@ def join_parts(parts: Mapping[str, Part]) -> Iterator[Joined | Unmatched]:
             why = f"has no number of a frame of {next(iter(videos.values()))} in its name"
             yield Unmatched(path=own[first], why=why)
             continue
-        masks = tuple(path for field, path in own.items() if field.startswith("mask"))
-        fields: dict[str, Any] = {f: path for f, path in own.items() if not f.startswith("mask")}
+        masks = tuple(own.pop(field) for field in [*own] if field.startswith("mask"))
+        fields: dict[str, Any] = {**own}
         for field, path in videos.items():
             fields[field] = VideoFrame(path=path, index=int(number[0] if number else 0))
-        yield Joined(stem, own, fields | {"masks": masks})
+        yield FrameFiles(name=stem, masks=masks, **fields)
 
 
 def row(
@@ -136,7 +127,7 @@ def row(
     below: str = "",
     marks: tuple[str, ...] = (),
     calib: str = "",
-    more: Callable[[Path], Callable[[Files], Mapping[str, Any] | None]] | None = None,
+    more: Callable[[Path], Callable[[FrameFiles], FrameFiles | None]] | None = None,
     **fields: Any,
 ) -> Layout:
     """Returns the layout of a data set whose parts lie in folders, with files of one stem.
@@ -149,8 +140,8 @@ def row(
         marks: Patterns of what else a place has. The first, or else the last needed part's folder,
             finds a place.
         calib: File in a place, the calibration of frames without one of their own.
-        more: Function of a place. It gives a function from a frame's files to its further fields,
-            or to None for a frame that is not wanted.
+        more: Function of a place. It gives a function of a frame, named by its stem, that returns
+            it with further fields, or None for one that is not wanted.
         fields: Fields that all frames have.
     """
     needed = [text.rpartition("/")[0] for text in parts.values() if not text.endswith("?")]
@@ -173,14 +164,14 @@ def row(
 
     def frames(root: Path) -> Iterator[FrameFiles | Unmatched]:
         for place in find(root):
-            shared = {"calib": place / calib} if calib and (place / calib).is_file() else {}
-            fields_of = more(place) if more else lambda files: {}
+            shared = place / calib if calib and (place / calib).is_file() else None
+            complete = more(place) if more else replace
             for found in join_parts(parts_in(place)):
                 if isinstance(found, Unmatched):
                     yield found
-                elif (extra := fields_of(found.files)) is not None:
-                    stated = {**shared, **found.fields, **fields, **extra}
-                    yield FrameFiles(name=name(root, place, found.stem), **stated)
+                elif (frame := complete(found)) is not None:
+                    named = name(root, place, frame.name)
+                    yield replace(frame, name=named, calib=frame.calib or shared, **fields)
 
     missing = (*(folders.split("|")[0] for folders in needed), *marks)
     return Layout(matches=find, frames=frames, needs=tuple(dict.fromkeys(filter(None, missing))))

@@ -9,14 +9,14 @@ test.txt beside it, with the numbers of its frames from 1, names the test set, e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pnpdepth_cli.dataset.arrays import shape_of
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Hdf5Array
-from pnpdepth_cli.dataset.layouts.layout import Files, Layout, row
+from pnpdepth_cli.dataset.layouts.layout import Layout, row
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.protocols import NYU_PART, ODOMETRY_PART
@@ -27,7 +27,7 @@ _MOST_FRAMES = 100_000
 """The official file of NYU has 1,449."""
 
 
-def _of_folder(place: Path) -> Callable[[Files], Mapping[str, Any]]:
+def _of_folder(place: Path) -> Callable[[FrameFiles], FrameFiles]:
     """The arrays rgb (3, H, W) and depth (H, W); the protocol for the width of the first file."""
     part = NYU_PART
     for path in sorted(place.glob("*.h5")):
@@ -35,11 +35,14 @@ def _of_folder(place: Path) -> Callable[[Files], Mapping[str, Any]]:
             if shape_of(path, "depth")[-1] > _WIDEST_KINECT:
                 part = ODOMETRY_PART
             break
-    return lambda files: {
-        "image": Hdf5Array(path=files["gt"], name="rgb", axes=(1, 2, 0)),
-        "gt": Hdf5Array(path=files["gt"], name="depth", axes=(0, 1)),
-        "part": part,
-    }
+
+    def arrays_of(frame: FrameFiles) -> FrameFiles:
+        assert isinstance(frame.gt, Path)
+        rgb = Hdf5Array(path=frame.gt, name="rgb", axes=(1, 2, 0))
+        depth = Hdf5Array(path=frame.gt, name="depth", axes=(0, 1))
+        return replace(frame, image=rgb, gt=depth, part=part)
+
+    return arrays_of
 
 
 H5 = row(

@@ -19,12 +19,12 @@ frames.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from pnpdepth_cli.dataset.frame_files import RawDepth
-from pnpdepth_cli.dataset.layouts.layout import Files, Layout, row
+from pnpdepth_cli.dataset.frame_files import FrameFiles, RawDepth
+from pnpdepth_cli.dataset.layouts.layout import Layout, row
 from pnpdepth_cli.io.file_bytes import read_bytes
 
 
@@ -37,18 +37,23 @@ def _below(root: Path, place: Path, stem: str) -> str:
     return (place.relative_to(root) / stem).as_posix()
 
 
-def _of_void(place: Path) -> Callable[[Files], Mapping[str, Any] | None]:
-    """Gives {} for a frame of the test split, and None for another; {} where no split is listed."""
+def _of_void(place: Path) -> Callable[[FrameFiles], FrameFiles | None]:
+    """Keeps the frames of the test split, or all where no split is listed."""
     split = place.parent.parent / "test_image.txt"
     if place.parent.name != "data" or not split.is_file():
-        return lambda files: {}
+        return replace
     words = read_bytes(split).decode("utf-8", "replace").split()
     wanted = {path.stem for path in map(Path, words) if path.parts[-3:-2] == (place.name,)}
-    return lambda files: {} if files["image"].stem in wanted else None
+    return lambda frame: frame if frame.name in wanted else None
 
 
-def _raw_truth(place: Path) -> Callable[[Files], Mapping[str, Any]]:
-    return lambda files: {"gt": RawDepth(path=files["gt"], image=files["image"])}
+def _raw_truth(place: Path) -> Callable[[FrameFiles], FrameFiles]:
+    def with_raw(frame: FrameFiles) -> FrameFiles:
+        assert isinstance(frame.gt, Path)
+        assert isinstance(frame.image, Path)
+        return replace(frame, gt=RawDepth(path=frame.gt, image=frame.image))
+
+    return with_raw
 
 
 ROWS: dict[str, Layout] = {
