@@ -242,7 +242,7 @@ def _camera(
         return camera, [describe_pinhole(camera)]
     of_record, _ = frame.camera_and_pose
     if of_record is not None:
-        if frame.record is None or frame.record.size != (size[1], size[0]):
+        if frame.record.size != (size[1], size[0]):
             raise SizeError(
                 f"{frame.depth} is {size[1]}×{size[0]}, unlike its record; refine it again, or give"
                 " --calib"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,6 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord, Pose
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.points import METRES
 
 DEPTH_ENDING = "_depth"
 """End of the stem of a depth file."""
@@ -30,25 +29,25 @@ class ResultFrame:
     depth: Path
     sigma: Path | None = None
     valid: Path | None = None
-    record: FrameRecord | None = None
-    """The record beside the depth. None: there is none."""
+    record: FrameRecord = field(default_factory=FrameRecord)
+    """The record beside the depth; an empty one where there is none."""
 
     @property
     def image(self) -> ImageSource | None:
         """The image that the record names, if it exists."""
-        entry = None if self.record is None else self.record.inputs.get("image")
+        entry = self.record.inputs.get("image")
         image = None if entry is None else source_of(entry.path)
         return image if image is not None and file_of(image).is_file() else None
 
     @property
     def unit(self) -> str:
         """The unit of the depth."""
-        return METRES if self.record is None else self.record.unit
+        return self.record.unit
 
     @functools.cached_property
     def camera_and_pose(self) -> tuple[Camera | None, Pose | None]:
         """The camera that the record holds, and its pose. Raises FileFormatError if damaged."""
-        camera = None if self.record is None else self.record.camera
+        camera = self.record.camera
         try:
             return (None, None) if camera is None else camera.read()
         except ValueError as error:
@@ -95,9 +94,9 @@ def result_frames(root: Path) -> list[ResultFrame]:
 
 def _frame(name: str, depth: Path) -> ResultFrame:
     path = _beside(depth, ".json")
-    record = None if path is None else FrameRecord.read(path)
+    record = FrameRecord() if path is None else FrameRecord.read(path)
     files = {"sigma": f"_sigma{depth.suffix}", "valid": "_valid.png"}
-    if record is not None:  # others are of other runs
+    if path is not None:  # others are of other runs
         files = {kind: ending for kind, ending in files.items() if kind in record.outputs}
     companions = {kind: _beside(depth, ending) for kind, ending in files.items()}
     return ResultFrame(name=name, depth=depth, record=record, **companions)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
@@ -145,6 +144,12 @@ def evaluate(
     if request.is_devkit:
         exact = devkit_mean(values[:, : len(request.measures)]).tolist()
         mean |= dict(zip(keys, exact, strict=False))
+    ends = {}
+    if clusters.count >= MIN_CLUSTERS:
+        sides = interval(lambda means: means, [values], clusters)
+        for measure, low, high in zip(measures, *(side.tolist() for side in sides), strict=True):
+            # within what the measure can be
+            ends[measure.key] = max(low, 0.0), min(high, 1.0 if measure.percent else math.inf)
     notes += clusters.notes()
     if len(scored) > 1 and clusters.count < MIN_CLUSTERS:
         notes.append(
@@ -157,7 +162,7 @@ def evaluate(
         frames=rows,
         measures=measures,
         mean=mean,
-        interval=_intervals(measures, values, clusters),
+        interval=ends or None,
         clusters=clusters,
         notes=[
             *notes,
@@ -166,18 +171,6 @@ def evaluate(
             *_notes_on_scales(scored, request),
         ],
     )
-
-
-def _intervals(
-    measures: Sequence[Measure], values: NDArray[np.float64], clusters: Clusters
-) -> dict[str, tuple[float, float]] | None:
-    """The ends of the interval of each mean within what the measure can be."""
-    if clusters.count < MIN_CLUSTERS:
-        return None
-    low, high = interval(lambda means: means, [values], clusters)
-    highest = [1.0 if measure.percent else math.inf for measure in measures]
-    ends = zip(np.maximum(low, 0.0).tolist(), np.minimum(high, highest).tolist(), strict=True)
-    return dict(zip((measure.key for measure in measures), ends, strict=True))
 
 
 def _readings(rows: Sequence[FrameRecord], side: str) -> list[tuple[Reading, int]]:

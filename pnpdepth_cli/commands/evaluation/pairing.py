@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_by_name
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
@@ -19,8 +20,6 @@ from pnpdepth_cli.io.text_files import read_json
 from pnpdepth_cli.protocols import WHOLE, FramePart
 
 _MARK = re.compile(r"(?<=.)[_.]depth$", re.DOTALL)
-# What a refinement writes beside x_depth.
-_COMPANION = re.compile(r"(?<=.)_(sigma_preview|preview|improvement|sigma|valid)$", re.DOTALL)
 # KITTI's selection names the kind of file in the middle.
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5
@@ -35,6 +34,11 @@ class FramePair(NamedTuple):
     Sparse depth is None where its file does not say which points the network saw."""
     result: ResultFrame | None
     """The prediction, and what lies beside it; None without."""
+
+    @property
+    def record(self) -> FrameRecord:
+        """The record beside the prediction; an empty one where there is none."""
+        return FrameRecord() if self.result is None else self.result.record
 
 
 def pair_frames(
@@ -136,7 +140,7 @@ def _pair(files: FrameFiles, prediction: Path | None) -> FramePair:
         (result,) = result_frames(prediction)
     except PnpDepthError:  # the record is damaged
         return FramePair(files, ResultFrame(name=files.name, depth=prediction))
-    sparse = None if result.record is None else result.record.inputs.get("sparse")
+    sparse = result.record.inputs.get("sparse")
     if sparse is not None and not (sparse.sampled or sparse.calibration):
         path = Path(sparse.path)
         files = replace(files, sparse=path if path.is_file() else files.sparse)
@@ -151,8 +155,7 @@ def frame_name(stem: str) -> str:
 def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     """Returns the depth files below a folder by frame name, sorted, and notes on them.
 
-    A frame in a subfolder has it in its name. Where `x_depth.png` exists, `x.png` is not depth, and
-    `x_preview.png` and the like belong to it.
+    A frame in a subfolder has it in its name. Where files `x_depth` are, all others are no depth.
 
     Raises:
         InputError: If there is none, or two are one frame.
@@ -161,22 +164,16 @@ def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     for problem in problems:
         if problem.path.is_file():
             raise InputError(str(problem))
-    marked = {_MARK.sub("", stem) for stem in found if _MARK.search(stem)}
+    marked = {stem: path for stem, path in found.items() if _MARK.search(stem)}
     by_frame: dict[str, Path] = {}
-    for stem, path in found.items():
-        name = frame_name(stem)
-        if stem in marked or (_COMPANION.search(stem) and _COMPANION.sub("", stem) in marked):
-            continue
-        if name in by_frame:
-            raise InputError(f"{path} and {by_frame[name].name} are one frame; keep one")
-        by_frame[name] = path
+    for stem, path in (marked or found).items():
+        first = by_frame.setdefault(frame_name(stem), path)
+        if first != path:
+            raise InputError(f"{path} and {first.name} are one frame; keep one")
     if not by_frame:
         suffixes = " ".join(DEPTH_SUFFIXES)
         raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
-    notes = [f"warning: {problem}" for problem in problems]
-    if ignored := [found[stem].name for stem in sorted(marked & found.keys())]:
-        notes.append(f"{folder}: ignored, as there is a _depth of each: {some_names(ignored)}")
-    return dict(sorted(by_frame.items())), notes
+    return dict(sorted(by_frame.items())), [f"warning: {problem}" for problem in problems]
 
 
 def some_names(names: Iterable[str]) -> str:

@@ -29,7 +29,7 @@ from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, 
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.measures import OF_SIGMA, Formula
-from pnpdepth_cli.points import METRES, in_frame
+from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import rays_of_image
 from pnpdepth_cli.sensors.pixels import pixel_index
 from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
@@ -91,7 +91,7 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
     record = FrameRecord(
         name=files.name,
         group=files.group,
-        unit=METRES if result is None else result.unit,
+        unit=pair.record.unit,
         inputs=inputs,
     )
     try:
@@ -247,11 +247,10 @@ def _read(path: Path, scale: float | None, request: EvalRequest) -> tuple[Depth,
 def _depth_of_distances(gt: Depth, pair: FramePair, whole: tuple[int, int]) -> Depth:
     """Depth z of distances from the camera of the data set, else of the prediction's record."""
     files, size, camera = pair.files, (gt.shape[0], gt.shape[1]), None
-    record = None if pair.result is None else pair.result.record
     if files.calib is not None:
         found, _ = camera_of_file(files.calib, files.camera, whole, files.image_file)
         camera = files.part.camera_in_crop(found, whole)
-    elif pair.result is not None and record is not None and record.size == size[::-1]:
+    elif pair.result is not None and pair.record.size == size[::-1]:
         camera, _ = pair.result.camera_and_pose
     if camera is None:
         raise InputError(
@@ -268,11 +267,10 @@ def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
     Points that were drawn from the ground truth (H, W) are drawn again.
     """
     frame, size = pair.files, (gt.shape[0], gt.shape[1])
-    record = None if pair.result is None else pair.result.record
-    sparse = None if record is None else record.inputs.get("sparse")
+    sparse = pair.record.inputs.get("sparse")
     drawn = None if sparse is None else sparse.sampled
     try:
-        if record is not None and drawn is not None and record.size == size[::-1]:
+        if drawn is not None and pair.record.size == size[::-1]:
             pattern = SamplePattern(kind=drawn.kind, count=drawn.count, fraction=drawn.fraction)
             image = image_of(pair, size) if drawn.kind == "features" else None
             xy = sample_points(gt, pattern, drawn.seed, image=image).xy

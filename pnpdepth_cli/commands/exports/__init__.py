@@ -205,7 +205,6 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
             f"{result.depth} has no pose in its record; refine it with a COLMAP model, as"
             " `batch --layout colmap` does"
         )
-    assert record is not None  # it has the camera
     # The numbers and the name of the record must be usable.
     width, height = record.size or (0, 0)
     sparse, points = record.inputs.get("sparse"), record.points

@@ -61,7 +61,7 @@ MATCHED = [
         + ["ä ö_depth.exr", "b.png"],
         ["b.png", "ä ö.npy"],
         {"b": "b_depth.png", "ä ö": "ä ö_depth.exr"},
-        ["out: ignored, as there is a _depth of each: b.png"],
+        [],
     ),
     (  # frames in folders of their own
         ["one/1_depth.png", "two/1_depth.png"],
