@@ -98,7 +98,7 @@ def error_sums(
             f"prediction is {tuple(predicted.shape)}, ground truth {tuple(ground_truth.shape)}"
         )
     terms = _terms_of(measures)
-    sums = torch.zeros(sum_count(measures), dtype=torch.float64, device=ground_truth.device)
+    sums = torch.zeros(1 + len(terms), dtype=torch.float64, device=ground_truth.device)
     predicted, ground_truth = predicted.reshape(-1), ground_truth.reshape(-1)
     for start in range(0, ground_truth.numel(), _CHUNK):
         piece = slice(start, start + _CHUNK)
@@ -121,11 +121,6 @@ def measures_of(sums: Tensor, measures: Sequence[Measure] = MEASURES) -> Tensor:
     formulas = [each.formula for each in measures if isinstance(each.formula, Formula)]
     values = [f.of_sums(*(sums[..., place[term]] for term in f.terms)) for f in formulas]
     return torch.stack(values, dim=-1)
-
-
-def sum_count(measures: Sequence[Measure]) -> int:
-    """Returns S, how many sums `error_sums` has for these measures."""
-    return 1 + len(_terms_of(measures))
 
 
 def _terms_of(measures: Sequence[Measure]) -> list[Term]:

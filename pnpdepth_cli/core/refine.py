@@ -93,7 +93,11 @@ def refine(
             if so_far is None:  # a point has no part in L where f(x) is unknown, such as in the sky
                 known = at_points.isfinite()
                 if settings.iterations and not bool(known.any()):
-                    raise bad_prediction(len(points))
+                    raise ModelError(
+                        f"the network's prediction is not finite at any of {len(points):,} sparse"
+                        " points, before any update of z; are its weights, its input range"
+                        " (normalise) and precision right?"
+                    )
                 points, at_points = points.select(known), at_points[known]
             loss = loss_of(at_points, points.depth)
         if settings.iterations and not bool(loss.isfinite()):
@@ -137,12 +141,4 @@ def _diverged(quantity: str, updates: int, step: float, so_far: Refinement | Non
         f"the {quantity} is not finite after {updates} update{'s' if updates != 1 else ''} of z"
         f" (step {step:.3g}); try a smaller lr or fewer iterations",
         so_far,
-    )
-
-
-def bad_prediction(points: int) -> ModelError:
-    """Returns the error of a plain prediction that is finite at none of so many points."""
-    return ModelError(
-        f"the network's prediction is not finite at any of {points:,} sparse points, before any"
-        " update of z; are its weights, its input range (normalise) and precision right?"
     )

@@ -90,7 +90,7 @@ def scan_frame() -> Frame:
 
 def expert(name: str, at: Tensor, weight: float = 1.0) -> Expert:
     """An expert with these predictions at the validation points."""
-    return Expert(name=name, weight=weight, at=at)
+    return Expert(name=name, weight=weight, at=at, dense=depth_of_scene)
 
 
 def split_of(depth: Tensor) -> Split:
