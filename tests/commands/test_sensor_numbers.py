@@ -138,7 +138,7 @@ SILENT = {"zeros": 0.0, "nan": np.nan, "one place": [1.2, 0.0, 0.9], "far": [0.0
 
 
 @pytest.mark.parametrize("kind", SILENT)
-@pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.ply", "a.txt"])
+@pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.txt"])
 def test_beams_without_return_are_no_points_and_are_counted(
     tmp_path: Path, scan: Rows, kind: str, name: str
 ) -> None:
@@ -149,12 +149,8 @@ def test_beams_without_return_are_no_points_and_are_counted(
         rows.tofile(path)
     elif name == "a.npy":
         np.save(path, rows)
-    elif name == "a.txt":
-        np.savetxt(path, rows)
     else:
-        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
-        header += "".join(f"property float {n}\n" for n in "xyzi") + "end_header\n"
-        path.write_bytes(header.encode() + rows.tobytes())
+        np.savetxt(path, rows)
     same_points(path, scan[:, :3])
     frame = read(path)
     assert 9000 in frame.sources["sparse"].dropped.values()

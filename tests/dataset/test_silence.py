@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.plausible import plausible_map
@@ -88,26 +87,6 @@ def test_nothing_is_said_of_real_frames(shared_data: Path) -> None:
     assert len(paths) > 120
     for path in paths:
         assert words(path) == [], path
-
-
-def test_nothing_is_said_of_real_frames_in_other_formats(shared_data: Path, tmp_path: Path) -> None:
-    paths = maps(shared_data)
-    for number in range(63):
-        path = paths[number * len(paths) // 63]
-        scale = next(value for name, value in SCALES.items() if name in str(path))
-        values = read_depth(path, scale=scale).values
-        rows, columns = np.nonzero(values)
-        few = np.random.default_rng(number).permutation(len(rows))[:500]
-        listed = np.column_stack([columns, rows, values[rows, columns]])[few]
-        suffix = (".npy", ".exr", ".tiff", ".pfm", ".npz", ".csv", ".txt")[number % 7]
-        sparse = tmp_path / f"{number}{suffix}"
-        if suffix in (".csv", ".txt"):
-            np.savetxt(sparse, listed, delimiter=", " if suffix == ".csv" else " ")
-        else:
-            write_depth(sparse, values)
-        height, width = values.shape
-        Image.new("RGB", (width, height)).save(tmp_path / "rgb.png")
-        assert said_of(image=tmp_path / "rgb.png", sparse=sparse) == [], (path, suffix)
 
 
 def test_nothing_is_said_of_scans_in_any_format(shared_data: Path, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ EXAMPLES: dict[str, tuple[float, ...]] = {
 }
 
 
-def directions(seed: int, widest: float = 0.9) -> NDArray[np.float64]:
+def directions(seed: int, widest: float) -> NDArray[np.float64]:
     return np.random.default_rng(seed).uniform(-widest, widest, (60, 2))
 
 
@@ -39,21 +39,14 @@ def directions(seed: int, widest: float = 0.9) -> NDArray[np.float64]:
         lambda c: st.sampled_from([c[:4], c[:5], c[:8], c[:12], c])
     ),
 )
-def test_radial_tangential_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
+def test_lenses_are_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
     points = 3 * np.column_stack([directions(seed, 0.6), np.ones(60)])
-    camera = Camera(intrinsics=K, distortion=coefficients)
-    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(coefficients))
+    camera, still = Camera(intrinsics=K, distortion=coefficients), np.zeros(3)
+    theirs, _ = cv2.projectPoints(points, still, still, K, np.array(coefficients))
     np.testing.assert_allclose(pixels_of(camera, points), theirs[:, 0], atol=1e-6)
-
-
-@settings(max_examples=60)
-@given(seed=st.integers(0, 2**32 - 1), coefficients=st.tuples(*[small] * 4))
-def test_fisheye_is_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
-    points = 3 * np.column_stack([directions(seed), np.ones(60)])
-    camera = Camera(intrinsics=K, distortion=coefficients, lens="fisheye")
-    theirs, _ = cv2.fisheye.projectPoints(
-        points[:, None], np.zeros(3), np.zeros(3), K, np.array(coefficients)
-    )
+    four = coefficients[:4]
+    camera = Camera(intrinsics=K, distortion=four, lens="fisheye")
+    theirs, _ = cv2.fisheye.projectPoints(points[:, None], still, still, K, np.array(four))
     np.testing.assert_allclose(pixels_of(camera, points), theirs[:, 0], atol=1e-6)
 
 

@@ -6,54 +6,9 @@ import itertools
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors.lens import pixels_of
-from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP
-from pnpdepth_cli.sensors.projection import edge_agreement, hidden_points, project_velodyne
-
-K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
-CAMERA = Camera(intrinsics=K)
-SIZE = (480, 640)
-
-
-def board_before_wall(left_m: float) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """A scan of a board 5 m away (|y| < 0.5, |z| < 0.5 of the scanner) and a wall at 20 m.
-
-    Also which points the camera, `left_m` to the scanner's right, cannot see.
-    """
-    elevation, azimuth = np.meshgrid(
-        np.radians(np.arange(-15, 15, 0.4)), np.radians(np.arange(-24, 24, 0.17)), indexing="ij"
-    )
-    y, z = np.tan(azimuth).ravel(), (np.tan(elevation) / np.cos(azimuth)).ravel()
-    on_board = (np.abs(5 * y) < 0.5) & (np.abs(5 * z) < 0.5)
-    x = np.where(on_board, 5.0, 20.0)
-    scan = np.column_stack([x, x * y, x * z])
-    # the camera's ray to a wall point passes the board's plane at a quarter of its length
-    at_board = np.array([0, -left_m, 0]) * 0.75 + scan * 0.25
-    hidden = ~on_board & (np.abs(at_board[:, 1]) < 0.5) & (np.abs(at_board[:, 2]) < 0.5)
-    return scan, hidden
-
-
-@pytest.mark.parametrize("left_m", [0.05, 0.09, -0.13])
-def test_wall_seen_past_a_board_is_hidden_and_little_else(left_m: float) -> None:
-    scan, hidden = board_before_wall(left_m)
-    scanner = Extrinsics(FORWARD_LEFT_UP, np.array([-left_m, 0.0, 0.0]))
-    tree = cKDTree(pixels_of(CAMERA, scanner.apply(scan)))
-    everything, kept = (
-        tree.query(project_velodyne(scan, CAMERA, scanner, SIZE, keep_occluded=keep).xy)[1]
-        for keep in (True, False)
-    )
-    removed = np.setdiff1d(everything, kept)
-    truly_hidden = np.intersect1d(everything, np.flatnonzero(hidden))
-    assert len(truly_hidden) > 50
-    assert len(np.intersect1d(removed, truly_hidden)) >= 0.9 * len(truly_hidden)
-    visible = np.setdiff1d(everything, truly_hidden)
-    assert len(np.intersect1d(kept, visible)) >= 0.98 * len(visible)
-    assert scan[removed, 0].min() == 20  # the foreground itself stays
+from pnpdepth_cli.sensors.projection import edge_agreement, hidden_points
 
 
 @pytest.mark.parametrize("focal_px", [240.0, 300.0])

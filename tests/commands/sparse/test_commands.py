@@ -24,10 +24,8 @@ from pnpdepth_cli.errors import (
     SizeError,
     UsageError,
 )
-from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth
 from pnpdepth_cli.io.sparse_files import read_sparse
-from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.lidar import Lidar, ideal_lidar
 from pnpdepth_cli.sensors.samplers import SamplePattern
 from tests.commands.scan_frames import ScanOnDisk, scan_on_disk
@@ -157,26 +155,3 @@ def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) ->
     assert record["sensor"]["name"] == "21 beams"
     assert record["sensor"]["max_range"] is None
     assert len(got.depth) > 500
-
-
-def test_kittis_own_projected_scan_comes_back_from_the_scanners_frame(
-    shared_data: Path, tmp_path: Path
-) -> None:
-    folder = shared_data / "kitti_dc"
-    name = "0000000005.png"
-    theirs = cv2.imread(str(folder / "velodyne_raw" / name), cv2.IMREAD_UNCHANGED)
-    calibration = read_calibration(folder, 2)
-    row, column = np.nonzero(theirs)
-    xy = np.column_stack([column, row]).astype(np.float64)
-    points = unproject(calibration.camera, xy, theirs[row, column] / 256)
-    points = calibration.scanner.inverse().apply(points)
-    scan = tmp_path / "scan.bin"
-    np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(scan)
-    project_scan(
-        scan=scan,
-        options=ScanOptions(calib=folder, camera=2, keep_occluded=True),
-        target=SparseTarget(output=tmp_path / "sparse.png"),
-        image=folder / "image" / "0000000005.jpg",
-    )
-    ours = cv2.imread(str(tmp_path / "sparse.png"), cv2.IMREAD_UNCHANGED)
-    assert np.array_equal(ours, theirs)

@@ -22,17 +22,6 @@ def frames_named(folder: Path, *names: str) -> list[FrameFiles]:
     return read_frames(path)
 
 
-@pytest.mark.parametrize(
-    ("text", "flag"), [("1", 1), ("True", 1), ("0", 0), ("false", 0), ("no", 0)]
-)
-def test_a_flag_is_a_word_in_either_case(text: str, flag: int, tmp_path: Path) -> None:
-    touch(tmp_path / "i.png", tmp_path / "g.png")
-    row = {"image": "i.png", "gt": "g.png", "gt_size_ok": text}
-    (tmp_path / "m.jsonl").write_text(json.dumps(row))
-    (frame,) = read_frames(tmp_path / "m.jsonl")
-    assert frame.gt_other_size is bool(flag)
-
-
 def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
     touch(*(tmp_path / name for name in ("i.png", "s.bin", "c.txt", "deep/g.png", "m.png")))
     row = {
