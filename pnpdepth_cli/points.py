@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, overload
 
 if TYPE_CHECKING:
@@ -52,24 +52,24 @@ class SparsePoints(Generic[A]):
         if (height, width) == self.size:
             return self
         scale = self._like_xy(width / self.size[1], height / self.size[0])
-        return self._with((self.xy + 0.5) * scale - 0.5, self.depth, (height, width))
+        return replace(self, xy=(self.xy + 0.5) * scale - 0.5, size=(height, width))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> SparsePoints[A]:
         """Returns the points inside these rows and columns, in coordinates of that crop."""
         xy = self.xy - self._like_xy(left, top)
         inside: Any = in_frame(xy, (height, width))
-        return self._with(xy[inside], self.depth[inside], (height, width))
+        return replace(self, xy=xy[inside], depth=self.depth[inside], size=(height, width))
 
     def select(self, mask: Any) -> SparsePoints[A]:
         """Returns the points where mask, (N,) bool of the same library, is true."""
-        return self._with(self.xy[mask], self.depth[mask], self.size)
+        return replace(self, xy=self.xy[mask], depth=self.depth[mask])
 
     def joined(self: SparsePoints[Tensor], others: SparsePoints[Tensor]) -> SparsePoints[Tensor]:
         """Returns these points and others of the same frame."""
         import torch
 
         xy, depth = torch.cat([self.xy, others.xy]), torch.cat([self.depth, others.depth])
-        return self._with(xy, depth, self.size)
+        return replace(self, xy=xy, depth=depth)
 
     def tensors(self, device: torch.device | str = "cpu") -> SparsePoints[Tensor]:
         """Returns the points as tensors on the device; arrays already there are not copied."""
@@ -123,9 +123,6 @@ class SparsePoints(Generic[A]):
         import numpy as np
 
         return np.asarray((x, y), dtype=xy.dtype)
-
-    def _with(self, xy: Any, depth: Any, size: tuple[int, int]) -> SparsePoints[A]:
-        return SparsePoints(xy=xy, depth=depth, size=size, dropped=self.dropped)
 
 
 @overload
