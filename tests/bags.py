@@ -73,30 +73,33 @@ def write_bag(
         start, step = 1_700_000_000 * 10**9, 30_000_000
         if static:
             yield "/tf_static", start, _transforms(make, header)
-        for number in range(frames):
+        for number in range(frames + 1):
             time_ns = start + step * number
-            if info:
-                stamp = header(time_ns, "camera")
-                yield "/front/camera_info", time_ns, _camera_info(make, stamp, ros1, view)
             if poses:
                 stamp = header(time_ns - step // 2, "odom")
                 yield _moved(make, stamp, 0.3 * number - 0.15, poses)
+            if number == frames:
+                return
+            stamp = header(time_ns, "camera")
+            if info:
+                yield "/front/camera_info", time_ns, _camera_info(make, stamp, ros1, view)
             pixels = np.full((HEIGHT, WIDTH, 3), 40 + number % 200, np.uint8)
             pixels[:, : WIDTH // 2, 0] = 200
             pixels, topic = (pixels, IMAGES) if view is None else (view.pixels, view.topic)
-            yield _image(make, header(time_ns, "camera"), pixels, time_ns, topic, compressed)
+            yield _image(make, stamp, pixels, time_ns, topic, compressed)
+            later_ns = time_ns + 5_000_000
             if depth:
                 stamp = header(time_ns + 4_000_000, depth_frame)
-                info_of_depth = _camera_info(make, stamp, ros1, view, depth_focal)
-                yield "/depth/camera_info", time_ns + 5_000_000, info_of_depth
+                yield (
+                    "/depth/camera_info",
+                    later_ns,
+                    _camera_info(make, stamp, ros1, view, depth_focal),
+                )
                 topic, message = _depth(make, stamp, depth)
-                yield topic, time_ns + 5_000_000, message
-                continue
-            cloud = _cloud(make, header(time_ns + 4_000_000 + round(clock_s * 1e9), "lidar"), view)
-            yield POINTS, time_ns + 5_000_000, cloud
-        if poses:
-            last = header(start + step * frames - step // 2, "odom")
-            yield _moved(make, last, 0.3 * frames - 0.15, poses)
+                yield topic, later_ns, message
+            else:
+                stamp = header(time_ns + 4_000_000 + round(clock_s * 1e9), "lidar")
+                yield POINTS, later_ns, _cloud(make, stamp, view)
 
     opened = _writer(path)
     if compression is not None:

@@ -1,6 +1,10 @@
+"""Outputs are whole or absent, and of one run at a time."""
+
 from __future__ import annotations
 
 import resource
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,8 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import InputError, OutputError
-from pnpdepth_cli.io.atomic import atomic_folder, atomic_path, make_folder, remove_leftovers
+from pnpdepth_cli.errors import InputError, OutputError, StorageError
+from pnpdepth_cli.io.atomic import (
+    atomic_folder,
+    atomic_path,
+    in_turn,
+    lock_folder,
+    make_folder,
+    remove_leftovers,
+)
 from pnpdepth_cli.io.depth import write_depth
 
 
@@ -24,30 +35,28 @@ def no_room_on_disk() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+@pytest.mark.parametrize("error", [None, InputError("the frame was bad"), KeyboardInterrupt()])
 @pytest.mark.parametrize("name", ["depth.png", "n" * 251 + ".npy"])
-def test_the_file_appears_whole_and_nothing_else_stays(name: str, tmp_path: Path) -> None:
+def test_a_file_is_replaced_whole_or_not_at_all(
+    tmp_path: Path, name: str, error: BaseException | None
+) -> None:
     target = tmp_path / name
-    with atomic_path(target) as temporary:
-        assert (temporary.parent, temporary.suffix) == (tmp_path, target.suffix)
-        temporary.write_bytes(b"new")
-        assert not target.exists()
-    assert target.read_bytes() == b"new"
-    assert list(tmp_path.iterdir()) == [target]
-
-
-@pytest.mark.parametrize("error", [InputError("the frame was bad"), KeyboardInterrupt()])
-def test_a_failure_leaves_the_old_file_and_no_other(error: BaseException, tmp_path: Path) -> None:
-    target = tmp_path / "depth.png"
     target.write_bytes(b"old")
 
-    def fail() -> None:
+    def write() -> None:
         with atomic_path(target) as temporary:
-            temporary.write_bytes(b"half")
-            raise error
+            assert (temporary.parent, temporary.suffix) == (tmp_path, target.suffix)
+            temporary.write_bytes(b"new")
+            assert target.read_bytes() == b"old"
+            if error is not None:
+                raise error
 
-    with pytest.raises(type(error)):
-        fail()
-    assert target.read_bytes() == b"old"
+    if error is None:
+        write()
+    else:
+        with pytest.raises(type(error)):
+            write()
+    assert target.read_bytes() == (b"new" if error is None else b"old")
     assert list(tmp_path.iterdir()) == [target]
 
 
@@ -58,7 +67,6 @@ def test_a_link_is_replaced_and_what_it_points_to_stays(tmp_path: Path) -> None:
         with atomic_path(tmp_path / name) as temporary:
             temporary.write_bytes(b"x")
         assert not (tmp_path / name).is_symlink()
-        assert (tmp_path / name).read_bytes() == b"x"
     assert (tmp_path / "real").read_bytes() == b"precious"
     assert not (tmp_path / "missing").exists()
 
@@ -75,14 +83,7 @@ def test_a_folder_in_the_output_is_no_link_but_the_output_itself_may_be(tmp_path
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "missing/out.png",
-        "file.txt/out.png",
-        "folder",
-        "/proc/out.png",
-        "/dev/null",
-    ],
+    "name", ["missing/out.png", "file.txt/out.png", "folder", "/proc/out.png", "/dev/null"]
 )
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / "file.txt").write_text("x")
@@ -97,41 +98,39 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> N
 def test_a_full_disk_is_an_output_error_that_names_the_file(tmp_path: Path, suffix: str) -> None:
     target = tmp_path / f"depth{suffix}"
     depth = np.random.default_rng(0).uniform(1, 9, (40, 50)).astype(np.float32)
-    with no_room_on_disk(), pytest.raises(OutputError) as caught:
+    with no_room_on_disk(), pytest.raises(OutputError, match=str(target)):
         write_depth(target, depth)
-    assert str(caught.value).startswith(f"{target} cannot be written")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_appears_whole_and_other_files_in_it_stay(tmp_path: Path) -> None:
+@pytest.mark.parametrize("existed", [False, True])
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_folder_appears_whole_or_not_at_all_and_other_files_in_it_stay(
+    tmp_path: Path, existed: bool, fails: bool
+) -> None:
     folder = tmp_path / "report"
-    (folder / "old").mkdir(parents=True)
-    for name in ("page", "old/a", "mine"):
-        (folder / name).write_text("before")
-    with atomic_folder(folder) as temporary:
-        (temporary / "old").mkdir()
-        for name in ("page", "old/b"):
-            (temporary / name).write_text("after")
-        assert (folder / "page").read_text() == "before"
+    before = {"page": "before", "old/a": "before", "mine": "before"} if existed else {}
+    for name, text in before.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+    def write() -> None:
+        with atomic_folder(folder) as temporary:
+            (temporary / "old").mkdir()
+            for name in ("page", "old/b"):
+                (temporary / name).write_text("after")
+            if fails:
+                raise KeyboardInterrupt
+
+    if fails:
+        with pytest.raises(KeyboardInterrupt):
+            write()
+    else:
+        write()
     files = [path for path in folder.rglob("*") if path.is_file()]
     contents = {path.relative_to(folder).as_posix(): path.read_text() for path in files}
-    assert contents == {"page": "after", "old/a": "before", "old/b": "after", "mine": "before"}
-
-
-@pytest.mark.parametrize("existed", [False, True])
-def test_a_folder_that_fails_stays_as_it_was(tmp_path: Path, existed: bool) -> None:
-    folder = tmp_path / "report"
-    if existed:
-        folder.mkdir()
-
-    def fail() -> None:
-        with atomic_folder(folder) as temporary:
-            (temporary / "page").write_text("half")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fail()
-    assert list(tmp_path.rglob("*")) == ([folder] if existed else [])
+    assert contents == before | ({} if fails else {"page": "after", "old/b": "after"})
+    assert folder.exists() == (existed or not fails)
 
 
 def test_a_folder_left_by_a_killed_writer_is_removed(tmp_path: Path) -> None:
@@ -139,3 +138,51 @@ def test_a_folder_left_by_a_killed_writer_is_removed(tmp_path: Path) -> None:
     (tmp_path / ".mine").mkdir()
     assert remove_leftovers(tmp_path) == 1
     assert [path.name for path in tmp_path.iterdir()] == [".mine"]
+
+
+@pytest.mark.parametrize(
+    ("held", "refused", "allowed"),
+    [
+        ([None], [None, (1, 2)], []),
+        ([(1, 3), (3, 3)], [(1, 3), (3, 3), None], [(2, 3)]),
+    ],
+)
+def test_shards_run_together_but_not_twice_nor_beside_a_whole_run(
+    tmp_path: Path, held: list, refused: list, allowed: list
+) -> None:
+    def hold(shards: list) -> None:
+        if shards:
+            with lock_folder(tmp_path, shards[0]):
+                hold(shards[1:])
+        else:
+            for shard in refused:
+                with pytest.raises(OutputError), lock_folder(tmp_path, shard):
+                    pass
+            for shard in allowed:
+                with lock_folder(tmp_path, shard):
+                    pass
+            raise ZeroDivisionError  # after which they are free again
+
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            hold(held)
+    with pytest.raises(StorageError), lock_folder(tmp_path / "no"):
+        pass
+
+
+def test_in_turn_one_waits_for_the_other(tmp_path: Path) -> None:
+    order, inside = list[str](), threading.Event()
+
+    def first() -> None:
+        with in_turn(tmp_path):
+            inside.set()
+            time.sleep(0.05)
+            order.append("first")
+
+    thread = threading.Thread(target=first)
+    thread.start()
+    inside.wait()
+    with in_turn(tmp_path):
+        order.append("second")
+    thread.join()
+    assert order == ["first", "second"]

@@ -24,8 +24,7 @@ Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27
 Tr_imu_to_velo: 1 0 0 -0.8 0 1 0 0.3 0 0 1 -0.8
 """
 PLAIN = """# a comment
-K: [[700.5, 0, 600],
-    [0, 701, 170],
+K: [[700.5, 0, 600], [0, 701, 170],
     [0, 0, 1]]
 R:
   - [0, -1, 0]
@@ -38,11 +37,7 @@ size: [1242, 375]
 K = [[500.5, 0, 320], [0, 501, 240], [0, 0, 1]]
 ROS = """image_width: 640
 image_height: 480
-camera_name: front
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [500.5, 0, 320, 0, 501, 240, 0, 0, 1]
+camera_matrix: {{rows: 3, cols: 3, data: [500.5, 0, 320, 0, 501, 240, 0, 0, 1]}}
 distortion_model: {model}
 distortion_coefficients: {{rows: 1, cols: 5, data: {data}}}
 rectification_matrix: {{rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
@@ -64,30 +59,25 @@ KALIBR = """cam0:
   distortion_model: equidistant
   intrinsics: [500.5, 501, 320, 240]
   resolution: [640, 480]
-  rostopic: /cam0/image_raw
 cam1:
-  T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-  T_cam_lidar:
-  - [0, -1, 0, 0.1]
-  - [0, 0, -1, -0.2]
-  - [1, 0, 0, -0.3]
-  - [0, 0, 0, 1]
+  T_cam_lidar: [[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1]]
   camera_model: pinhole
   distortion_coeffs: [-0.1, 0.02, 0.001, -0.002]
   distortion_model: radtan
   intrinsics: [400, 401, 310, 230]
   resolution: [640, 480]
 """
+RADIAL = "radial-tangential"
 TURN = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
 SHIFT = [0.1, -0.2, -0.3]
+PINHOLE = [[700, 0, 600], [0, 700, 170], [0, 0, 1]]
 POSES = {
     "matrix of 16": "0 -1 0 0.1\n0 0 -1 -0.2\n1 0 0 -0.3\n0 0 0 1\n",
     "matrix of 12": "[[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3]]  # by rows",
     "quaternion": "0.1 -0.2 -0.3 0.5 -0.5 0.5 0.5",
     "two lists": "translation: [0.1, -0.2, -0.3]\nrotation: [0.5, -0.5, 0.5, 0.5]\n",
     "json": '{"translation": [0.1, -0.2, -0.3], "quaternion": [0.5, -0.5, 0.5, 0.5]}',
-    "tf": "transforms:\n- header: {frame_id: camera}\n  child_frame_id: lidar\n  transform:\n"
-    "    translation: {x: 0.1, y: -0.2, z: -0.3}\n"
+    "tf": "transforms:\n- transform:\n    translation: {x: 0.1, y: -0.2, z: -0.3}\n"
     "    rotation: {x: 0.5, y: -0.5, z: 0.5, w: 0.5}\n",
     "named matrix": "T_cam_lidar: [[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3]]",
     "R and t": "R: [0, -1, 0, 0, 0, -1, 1, 0, 0]\nt: [0.1, -0.2, -0.3]\n",
@@ -121,59 +111,45 @@ def facts(calibration: Calibration) -> tuple[Any, ...]:
     return camera.intrinsics.tolist(), camera.size, camera.lens, camera.distortion, has_pose
 
 
-def test_kittis_object_file_becomes_one_pinhole_camera(tmp_path: Path) -> None:
+def test_kittis_files_become_one_pinhole_camera(tmp_path: Path) -> None:
     path = write(tmp_path, KITTI)
     got = read_calibration(path)
-    pinhole = [[700, 0, 600], [0, 700, 170], [0, 0, 1]]
-    assert facts(got) == (pinhole, None, "radial-tangential", (), True)
+    assert facts(got) == (PINHOLE, None, RADIAL, (), True)
     assert got.scanner.rotation.tolist() == TURN
     # P · [0 -0.08 -0.27 1] must come out the same as K · translation
     p2 = np.array([[700, 0, 600, 42], [0, 700, 170, -0.35], [0, 0, 1, 0.005]])
-    np.testing.assert_allclose(
-        got.camera.intrinsics @ got.scanner.translation, p2 @ [0, -0.08, -0.27, 1]
-    )
+    shown = got.camera.intrinsics @ got.scanner.translation
+    np.testing.assert_allclose(shown, p2 @ [0, -0.08, -0.27, 1])
     assert read_calibration(path, 0).scanner.translation.tolist() == [0, -0.08, -0.27]
     with pytest.raises(UsageError):
         read_calibration(path, 3)
-
-
-def test_kittis_odometry_file_has_the_scanner_in_tr(tmp_path: Path) -> None:
+    # odometry has the scanner in Tr, and no rectification
     lines = KITTI.splitlines()
     odometry = "\n".join([*lines[:2], lines[3].replace("Tr_velo_to_cam", "Tr")])
-    got, want = (read_calibration(write(tmp_path, text)) for text in (odometry, KITTI))
-    assert np.array_equal(got.scanner.square(), want.scanner.square())
+    same = read_calibration(write(tmp_path, odometry))
+    assert np.array_equal(same.scanner.square(), got.scanner.square())
 
 
 def test_kitti_360_maps_camera_0_to_the_scanner_and_has_one_rectification(tmp_path: Path) -> None:
-    turn = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
-    to_scanner = np.column_stack([np.linalg.inv(np.array(TURN, float)), [0.77, 0.29, -0.16]])
-    offset = -328.7142
-    numbers = {
-        "S_rect": [1408, 376],
-        "R_rect": turn.ravel(),
-        "P_rect": [552.554, 0, 682.05, 0, 0, 552.554, 238.77, 0, 0, 0, 1, 0],
-    }
-    lines = ["calib_time: 03-Apr-2018 18:47:03", "corner_dist: 0.100000"]
-    for camera in (0, 1):
-        numbers["P_rect"][3] = camera * offset
-        lines += [
-            f"{k}_{camera:02}: {' '.join(map(repr, map(float, v)))}" for k, v in numbers.items()
-        ]
+    k, turn = np.array([[552.5, 0, 682], [0, 552.5, 238.7], [0, 0, 1]]), np.array(TURN, float).T
+    rectify = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
+    to_scanner = np.column_stack([turn, [0.77, 0.29, -0.16]])
+    offsets, lines = (0.0, -328.7), ["calib_time: 03-Apr-2018 18:47:03", "corner_dist: 0.100000"]
+    for camera, offset in enumerate(offsets):
+        p = np.column_stack([k, [offset, 0, 0]])
+        for name, values in {"S_rect": [1408, 376], "R_rect": rectify, "P_rect": p}.items():
+            lines.append(f"{name}_{camera:02}: {' '.join(map(str, np.ravel(values).tolist()))}")
     (tmp_path / "perspective.txt").write_text("\n".join(lines))
     np.savetxt(tmp_path / "calib_cam_to_velo.txt", to_scanner.reshape(1, 12))
     point = np.array([12.0, -3.0, 0.5])  # in the scanner's frame
-    in_camera = np.linalg.solve(to_scanner[:, :3], point - to_scanner[:, 3])
-    for camera in (0, 1):
-        u, v, w = (
-            np.array([[552.554, 0, 682.05], [0, 552.554, 238.77], [0, 0, 1]]) @ turn @ in_camera
-        )
-        expected = [(u + camera * offset) / w, v / w, w]
+    u, v, w = k @ rectify @ np.linalg.solve(turn, point - to_scanner[:, 3])
+    for camera, offset in enumerate(offsets):
         for path in (tmp_path, tmp_path / "perspective.txt"):
             calibration = read_calibration(path, camera or None)
             assert calibration.scanner is not None
             seen = calibration.scanner.apply(point[None])
             pixel = pixels_of(calibration.camera, seen)[0]
-            np.testing.assert_allclose([*pixel, seen[0, 2]], expected)
+            np.testing.assert_allclose([*pixel, seen[0, 2]], [(u + offset) / w, v / w, w])
             assert calibration.camera.size == (376, 1408)
     with pytest.raises(UsageError):
         read_calibration(tmp_path, 2)
@@ -186,10 +162,9 @@ def test_kittis_cameras_are_read_without_their_scanner(tmp_path: Path) -> None:
         "S_rect_02: 1242 375\nP_rect_02: 700 0 600 42 0 700 170 0 0 0 1 0\n",
         "calib_cam_to_cam.txt",
     )
-    pinhole = [[700, 0, 600], [0, 700, 170], [0, 0, 1]]
     for place in (tmp_path, path):
         got = read_calibration(place)
-        assert facts(got) == (pinhole, (375, 1242), "radial-tangential", (), False)
+        assert facts(got) == (PINHOLE, (375, 1242), RADIAL, (), False)
     path.rename(tmp_path / "calib_velo_to_cam.txt")
     with pytest.raises(InputError):
         read_calibration(tmp_path)
@@ -220,7 +195,7 @@ def test_a_plain_text_file_and_its_json_are_read_the_same(tmp_path: Path) -> Non
     for text in (PLAIN, json.dumps(values)):
         got = read_calibration(write(tmp_path, text))
         distortion = tuple(values["distortion"])
-        assert facts(got) == (values["K"], (375, 1242), "radial-tangential", distortion, True)
+        assert facts(got) == (values["K"], (375, 1242), RADIAL, distortion, True)
         assert [each.tolist() for each in got.scanner] == [values["R"], values["t"]]
     with pytest.raises(UsageError):
         read_calibration(tmp_path / "calib.txt", 1)
@@ -230,19 +205,15 @@ FIVE = [-0.1, 0.02, 0.001, -0.002, 0.01]
 FOUR = [-0.02, 0.01, -0.003, 0.001]
 EIGHT = [0.1, 0.2, 0.0, 0.0, 0.1, 0.2, 0.1, 0.01]
 NAMED = {
-    "of OpenCV": (opencv_file(FIVE), FIVE, "radial-tangential"),
-    "of OpenCV, not fisheye": (opencv_file(FOUR, fisheye_model=0), FOUR, "radial-tangential"),
+    "of OpenCV": (opencv_file(FIVE), FIVE, RADIAL),
+    "of OpenCV, not fisheye": (opencv_file(FOUR, fisheye_model=0), FOUR, RADIAL),
     "of OpenCV, fisheye": (opencv_file(FOUR, fisheye_model=1), FOUR, "fisheye"),
-    "of ROS": (ROS.format(model="plumb_bob", data=FIVE), FIVE, "radial-tangential"),
-    "of ROS, rational": (
-        ROS.format(model="rational_polynomial", data=EIGHT),
-        EIGHT,
-        "radial-tangential",
-    ),
+    "of ROS": (ROS.format(model="plumb_bob", data=FIVE), FIVE, RADIAL),
+    "of ROS, rational": (ROS.format(model="rational_polynomial", data=EIGHT), EIGHT, RADIAL),
     "of ROS, fisheye": (ROS.format(model="equidistant", data=FOUR), FOUR, "fisheye"),
-    "of ROS, without distortion": (ROS.format(model="''", data=[0] * 4), [], "radial-tangential"),
-    "of ROS, without a model": (ROS.format(model="''", data=FOUR), FOUR, "radial-tangential"),
-    "an echoed topic": (TOPIC, FIVE, "radial-tangential"),
+    "of ROS, without distortion": (ROS.format(model="''", data=[0] * 4), [], RADIAL),
+    "of ROS, without a model": (ROS.format(model="''", data=FOUR), FOUR, RADIAL),
+    "an echoed topic": (TOPIC, FIVE, RADIAL),
 }
 """Text, coefficients and lens of files that name what they hold, of one camera."""
 
@@ -258,23 +229,19 @@ def test_files_of_opencv_and_ros_are_read(
     assert read_calibration(write(tmp_path, text.replace("height:", "rows:"))).camera.size is None
 
 
+PLAIN_P, SHIFTED_P = [9, 0, 3, 0, 0, 8, 2, 0, 0, 0, 1, 0], [9, 0, 3, -18, 0, 8, 2, 0, 0, 0, 1, 0]
+TURNED = {"P and R": (TURN, 0), "P": (None, 0)}
+
+
 @pytest.mark.parametrize(
     ("p", "r", "cameras"),
     [
         ([0] * 12, [], {}),
         ([9, 0, 3, 0, 0, 0, 2, 0, 0, 0, 1, 0], [], {}),
-        ([9, 0, 3, 0, 0, 8, 2, 0, 0, 0, 1, 0], [0] * 9, {"P": (None, 0)}),
-        ([9, 0, 3, 0, 0, 8, 2, 0, 0, 0, 1, 0], TURN, {"P and R": (TURN, 0), "P": (None, 0)}),
-        (
-            [9, 0, 3, -18, 0, 8, 2, 0, 0, 0, 1, 0],
-            [],
-            {"P with its offset": (None, -2), "P": (None, 0)},
-        ),
-        (
-            [9, 0, 3, -18, 0, 8, 2, 0, 0, 0, 1, 0],
-            TURN,
-            {"P with its offset, and R": (TURN, -2), "P and R": (TURN, 0), "P": (None, 0)},
-        ),
+        (PLAIN_P, [0] * 9, {"P": (None, 0)}),
+        (PLAIN_P, TURN, TURNED),
+        (SHIFTED_P, [], {"P with its offset": (None, -2), "P": (None, 0)}),
+        (SHIFTED_P, TURN, {"P with its offset, and R": (TURN, -2), **TURNED}),
     ],
 )
 def test_the_cameras_of_rectified_images_follow_p_and_r(
@@ -295,7 +262,7 @@ def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
     path = write(tmp_path, KALIBR)
     first, second = read_calibration(path), read_calibration(path, 1)
     assert facts(first) == (K, (480, 640), "fisheye", (-0.02, 0.01, -0.003, 0.001), False)
-    assert second.camera.lens == "radial-tangential"
+    assert second.camera.lens == RADIAL
     assert [each.tolist() for each in second.scanner] == [TURN, SHIFT]
     with pytest.raises(UsageError):
         read_calibration(path, 7)

@@ -20,11 +20,8 @@ def test_a_binary_model_is_read_as_written(tmp_path: Path) -> None:
     write_binary_model(tmp_path)
     model = read_model(tmp_path)
     camera = model.images["dir/1.png"].camera
-    assert (camera.source, camera.size, camera.lens) == (
-        "SIMPLE_RADIAL camera",
-        (48, 64),
-        "radial-tangential",
-    )
+    assert (camera.source, camera.size) == ("SIMPLE_RADIAL camera", (48, 64))
+    assert camera.lens == "radial-tangential"
     assert camera.intrinsics.tolist() == [[50, 0, 31.5], [0, 50, 23.5], [0, 0, 1]]
     assert camera.distortion == (0.1, 0, 0, 0)
     assert list(model.images) == ["dir/1.png", "dir/2.png"]
@@ -106,10 +103,8 @@ def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:
         "# comment\n\n7 1 2 3 9 8 7 0.5 1 0 2 0\n8 4 5 6 9 8 7 1\n"
     )
     model = read_model(tmp_path)
-    assert (model.points.xyz.tolist(), model.points.error.tolist()) == (
-        [[1, 2, 3], [4, 5, 6]],
-        [0.5, 1],
-    )
+    assert model.points.xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert model.points.error.tolist() == [0.5, 1]
     assert model.points.track.tolist() == [2, 0]
     assert model.images["b.png"].points.tolist() == [1, 2, 3]
     assert model.images["b.png"].pose.translation.tolist() == [0.1, 0, 0]
@@ -126,10 +121,7 @@ IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"
         ("cameras", "# x\n1 PINHOLE 64\n"),
         ("cameras", "1 PINHOLE 64 48\n"),
         ("cameras", "\n\n1 PINHOLE 64 48 1 2 3 x\n"),
-        (
-            "images",
-            f"{IMAGE}5 5 -1\n\n{IMAGE}",
-        ),
+        ("images", f"{IMAGE}5 5 -1\n\n{IMAGE}"),
         ("images", f"{IMAGE}5 5\n"),
         ("images", "1 1 0 0 0 0 0 0 1\n\n"),
         ("points3D", "# x\n7 1 2 3 9 8 7 0.5 1\n"),

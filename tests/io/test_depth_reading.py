@@ -51,23 +51,18 @@ def ones(*names: str) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("name", ["d.png", "d.tif"])
 @pytest.mark.parametrize(
-    ("text", "scale", "used", "end"),
-    [
-        (None, None, 256, "÷ 256"),
-        (None, 1000, 1000, "÷ 1000"),
-        ("1000", None, 1000, "÷ 1000 (from the file)"),
-        ("1000", 500, 500, "÷ 500"),
-    ],
+    ("text", "scale", "used"),
+    [(None, None, 256), (None, 1000, 1000), ("1000", None, 1000), ("1000", 500, 500)],
 )
 def test_a_given_scale_beats_that_in_the_file_which_beats_kittis(
-    name: str, text: str | None, scale: float | None, used: float, end: str, tmp_path: Path
+    name: str, text: str | None, scale: float | None, used: float, tmp_path: Path
 ) -> None:
     depth = read_depth(save(tmp_path / name, CODES, text), scale=scale)
     assert np.array_equal(depth.values, (CODES / used).astype(np.float32))
     assert depth.values.dtype == np.float32
-    assert depth.reading.source == f"16-bit {'PNG' if name == 'd.png' else 'TIFF'} {end}"
     assert depth.reading.assumed == (text is None and scale is None)
     assert depth.reading.scale == used
+    assert ("(from the file)" in depth.reading.source) == (text is not None and scale is None)
     assert np.array_equal(depth.valid, CODES > 0)
 
 
@@ -136,10 +131,6 @@ def test_every_format_gives_metres_where_they_are_finite_and_above_zero(
         assert depth.reading.scale is None
 
 
-def broken_pfm(header: bytes, count: int) -> tuple[str, bytes]:
-    return "d.pfm", header + bytes(count)
-
-
 @pytest.mark.parametrize(
     ("name", "values"),
     [
@@ -149,27 +140,20 @@ def broken_pfm(header: bytes, count: int) -> tuple[str, bytes]:
         ),
         *(("d.npy", np.array([[value]])) for value in (True, 1j, "a")),
         ("d.npz", {}),
-        *(
-            (f"d{suffix}", np.zeros((3, 4), np.uint8))
-            for suffix in (".png", ".tif", ".jpg", ".webp")
-        ),
+        *((f"d.{suffix}", np.zeros((3, 4), np.uint8)) for suffix in ("png", "tif", "jpg", "webp")),
         ("d.png", np.zeros((3, 4, 4), np.uint16)),
         ("d.tif", np.zeros((3, 4, 3), np.float32)),
         ("d.pfm", b"PF\n1 1\n-1\n" + bytes(12)),
-        broken_pfm(b"Pf\n2 1\n-1\n", 7),
-        broken_pfm(b"Pf\n2 1\n-1\n", 9),
-        broken_pfm(b"Pf\n2 1\n0\n", 8),
-        broken_pfm(b"Pf\n2 1\n1e999\n", 8),
-        broken_pfm(b"Pf\n2 1\n--1\n", 8),
-        broken_pfm(b"Pf\n2 0\n-1\n", 0),
-        broken_pfm(b"Pf\n-2 1\n-1\n", 8),
+        *(("d.pfm", b"Pf\n2 1\n-1\n" + bytes(count)) for count in (7, 9)),
+        *(
+            ("d.pfm", b"Pf\n" + header + b"\n" + bytes(8))
+            for header in (b"2 1\n0", b"2 1\n1e999", b"2 1\n--1", b"2 0\n-1", b"-2 1\n-1")
+        ),
         ("d.pfm", b"hello"),
         ("d.pfm", b""),
     ],
 )
-def test_what_is_no_depth_is_refused_with_its_reason(
-    tmp_path: Path, name: str, values: Any
-) -> None:
+def test_what_is_no_depth_is_refused(tmp_path: Path, name: str, values: Any) -> None:
     with pytest.raises(FileFormatError):
         read_depth(save(tmp_path / name, values))
 
@@ -203,27 +187,17 @@ def test_ambiguous_channels_or_arrays_are_refused_and_listed(
         read_depth(path)
 
 
-@pytest.mark.parametrize(
-    ("corner", "rows", "columns"),
-    [
-        ((1, 1), (1, 3), (1, 4)),
-        ((-1, -1), (0, 1), (0, 2)),
-        ((3, 2), (2, 4), (3, 5)),
-        ((9, 9), 0, 0),
-    ],
-)
+@pytest.mark.parametrize("corner", [(1, 1), (-1, -1), (3, 2), (9, 9), (-9, 0)])
 def test_a_cropped_exr_is_placed_in_its_display_window(
-    tmp_path: Path, corner: tuple[int, int], rows: Any, columns: Any
+    tmp_path: Path, corner: tuple[int, int]
 ) -> None:
     window = (np.array([0, 0], np.int32), np.array([4, 3], np.int32))
     crop = (np.array(corner, np.int32), np.array(corner, np.int32) + np.array([2, 1], np.int32))
     write_exr(tmp_path / "d.exr", {"Z": KNOWN + 1}, displayWindow=window, dataWindow=crop)
-    expected = np.zeros((4, 5), np.float32)
-    if rows:
-        inside = expected[slice(*rows), slice(*columns)]
-        top, left = (max(-start, 0) for start in corner[::-1])
-        inside[:] = (KNOWN + 1)[top : top + inside.shape[0], left : left + inside.shape[1]]
-    assert np.array_equal(read_depth(tmp_path / "d.exr").values, expected)
+    around = np.zeros((40, 40), np.float32)
+    row, column = 20 + corner[1], 20 + corner[0]
+    around[row : row + 2, column : column + 3] = KNOWN + 1
+    assert np.array_equal(read_depth(tmp_path / "d.exr").values, around[20:24, 20:25])
 
 
 def test_the_parts_of_an_exr_are_read(tmp_path: Path) -> None:

@@ -1,24 +1,38 @@
-"""Small files that claim much, and headers that evaluate to nothing: one line, little memory."""
+"""Files that claim much or are no files: one line, little memory, and no word of a library."""
 
 from __future__ import annotations
 
 import io
+import os
 import struct
 import subprocess
 import sys
 import tempfile
+import threading
+import tracemalloc
+import warnings
+import zipfile
 import zlib
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
+import PIL.Image
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.decoding import check_tags
-from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.budget import set_max_pixels
+from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.calibration import read_calibration
+from pnpdepth_cli.io.decoding import check_tags, silence
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.file_bytes import sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.io.sparse_files import read_sparse
+from pnpdepth_cli.io.text_files import read_json
 from tests.models.weights.files import little
 
 
@@ -43,22 +57,27 @@ def test_an_image_beyond_64_megapixels_is_refused_by_its_header(
             read(path)
 
 
+PROGRAM = """
+import sys
+from pathlib import Path
+from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.rgb import read_rgb
+for read in (read_rgb, read_depth):
+    try:
+        read(Path(sys.argv[1]))
+    except FileFormatError as error:
+        print(error)
+"""
+
+
 @pytest.mark.parametrize("colour", [0, 2])
 def test_pixels_that_do_not_decode_are_one_line_and_libraries_say_nothing(
     tmp_path: Path, colour: int
 ) -> None:
     path = png(tmp_path / "broken.png", (64, 64), 16, colour, zlib.compress(b"x" * 9)[:-6])
-    program = (
-        "import sys\nfrom pathlib import Path\n"
-        "from pnpdepth_cli.errors import FileFormatError\n"
-        "from pnpdepth_cli.io.depth import read_depth\nfrom pnpdepth_cli.io.rgb import read_rgb\n"
-        "for read in (read_rgb, read_depth):\n"
-        "    try:\n        read(Path(sys.argv[1]))\n"
-        "    except FileFormatError as error:\n        print(error)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", PROGRAM, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
     assert len(lines) == 2
@@ -113,6 +132,7 @@ EXRS = {
         PLAIN, "dataWindow", "box2i", window(-HIGH, -HIGH, HIGH, HIGH)
     ),
     "a window upside down": claiming(PLAIN, "dataWindow", "box2i", window(5, 5, 4, 4)),
+    "a vast display": claiming(PLAIN, "displayWindow", "box2i", window(0, 0, 7999, 7989)),
     "a display of every pixel": claiming(PLAIN, "displayWindow", "box2i", window(0, 0, HIGH, HIGH)),
     "5,000 channels": claiming(
         exr(*(f"c{n}" for n in range(5000))), "dataWindow", "box2i", window(0, 0, 99, 99)
@@ -176,3 +196,130 @@ def test_pages_of_a_tiff_that_overlap_are_refused() -> None:
     data = b"II*\0" + struct.pack("<IH", 8, 3000) + pointers + bytes(4) + shared
     with little(seconds=2), pytest.raises(ValueError, match="overlap"):
         check_tags(data)
+
+
+def test_only_the_thread_inside_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
+    before = sys.stdout
+    inside, done = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with silence():
+            sys.stdout.write("dropped\n")
+            inside.set()
+            done.wait(10)
+            sys.stdout.write("dropped\n")
+        sys.stdout.write("said afterwards\n")
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    assert inside.wait(10)
+    sys.stdout.write("said meanwhile\n")
+    with silence():
+        sys.stdout.write("dropped\n")
+    done.set()
+    thread.join()
+    assert capsys.readouterr().out == "said meanwhile\nsaid afterwards\n"
+    assert sys.stdout is before
+
+
+def test_the_state_comes_back_after_an_error_and_in_whatever_order_they_leave() -> None:
+    before, limit = sys.stdout, PIL.Image.MAX_IMAGE_PIXELS
+    first, second = ExitStack(), ExitStack()
+    first.enter_context(silence())
+    second.enter_context(silence())
+    assert PIL.Image.MAX_IMAGE_PIXELS is None
+    first.close()
+    assert PIL.Image.MAX_IMAGE_PIXELS is None  # the second is still inside
+    assert sys.stdout.encoding == before.encoding
+
+    def fail() -> None:
+        with second:
+            warnings.warn("dropped", UserWarning, stacklevel=1)
+            raise ValueError("inside")
+
+    with pytest.raises(ValueError, match="inside"):
+        fail()
+    assert (sys.stdout, PIL.Image.MAX_IMAGE_PIXELS) == (before, limit)
+
+
+READERS = [read_depth, read_sparse, read_rgb, read_calibration, read_json, sha256_of, read_scan]
+DEPTH = np.full((6, 8), 2.5, np.float32)
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_a_device_a_pipe_and_a_sparse_file_of_terabytes_are_refused_unread(
+    read: Any, tmp_path: Path
+) -> None:
+    pipe, huge = tmp_path / "pipe.bin", tmp_path / "huge.png"
+    os.mkfifo(pipe)
+    for path in (pipe,) if read is read_scan else (Path("/dev/zero"), pipe):
+        with little(), pytest.raises(InputError):
+            read(path)
+    with huge.open("wb") as file:
+        file.truncate(1 << 42)
+    if read not in (sha256_of, read_scan):
+        with little(), pytest.raises(FileFormatError):
+            read(huge)
+
+
+def npz(path: Path, content: bytes, compression: int = zipfile.ZIP_DEFLATED) -> None:
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        archive.writestr("depth.npy", content)
+
+
+def npy(shape: tuple[int, ...], body: bytes) -> bytes:
+    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, header)
+    return buffer.getvalue() + body
+
+
+def test_an_npz_that_lies_is_refused_and_what_follows_its_array_is_not_decompressed(
+    tmp_path: Path,
+) -> None:
+    path, valid = tmp_path / "lie.npz", npy((6, 8), DEPTH.tobytes())
+    npz(path, valid + bytes(100 << 20))
+    tracemalloc.start()
+    assert np.array_equal(read_depth(path).values, DEPTH)
+    assert tracemalloc.get_traced_memory()[1] < 2e7
+    tracemalloc.stop()
+    lies = [(npy((10_000, 5_000), bytes(1000)), zipfile.ZIP_DEFLATED)]
+    lies += [(valid, compression) for compression in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)]
+    for lie in lies:
+        npz(path, *lie)
+        with little(), pytest.raises(FileFormatError):
+            read_depth(path)
+    npz(path, npy((600, 800), bytes(4 * 600 * 800)))
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<I", content, content.index(b"PK\x01\x02") + 24, 500)  # uncompressed size
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError):
+        read_depth(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".exr", ".pfm", ".tiff", ".npy", ".npz"])
+def test_more_pixels_than_the_budget_are_refused_before_they_are_read(
+    tmp_path: Path, suffix: str
+) -> None:
+    path = tmp_path / f"d{suffix}"
+    write_depth(path, np.ones((300, 400), np.float32))
+    try:
+        set_max_pixels(119_999)
+        with pytest.raises(FileFormatError):
+            read_depth(path)
+        set_max_pixels(120_000)
+        assert read_depth(path).values.shape == (300, 400)
+    finally:
+        set_max_pixels(None)
+
+
+def test_an_image_is_read_however_many_pixels_pillow_allows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    codes = np.arange(64 * 64, dtype=np.uint16).reshape(64, 64)
+    Image.fromarray(codes).save(tmp_path / "codes.png")
+    Image.fromarray((codes % 256).astype(np.uint8)).save(tmp_path / "bytes.png")
+    monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", 100)  # as 268 megapixels are to its own
+    for name in ("codes.png", "bytes.png"):
+        assert read_rgb(tmp_path / name).values.shape == (64, 64, 3)
+    assert PIL.Image.MAX_IMAGE_PIXELS == 100

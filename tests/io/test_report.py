@@ -48,11 +48,10 @@ def written(folder: Path, head: Head, frames: Iterable[dict[str, Any]]) -> None:
 def test_names_are_data_whatever_they_say(tmp_path: Path) -> None:
     head = Head(kind="Test", title=NAMES[0], without=[(n, n) for n in NAMES], labels=LABELS)
     written(tmp_path, head, (frame(name) for name in NAMES))
-    data = page_data(tmp_path)
+    data, text = page_data(tmp_path), (tmp_path / "index.html").read_text()
     assert data["title"] == NAMES[0]
     assert [each["name"] for each in data["frames"]] == NAMES
     assert [name for name, _ in data["without"]] == [visible(name) for name in NAMES]
-    text = (tmp_path / "index.html").read_text()
     assert text.count("<script") == text.count("</script>") == 2
 
 

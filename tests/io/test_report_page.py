@@ -183,7 +183,7 @@ def test_the_worst_frame_is_first_and_it_sorts_by_every_column_and_can_be_search
     assert one(page, "#count").text == "1 of 4 frames."
 
 
-@pytest.mark.parametrize(("width", "dark"), [(320, False), (768, True), (1280, False)])
+@pytest.mark.parametrize(("width", "dark"), [(320, False), (1280, True)])
 def test_no_width_overflows_and_colours_are_those_that_the_reader_prefers(
     page: webdriver.Chrome, width: int, dark: bool
 ) -> None:
@@ -193,12 +193,8 @@ def test_no_width_overflows_and_colours_are_those_that_the_reader_prefers(
     inner, outer = page.execute_script(script.replace("{}", "document.documentElement"))
     assert inner == outer <= width  # a scroll bar takes some of it
     style = "const s = getComputedStyle(document.body); return [s.color, s.backgroundColor]"
-    ink, paper = (
-        sum(int(level) for level in colour[4:-1].split(","))
-        for colour in page.execute_script(style)
-    )
-    assert (ink > paper) == dark
-    assert abs(ink - paper) > 500
+    ink, paper = (sum(map(int, colour[4:-1].split(","))) for colour in page.execute_script(style))
+    assert (ink - paper > 500) if dark else (paper - ink > 500)
     one(page, "#rows .open").send_keys(Keys.ENTER)
     wait(page, lambda: loaded(page, "#views img"))
     inner, outer = page.execute_script(script.replace("{}", "document.getElementById('frame')"))

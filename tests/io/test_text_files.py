@@ -1,0 +1,75 @@
+"""JSON is read as it was written, and no cell of a CSV file is a formula to a spreadsheet."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError
+from pnpdepth_cli.io.text_files import read_json, write_csv, write_json
+
+
+@dataclass
+class Point:
+    x: float
+
+
+def test_what_is_written_is_read_back_in_the_same_order(tmp_path: Path) -> None:
+    inner = {"z": [None, True, -1.5e-300, 10**30], "ä": {}, "": '\u2028 "\\\n\0 \U0001f600'}
+    mapping = {"é-_": [inner, [], [[1]]], "a": inner, "0": 0.1 + 0.2}
+    write_json(tmp_path / "record.json", mapping)
+    again = read_json(tmp_path / "record.json")
+    assert again == mapping
+    assert [list(again), list(again["a"])] == [list(mapping), list(inner)]
+
+
+def test_numpy_values_paths_and_dataclasses_become_plain_and_nan_null(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    content = {"n": np.int64(3), "x": np.array([0.5, np.nan]), "p": Path("a/b"), "t": (1, 2)}
+    write_json(path, content | {"d": Point(x=float("inf")), "c": [{"c": np.float32("nan")}]})
+    plain = {"n": 3, "x": [0.5, None], "p": "a/b", "t": [1, 2], "d": {"x": None}}
+    assert read_json(path) == {**plain, "c": [{"c": None}]}
+
+
+def test_the_text_is_readable_and_what_json_cannot_hold_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    write_json(path, {"name": "Tübingen", "δ1": 0.5})
+    with pytest.raises(TypeError):
+        write_json(path, {"a": object()})
+    assert path.read_text("utf-8") == '{\n  "name": "Tübingen",\n  "δ1": 0.5\n}\n'
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(OutputError):
+        write_json(tmp_path / "none" / "r.json", {})
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"{", b"[1]", b'{"a": NaN}', b"\xff\xfe", b"null", b"[" * 100_000, b"{} {}", None),
+        b'{"a": 1%s}' % (b"0" * 400),
+    ],
+)
+def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "r.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError if content is None else FileFormatError, match=r"r\.json") as no:
+        read_json(path)
+    assert "\n" not in str(no.value)
+
+
+FORMULAS = ["=1+1", "+1+1", "-1+2", "@SUM(A1)", "\t=1", "-", "\t1"]
+OTHERS = ["frame", "1=1", "'=1", "", "-0.25", "+5.20", "-1e-3", "–"]
+
+
+def test_formulas_become_text_and_other_text_and_numbers_stay_as_they_are() -> None:
+    file = io.StringIO()
+    write_csv(file, ["name", "=x"], [["@a,b", -1.5], ["c", None], FORMULAS, OTHERS])
+    head, comma, none, formulas, others = file.getvalue().splitlines()
+    assert (head, comma, none) == ("name,'=x", '"\'@a,b",-1.5', "c,")
+    assert formulas.split(",") == [f"'{text}" for text in FORMULAS]
+    assert others.split(",") == OTHERS
