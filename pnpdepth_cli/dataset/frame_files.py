@@ -158,13 +158,17 @@ class Unmatched:
 
 def _check_path(path: Path) -> None:
     """Raises FileFormatError for a path that no file can have: an index file may hold any text."""
-    try:
-        encoded = os.fsencode(path)
-    except UnicodeEncodeError:
-        encoded = b"\0"
-    if b"\0" in encoded:
+    if not _can_be_named(str(path)):
         name = str(path).encode("unicode_escape").decode()
         raise FileFormatError(f"{name}: no file can have this name; correct the list of files")
+
+
+def _can_be_named(text: str) -> bool:
+    """Whether a file can have the name."""
+    try:
+        return b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
 
 
 def find_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path], list[Unmatched]]:
@@ -226,13 +230,9 @@ def _walk(folder: Path, above: frozenset[str], problems: list[Unmatched]) -> Ite
 def name_problem(name: str) -> str | None:
     """Returns why no result can be stored under a frame's name; None if it can.
 
-    The reason is a predicate, such as "holds a NUL character".
+    The reason is a predicate, such as "names no file".
     """
-    if "\0" in name:
-        return "holds a NUL character"
-    try:
-        os.fsencode(name)
-    except UnicodeEncodeError:
+    if not _can_be_named(name):
         return "holds a character that no file name has"
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts:

@@ -88,11 +88,7 @@ def list_frames(
 
 
 def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
-    """The folder, or those in it that are of one layout, and that layout.
-
-    Raises:
-        InputError: Neither is, or the folders in it are of several layouts.
-    """
+    """The folder, or those in it that are of one layout, and that layout."""
     if not root.exists():
         raise InputError(f"{root}: no such folder; check the path")
     if (layout := _match(root, name)) is not None:

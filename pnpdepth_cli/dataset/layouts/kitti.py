@@ -41,11 +41,7 @@ _AS_PUBLISHED: dict[str, Any] = {
 
 
 def _of_sequence(place: Path) -> Callable[[FrameFiles], FrameFiles]:
-    """The pose; poses belong to frames by number, so a part of a sequence has its own.
-
-    Raises:
-        InputError: A frame has no row in an existing file of poses.
-    """
+    """The pose; poses belong to frames by number, so a part of a sequence has its own."""
     folder = place.absolute()  # the parents of "." are in its absolute path
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():

@@ -50,11 +50,7 @@ _VALUES: dict[str, Callable[[str], Any]] = {
 
 
 def _frames(root: Path) -> list[FrameFiles | Unmatched]:
-    """A frame for each line of the file; missing files are broken.
-
-    Raises:
-        FileFormatError: A line is invalid, or two frames would share the files of their results.
-    """
+    """A frame for each line of the file; missing files are unmatched."""
     try:
         text = read_bytes(root).decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -119,7 +119,7 @@ def test_names_stay_but_for_dots_and_double_slashes(tmp_path: Path) -> None:
     [
         *((name, "leads out of the output folder") for name in ("../a", "/a", "x/../../a")),
         *((name, "on Windows") for name in ("a\\b", "C:/frames/a")),
-        ("a\0b", "NUL"),
+        ("a\0b", "no file name has"),
         ("\ud800", "no file name has"),
         (".", "names no file"),
         ("n" * 240, "is longer than 239 bytes"),
