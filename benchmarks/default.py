@@ -20,7 +20,6 @@ are for reporting.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -186,11 +185,10 @@ def main() -> None:
     parser.add_argument("--points", nargs="+", type=int, help="only these numbers of points")
     parser.add_argument("--outliers", choices=OUTLIERS, help="make a fifth of the points wrong")
     parser.add_argument("--registration", choices=REGISTRATIONS, default="frame")
-    parser.add_argument("--json", type=Path, help="everything, to this file")
     args = parser.parse_args()
     print_row(*HEAD, head=True)
     networks: dict[str, Network] = {}
-    everything, second = [], list[tuple[Any, ...]]()
+    second = list[tuple[Any, ...]]()
     for name, set_name, count in cases(args):
         network = networks.setdefault(name, opened(name, args.data))
         frames = frames_of(set_name, args.data, args.half, args.frames)
@@ -212,10 +210,6 @@ def main() -> None:
             *(f"{of['worse']:.0%}", f"{of['weight']:.0%}", f"{of['no_part']:.0%}"),
             *(f"{of['warned']:.0%}", f"{of['cpu_s']:.1f}"),
         )
-        cell = {"network": name, "frames": set_name, "points": count}
-        everything.append({"cell": cell, "summary": of, "frames": rows})
-        if args.json:
-            args.json.write_text(json.dumps(everything, indent=1))
     print()
     print_row(*UNCERTAINTY_HEAD, head=True)
     for cells in second:

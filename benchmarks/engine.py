@@ -1,30 +1,24 @@
 """How close a refinement comes to one cut by hand, and how far ahead of the paper's code it is.
 
-    python -m benchmarks.engine [--runs 15] [--only NAME …] [--no-memory] [--json]
+    python -m benchmarks.engine [--runs 15] [--only NAME …]
 
 For the paper's seven networks at full size, random weights, K = 5, in one process, in turn: a plain
 forward pass, its front and rear, refinement with a hand-written front and rear, ours (a network
-that stays open from frame to frame, as in a batch), ours opened anew for one frame, ours in bf16, a
-hook that replaces the layer's output and re-runs the whole network, and a loop written after the
-description of the paper's PyTorch code: the front with gradients on, `create_graph=True`. The limit
-is (front + 11·rear)/(front + rear). Peak memory of each is measured in a process of its own, above
-that of a plain forward pass.
+that stays open from frame to frame, as in a batch), ours opened anew for one frame, a hook that
+replaces the layer's output and re-runs the whole network, and a loop written after the description
+of the paper's PyTorch code: the front with gradients on, `create_graph=True`. The limit is
+(front + 11·rear)/(front + rear).
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import ctypes
-import json
 import platform
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -33,17 +27,13 @@ from benchmarks.frames import print_row
 from benchmarks.hand_cuts import ZOO, Case
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.models.precision import lower
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
 ITERATIONS, STEP, POINTS = 5, 0.01, 500
 SETTINGS = ClosedSettings(iterations=ITERATIONS, lr=STEP)
-CPU = torch.device("cpu")
 COMPARED = ("by hand", "ours", "ours, one frame", "by hook", "paper's code")
 """What gives the same, bit for bit."""
-
-LOWERED = "ours, bf16"
 
 Inputs = tuple[Tensor, ...]
 
@@ -150,16 +140,11 @@ def variants(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
     """What is timed, by name."""
     network, inputs, points = setup(case)
     no_grad = torch.no_grad()
-    with ExitStack() as stack:
-        with torch.no_grad():
-            z, kept = case.front(network, *inputs)
-        twin = case.network()
-        twin.load_state_dict(network.state_dict())
-        split = stack.enter_context(Split(twin, case.layer))
-        low = case.network()
-        low.load_state_dict(network.state_dict())
-        lower(low, torch.bfloat16, CPU)
-        low_split = stack.enter_context(Split(low, case.layer))
+    with torch.no_grad():
+        z, kept = case.front(network, *inputs)
+    twin = case.network()
+    twin.load_state_dict(network.state_dict())
+    with Split(twin, case.layer) as split:
         arguments = (case, network, inputs, points)
         yield {
             "forward": no_grad(lambda: network(*inputs)),
@@ -168,13 +153,12 @@ def variants(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
             "by hand": lambda: by_hand(*arguments),
             "ours": lambda: by_split(split, inputs, points),
             "ours, one frame": lambda: by_new_split(*arguments),
-            LOWERED: lambda: by_split(low_split, inputs, points),
             "by hook": lambda: by_hook(*arguments),
             "paper's code": lambda: by_papers_code(*arguments),
         }
 
 
-def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
+def measure(case: Case, runs: int) -> dict[str, float | str]:
     """Medians of every variant, taken in turn, and the ratios."""
     with variants(case) as todo:
         results = [todo[name]() for name in COMPARED]
@@ -185,15 +169,12 @@ def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
     limit = (median["front"] + (2 * ITERATIONS + 1) * median["rear"]) / (
         median["front"] + median["rear"]
     )
-    ratio = {name: median[name] / median["forward"] for name in (*COMPARED, LOWERED)}
+    ratio = {name: median[name] / median["forward"] for name in COMPARED}
 
     def paired(one: str, other: str) -> float:
         pairs = zip(spent[one], spent[other], strict=True)
         return statistics.median(a / b for a, b in pairs)
 
-    forward = peak_of(case, "forward") if memory else 0
-    measured = ("by hand", "ours", "paper's code") if memory else ()
-    extra = {name: peak_of(case, name) - forward for name in measured}
     return {
         "network": f"{case.name}, {case.size[0]}×{case.size[1]}",
         "forward, ms": 1000 * median["forward"],
@@ -203,8 +184,6 @@ def measure(case: Case, runs: int, *, memory: bool) -> dict[str, float | str]:
         "ours / by hand": paired("ours", "by hand"),
         "ours / paper's code": paired("ours", "paper's code"),
         "one frame / paper's code": paired("ours, one frame", "paper's code"),
-        "paper's code / bf16": paired("paper's code", LOWERED),
-        **{f"extra MB {name}": value for name, value in extra.items()},
     }
 
 
@@ -223,52 +202,16 @@ def in_turn(todo: Mapping[str, Callable[[], object]], runs: int) -> dict[str, li
     return spent
 
 
-def peak_mb(run: Callable[[], object]) -> float:
-    """The peak memory of the process beyond what is in use before, in 10^6 bytes; Linux only."""
-    ctypes.CDLL(None).malloc_trim(0)  # reuse of the C library's free memory would not be measured
-    Path("/proc/self/clear_refs").write_text("5")  # resets the peak to what is in use now
-    resident = kilobytes("VmRSS")
-    run()
-    return max(0.0, (kilobytes("VmHWM") - resident) * 1024 / 1e6)
-
-
-def kilobytes(name: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
-
-
-def peak_of(case: Case, variant: str) -> float:
-    """What this needs at its peak, in a new process that has done it once, after a forward pass."""
-    command = [sys.executable, "-m", "benchmarks.engine", "--peak", case.name, variant]
-    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-
-
-def print_peak(name: str, variant: str) -> None:
-    with variants(next(case for case in ZOO if case.name == name)) as todo:
-        todo["forward"]()
-        todo[variant]()
-        print(peak_mb(todo[variant]))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=15)
     parser.add_argument("--only", nargs="+", default=[case.name for case in ZOO])
-    parser.add_argument("--no-memory", action="store_true")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.peak:
-        print_peak(*args.peak)
-        return
     results = []
     for case in ZOO:
         if case.name in args.only:
             print(case.name, file=sys.stderr)
-            results.append(measure(case, args.runs, memory=not args.no_memory))
-    if args.json:
-        print(json.dumps(results, indent=2))
-        return
+            results.append(measure(case, args.runs))
     print(
         f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads,"
         f" torch {torch.__version__}, fp32, K = {ITERATIONS}, {args.runs} runs, medians; in units"
