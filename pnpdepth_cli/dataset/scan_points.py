@@ -76,22 +76,8 @@ def read_scan_points(
         SizeError: Calibration and image do not fit together.
         NoPointsError: No point is visible.
     """
-    # The calibration, with the pose of the scanner.
-    named = options.calib
-    if named is None:
-        raise UsageError(
-            f"{path} is a scan, which needs --calib: a calibration file, or KITTI's raw folder"
-        )
-    calibration = read_calibration(named, options.camera)
-    if options.extrinsics is not None:
-        pose = calibration.rectification @ read_extrinsics(options.extrinsics)
-        calibration = replace(calibration, scanner=pose)
-    if calibration.scanner is None:
-        raise UsageError(
-            f"{named} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or"
-            " give --extrinsics FILE"
-        )
-    # It must be of the image.
+    # The calibration must be of the image.
+    calibration, named = _calibration_of(path, options)
     size = size or calibration.camera.size
     if size is None:
         raise SizeError(f"{named} does not give the image's size; give --image")
@@ -116,7 +102,7 @@ def read_scan_points(
     points = project_velodyne(xyz, camera, scanner, size, keep_occluded=options.keep_occluded)
     warnings += _outside_warning(scanner.apply(xyz), camera, size)
     if image is not None and not calibration.rectified:
-        warnings += _better_reading(points, calibration, _other_cameras(named, options), image)
+        warnings += _better_reading(points, calibration, options, image)
     # What a person should know, and what a record keeps.
     reading = Reading(f"{scan.source} of {len(xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
@@ -139,6 +125,25 @@ def read_scan_points(
         notes=(*notes, *warnings),
         reading=reading,
     )
+
+
+def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path]:
+    """The calibration, with a pose of the scanner, and its path."""
+    named = options.calib
+    if named is None:
+        raise UsageError(
+            f"{path} is a scan, which needs --calib: a calibration file, or KITTI's raw folder"
+        )
+    calibration = read_calibration(named, options.camera)
+    if options.extrinsics is not None:
+        pose = calibration.rectification @ read_extrinsics(options.extrinsics)
+        calibration = replace(calibration, scanner=pose)
+    if calibration.scanner is None:
+        raise UsageError(
+            f"{named} has no pose of the scanner; add it (R and t, Tr, T_camera_lidar), or give"
+            " --extrinsics FILE"
+        )
+    return calibration, named
 
 
 def choose_camera(
@@ -246,18 +251,8 @@ def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: tuple[int,
     ]
 
 
-def _other_cameras(named: Path, options: ScanOptions) -> dict[str, Calibration]:
-    """The other cameras of a calibration, by the option that chooses them."""
-    cameras = dict[str, Calibration]()
-    if options.extrinsics is None:
-        for number in range(_CAMERAS):
-            with suppress(UsageError):  # there is no such camera
-                cameras[f"--camera {number}"] = read_calibration(named, number)
-    return cameras
-
-
 def _better_reading(
-    points: Points, own: Calibration, others: Mapping[str, Calibration], image: Path
+    points: Points, own: Calibration, options: ScanOptions, image: Path
 ) -> list[str]:
     """A warning if jumps of depth meet the image's edges clearly better by another calibration.
 
@@ -287,10 +282,12 @@ def _better_reading(
         flipped = xyz * np.where(np.arange(3) == axis, -1, 1)
         text = f"with {name} of the scan negated, as of left-handed ones (CARLA, Unity)"
         readings[text] = _OTHER_READING, agreement(scanner.apply(flipped), own.camera)
-    for option, other in others.items():
-        if other.scanner is not None:
+    for number in range(_CAMERAS) if options.extrinsics is None else ():
+        with suppress(UsageError):  # there is no such camera
+            other, _ = _calibration_of(image, replace(options, camera=number))
+            assert other.scanner is not None
             of_other = agreement(other.scanner.apply(xyz), other.camera)
-            readings[f"with {option}"] = _OTHER_READING, of_other
+            readings[f"with --camera {number}"] = _OTHER_READING, of_other
     for down, right in itertools.product(_TURNS_DEG, _TURNS_DEG):
         turn = Rotation.from_euler("xy", (down, right), degrees=True).as_matrix()
         text = f"with the extrinsics turned by {down}° about the camera's x and {right}° about y"
