@@ -342,17 +342,11 @@ def boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
 def _boundary_counts(
     predicted: Image, truth: Image, offsets: Sequence[tuple[int, int]], *, margin: int
 ) -> Counts:
-    """How many pixels have a neighbour that is farther.
+    """(3, N, ratios) how many pixels have a farther neighbour, in each of N places of it.
 
-    Args:
-        predicted: (H, W) metres, 0 where unknown.
-        truth: (H, W) metres, 0 where unknown.
-        offsets: Rows and columns from the pixel to each of N neighbours.
-        margin: Width of the border whose pixels are neighbours alone.
-
-    Returns:
-        (3, N, ratios) pairs of known true depth that are farther by the ratio in both, in the
-        prediction, and in the truth; NaN without any such pair.
+    Pairs of known true depth count that are farther by the ratio in both images, in the prediction,
+    and in the truth; NaN without any such pair. In a border as wide as the margin are no pixels but
+    neighbours.
     """
     import numpy as np
 

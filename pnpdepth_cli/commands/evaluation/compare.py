@@ -160,6 +160,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     means = [_means(keys, of_run) for of_run in values.tolist()]
     gains, exact = _gains(values, means, measures, clusters)
+    tests = len(gains) * len(measures)
     return Comparison(
         frames=names,
         measures=measures,
@@ -180,8 +181,8 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
         ),
         clusters=clusters,
         exact_p_values=exact,
-        tests=len(gains) * len(measures),
-        notes=[*_notes_on_frames(runs, names), *_notes_on_tests(measures, known, clusters, gains)],
+        tests=tests,
+        notes=[*_notes_on_frames(runs, names), *_notes_on_tests(measures, known, clusters, tests)],
     )
 
 
@@ -208,11 +209,7 @@ def _gains(
 ) -> tuple[list[dict[str, Gain]], bool]:
     """The gain of each run but the first by measure, and whether the p-values are exact.
 
-    Args:
-        values: (runs, frames, measures), NaN where a frame lacks a measure in any run.
-        means: Means over the frames, by measure.
-        measures: Measures of the last axis.
-        clusters: Clusters of the frames.
+    The values are (runs, frames, measures), NaN where a frame lacks a measure in any run.
     """
     better = np.array([measure.sign for measure in measures], np.float64)
     first, *others = (np.array([*mean.values()], np.float64) for mean in means)
@@ -275,21 +272,16 @@ def _notes_on_frames(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]
 
 
 def _notes_on_tests(
-    measures: Sequence[Measure],
-    known: NDArray[np.bool_],
-    clusters: Clusters,
-    gains: Sequence[dict[str, Gain]],
+    measures: Sequence[Measure], known: NDArray[np.bool_], clusters: Clusters, tests: int
 ) -> Iterator[str]:
     """Measures that frames lack, and whether frames are too dependent or too few to conclude."""
-    frames, tests, smallest = len(known), len(gains) * len(measures), 2.0 ** (1 - clusters.count)
     for measure, has in zip(measures, known.T, strict=True):
         if not has.all():
-            yield (
-                f"{measure.title}: over {has.sum():,} of {frames:,} frames; the others lack it in a"
-                " run"
-            )
+            of = f"{has.sum():,} of {len(has):,} frames"
+            yield f"{measure.title}: over {of}; the others lack it in a run"
     yield from clusters.notes()
-    if frames > 1 and tests * smallest >= ALPHA:
+    smallest = 2.0 ** (1 - clusters.count)
+    if len(known) > 1 and tests * smallest >= ALPHA:
         few = f"; there is no interval below {MIN_CLUSTERS}" * (clusters.count < MIN_CLUSTERS)
         yield (
             f"warning: {clusters.describe()} are too few independent ones to conclude anything from"

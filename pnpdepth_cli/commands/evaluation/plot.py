@@ -12,7 +12,6 @@ from pnpdepth_cli.commands.evaluation.compare import ComparedRun, Comparison
 from pnpdepth_cli.commands.statistics import gain
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.measures import Measure
 
 _CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
 """Metadata that a plot lacks, by its suffix, so that the same runs give the same bytes."""
@@ -55,7 +54,10 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
         for measure, above, below in zip(measures, *panels, strict=True):
             for number, (label, runs) in enumerate(lines.items()):
                 x = [positions[run.varied[across]] for run in runs]
-                before, after, improved = _values(measure, runs)
+                means = [[run.before[measure.key], run.mean[measure.key]] for run in runs]
+                # None becomes NaN
+                before, after = np.array(means, np.float64).T * measure.shown_factor
+                improved = gain(before, after, np.array(measure.sign, np.float64))
                 above.plot(x, before, f"C{number}--", linewidth=0.8)
                 above.plot(x, after, f"C{number}o-", label=label)
                 below.plot(x, improved, f"C{number}o-")
@@ -69,13 +71,6 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
         with atomic_path(path) as temporary:
             metadata: dict[str, Any] = {_CHANGING[path.suffix]: None}
             figure.savefig(temporary, format=path.suffix[1:], metadata=metadata)
-
-
-def _values(measure: Measure, runs: Sequence[ComparedRun]) -> tuple[Any, Any, Any]:
-    """The means before and after, in the shown unit, and the improvement in per cent."""
-    means = [[run.before[measure.key] for run in runs], [run.mean[measure.key] for run in runs]]
-    before, after = np.array(means, np.float64) * measure.shown_factor  # None becomes NaN
-    return before, after, gain(before, after, np.array(measure.sign, np.float64))
 
 
 def _axis(runs: Sequence[ComparedRun]) -> tuple[str, dict[str, float]]:
