@@ -374,7 +374,9 @@ def _expert(
     """
     whole, kept, takes_points = split.whole, split.kept, network.member.takes_points
     # A prior is given with all points, and made from the others where the others are used.
-    if prior is not None and prior.whole is not None and prior.kept is not None:
+    if prior is not None:
+        assert prior.whole is not None
+        assert prior.kept is not None
         whole = replace(whole, prior=prior.whole.before)
         kept = replace(kept, prior=prior.kept.before)
     # The network predicts from all points, and the validation points from the others.

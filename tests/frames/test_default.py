@@ -13,11 +13,10 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.core.split import Split as Cut
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.frames import default, fuse
+from pnpdepth_cli.frames import fuse
 from pnpdepth_cli.frames.default import refine_default, without_outliers
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.fuse import (
-    FEW_POINTS,
     FOLDS,
     MIN_POINTS,
     OWN_SCANNER,
@@ -392,15 +391,13 @@ def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:
     return frame.with_points(replace(frame.points, depth=depth)), bad
 
 
-@pytest.mark.parametrize("count", [FEW_POINTS - 1, FEW_POINTS])
-@pytest.mark.parametrize(("alone", "beside"), [(False, True), (True, False), (True, True)])
-def test_outliers_among_few_points_are_those_beside_the_network_and_else_those_of_either_check(
-    count: int, alone: bool, beside: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frame, bad = spoiled(frame_in_memory(count))
-    found = iter([bad & alone, bad & beside])
-    monkeypatch.setattr(default, "outliers", lambda *_: next(found))
+def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
+    frame, bad = spoiled(frame_in_memory(60))
     with OpenNetwork(member(Brightness)) as judge:
         inliers, _ = without_outliers(judge, frame)
-    expected = frame.points.select(~(bad & (beside or count >= FEW_POINTS)))
-    assert torch.equal(inliers.points.xy, expected.xy)
+        clean, _ = without_outliers(judge, frame_in_memory(60))
+    assert inliers.outliers is not None
+    assert torch.equal(inliers.outliers.xy, frame.points.xy[bad])
+    assert torch.equal(inliers.points.xy, frame.points.xy[~bad])
+    assert clean.outliers is None
+    assert len(clean.points) == 60
