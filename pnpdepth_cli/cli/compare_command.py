@@ -57,18 +57,17 @@ def compare(
     groups, else computed with random permutations.
     """
     from pnpdepth_cli.cli.printing import TableFiles, print_notes, print_table
-    from pnpdepth_cli.commands.evaluation.compare import compare as compare_runs
-    from pnpdepth_cli.commands.evaluation.eval_tables import comparison_table, methods_table
+    from pnpdepth_cli.commands.evaluation import compare as command
     from pnpdepth_cli.commands.evaluation.plot import plot_comparison
 
     files = TableFiles(**table_files)
     files.check([Path(run) for run in runs])
-    comparison = compare_runs(runs, columns=columns)
+    comparison = command.compare(runs, columns=columns)
     if plot is not None:
         plot_comparison(comparison, plot, overwrite=files.overwrite)
     print_notes(comparison.notes)
-    table = comparison_table(comparison)
-    to_stdout = files.write(csv=table, latex=methods_table(comparison))
+    table = command.comparison_table(comparison)
+    to_stdout = files.write(csv=table, latex=command.methods_table(comparison))
     if files.as_json:
         print_json(comparison.to_json())
     elif not to_stdout:

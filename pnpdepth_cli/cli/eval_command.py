@@ -69,8 +69,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     eigen, garg   0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
     """
     from pnpdepth_cli.cli.printing import TableFiles, print_notes, print_table
-    from pnpdepth_cli.commands.evaluation import eval_tables as tables
-    from pnpdepth_cli.commands.evaluation.evaluate import evaluate as run_evaluation
+    from pnpdepth_cli.commands.evaluation import evaluate as command
     from pnpdepth_cli.commands.report import eval_report as report_eval
     from pnpdepth_cli.measures import OF_SIGMA, choose_measures
 
@@ -84,9 +83,9 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     choose_measures((*request.measures, *OF_SIGMA), keys)
     # The scores, as tables and as JSON.
     with progress_bar("eval", "frame") as show:
-        evaluation = run_evaluation(request, on_frame=show)
+        evaluation = command.evaluate(request, on_frame=show)
     print_notes([f"protocol {request.describe()}", *evaluation.notes])
-    frames, means = tables.frames_table(evaluation, keys), tables.means_table(evaluation, keys)
+    frames, means = command.frames_table(evaluation, keys), command.means_table(evaluation, keys)
     described = replace(means, title=f"{means.title}; {evaluation.describe()}")
     to_stdout = files.write(csv=frames, latex=described)
     if files.as_json:
@@ -94,7 +93,7 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     elif not to_stdout:
         print_table(means)
         if len(evaluation.frames) > 1:
-            print_table(tables.worst_frames(evaluation, keys))
+            print_table(command.worst_frames(evaluation, keys))
     if html is not None:
         with progress_bar("report", "frame") as show:
             report_eval.write_eval_report(html, evaluation, keys, on_frame=show)

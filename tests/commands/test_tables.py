@@ -16,8 +16,13 @@ from pnpdepth_cli.commands.error_tables import (
     names_of_depths,
     refinement_table,
 )
-from pnpdepth_cli.commands.evaluation.compare import ComparedRun, Comparison, Gain
-from pnpdepth_cli.commands.evaluation.eval_tables import comparison_table, methods_table
+from pnpdepth_cli.commands.evaluation.compare import (
+    ComparedRun,
+    Comparison,
+    Gain,
+    comparison_table,
+    methods_table,
+)
 from pnpdepth_cli.commands.statistics import find_clusters
 from pnpdepth_cli.commands.tables import Table
 from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.evaluation.eval_request import scoring_of
+from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, scoring_of
 from pnpdepth_cli.commands.evaluation.pairing import some_names
 from pnpdepth_cli.commands.statistics import (
     MIN_CLUSTERS,
@@ -23,6 +23,7 @@ from pnpdepth_cli.commands.statistics import (
     interval,
     swap_p_values,
 )
+from pnpdepth_cli.commands.tables import Cell, Style, Table
 from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
@@ -36,6 +37,7 @@ ALPHA = 0.05
 PERMUTATIONS, SEED = 10_000, 0
 """Most swaps of the permutation test, and their seed where not all are tried."""
 _SUMMARY = "summary.json"
+_STARS = (0.05, 0.01, 0.001)
 
 
 class Run(NamedTuple):
@@ -336,3 +338,69 @@ def read_run(text: str) -> Run:
             f"{path} does not hold scores as pnpdepth writes them ({one_line(repr(error))}); give"
             " what eval --json printed, or the summary of a batch with ground truth"
         ) from error
+
+
+def comparison_table(comparison: Comparison) -> Table:
+    """Returns a row for each measure and run; all runs but the first have gain and p."""
+    first, *others = comparison.runs
+    rows: list[list[str]] = []
+    for measure in comparison.measures:
+        rows.append([measure.heading, first.name, measure.text(first.mean[measure.key]), *"––––"])
+        for run in others:
+            found, p = run.gains[measure.key], run.gains[measure.key].p_adjusted
+            style: Style = "good" if (found.percent or 0) > 0 else "bad"
+            percents = (found.percent, found.low_percent, found.high_percent)
+            percent, *ends = ("–" if value is None else f"{value:+.2f}" for value in percents)
+            rows.append([
+                measure.heading,
+                run.name,
+                measure.text(run.mean[measure.key]),
+                Cell(percent, style if p is not None and p < ALPHA else "dim"),
+                *ends,
+                "–" if p is None else f"{p:.4f}",
+            ])  # fmt: skip
+    # What was tested, in the title.
+    swaps = "all" if comparison.exact_p_values else f"{PERMUTATIONS:,} random"
+    return Table(
+        title=(
+            f"{len(comparison.frames):,} shared frames; gains in per cent of the error of"
+            f" {first.name}, positive is better; intervals (95 %) and p-values, from {swaps}"
+            f" swaps, {_describe_tests(comparison)}"
+        ),
+        columns=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
+        rows=rows,
+    )
+
+
+def methods_table(comparison: Comparison) -> Table:
+    """Returns a row for each run and a column for each measure, the best of a column in bold.
+
+    Stars mark where a run differs from the first significantly.
+    """
+    runs = comparison.runs
+    rows: list[list[str]] = [[run.name] for run in runs]
+    for measure in comparison.measures:
+        means = [run.mean[measure.key] for run in runs]
+        pick = max if measure.better == "higher" else min
+        best = measure.text(pick((mean for mean in means if mean is not None), default=None))
+        for row, run, mean in zip(rows, runs, means, strict=True):
+            p = run.gains[measure.key].p_adjusted if run.gains else None
+            stars = "*" * sum(p is not None and p < limit for limit in _STARS)
+            text = measure.text(mean)
+            is_best = mean is not None and text == best and measure.sign != 0
+            row.append(Cell(text + stars, "bold" if is_best else ""))
+    return Table(
+        title=(
+            f"means over {len(comparison.frames):,} frames, the best in bold; *, **, ***:"
+            f" differs from {runs[0].name} with p < 0.05, 0.01, 0.001 {_describe_tests(comparison)}"
+        ),
+        columns=["", *comparison.measures],
+        rows=rows,
+    )
+
+
+def _describe_tests(comparison: Comparison) -> str:
+    others, measures = len(comparison.runs) - 1, len(comparison.measures)
+    tests = f"{measures} measures" + (f" of {others} runs" if others > 1 else "")
+    tested = f"over {comparison.clusters.describe()}, p adjusted for {tests} (Holm)"
+    return tested + WITHOUT_SPARSE * bool(comparison.scoring.get("exclude_sparse"))

@@ -14,6 +14,8 @@ from pnpdepth_cli.measures import MEASURES, Measure, by_depth, parse_keys
 from pnpdepth_cli.protocols import KITTI_DEVKIT, Protocol, find_protocol
 from pnpdepth_cli.settings import option
 
+WITHOUT_SPARSE = "; without the pixels of sparse points"
+"""What titles of tables say where the pixels of input points are excluded."""
 _IN_MILLIMETRES = tuple(
     replace(m, shown_unit="mm", shown_factor=1000.0, decimals=1) if m.key in ("rmse", "mae") else m
     for m in MEASURES

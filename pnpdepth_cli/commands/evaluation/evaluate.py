@@ -10,23 +10,27 @@ from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
+from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
-from pnpdepth_cli.commands.evaluation.scoring import is_missing, score_pair, scores_of
+from pnpdepth_cli.commands.evaluation.scoring import FILES, is_missing, score_pair, scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.commands.statistics import LEVEL, MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.stopwatch import versions
+from pnpdepth_cli.commands.tables import Table
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.text_files import plain
-from pnpdepth_cli.measures import OF_SIGMA, FrameMeans, Measure
+from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, FrameMeans, Measure, choose_measures
 from pnpdepth_cli.points import METRES
 
 _LISTED = 3
+_FRAMES_SHOWN = 12
+_FRAME_COLUMNS = 6
+_COUNTS = ("pixels", "known", COVERAGE.key, "given", "median_ratio", "factor", "shift")
 _OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
 
 
@@ -266,3 +270,59 @@ def _notes_on_scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
     }
     if warning := scale_warning("predictions", float(np.median(ratios)), by_option):
         yield warning
+
+
+def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
+    """Returns a row for each measure: its mean and the interval of it."""
+    count, intervals = len(evaluation.scored), evaluation.interval
+    title = f"Means over {count:,} frame{'s' * (count != 1)}, {evaluation.pixels:,} pixels"
+    columns = ["", "mean"]
+    if intervals is not None:
+        columns.append("95 %")
+        title += f"; 95 % interval over {evaluation.clusters.describe()}"
+    rows = []
+    mean = evaluation.mean | {COVERAGE.key: evaluation.coverage}
+    for measure in (*choose_measures(evaluation.measures, keys), COVERAGE):
+        ends = [] if intervals is None else [intervals.get(measure.key, ())]
+        texts = (" … ".join(map(measure.text, each)) for each in ends)
+        rows.append([measure.heading, measure.text(mean[measure.key]), *texts])
+    title += WITHOUT_SPARSE * evaluation.request.rules.exclude_sparse
+    return Table(title=title, columns=columns, rows=rows)
+
+
+def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
+    """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
+    measures = choose_measures(evaluation.measures, keys)
+    rows = []
+    for frame in evaluation.frames:
+        files, scores = (frame.inputs.get(name) for name in FILES), plain(scores_of(frame))
+        row = [frame.name, frame.group, *(file and file.path for file in files)]
+        row += map(scores.get, (*_COUNTS, *(measure.key for measure in measures)))
+        rows.append([*row, frame.message])
+    counts = [COVERAGE if name == COVERAGE.key else name for name in _COUNTS]
+    return Table(columns=["name", "group", *FILES, *counts, *measures, "error"], rows=rows)
+
+
+def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
+    """Returns the chosen or first measures of each frame, or of the worst of many."""
+    title, frames = "Frames", evaluation.frames
+    if len(frames) > _FRAMES_SHOWN:
+        frames = worst(evaluation)[:_FRAMES_SHOWN]
+        title = f"The {_FRAMES_SHOWN} worst by RMSE; --csv has all"
+    measures = choose_measures(evaluation.measures, keys)
+    shown = [*(measures if keys else measures[:_FRAME_COLUMNS]), COVERAGE]
+    return Table(
+        title=title + WITHOUT_SPARSE * evaluation.request.rules.exclude_sparse,
+        columns=["name", *shown],
+        rows=[[frame.name, *(scores_of(frame).get(m.key) for m in shown)] for frame in frames],
+    )
+
+
+def worst(evaluation: Evaluation) -> list[FrameRecord]:
+    """Returns the scored frames by RMSE, worst first, those with NaN at the very end."""
+
+    def rank(frame: FrameRecord) -> float:
+        rmse = scores_of(frame)["rmse"]
+        return math.inf if rmse is None or math.isnan(rmse) else -rmse
+
+    return sorted(evaluation.scored, key=rank)

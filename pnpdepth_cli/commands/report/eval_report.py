@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
-from pnpdepth_cli.commands.evaluation.eval_tables import means_table
-from pnpdepth_cli.commands.evaluation.evaluate import Evaluation
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, means_table
 from pnpdepth_cli.commands.evaluation.kitti_devkit import fill_background
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.evaluation.scoring import FILES, image_of, load_frame, scores_of

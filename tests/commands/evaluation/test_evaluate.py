@@ -13,8 +13,7 @@ import pytest
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
-from pnpdepth_cli.commands.evaluation.eval_tables import worst
-from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate, worst
 from pnpdepth_cli.commands.evaluation.scoring import is_missing, scores_of
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError
