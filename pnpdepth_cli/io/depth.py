@@ -190,7 +190,8 @@ def describe_range(
     An assumed scale adds the option that changes it and, where KITTI's scale gives near depths
     only, their range if they are millimetres. Unknown depth is 0 or not finite.
     """
-    known = _known_values(depth)
+    values = np.asarray(depth, dtype=np.float64)
+    known = values[np.isfinite(values) & (values > 0)]
     source, _, assumed = reading
     hint = f"; {option} to change" if assumed else ""
     if known.size == 0:
@@ -244,8 +245,3 @@ def metres(value: float) -> str:
     if value >= 1e6 or (0 < value < 1e-3):
         return f"{value:.1e}"
     return f"{value:,.1f}" if value >= 0.95 else f"{value:.2g}"
-
-
-def _known_values(depth: NDArray[Any]) -> NDArray[np.float64]:
-    values = np.asarray(depth, dtype=np.float64)
-    return values[np.isfinite(values) & (values > 0)]

@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -94,7 +95,10 @@ def check_report_folder(
         empty = not folder.exists() or all(path.name[0] == "." for path in folder.iterdir())
     except OSError as error:
         raise cannot_write(folder, error) from error
-    if not (empty or overwrite or _is_of(folder, made_of)):
+    before = None
+    with suppress(InputError):
+        before = read_json(folder / _MADE_OF)
+    if not (empty or overwrite or (before is not None and before == plain(made_of))):
         raise OutputError(f"{folder} is not empty; add --overwrite, or name another folder")
 
 
@@ -213,13 +217,6 @@ def _remove_unused(folder: Path, used: set[str]) -> None:
                 path.unlink(missing_ok=True)
     except OSError as error:
         raise cannot_write(folder, error) from error
-
-
-def _is_of(folder: Path, made_of: Mapping[str, Any] | None) -> bool:
-    try:
-        return made_of is not None and read_json(folder / _MADE_OF) == plain(made_of)
-    except InputError:
-        return False
 
 
 def _environment() -> jinja2.Environment:

@@ -74,17 +74,14 @@ def read_scan(path: Path) -> ScanFile:
     Raises:
         FileFormatError: The file is damaged or ambiguous.
     """
-    suffix = path.suffix.lower()
-    if suffix not in SCAN_SUFFIXES:
-        raise FileFormatError(f"{path} is not a scan; give a file of {', '.join(SCAN_SUFFIXES)}")
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise FileFormatError(f"{path} is not a scan; give a file of {', '.join(_READERS)}")
     data = read_bytes(path)
     kind = kind_of(data)
     if kind not in (None, "NPY"):
         raise FileFormatError(f"{path} is a {kind} file, not a scan; check what is given as scan")
-    if suffix == ".bin":
-        points, source = _parse_bin(path, data)
-    else:
-        points, source = _READERS[suffix](path, data)
+    points, source = read(path, data)
     return ScanFile(points=points, source=source)
 
 
@@ -328,6 +325,7 @@ def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:
 
 
 _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
+    ".bin": _parse_bin,
     ".npy": _parse_array,
     ".pcd": _parse_pcd,
     ".ply": _parse_ply,
@@ -335,12 +333,15 @@ _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
     ".txt": _parse_text,
 }
 
-SCAN_SUFFIXES = (".bin", *_READERS)
-"""What `read_scan` can read."""
+_PROPERTIES = {
+    "points": ("<f4", ["float x", "float y", "float z"]),
+    "normals": ("<f4", ["float nx", "float ny", "float nz"]),
+    "colours": ("|u1", ["uchar red", "uchar green", "uchar blue"]),
+}
+"""NumPy type and properties of what a PLY has of each point."""
 
-
-Part = tuple[NDArray[np.float32], NDArray[np.float32], "NDArray[np.uint8] | None"]
-"""(N, 3) points; (N, 3) unit normals, 0 where unknown; (N, 3) colours 0…255, or None."""
+Part = tuple[Points, "Points | None", "NDArray[np.uint8] | None"]
+"""(N, 3) points; (N, 3) unit normals, 0 where unknown, or None; (N, 3) colours 0…255, or None."""
 
 
 def write_cloud(path: Path, parts: Iterable[Part]) -> int:
@@ -356,36 +357,25 @@ def write_cloud(path: Path, parts: Iterable[Part]) -> int:
     Raises:
         OutputError: The file cannot be written.
     """
-    coordinates, colours = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
-    count, coloured = 0, False
+    count, properties = 0, _PROPERTIES["points"][1]
     with atomic_path(path) as temporary, TemporaryFile(dir=temporary.parent) as body:
-        for xyz, normals, rgb in parts:
-            coloured = rgb is not None
-            names = (*coordinates, *colours) if coloured else coordinates
-            kinds = ["<f4"] * 6 + ["|u1"] * 3
-            rows = np.empty(len(xyz), np.dtype(list(zip(names, kinds, strict=False))))
-            columns = [*xyz.T, *normals.T, *(() if rgb is None else rgb.T)]
-            for name, column in zip(names, columns, strict=True):
-                rows[name] = column
+        for part in parts:
+            columns = {
+                name: values
+                for name, values in zip(_PROPERTIES, part, strict=True)
+                if values is not None
+            }
+            rows = np.empty(len(part[0]), [(name, _PROPERTIES[name][0], 3) for name in columns])
+            for name, values in columns.items():
+                rows[name] = values
             body.write(rows.tobytes())
             count += len(rows)
-        header = _ply_header(count, coordinates, colours if coloured else ())
+            properties = [each for name in columns for each in _PROPERTIES[name][1]]
+        # The header has the number of points, which is known last.
+        header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+        header += [*(f"property {each}" for each in properties), "end_header\n"]
         body.seek(0)
         with temporary.open("wb") as file:
-            file.write(header.encode())
+            file.write("\n".join(header).encode())
             shutil.copyfileobj(body, file, 1 << 20)
     return count
-
-
-def write_points(path: Path, xyz: NDArray[np.float32]) -> None:
-    """Writes points (N, 3) as a PLY without normals."""
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(_ply_header(len(xyz), "xyz").encode())
-        file.write(xyz.astype("<f4").tobytes())
-
-
-def _ply_header(count: int, floats: Iterable[str], bytes_: Iterable[str] = ()) -> str:
-    properties = [f"property float {name}\n" for name in floats]
-    properties += [f"property uchar {name}\n" for name in bytes_]
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
-    return f"{header}{''.join(properties)}end_header\n"

@@ -52,7 +52,7 @@ from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.poses import POSES_FILE
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.scans import read_scan, write_points
+from pnpdepth_cli.io.scans import read_scan, write_cloud
 from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.sensors.pixels import describe_dropped
 
@@ -222,7 +222,7 @@ def _write_frame(
     if sensors.is_map:
         write_depth(sparse.with_suffix(".exr"), values)
     else:
-        write_points(sparse.with_suffix(".ply"), values)
+        write_cloud(sparse.with_suffix(".ply"), [(values, None, None)])
 
 
 def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: Say) -> str:

@@ -103,7 +103,10 @@ def _read_npz(path: Path, data: bytes) -> DepthFile:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            name = _only(path, list(members))
+            if len(members) != 1:
+                listing = one_line(", ".join(members)) or "none"
+                raise FileFormatError(f"{path} holds several arrays or none ({listing}); save one")
+            (name,) = members
             if members[name].compress_type not in COMPRESSIONS:
                 raise FileFormatError(f"{path} is compressed; save it by numpy.savez_compressed")
             with archive.open(members[name]) as member:
@@ -125,15 +128,6 @@ def _array(path: Path, name: str, member: IO[bytes], file_bytes: int) -> NDArray
     content = beginning + member.read(max(0, needed - len(beginning)))
     member.read(1)  # at the end of the member, its checksum is compared
     return parse_npy(path, content, "NPZ")
-
-
-def _only(path: Path, keys: list[str]) -> str:
-    if not keys:
-        raise FileFormatError(f"{path} holds no array; save one with numpy.savez")
-    if len(keys) > 1:
-        listing = one_line(", ".join(keys))
-        raise FileFormatError(f"{path} holds {len(keys)} arrays ({listing}); save the depth alone")
-    return keys[0]
 
 
 def _write_npz(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
