@@ -86,15 +86,16 @@ def write_bag(
             pixels = np.full((HEIGHT, WIDTH, 3), 40 + number % 200, np.uint8)
             pixels[:, : WIDTH // 2, 0] = 200
             pixels, topic = (pixels, IMAGES) if view is None else (view.pixels, view.topic)
-            yield _image(make, stamp, pixels, time_ns, topic, compressed)
+            if compressed:
+                jpeg = cv2.imencode(".jpg", pixels[:, :, ::-1])[1].ravel()
+                yield f"{topic}/compressed", time_ns, _compressed(make, stamp, "jpeg", jpeg)
+            else:
+                yield topic, time_ns, _image(make, stamp, pixels, "rgb8")
             later_ns = time_ns + 5_000_000
             if depth:
                 stamp = header(time_ns + 4_000_000, depth_frame)
-                yield (
-                    "/depth/camera_info",
-                    later_ns,
-                    _camera_info(make, stamp, ros1, view, depth_focal),
-                )
+                of_depth = _camera_info(make, stamp, ros1, view, depth_focal)
+                yield "/depth/camera_info", later_ns, of_depth
                 topic, message = _depth(make, stamp, depth)
                 yield topic, later_ns, message
             else:
@@ -119,16 +120,14 @@ def write_bag(
 
 
 def _writer(path: Path) -> Any:
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags import rosbag1, rosbag2
 
     if path.suffix == ".bag":
-        return Writer1(path)
+        return rosbag1.Writer(path)
     if path.suffix == ".mcap":
-        folder = path.with_suffix(".folder")
-        return Writer2(folder, version=9, storage_plugin=StoragePlugin.MCAP)
-    return Writer2(path, version=9)
+        plugin = rosbag2.StoragePlugin.MCAP
+        return rosbag2.Writer(path.with_suffix(".folder"), version=9, storage_plugin=plugin)
+    return rosbag2.Writer(path, version=9)
 
 
 def _link(make: Make, header: Any, child: str, shift: Sequence[float], xyzw: Any) -> Any:
@@ -155,14 +154,12 @@ def _moved(make: Make, header: Any, x: float, kind: str) -> tuple[str, int, Any]
         return "/vio/pose", time_ns, make("geometry_msgs/PoseStamped", header=header, pose=pose)
     still, unknown = make("geometry_msgs/Vector3", x=0.0, y=0.0, z=0.0), np.zeros(36)
     twist = make("geometry_msgs/Twist", linear=still, angular=still)
-    message = make(
-        "nav_msgs/Odometry",
-        header=header,
-        child_frame_id="base",
-        pose=make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=unknown),
-        twist=make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
-    )
-    return "/odom", time_ns, message
+    uncertain = {
+        "pose": make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=unknown),
+        "twist": make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
+    }
+    odometry = make("nav_msgs/Odometry", header=header, child_frame_id="base", **uncertain)
+    return "/odom", time_ns, odometry
 
 
 def _transforms(make: Make, header: Make) -> Any:
@@ -186,40 +183,23 @@ def _camera_info(
         values = {name: getattr(view, name).ravel().astype(float) for name in "dkrp"}
     height, width = (HEIGHT, WIDTH) if view is None else view.pixels.shape[:2]
     whole = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
-    return make(
-        "sensor_msgs/CameraInfo",
-        header=header,
-        height=height,
-        width=width,
-        binning_x=0,
-        binning_y=0,
-        roi=make("sensor_msgs/RegionOfInterest", **whole),
-        distortion_model="plumb_bob",
-        **{name.upper() if ros1 else name: value for name, value in values.items()},
-    )
+    matrices = {name.upper() if ros1 else name: value for name, value in values.items()}
+    sizes = {"height": height, "width": width, "binning_x": 0, "binning_y": 0}
+    sizes["roi"] = make("sensor_msgs/RegionOfInterest", **whole)
+    matrices["distortion_model"] = "plumb_bob"
+    return make("sensor_msgs/CameraInfo", header=header, **sizes, **matrices)
 
 
-def _image(
-    make: Make, header: Any, pixels: np.ndarray, time_ns: int, topic: str, compressed: bool
-) -> tuple[str, int, Any]:
-    if compressed:
-        data = cv2.imencode(".jpg", pixels[:, :, ::-1])[1].ravel()
-        message = make("sensor_msgs/CompressedImage", header=header, format="jpeg", data=data)
-        return f"{topic}/compressed", time_ns, message
+def _compressed(make: Make, header: Any, kind: str, data: np.ndarray) -> Any:
+    return make("sensor_msgs/CompressedImage", header=header, format=kind, data=data)
+
+
+def _image(make: Make, header: Any, pixels: np.ndarray, encoding: str) -> Any:
+    """An image whose rows are longer than their pixels."""
     height, width = pixels.shape[:2]
-    padded = np.zeros((height, width * 3 + 8), np.uint8)  # rows may be longer than their pixels
-    padded[:, : width * 3] = pixels.reshape(height, -1)
-    message = make(
-        "sensor_msgs/Image",
-        header=header,
-        height=height,
-        width=width,
-        encoding="rgb8",
-        is_bigendian=0,
-        step=padded.shape[1],
-        data=padded.ravel(),
-    )
-    return topic, time_ns, message
+    rows = np.pad(pixels.reshape(height, -1).view(np.uint8), ((0, 0), (0, 8)))
+    sizes = {"height": height, "width": width, "step": rows.shape[1], "data": rows.ravel()}
+    return make("sensor_msgs/Image", header=header, encoding=encoding, is_bigendian=0, **sizes)
 
 
 def depth_m() -> np.ndarray:
@@ -234,12 +214,7 @@ def _depth(make: Make, header: Any, kind: str) -> tuple[str, Any]:
     depth, (encoding, _, compressed) = depth_m(), kind.partition("; ")
     codes = (1000 * depth).astype("<u2") if encoding == "16UC1" else depth.astype("<f4")
     if not compressed:
-        message = make(
-            "sensor_msgs/Image", header=header, height=HEIGHT, width=WIDTH, encoding=encoding,
-            is_bigendian=0, step=WIDTH * codes.itemsize,
-            data=np.frombuffer(codes.tobytes(), np.uint8),
-        )  # fmt: skip
-        return "/depth/image_raw", message
+        return "/depth/image_raw", _image(make, header, codes, encoding)
     # compressed_depth_image_transport with depth_quantization = 100, depth_max = 10
     a = 100.0 * (100 + 1)
     b = 1 - a / 10
@@ -248,8 +223,7 @@ def _depth(make: Make, header: Any, kind: str) -> tuple[str, Any]:
     png = cv2.imencode(".png", codes)[1].ravel()
     start = np.frombuffer(np.array([a, b], "<f4").tobytes(), np.uint8)
     data = np.concatenate([np.zeros(4, np.uint8), start, png])
-    message = make("sensor_msgs/CompressedImage", header=header, format=kind, data=data)
-    return "/depth/image_raw/compressedDepth", message
+    return "/depth/image_raw/compressedDepth", _compressed(make, header, kind, data)
 
 
 def _cloud(make: Make, header: Any, view: View | None) -> Any:
@@ -267,15 +241,7 @@ def _cloud(make: Make, header: Any, view: View | None) -> Any:
         make("sensor_msgs/PointField", name=name, offset=offset, datatype=kind, count=1)
         for name, offset, kind in zip(names, offsets, [4, 7, 7, 8], strict=True)
     ]
-    return make(
-        "sensor_msgs/PointCloud2",
-        header=header,
-        height=1,
-        width=len(points),
-        fields=fields,
-        is_bigendian=False,
-        point_step=layout.itemsize,
-        row_step=layout.itemsize * len(points),
-        data=np.frombuffer(points.tobytes(), np.uint8),
-        is_dense=False,
-    )
+    data, step = np.frombuffer(points.tobytes(), np.uint8), layout.itemsize
+    sizes = {"height": 1, "width": len(points), "point_step": step, "row_step": data.size}
+    kind = {"fields": fields, "is_bigendian": False, "is_dense": False}
+    return make("sensor_msgs/PointCloud2", header=header, data=data, **sizes, **kind)
