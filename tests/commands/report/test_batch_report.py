@@ -195,7 +195,7 @@ def test_outputs_inside_the_inputs_or_around_them_are_refused(root: Path, tmp_pa
 def test_another_batchs_report_is_replaced_only_on_request(root: Path, report: Path) -> None:
     batch(root, html=report)
     before = everything(report)
-    with pytest.raises(OutputError, match="--overwrite replaces the report"):
+    with pytest.raises(OutputError, match="--overwrite"):
         batch(root, output=root / "other", html=report)
     assert everything(report) == before
     batch(root, output=root / "other", html=report, refine={"overwrite": True})
