@@ -29,7 +29,6 @@ def load_network(
     *,
     definition: ModelDefinition | None = None,
     device: str = "cpu",
-    precision: str = "fp32",
 ) -> Network:
     """Returns a network in eval mode with its weights.
 
@@ -41,7 +40,6 @@ def load_network(
         definition: Definition of a module. None: the module takes an rgb image, and its layers and
             what its output means are decided by the first frame.
         device: torch device, such as "cpu" or "cuda:1".
-        precision: "fp32", "bf16" or "fp16" for convolutions and matrix products.
 
     Raises:
         ModelError: There is no such network, or it cannot be built.
@@ -61,7 +59,7 @@ def load_network(
         raise UsageError("definition is for a module; a name or a file has its own")
     else:
         what = str(spec)
-    return networks.load_network(what, path, device, precision=precision)
+    return networks.load_network(what, path, device)
 
 
 def refine(

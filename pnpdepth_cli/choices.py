@@ -223,7 +223,6 @@ FITS: tuple[Fit, ...] = get_args(Fit)
 """How an image is brought to a network's fixed input size."""
 
 NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mean and std, −1…1, 0…255
-PRECISIONS = ("fp32", "bf16", "fp16")  # of the network's convolutions and matrix products
 
 # Files and sensors
 REGISTRATIONS = ("auto", "off")  # whether the image is moved to the points

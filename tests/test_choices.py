@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-import torch
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.choices import OpenList
@@ -16,7 +15,6 @@ from pnpdepth_cli.core.update_rules import SCHEDULES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
-from pnpdepth_cli.models.precision import dtype_of
 from pnpdepth_cli.sensors.lidar import LIDARS
 from pnpdepth_cli.sensors.samplers import PATTERNS
 
@@ -76,8 +74,6 @@ def test_every_name_of_a_closed_list_is_implemented() -> None:
     assert tuple(NORMALISATIONS) == choices.NORMALISATIONS
     assert tuple(PATTERNS) == choices.PATTERNS
     assert tuple(LIDARS) == choices.SENSORS
-    for precision in choices.PRECISIONS:
-        dtype_of(precision, torch.device("cuda"))
 
 
 def test_every_format_has_a_file_name_made_of_its_own_name() -> None:

@@ -34,10 +34,10 @@ class InlierWeights(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.enter = ExactLinear(2, WIDTH)
+        self.enter = nn.Linear(2, WIDTH)
         self.rounds = nn.ModuleList(Messages() for _ in range(ROUNDS))
-        self.score = ExactLinear(WIDTH, WIDTH)
-        self.leave = ExactLinear(WIDTH, 1)
+        self.score = nn.Linear(WIDTH, WIDTH)
+        self.leave = nn.Linear(WIDTH, 1)
         nn.init.zeros_(self.leave.weight)
         nn.init.constant_(self.leave.bias, 4.0)  # weights of exactly 1
 
@@ -78,11 +78,11 @@ class Messages(nn.Module):
         super().__init__()
         self.pair = _matrix(MESSAGE, AGREEMENT + COLOUR + POSITION)
         self.bias = nn.Parameter(torch.zeros(MESSAGE))
-        self.neighbour = ExactLinear(WIDTH, MESSAGE, bias=False)
+        self.neighbour = nn.Linear(WIDTH, MESSAGE, bias=False)
         self.message, self.message_bias = _matrix(WIDTH, MESSAGE), nn.Parameter(torch.zeros(WIDTH))
         self.attention = _matrix(HEADS, MESSAGE)
-        self.update = ExactLinear(4 * WIDTH, 2 * WIDTH)
-        self.change = ExactLinear(2 * WIDTH, WIDTH)
+        self.update = nn.Linear(4 * WIDTH, 2 * WIDTH)
+        self.change = nn.Linear(2 * WIDTH, WIDTH)
         nn.init.zeros_(self.change.weight)
 
     def forward(self, state: Tensor, cloud: Cloud, pairs: list[Tensor]) -> Tensor:
@@ -104,10 +104,6 @@ class Messages(nn.Module):
         per_head = message.view(*message.shape[:2], HEADS, -1)
         mean = (attention.unsqueeze(3) * per_head).sum(1).flatten(1)
         return torch.cat([mean, message.amax(1)], 1)
-
-
-class ExactLinear(nn.Linear):
-    """A linear layer that stays in float32 at any precision: only plain `nn.Linear` is cast."""
 
 
 def chunks(cloud: Cloud) -> list[slice]:

@@ -83,8 +83,7 @@ class Method:
         named = {network.definition.name for network in resolved}
         fused = self.is_default and asked.method == "fused" and first.rgb is not None
         if fused and COMPANION not in named:
-            device, precision = str(resolved[0].device), resolved[0].precision
-            companion = load_network(COMPANION, None, device, precision=precision)
+            companion = load_network(COMPANION, None, str(resolved[0].device))
             resolved.append(resolve_definition(companion, first))
         # Layers and settings are decided.
         own, *others = resolved

@@ -72,7 +72,7 @@ class AlignedDepth:
             f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there; left"
             f" {lost:,} of {len(seen):,} sparse points there out of the loss"
         )
-        doubt = "; are the network's weights, input range (--normalise) and precision right?"
+        doubt = "; are the network's weights and input range (--normalise) right?"
         return (f"warning: {note}{doubt}" if lost > _MOST_LOST * len(seen) else note,)
 
     def _notes(self, fit: Alignment, raw: Tensor) -> tuple[str, ...]:

@@ -19,7 +19,6 @@ from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageE
 from pnpdepth_cli.models.cut_layers import suggest_layers
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, file_and_part
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_camera, synthetic_frame
-from pnpdepth_cli.models.precision import dtype_of, lower
 from pnpdepth_cli.models.registry import find_definition, importing_beside
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 from pnpdepth_cli.points import SparsePoints
@@ -41,7 +40,6 @@ class Network:
     module: nn.Module
     device: torch.device
     checkpoint: Path | None
-    precision: str = "fp32"
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -215,8 +213,6 @@ def load_network(
     spec: str | ModelDefinition,
     checkpoint: Path | None,
     device: str = "cpu",
-    *,
-    precision: str = "fp32",
 ) -> Network:
     """Returns a network, built, with its weights, on its device.
 
@@ -224,7 +220,6 @@ def load_network(
         spec: A name, file or folder, see `find_definition`; or a definition itself.
         checkpoint: The weights; None takes those of the definition.
         device: Name of a torch device.
-        precision: "fp32", "bf16" or "fp16"; see `pnpdepth_cli.models.precision`.
 
     Raises:
         ModelError: There is no such network, or it cannot be built.
@@ -233,7 +228,6 @@ def load_network(
         UsageError: A checkpoint is named for a network that brings its own weights.
     """
     torch_device = find_device(device)
-    dtype = dtype_of(precision, torch_device)
     definition = find_definition(spec) if isinstance(spec, str) else spec
     # `build` may import modules beside the model file.
     beside = importing_beside(spec) if isinstance(spec, str) else nullcontext()
@@ -251,14 +245,11 @@ def load_network(
     module.eval().requires_grad_(False)
     with out_of_memory_is_a_device_error(torch_device):
         module.to(torch_device)
-    if dtype is not None:
-        lower(module, dtype, torch_device)
     network = Network(
         definition=definition,
         module=module,
         device=torch_device,
         checkpoint=None if path is None else file_and_part(path)[0],
-        precision=precision,
         notes=tuple(notes),
     )
     if definition.layers or definition.defaults.layer:

@@ -194,7 +194,6 @@ def _record_of(
             "output_kind": network.definition.output_kind,
             "normalise": normalisation_name(network.definition),
             "holdout": request.hold_out.holdout,
-            "precision": network.precision,
             "device": str(network.device),
         },
         registration=asdict(refined.registration) if refined.registration else None,
