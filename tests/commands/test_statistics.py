@@ -49,8 +49,7 @@ def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewne
 
 def test_clusters_of_equal_frames_are_as_sure_as_one_frame_each() -> None:
     values = np.random.default_rng(2).lognormal(0, 0.5, (9, 1))
-    repeated = np.repeat(values, 20, axis=0)
-    bounds = interval(repeated, ids=np.repeat(np.arange(9), 20))
+    bounds = interval(np.repeat(values, 20, axis=0), ids=np.repeat(np.arange(9), 20))
     assert bounds == pytest.approx(interval(values))
     assert interval(np.full((6, 1), 2.5)).tolist() == [[2.5], [2.5]]
 

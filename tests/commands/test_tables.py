@@ -12,7 +12,6 @@ import pytest
 from pnpdepth_cli.commands.error_tables import (
     baselines_table,
     change,
-    format_error,
     names_of_depths,
     refinement_table,
 )
@@ -46,11 +45,6 @@ def test_a_change_is_relative_or_in_points_and_coloured_by_whether_it_is_better(
 ) -> None:
     cell = change(key, before, after)
     assert (cell, cell.style) == (text, style)
-
-
-def test_an_error_has_its_unit_and_nothing_is_a_dash() -> None:
-    shown = [format_error(*case, "m") for case in (("mae", 1.25), ("mae", None), ("mae", nan))]
-    assert shown == ["1.2500 m", "–", "–"]
 
 
 def record_of(
@@ -119,12 +113,8 @@ def test_baselines_are_sorted_and_have_ground_truth_where_one_of_them_has() -> N
         "validation": at_points(12, nearest=2.0, after=1.0, linear=None),
     }
     table = baselines_table(errors, "m")
-    assert table.columns == [
-        "",
-        "MAE, validation points",
-        "MAE, ground truth",
-        "RMSE, ground truth",
-    ]
+    columns = ["MAE, validation points", "MAE, ground truth", "RMSE, ground truth"]
+    assert table.columns == ["", *columns]
     assert styled(table) == [
         [("result", "bold"), ("1.0000 m", "bold"), ("–", "bold"), ("–", "bold")],
         [("nearest", ""), ("2.0000 m", ""), ("3.0000 m", ""), ("4.0000 m", "")],
