@@ -7,7 +7,7 @@ import json
 import re
 import tempfile
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -199,16 +199,14 @@ def write_summary(
                 file.write(f"{line}\n")
                 yield record
 
-        def lines() -> Iterator[str]:
-            file.seek(0)
-            return (line.removesuffix("\n") for line in file)
-
         def records() -> Iterator[FrameRecord]:
-            return (FrameRecord.from_json(json.loads(line), request.output) for line in lines())
+            file.seek(0)
+            return (FrameRecord.from_json(json.loads(line), request.output) for line in file)
 
         # What is made of them.
         summary = summarise(request, found, settings, kept())
-        _write_json(request.output / JSON, summary, lines())
+        file.seek(0)
+        _write_json(request.output / JSON, summary, file)
         _write_csv(request.output / CSV, summary, records())
         if request.html is not None:
             from pnpdepth_cli.commands.report.batch_report import write_batch_report
@@ -223,38 +221,32 @@ def _write_json(path: Path, summary: BatchSummary, lines: Iterable[str]) -> None
     with atomic_path(path) as temporary, temporary.open("w", **_TEXT) as file:
         file.write(text.removesuffix("\n}") + ',\n  "frames": [')
         for number, line in enumerate(lines):
-            file.write(f"{',' if number else ''}\n    {line}")
+            file.write(f"{',' if number else ''}\n    {line.rstrip()}")
         file.write("\n  ]\n}\n")
 
 
 def _write_csv(path: Path, summary: BatchSummary, records: Iterable[FrameRecord]) -> None:
-    """Writes a row for each record."""
-    measured = list(_error_columns(summary.errors, summary.columns))
+    """Writes a row for each record, with errors of ground truth first."""
+    shown = _MEASURED if summary.columns is None else (*summary.columns, COVERAGE.key)
+    measured = [
+        (basis, stage, key)
+        for basis in BASES
+        for stage, scores in summary.errors.get(basis, {}).items()
+        for key in shown
+        if key in scores
+    ]
     header = ["name", "status", "message", "points", "held_out_points", "improved_fraction"]
-    header += [name for name, *_ in measured]
+    header += [f"{'' if b == GT else f'{b}_'}{key}_{stage}" for b, stage, key in measured]
     header += ["warnings", *(f"seconds_{stage}" for stage in _RUN_STAGES)]
+
+    def cells(record: FrameRecord) -> Iterator[Any]:
+        points = record.points
+        yield from (record.name, record.status, record.message or "")
+        yield from (points and points.used, points and points.held_out, record.improved_fraction)
+        for basis, stage, key in measured:
+            yield record.errors.get(basis, {}).get(stage, {}).get(key)
+        yield "; ".join(record.warnings)
+        yield from (record.seconds.get(stage) for stage in _RUN_STAGES)
+
     with atomic_path(path) as temporary, temporary.open("w", **_TEXT) as file:
-        write_csv(file, header, (list(_cells(record, measured)) for record in records))
-
-
-def _error_columns(
-    errors: Mapping[str, Mapping[str, Scores]], keys: Sequence[str] | None
-) -> Iterator[tuple[str, str, str, str]]:
-    """The columns of errors: heading, basis, stage and key, those of ground truth first."""
-    shown = _MEASURED if keys is None else (*keys, COVERAGE.key)
-    for basis in BASES:
-        start = "" if basis == GT else f"{basis}_"
-        for stage, scores in errors.get(basis, {}).items():
-            for key in (key for key in shown if key in scores):
-                yield f"{start}{key}_{stage}", basis, stage, key
-
-
-def _cells(record: FrameRecord, measured: Sequence[tuple[str, str, str, str]]) -> Iterator[Any]:
-    """The cells of a row; None where a frame has no value."""
-    points = record.points
-    yield from (record.name, record.status, record.message or "")
-    yield from (points and points.used, points and points.held_out, record.improved_fraction)
-    for _, basis, stage, key in measured:
-        yield record.errors.get(basis, {}).get(stage, {}).get(key)
-    yield "; ".join(record.warnings)
-    yield from (record.seconds.get(stage) for stage in _RUN_STAGES)
+        write_csv(file, header, (list(cells(record)) for record in records))

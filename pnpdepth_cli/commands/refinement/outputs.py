@@ -130,24 +130,16 @@ def write_outputs(
     image = replace(inputs, register=frame.registration).registered().image
     # Depth, its standard deviation, and where it is valid.
     write_depth(outputs["depth"], frame.after, scale=output_scale(inputs))
-    if frame.sigma is not None and "sigma" in outputs:
+    if "sigma" in outputs and frame.sigma is not None and frame.valid is not None:
         _write_sigma(outputs["sigma"], frame.sigma)
-    if frame.sigma is not None and "sigma_preview" in outputs:
         sigma_preview(frame.sigma, outputs["sigma_preview"], inputs.unit)
-    if frame.valid is not None and "valid" in outputs:
         write_mask(outputs["valid"], frame.valid)
     # Images for a person.
     improved, figures = None, {}
     if "preview" in outputs:
+        xy, depth = inputs.own.xy.numpy(), inputs.own.depth.numpy()
         figures["preview"] = preview(
-            image,
-            inputs.own.xy.numpy(),
-            inputs.own.depth.numpy(),
-            frame.before,
-            frame.after,
-            outputs["preview"],
-            inputs.unit,
-            made_by,
+            image, xy, depth, frame.before, frame.after, outputs["preview"], inputs.unit, made_by
         )
     if "improvement" in outputs:
         improved, figures["improvement"] = _write_improvement(
