@@ -112,11 +112,6 @@ def test_3dgs_gets_the_inverse_depth_of_the_model(root: Path) -> None:
         assert inverse == pytest.approx(1 / DEPTH, rel=2e-4)
 
 
-def test_results_without_any_known_depth_are_refused_for_3dgs(root: Path) -> None:
-    with pytest.raises(InputError, match="no frame has a pixel with known depth"):
-        export(results(root, np.zeros_like(DEPTH)), "gaussian-splatting", root)
-
-
 def test_no_pixel_is_infinitely_far_in_3dgs(root: Path) -> None:
     depth = DEPTH.copy()
     depth[:2] = 0  # unknown: taken from the nearest pixel
@@ -322,6 +317,9 @@ def test_results_need_depth_a_folder_to_go_to_and_masks_of_their_size(root: Path
     folder = results(root)
     with pytest.raises(InputError, match=r"images has no files NAME_depth\.png"):
         export(root / "images", "colmap", root / "dense")
+    unknown = results(project(root / "unknown"), np.zeros_like(DEPTH))
+    with pytest.raises(InputError, match="no frame has a pixel with known depth"):
+        export(unknown, "gaussian-splatting", root / "dense")
     with pytest.raises(OutputError, match=r"a\.json is a file; name a folder"):
         export(folder, "colmap", folder / "a.json")
     cv2.imwrite(str(folder / "a_valid.png"), np.zeros((2, 2), np.uint8))

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.depth import read_depth
 from tests.commands.frames import FrameOnDisk, run
@@ -63,17 +61,3 @@ def test_the_standard_deviation_is_positive_and_rounded_in_a_png(frame: FrameOnD
     assert sigma.shape == frame.depth.shape
     assert (sigma > 0).all()
     assert np.abs(exact - sigma).max() < 0.00051
-
-
-def test_networks_of_the_default_method_are_aligned_and_updated_a_few_times(
-    frame: FrameOnDisk,
-) -> None:
-    request = RefineRequest.from_fields(
-        image=frame.image,
-        sparse=frame.sparse,
-        model=str(frame.model),
-        checkpoint=frame.checkpoint,
-    )
-    user, compact = load_method(request, read_requested(request)).members
-    assert (user.settings.align, user.settings.iterations) == ("auto", 5)
-    assert (compact.settings.align, compact.settings.iterations) == ("none", 2)

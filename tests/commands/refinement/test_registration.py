@@ -1,21 +1,17 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from pnpdepth_cli import Refiner, load_network
-from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested
+from pnpdepth_cli.commands.refinement.refine_image import read_requested
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.settings import Settings
@@ -119,25 +115,6 @@ def test_the_frames_of_a_batch_share_a_registration_that_none_shows_alone(
     assert registrations[0] is not None
     assert registrations[0]["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.02)
     assert all(each == registrations[0] for each in registrations)
-
-
-def test_of_frames_that_say_nothing_three_are_read(frame: FrameOnDisk) -> None:
-    request = RefineRequest.from_fields(
-        image=frame.image, sparse=frame.sparse, model=str(frame.model), checkpoint=frame.checkpoint
-    )
-    inputs = read_requested(request)
-    few = replace(inputs, points=inputs.points.select(torch.arange(60) < 5))
-    read = []
-
-    def group() -> Iterator[Frame]:
-        for number in range(10):
-            read.append(number)
-            yield few
-
-    method = load_method(request, inputs)
-    method.share_registration(group())
-    assert read == [0, 1, 2]
-    assert method.registrations == {}
 
 
 def test_arrays_in_memory_are_registered_too() -> None:
