@@ -157,13 +157,7 @@ class Protocol:
 # The reference codes (monodepth2's evaluate_depth.py, BTS's eval) clamp predictions with
 # `pred[pred < min_depth] = min_depth`, which scores empty ones (0, NaN) as the lower bound.
 _EIGEN = Protocol(
-    name="eigen",
-    part=WHOLE,
-    crop="eigen",
-    min_depth=1e-3,
-    max_depth=80.0,
-    clip=True,
-    missing="min",
+    name="eigen", part=WHOLE, crop="eigen", min_depth=1e-3, max_depth=80.0, clip=True, missing="min"
 )
 _NOT_FOUND = "which pixels the paper draws, with which seed, size and bounds, was not found"
 _RESAMPLED = "the paper halves frames by interpolation; here every second pixel is taken"
