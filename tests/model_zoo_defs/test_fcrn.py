@@ -78,16 +78,6 @@ def random_arrays(seed: int) -> Fill:
 # ------------------------------------------------------------------ the authors' file
 
 
-def test_the_network_has_as_many_values_as_the_published_file() -> None:
-    with torch.device("meta"):
-        own = FCRN().state_dict()
-    held = [tensor for name, tensor in own.items() if not name.endswith("num_batches_tracked")]
-    shapes = authors(64, lambda shape: np.broadcast_to(np.float32(1), shape))
-    assert len(held) == sum(len(layer) for layer in shapes.values())
-    assert sum(tensor.numel() for tensor in held) == 63_633_665
-    assert sum(array.size for layer in shapes.values() for array in layer.values()) == 63_633_665
-
-
 def narrow(arrays: Arrays, path: Path, width: int = 4) -> FCRN:
     """A network of this width with these arrays, loaded from a file."""
     network = FCRN(width)

@@ -64,18 +64,3 @@ def test_points_without_neighbours_have_a_weight(shaken: InlierWeights, count: i
     weights = shaken(points, Cloud.of(points, images(1)))
     assert bool(((weights >= 0) & (weights <= 1)).all())
     assert torch.equal(weights != 1, points.mask > 0)
-
-
-def test_images_of_a_batch_do_not_influence_each_other(shaken: InlierWeights) -> None:
-    maps = [sparse_map(70, 1), sparse_map(300, 2)]
-    together = Points(torch.cat(maps))
-    rgb = images(2)
-    cloud = Cloud.of(together, rgb)
-    log_odds = shaken.log_odds(cloud).split([70, 300])
-    weights = shaken(together, cloud)
-    for number, sparse in enumerate(maps):
-        alone, own = Points(sparse), rgb[number : number + 1]
-        cloud = Cloud.of(alone, own)
-        expected = shaken.log_odds(cloud)
-        torch.testing.assert_close(log_odds[number], expected, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(weights[number], shaken(alone, cloud)[0], rtol=1e-3, atol=1e-4)

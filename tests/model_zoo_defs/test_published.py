@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from model_zoo_defs.eigen import Eigen
 from model_zoo_defs.fcrn import FCRN
 from model_zoo_defs.sfmlearner import DispNet
 from model_zoo_defs.sparse2dense import SparseToDense
@@ -33,6 +34,7 @@ LAYOUTS = {
 }
 """Digests of the names and shapes of all tensors."""
 NARROW: dict[str, Callable[[], nn.Module]] = {
+    "eigen": lambda: Eigen(channels=(6, 8, 10, 9, 7), hidden=20, fine=12),
     "fcrn": lambda: FCRN(8),
     "sparse2dense": lambda: SparseToDense(50, width=16),
     "sparse2dense-kitti": lambda: SparseToDense(18, width=16),
@@ -44,6 +46,7 @@ FILES: dict[str, Callable[[dict[str, Tensor]], dict[str, object]]] = {
 }
 """What lies in the published file around the state."""
 COMPUTED = {
+    ("eigen", 228, 304): [5.306, 4.414, 3.537, 4.885, 5.314, 4.539],
     ("fcrn", 228, 304): [0.985, 0.0, 0.838, 2.244, 1.512, 3.467],
     ("fcrn", 97, 130): [0.0, 1.017, 1.938, 0.0, 1.469, 0.076],
     ("sparse2dense", 100, 130): [2.507, 2.262, 0.931, -1.293, -4.631, 0.754],
