@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
-from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest, nyu, rows
+from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest, rows
 from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import InputError
 
@@ -23,8 +23,7 @@ __all__ = ["LAYOUTS", "Layout", "list_frames"]
 TABLE: dict[str, Layout] = {
     **rows.ROWS,
     "manifest": manifest.MANIFEST,
-    "nyu-mat": nyu.MAT,
-    "nyu-h5": nyu.H5,
+    "nyu-mat": rows.NYU_MAT,
     "kitti-odometry": kitti.ODOMETRY,
     "kitti-depth": kitti.DEPTH,
     "kitti-raw": kitti.RAW,

@@ -111,9 +111,6 @@ def _parts(folder: Path, where: str, row: dict[str, Any]) -> tuple[dict[str, Pat
         commas = "; columns are parted by commas" if ";" in unknown[0] else ""
         keys = ", ".join((*_PATHS, *_VALUES))
         raise FileFormatError(f"{where}: column {unknown[0]!r} is not one of {keys}{commas}")
-    nul = next((key for key, text in texts.items() if "\0" in text), None)
-    if nul is not None:
-        raise FileFormatError(f"{where}: {nul} holds a NUL character; correct it")
     if "image" not in texts and "sparse" not in texts:
         raise FileFormatError(f"{where}: has neither image nor sparse; give one")
     try:
