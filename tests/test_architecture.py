@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import traceback
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -169,3 +170,16 @@ def test_few_functions_lie_between_the_command_and_equation_3(
     names = [each.name for each in own if Path(each.filename).parent.name != "cli"]
     assert names[0] == "refine_image"
     assert len(names) <= 5, names
+
+
+def test_a_name_is_a_place() -> None:
+    """No two classes, and no two files but `__init__`, have one name."""
+    files = sorted(PACKAGE.rglob("*.py"))
+    classes = [
+        node.name
+        for file in files
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.ClassDef)
+    ]
+    for names in (classes, [file.stem for file in files if file.stem != "__init__"]):
+        assert [name for name, count in Counter(names).items() if count > 1] == []

@@ -21,7 +21,7 @@ from pnpdepth_cli.frames.fuse import (
     FOLDS,
     LEAST_PART,
     Expert,
-    Split,
+    ValidatedFrame,
     add_blind_expert,
     fit_weights,
     predict,
@@ -105,7 +105,7 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> tuple[Frame, Predictio
     return inliers, judged
 
 
-def _propagate(depth: Tensor, frame: Frame, split: Split) -> Tensor:
+def _propagate(depth: Tensor, frame: Frame, split: ValidatedFrame) -> Tensor:
     """Depth (H, W) with its residual at the points propagated."""
     return propagate(depth, frame.points, frame.rgb, kind=split.propagation)
 
@@ -127,7 +127,7 @@ def _alone(experts: Sequence[Expert]) -> Expert | None:
     return next((e for e in experts[1:] if e.user is None and e.network is not None), None)
 
 
-def _stages(experts: Sequence[Expert], frame: Frame, split: Split) -> dict[str, Tensor]:
+def _stages(experts: Sequence[Expert], frame: Frame, split: ValidatedFrame) -> dict[str, Tensor]:
     """The user's network after each step of its own, and the network that takes a prior alone."""
     own, alone = _own(experts[0]), _alone(experts)
     propagated = own.after if experts[0].of_scanner else _propagate(own.after, frame, split)
@@ -137,7 +137,9 @@ def _stages(experts: Sequence[Expert], frame: Frame, split: Split) -> dict[str, 
     )
 
 
-def _validation(experts: Sequence[Expert], split: Split, shares: Mapping[str, float]) -> Validation:
+def _validation(
+    experts: Sequence[Expert], split: ValidatedFrame, shares: Mapping[str, float]
+) -> Validation:
     """The stages and the result at the validation points.
 
     Each fifth of these is predicted by weights that were fitted to the others.
@@ -176,7 +178,7 @@ def _validation(experts: Sequence[Expert], split: Split, shares: Mapping[str, fl
 def _notes(
     frame: Frame,
     inliers: Frame,
-    split: Split,
+    split: ValidatedFrame,
     experts: Sequence[Expert],
     weights: Mapping[str, float],
 ) -> tuple[str, ...]:

@@ -66,7 +66,7 @@ LEAST_PART = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
-class Split(ValidationPoints):
+class ValidatedFrame(ValidationPoints):
     """A frame with all its inliers, and without its validation points."""
 
     whole: Frame
@@ -99,7 +99,7 @@ class Split(ValidationPoints):
         return float(mean / error.clamp_min(1e-12))
 
 
-def split_frame(frame: Frame, judged: Tensor, seed: int) -> Split:
+def split_frame(frame: Frame, judged: Tensor, seed: int) -> ValidatedFrame:
     """Returns the frame with and without its validation points; a frame of few points has none.
 
     Args:
@@ -113,7 +113,7 @@ def split_frame(frame: Frame, judged: Tensor, seed: int) -> Split:
     if len(points) >= MIN_POINTS:
         chosen = spatial_folds(points, FOLDS, seed=seed) == 0
     if not bool(chosen.any()) or bool(chosen.all()):
-        return Split(
+        return ValidatedFrame(
             whole=frame, kept=frame, points=points.select(slice(0)), weights=torch.empty(0)
         )
     # Of many validation points some are drawn; all of them are kept from the experts.
@@ -126,7 +126,7 @@ def split_frame(frame: Frame, judged: Tensor, seed: int) -> Split:
     weights = torch.where(at > 0, inlier_weights(validation, residual), 0.0).float()
     weights = weights if bool(weights.any()) else torch.ones_like(weights)
     kept = frame.with_points(points.select(~chosen))
-    return Split(whole=frame, kept=kept, points=validation, weights=weights)
+    return ValidatedFrame(whole=frame, kept=kept, points=validation, weights=weights)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,13 +144,13 @@ class Expert:
     user: OpenNetwork | None = None  # the user's network whose depth it is, or has as a prior
     of_scanner: bool = False  # whether it is a completion network of the user's, given scan lines
 
-    def updated(self, split: Split) -> Tensor:
+    def updated(self, split: ValidatedFrame) -> Tensor:
         """Returns `at` before the residual is propagated."""
         return self.at if self.kept is None else split.points.sample(self.kept.after)
 
 
 def predictions(
-    networks: Sequence[OpenNetwork], split: Split, known: Mapping[OpenNetwork, Prediction]
+    networks: Sequence[OpenNetwork], split: ValidatedFrame, known: Mapping[OpenNetwork, Prediction]
 ) -> list[Expert]:
     """Returns the experts, the user's network first.
 
@@ -197,7 +197,7 @@ def predictions(
     return [*experts, *with_prior, replace(alone, weight=rest), interpolation]
 
 
-def trust(expert: Expert, split: Split, alone: Expert) -> float:
+def trust(expert: Expert, split: ValidatedFrame, alone: Expert) -> float:
     """Returns 0…1, the part of its prior weights that a network gets, by what it explains.
 
     The aligned depth of a network that takes the image alone explains a fraction of the variance of
@@ -233,7 +233,7 @@ def trust(expert: Expert, split: Split, alone: Expert) -> float:
 
 
 def add_blind_expert(
-    networks: Sequence[OpenNetwork], split: Split, experts: list[Expert]
+    networks: Sequence[OpenNetwork], split: ValidatedFrame, experts: list[Expert]
 ) -> tuple[list[Expert], tuple[str, ...]]:
     """Returns the experts, joined by one that sees a grey image where the image is in doubt.
 
@@ -266,7 +266,7 @@ def add_blind_expert(
 
 
 def fit_weights(
-    experts: Sequence[Expert], split: Split, chosen: Tensor | None = None
+    experts: Sequence[Expert], split: ValidatedFrame, chosen: Tensor | None = None
 ) -> dict[str, float]:
     """Returns the weights of the experts by name, >= 0, their sum 1.
 
@@ -310,7 +310,7 @@ def fit_weights(
 
 
 def scanner_shares(
-    experts: Sequence[Expert], split: Split, weights: Mapping[str, float]
+    experts: Sequence[Expert], split: ValidatedFrame, weights: Mapping[str, float]
 ) -> dict[str, float]:
     """Returns the weights of completion networks of the scanner, by name.
 
@@ -360,7 +360,7 @@ def predict(network: OpenNetwork, frame: Frame, *, updates: bool = True) -> Pred
 
 def _expert(
     network: OpenNetwork,
-    split: Split,
+    split: ValidatedFrame,
     name: str,
     *,
     known: Prediction | None = None,

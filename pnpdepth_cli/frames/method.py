@@ -20,7 +20,7 @@ from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.errors import PnpDepthError, UsageError
 from pnpdepth_cli.frames.default import refine_default
 from pnpdepth_cli.frames.frame import Frame, Register
-from pnpdepth_cli.frames.fuse import Split, split_frame
+from pnpdepth_cli.frames.fuse import ValidatedFrame, split_frame
 from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Refined, Validation, make_refined
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_member
@@ -193,7 +193,7 @@ def refine_fixed(
     return make_refined(frame, own, depth, used=frame.points, validation=validation)
 
 
-def _validation(network: OpenNetwork, split: Split, kind: str) -> Validation | None:
+def _validation(network: OpenNetwork, split: ValidatedFrame, kind: str) -> Validation | None:
     """Depth at validation points, refined without them. None where the method fails."""
     points, kept = split.points, split.kept
     try:

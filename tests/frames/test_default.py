@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.split import Split as Cut
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames import fuse
 from pnpdepth_cli.frames.default import refine_default, without_outliers
@@ -21,7 +21,7 @@ from pnpdepth_cli.frames.fuse import (
     MIN_POINTS,
     OWN_SCANNER,
     Expert,
-    Split,
+    ValidatedFrame,
     fit_weights,
     split_frame,
     trust,
@@ -92,15 +92,15 @@ def expert(name: str, at: Tensor, weight: float = 1.0) -> Expert:
     return Expert(name=name, weight=weight, at=at, dense=depth_of_scene)
 
 
-def split_of(depth: Tensor) -> Split:
+def split_of(depth: Tensor) -> ValidatedFrame:
     """A frame with validation points of these depths."""
     xy = torch.stack([torch.arange(len(depth)) % 128, torch.arange(len(depth)) // 128], 1).float()
     points = SparsePoints(xy=xy, depth=depth, size=SIZE)
     frame = frame_in_memory(60)
-    return Split(whole=frame, kept=frame, points=points, weights=torch.ones(len(depth)))
+    return ValidatedFrame(whole=frame, kept=frame, points=points, weights=torch.ones(len(depth)))
 
 
-def split_of_frame(count: int) -> Split:
+def split_of_frame(count: int) -> ValidatedFrame:
     """A frame of so many points with and without its validation points."""
     return split_frame(frame_in_memory(count), depth_of_scene(), 0)
 
@@ -349,8 +349,8 @@ def test_the_same_frame_gives_the_same_depth_whatever_was_refined_before() -> No
 def test_the_front_runs_once_for_all_sets_of_points_of_an_image(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    frame, fronts, front = frame_in_memory(60), [], Cut.front
-    monkeypatch.setattr(Cut, "front", lambda *args: fronts.append(args) or front(*args))
+    frame, fronts, front = frame_in_memory(60), [], Split.front
+    monkeypatch.setattr(Split, "front", lambda *args: fronts.append(args) or front(*args))
     fewer = frame.with_points(frame.points.select(torch.arange(60) < 40))
     with opened(member(Brightness, settings=UPDATES)) as networks:
         (one,) = networks
