@@ -24,7 +24,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +83,7 @@ class Calibration:
 class _Fields:
     """The named values of a calibration file."""
 
-    def __init__(self, path: Path, values: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, values: Mapping[str, object]) -> None:
         self.path, self.values = path, values
 
     def __contains__(self, name: str) -> bool:
@@ -166,7 +165,7 @@ def read_rigid_motion(path: Path) -> Extrinsics:
     return _named_values(path, _text(path)).pose("T")
 
 
-def camera_in_yaml(path: Path, content: Any, camera: int | None) -> Calibration:
+def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibration:
     """Returns a camera of the content of a YAML file of OpenCV, ROS or Kalibr.
 
     `camera` is the number of a camera of a camchain, None for cam0.
@@ -261,7 +260,7 @@ def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
     )
 
 
-def _bare_intrinsics(text: str) -> dict[str, Any]:
+def _bare_intrinsics(text: str) -> Mapping[str, object]:
     """K, and the size if it is there, of numbers without names."""
     numbers = numbers_in(text) or []
     if len(numbers) == 16:  # ScanNet's, by rows

@@ -124,15 +124,13 @@ def known_metres(values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def _as_image(path: Path, values: NDArray[Any]) -> NDArray[Any]:
-    shape = values.shape
-    if len(shape) == 4 and shape[0] == 1:  # a batch of one, as networks give it
-        return _as_image(path, values[0])
-    if len(shape) == 3 and 1 in (shape[0], shape[2]):
-        return values.reshape(shape[1:] if shape[0] == 1 else shape[:2])
-    if len(shape) == 2:
-        return values
-    listing = "x".join(str(length) for length in shape) or "a single number"
-    raise FileFormatError(f"{path} holds an array of shape {listing}; a depth image is (H, W)")
+    """The array (H, W) of one channel, also of a batch of one as networks give it."""
+    image = values[0] if values.ndim == 4 and len(values) == 1 else values
+    if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]):
+        image = image[0] if len(image) == 1 else image[:, :, 0]
+    if image.ndim != 2:
+        raise FileFormatError(f"{path} has the shape {values.shape}; a depth image is (H, W)")
+    return image
 
 
 def write_depth(

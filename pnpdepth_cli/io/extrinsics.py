@@ -50,7 +50,7 @@ def read_extrinsics(path: Path) -> Extrinsics:
     raise FileFormatError(f"{path} holds {len(numbers)} numbers; extrinsics are {kinds}")
 
 
-def numbers_in(value: Any) -> list[float] | None:
+def numbers_in(value: object) -> list[float] | None:
     """Returns the numbers of a text, a list, nested lists, or the `data` of a matrix.
 
     None for anything that is not made of numbers.
@@ -123,7 +123,7 @@ def rotation_of(wxyz: Floats) -> Floats:
     )
 
 
-def _pose_of_fields(path: Path, fields: Any) -> Extrinsics:
+def _pose_of_fields(path: Path, fields: object) -> Extrinsics:
     """The pose in a mapping; tf nests it: transforms: - header, transform: translation, …."""
     for _ in range(3):
         if isinstance(fields, list) and fields:
@@ -148,7 +148,7 @@ def _pose_of_fields(path: Path, fields: Any) -> Extrinsics:
     raise FileFormatError(f"{path} holds no extrinsics; give {kinds}")
 
 
-def _components(path: Path, value: Any, names: str) -> list[float]:
+def _components(path: Path, value: object, names: str) -> list[float]:
     """The numbers of a list, or of the fields of these names."""
     if isinstance(value, Mapping) and "data" not in value:
         value = [value.get(name) for name in names]

@@ -70,7 +70,7 @@ class Head:
 
 
 def check_report_folder(
-    folder: Path, inputs: Sequence[Path], *, made_of: Mapping[str, Any] | None, overwrite: bool
+    folder: Path, inputs: Sequence[Path], *, made_of: Mapping[str, object] | None, overwrite: bool
 ) -> None:
     """Raises OutputError for a folder that holds inputs, lies in one, or is not this report's.
 
@@ -114,9 +114,9 @@ def visible(text: str) -> str:
 
 def write_report(
     folder: Path,
-    made_of: Mapping[str, Any],
+    made_of: Mapping[str, object],
     head: Head,
-    frames: Callable[[Path], Iterable[Mapping[str, Any]]],
+    frames: Callable[[Path], Iterable[Mapping[str, object]]],
     *,
     viewer: bool = False,
 ) -> None:
@@ -141,7 +141,7 @@ def write_report(
 
 
 def _write_page(
-    folder: Path, head: Head, frames: Iterable[Mapping[str, Any]], *, viewer: bool
+    folder: Path, head: Head, frames: Iterable[Mapping[str, object]], *, viewer: bool
 ) -> None:
     style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
     data = {
@@ -165,7 +165,7 @@ def _write_page(
         _write_text(folder / VIEWER, _source("../three/three.min.js") + "\n" + _source(VIEWER))
 
 
-def save_views(images: Path, key: str, views: Mapping[str, Pixels]) -> dict[str, dict[str, Any]]:
+def save_views(images: Path, key: str, views: Mapping[str, Pixels]) -> dict[str, dict[str, str]]:
     """Writes a JPEG of each (H, W, 3) view, at most 960 pixels long; returns the page's entries.
 
     Args:

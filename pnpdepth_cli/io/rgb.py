@@ -250,8 +250,11 @@ def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
         FileFormatError: It is no MP4 or MOV file, cannot be decoded, or exceeds the budget.
     """
     size_of_regular_file(path)
+    opened = path, path.stat().st_mtime_ns
     with _VIDEO_LOCK, silence():
-        bgr = _open_video(path, path.stat().st_mtime_ns).frame(index)
+        if index < _open_video(*opened).first:
+            _open_video.cache_clear()
+        bgr = _open_video(*opened).frame(index)
     return np.divide(bgr[:, :, ::-1], np.float32(255), dtype=np.float32)
 
 
@@ -263,29 +266,28 @@ class _Video:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._begin()
-
-    def _begin(self) -> None:
         import cv2
 
-        with self._path.open("rb") as file:
+        with path.open("rb") as file:
             if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow the addresses in a playlist
-                raise FileFormatError(f"{self._path} is not an MP4 or MOV video; convert it")
-        self._capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
+                raise FileFormatError(f"{path} is not an MP4 or MOV video; convert it")
+        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
-            raise damaged(self._path, "video", "cannot be decoded")
+            raise damaged(path, "video", "cannot be decoded")
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         sides = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
         width, height = (int(self._capture.get(side)) for side in sides)
-        check_pixel_count(self._path, width, height, channels=3)
-        self._done = 0
+        check_pixel_count(path, width, height, channels=3)
+        self._path, self._done = path, 0
         self._last = deque[NDArray[np.uint8]](maxlen=_FRAMES_IN_MEMORY)
+
+    @property
+    def first(self) -> int:
+        """Number of the first frame that can still be had."""
+        return self._done - len(self._last)
 
     def frame(self, index: int) -> NDArray[np.uint8]:
         """Returns a frame (H, W, 3), blue first."""
-        if index < self._done - len(self._last):
-            self._begin()
         while self._done <= index:
             found, pixels = self._capture.read()
             if not found:

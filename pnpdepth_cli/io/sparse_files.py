@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,7 +134,7 @@ def write_sparse(
     depth: NDArray[np.float32],
     image: NDArray[np.float32],
     *,
-    provenance: Mapping[str, Any],
+    provenance: Mapping[str, object],
 ) -> None:
     """Writes N points, of pixels (N, 2) and metres (N,), in the format that the suffix names.
 

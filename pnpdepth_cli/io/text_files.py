@@ -31,7 +31,7 @@ _SEPARATOR = re.compile(r"[\s,;]+")
 _STARTS_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
-def write_json(path: Path, mapping: Mapping[str, Any]) -> None:
+def write_json(path: Path, mapping: Mapping[str, object]) -> None:
     """Writes the mapping as indented JSON in its own order; NaN and infinity become null."""
     text = json.dumps(plain(mapping), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with atomic_path(path) as temporary:
@@ -55,7 +55,7 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Returns the value in JSON's own types; NaN and infinity become None."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
@@ -154,7 +154,7 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     return np.array(rows, dtype=np.float64).reshape(len(rows), -1 if rows else 3), header
 
 
-def write_csv(file: TextIO, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+def write_csv(file: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Writes RFC 4180 with lines that end in \\n, each text as `text_cell`, None as nothing."""
     writer = csv.writer(file, lineterminator="\n")
     for row in itertools.chain([header], rows):

@@ -37,6 +37,10 @@ COMPRESSED = ("/compressed", "/compressedDepth")
 """Ends of the names of topics of compressed images."""
 
 
+Message = Any
+"""A ROS message, whose type rosbags makes when it runs."""
+
+
 def is_bag(path: Path) -> bool:
     """Returns whether this is a bag file, or a folder that ROS 2 recorded."""
     if path.is_dir():
@@ -61,7 +65,7 @@ class Bag:
                 if info.msgtype in kinds
             }
 
-    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Message]]:
         """Yields (topic, nanoseconds at which it was logged, message) in the order of the log."""
         wanted = [each for each in self._reader.connections if each.topic in topics]
         if not wanted:
@@ -160,18 +164,16 @@ def _as_our_errors(path: Path) -> Iterator[None]:
 
 def _errors_of_rosbags() -> tuple[type[Exception], ...]:
     """What rosbags and its parts raise on damaged files."""
-    from rosbags.highlevel import AnyReaderError
     from rosbags.rosbag1 import ReaderError as Reader1Error
     from rosbags.rosbag2 import ReaderError as Reader2Error
     from rosbags.serde import SerdeError
 
     mcap: Any = importlib.import_module("rosbags.rosbag2.storage_mcap")
     database: Any = importlib.import_module("rosbags.rosbag2.storage_sqlite3")
-    own = (AnyReaderError, Reader1Error, Reader2Error, SerdeError)
+    own = (Reader1Error, Reader2Error, SerdeError)
     libraries = (sqlite3.Error, database.apsw.Error, mcap.zstd.ZstdError, struct.error)
-    parts = (OSError, EOFError, RuntimeError)
     content = (ValueError, LookupError, OverflowError, TypeError, AssertionError)
-    return (*own, *libraries, *parts, *content)
+    return (*own, *libraries, *content, OSError, EOFError, RuntimeError)
 
 
 _CHUNK_BYTES = 1 << 28

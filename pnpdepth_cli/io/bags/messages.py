@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_PLACE, Extrinsics
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.bags import CAMERAS, COMPRESSED, ODOMETRY, POSES, TRANSFORMS, Bag
+from pnpdepth_cli.io.bags import CAMERAS, COMPRESSED, ODOMETRY, POSES, TRANSFORMS, Bag, Message
 from pnpdepth_cli.io.calibration import Calibration, camera_in_yaml
 from pnpdepth_cli.io.depth import known_metres
 from pnpdepth_cli.io.extrinsics import pose_of_quaternion
@@ -59,7 +59,7 @@ Links = dict[str, dict[str, Extrinsics]]
 Floats = NDArray[np.float64]
 
 
-def image_file(message: Any, topic: str) -> tuple[str, bytes]:
+def image_file(message: Message, topic: str) -> tuple[str, bytes]:
     """Returns (suffix, bytes) of the file in a CompressedImage, or of a PNG of an Image.
 
     Raises:
@@ -78,7 +78,7 @@ def image_file(message: Any, topic: str) -> tuple[str, bytes]:
     return ".png", encoded.tobytes()
 
 
-def _pixels(message: Any, topic: str) -> NDArray[np.uint8]:
+def _pixels(message: Message, topic: str) -> NDArray[np.uint8]:
     """(H, W) or (H, W, 3) blue, green, red."""
     encoding = str(message.encoding)
     if encoding not in _CHANNELS:
@@ -91,7 +91,7 @@ def _pixels(message: Any, topic: str) -> NDArray[np.uint8]:
     return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), np.uint8)
 
 
-def _rows(message: Any, topic: str, pixel_bytes: int) -> NDArray[np.uint8]:
+def _rows(message: Message, topic: str, pixel_bytes: int) -> NDArray[np.uint8]:
     """The bytes of an Image's pixels, (H, W * pixel_bytes)."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
@@ -102,7 +102,7 @@ def _rows(message: Any, topic: str, pixel_bytes: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(rows)
 
 
-def is_depth(message: Any, topic: str) -> bool:
+def is_depth(message: Message, topic: str) -> bool:
     """Returns whether an Image, or CompressedImage, is a depth image.
 
     Grey images of 16 bits are if the topic says so, as those that librealsense records.
@@ -113,7 +113,7 @@ def is_depth(message: Any, topic: str) -> bool:
     return _COMPRESSED_DEPTH in str(message.format)
 
 
-def depth_image(message: Any, topic: str) -> NDArray[np.float32]:
+def depth_image(message: Message, topic: str) -> NDArray[np.float32]:
     """Returns the depth image (H, W) of a message in metres, 0 where unknown.
 
     16UC1 holds millimetres, 32FC1 metres (REP 118). A compressed one is a PNG behind 12 bytes: a
@@ -140,7 +140,7 @@ def depth_image(message: Any, topic: str) -> NDArray[np.float32]:
         return known_metres(np.where(codes > 0, a / (codes.astype(np.float64) - b), 0))
 
 
-def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
+def cloud_points(message: Message, topic: str) -> NDArray[np.float32]:
     """Returns the (N, 3) points x y z of a sensor_msgs/PointCloud2, of any field layout.
 
     Raises:
@@ -173,7 +173,7 @@ def cloud_points(message: Any, topic: str) -> NDArray[np.float32]:
         return np.column_stack([points[name] for name in "xyz"]).astype(np.float32)
 
 
-def seconds_of(message: Any, logged_ns: int) -> float:
+def seconds_of(message: Message, logged_ns: int) -> float:
     """Returns the time of a message's header; where it is 0, the time at which it was logged."""
     stamp = message.header.stamp
     time_s = int(stamp.sec) + 1e-9 * int(stamp.nanosec)
@@ -184,7 +184,7 @@ class Stamped(NamedTuple):
     """A message with the time of its header."""
 
     time_s: float
-    message: Any
+    message: Message
 
 
 def nearest_pairs(
@@ -258,7 +258,7 @@ def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
     return None
 
 
-def frame_of(message: Any) -> str:
+def frame_of(message: Message) -> str:
     """Returns the frame_id in a message's header, without ROS 1's leading slash."""
     return str(message.header.frame_id).lstrip("/")
 
