@@ -4,7 +4,6 @@ import csv
 import json
 import os
 import shutil
-import threading
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -18,17 +17,14 @@ from safetensors.torch import load_file
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.cli.printing import print_batch
-from pnpdepth_cli.commands.batch import running as batch_running
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.batch.run_batch import run_batch
 from pnpdepth_cli.commands.batch.summary import BatchSummary, summarise
-from pnpdepth_cli.commands.refinement.refine_image import read_requested
 from pnpdepth_cli.commands.report.batch_report import write_batch_report
 from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.text_files import plain
 from pnpdepth_cli.sensors.samplers import SamplePattern
@@ -436,40 +432,6 @@ def test_a_protocol_cuts_image_points_and_truth_alike(root: Path) -> None:
     assert record["points"]["used"] == np.count_nonzero(depth)
     batch(root, source=root / "list.csv", refine=options, protocol="whole")
     assert read_depth(root / "out/a_depth.png").values.shape == size
-
-
-def test_reading_and_writing_go_on_while_the_network_runs(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read: set[str] = set()
-    second_is_read, second_is_refined = threading.Event(), threading.Event()
-    refined = 0
-    refine, write = Method.refine, batch_running.write_refined
-
-    def reading(request: Any) -> Any:
-        read.add(str(request.files.image))
-        if len(read) == 2:
-            second_is_read.set()
-        return read_requested(request)
-
-    def refining(self: Method, inputs: Any) -> Any:
-        nonlocal refined
-        assert threading.current_thread() is threading.main_thread()
-        assert second_is_read.wait(60), "the second frame is not read while the first is refined"
-        refined += 1
-        if refined == 2:
-            second_is_refined.set()
-        return refine(self, inputs)
-
-    def writing(*arguments: Any, **named: Any) -> Any:
-        assert second_is_refined.wait(60), "the second frame waits until the first is written"
-        return write(*arguments, **named)
-
-    monkeypatch.setattr(batch_running, "read_requested", reading)
-    monkeypatch.setattr(batch_running, "write_refined", writing)
-    monkeypatch.setattr(Method, "refine", refining)
-    monkeypatch.setattr(batch_running, "THREADS", 1)
-    assert batch(root).counts["done"] == 4
 
 
 def test_a_plain_prediction_without_scores_ends_no_batch(
