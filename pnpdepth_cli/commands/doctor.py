@@ -38,7 +38,7 @@ def examine() -> dict[str, str | list[str]]:
 
 
 def _requirements() -> tuple[list[str], dict[str, list[str]]]:
-    """Names of the required packages, and of those of each extra."""
+    """Names of the required packages that are installed, and of all packages of each extra."""
     required, extras = [], dict[str, list[str]]()
     for line in metadata.requires("pnpdepth") or []:
         match = _REQUIREMENT.match(line)

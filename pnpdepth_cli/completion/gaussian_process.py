@@ -151,7 +151,10 @@ def neighbourhoods(field: ResidualField, max_exact: int) -> Tensor:
 
 
 def _steps(points: SparsePoints) -> tuple[int, int]:
-    """Rows and columns between the nodes of the grid on which the residual is predicted."""
+    """Rows and columns between the nodes of the grid on which the residual is predicted.
+
+    Between scan lines, which lie along rows, the rows of nodes may be farther apart.
+    """
     if points.size[0] * points.size[1] < _WORTH_A_GRID:
         return 1, 1
     spacing = math.sqrt(points.size[0] * points.size[1] / len(points))

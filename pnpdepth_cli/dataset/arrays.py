@@ -74,10 +74,13 @@ def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.floa
 
 
 def read_levels(path: Path) -> NDArray[Any]:
-    """Returns (H, W) the numbers of an array, or the largest code of the channels of an image.
+    """Returns the numbers (H, W) in the file of a mask or of the confidence of depth.
+
+    They are as stored; only an EXR is converted to 8 bits as a photo is. Of a pixel in colour it is
+    the largest channel.
 
     Raises:
-        InputError: The file holds no mask.
+        InputError: The file holds no such numbers.
     """
     if path.suffix.lower() in IMAGE_SUFFIXES:
         image = read_rgb(path)

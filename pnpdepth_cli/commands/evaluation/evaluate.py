@@ -304,7 +304,7 @@ def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
 
 
 def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
-    """Returns the chosen or first measures of each frame, or of the worst of many."""
+    """Returns a row for each frame or the worst of many: the chosen measures, else the first."""
     title, frames = "Frames", evaluation.frames
     if len(frames) > _FRAMES_SHOWN:
         frames = worst(evaluation)[:_FRAMES_SHOWN]

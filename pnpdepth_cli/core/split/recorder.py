@@ -50,7 +50,7 @@ class Recorder:
         self._cut, self._replay, self._uncacheable = cut, replay, uncacheable
         known = zip(replay.recording.calls, replay.outputs, strict=True)
         self._calls = [_Call(call.module, saved) for call, saved in known]
-        self._known = len(self._calls)
+        self._known = len(self._calls)  # before this pass; in the rear's, those up to the cut
         self._inside_one = False  # in a submodule that is to be cached as a whole
 
     def run(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
@@ -100,6 +100,10 @@ class Recorder:
     def finish_rear(self, output: Any, *, promised_static: bool) -> None:
         """Gives the replay the whole recording, whose last pass returned `output`.
 
+        Args:
+            output: What the network returned.
+            promised_static: Whether the same calls are promised for all arguments of these shapes.
+
         Raises:
             LayerError: The cut is ambiguous, or its output cannot be replaced.
         """
@@ -109,7 +113,8 @@ class Recorder:
             raise self._cut.several_calls(calls)
         if self.watch.torn:
             raise self._cut.aliased()
-        # Another z may take another path behind the cut, unless the definition says otherwise.
+        # Another z may take another path behind the cut, unless the definition says otherwise. So
+        # no call there is recorded, and saved outputs stay whole, as it may read or change them.
         if self.watch.data_dependent and not promised_static:
             self._drop_from(self._known)
             for call in self._calls:
@@ -117,6 +122,7 @@ class Recorder:
                     call.saved.copied = True
         else:
             self._release_unread()
+        # The recording holds for other arguments if no value reached Python, in front of the cut and behind.
         static = self._replay.recording.static_graph
         self._finish(static and (promised_static or not self.watch.escaped), complete=True)
 

@@ -267,7 +267,14 @@ def _along(x: Tensor, axis: int, index: Tensor, weight: Tensor) -> Tensor:
 
 
 def _taps(node: Node, size: int, out: int, factor: float) -> tuple[Tensor, Tensor]:
-    """Indices and weights (out, k) along one axis."""
+    """Indices and weights (out, k) of the input's elements that make up each of the output's.
+
+    Args:
+        node: The Resize or Upsample.
+        size: Number of the input's elements along the axis.
+        out: Number of the output's.
+        factor: Scale of the axis: about out / size.
+    """
     mode, antialias = node.get("mode", "nearest"), node.get("antialias", 0)
     coordinates = node.get("coordinate_transformation_mode", "half_pixel")
     position = _coordinates(coordinates, size, out, factor)
