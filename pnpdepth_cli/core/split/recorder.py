@@ -122,7 +122,7 @@ class Recorder:
                     call.saved.copied = True
         else:
             self._release_unread()
-        # The recording holds for other arguments if no value reached Python, in front of the cut and behind.
+        # It holds for other arguments if no value reached Python in front of the cut or behind it.
         static = self._replay.recording.static_graph
         self._finish(static and (promised_static or not self.watch.escaped), complete=True)
 
