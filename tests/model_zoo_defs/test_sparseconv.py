@@ -1,8 +1,6 @@
-"""sparseconv: the sparse convolution against a loop, the published layout against a reference."""
+"""sparseconv: the sparse convolution against a loop, and where it is cut."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,30 +9,13 @@ from torch import Tensor
 
 from model_zoo_defs.sparseconv import SparseConv, definitions
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.models.network import load_network
 from tests.model_zoo_defs.cuts import built
-
-KERNELS = (11, 7, 5, 3, 3)
 
 
 def sparse_depth(height: int, width: int, fraction: float = 0.1) -> Tensor:
     generator = torch.Generator().manual_seed(1)
     depth = 1 + 9 * torch.rand(1, 1, height, width, generator=generator)
     return depth * (torch.rand(depth.shape, generator=generator) < fraction)
-
-
-def port() -> dict[str, Tensor]:
-    """Every key and shape of the port's checkpoint, with weights of the size of trained ones."""
-    generator = torch.Generator().manual_seed(2)
-    state, channels = {}, 1
-    for index, kernel in enumerate(KERNELS):
-        name, shape = f"sparse_convs.{index}.sparse_conv", (16, channels, kernel, kernel)
-        state[f"{name}.bias"] = 0.1 * torch.randn(16, generator=generator)
-        state[f"{name}.conv.weight"] = 1 + torch.randn(shape, generator=generator)
-        channels = 16
-    state["mask_conv.weight"] = torch.randn(1, 17, 1, 1, generator=generator)
-    state["mask_conv.bias"] = torch.randn(1, generator=generator)
-    return state
 
 
 def looped(x: Tensor, mask: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -71,46 +52,6 @@ def test_a_layer_is_the_sum_over_known_pixels_over_their_number(kernel: int) -> 
     ]
     assert torch.equal(grown.flatten(), torch.stack(near))
     assert 0 < float(grown.mean()) < 1
-
-
-# ------------------------------------------------------------------ published files
-
-
-def reference(state: dict[str, Tensor], sparse: Tensor) -> Tensor:
-    """Depth before the last convolution's bias, straight from the named tensors, in float64."""
-    x, mask = sparse.double(), (sparse > 0).double()
-    for index, kernel in enumerate(KERNELS):
-        name = f"sparse_convs.{index}.sparse_conv"
-        channels, box = x.shape[1], torch.ones(1, 1, kernel, kernel).double()
-        pixels = F.conv2d(mask, box, padding=kernel // 2)
-        count = pixels * channels
-        weight, bias = state[f"{name}.conv.weight"].double(), state[f"{name}.bias"].double()
-        x = F.conv2d(x * mask, weight, padding=kernel // 2)
-        x = F.relu(torch.where(count > 0, x / count.clamp_min(1), 0.0) + bias.view(1, -1, 1, 1))
-        mask = (pixels > 0).double()
-    last = state["mask_conv.weight"].double()
-    return F.conv2d(torch.cat([x, mask], 1), last)
-
-
-def close(output: Tensor, expected: Tensor) -> None:
-    torch.testing.assert_close(
-        output.double(), expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max())
-    )
-
-
-def test_the_ports_file_loads_whole_and_gives_what_its_tensors_say(tmp_path: Path) -> None:
-    state = port()
-    optimizer = {"state": {}, "param_groups": [{"lr": 0.001, "params": [0, 1]}]}
-    content = {"epoch": 20, "rmse": 1777.0, "arch": "sparseconv", "optimizer": optimizer}
-    torch.save({**content, "state_dict": state}, tmp_path / "best_model.pth.tar")
-    network = load_network("sparseconv", tmp_path / "best_model.pth.tar")
-    own = network.module.state_dict()
-    assert own.keys() == state.keys()
-    assert all(torch.equal(own[name], tensor) for name, tensor in state.items())
-    sparse = sparse_depth(40, 60, 0.01)
-    with torch.no_grad():
-        depth = network.module(sparse)
-    close(depth, reference(state, sparse) + state["mask_conv.bias"])
 
 
 # ------------------------------------------------------------------ the cut
