@@ -44,6 +44,10 @@ class SparsePoints(Generic[A]):
     def __len__(self) -> int:
         return len(self.depth)
 
+    def __repr__(self) -> str:
+        height, width = self.size
+        return f"SparsePoints({width}×{height}, {len(self):,} points)"
+
     def resized(self, height: int, width: int) -> SparsePoints[A]:
         """Returns the points in a frame of the same field of view with height × width pixels.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -58,6 +59,8 @@ def test_arrays_are_refined_as_the_command_refines_files(
     from pnpdepth_cli.cli.main import main
 
     refined = pnp.refine(network, *frame)
+    for shown in (refined, refined.used, refined.validation):
+        assert re.fullmatch(r"\w+\([\w×,. ]+\)", repr(shown))
     files = [str(tmp_path / "rgb.png"), "--sparse", str(tmp_path / "sparse.npy")]
     cv2.imwrite(files[0], np.rint(frame[0][:, :, ::-1] * 255))
     np.save(files[2], frame[1])
@@ -185,6 +188,13 @@ def test_rows_that_are_no_points_of_the_image_are_counted() -> None:
     assert frame.points.depth.tolist() == [3, 4]
     assert [note.split()[1] for note in frame.notes] == ["3", "4"]
     assert frame_of_arrays(rgb, good).notes == ()
+
+
+def test_frames_that_are_no_pairs_are_input_errors(network: pnp.Network, frame: Frame) -> None:
+    with pnp.Refiner(network) as refiner, pytest.raises(pnp.InputError, match="ndarray"):
+        refiner.share_registration([frame[0]])  # type: ignore[list-item]
+    with pytest.raises(pnp.InputError, match="tuple"):
+        pnp.Refiner(network, adapt=[(*frame, "m")])  # type: ignore[list-item]
 
 
 def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -> None:

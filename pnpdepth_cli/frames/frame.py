@@ -64,6 +64,10 @@ class Frame:
     """Files of neighbouring frames, whose points are among `points`."""
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        height, width = self.size
+        return f"Frame({width}×{height}, {len(self.points):,} points)"
+
     @property
     def own(self) -> SparsePoints:
         """All points of the frame's own files, also those held out."""

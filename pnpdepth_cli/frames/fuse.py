@@ -259,8 +259,8 @@ def add_blind_expert(
     without = min(split.error(at[LINEAR]), split.error(expert.at))
     warning = (
         f"warning: the image does not lower the error: at {count:,} validation points it is"
-        f" {split.error(at[name]):.4f} with the image and {without:.4f} without it; see"
-        " --registration"
+        f" {split.error(at[name]):.4f} with the image and {without:.4f} without it; check"
+        " the registration"
     )
     return experts, (warning,)
 

@@ -59,6 +59,11 @@ class Refined:
     registration: ImageRegistration | None = None
     """How the image was moved to the points. None: it was not."""
 
+    def __repr__(self) -> str:
+        height, width = self.after.shape
+        weights = "".join(f", {name} {weight:.2f}" for name, weight in self.weights.items())
+        return f"Refined({width}×{height}, {len(self.used):,} points{weights})"
+
     @property
     def depth(self) -> DepthMap:
         """The refined depth, `after`."""
@@ -77,6 +82,9 @@ class ValidationPoints:
     points: SparsePoints  # the M validation points; none of a frame with few points
     weights: Tensor  # (M,) 0…1, how consistent each is with its neighbours
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self.points):,} points)"
+
     def error(self, at: Tensor) -> float:
         """Returns the weighted mean absolute error in metres of a prediction (M,).
 
@@ -86,7 +94,7 @@ class ValidationPoints:
         return float((error * self.weights).sum() / self.weights.sum())
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Validation(ValidationPoints):
     """Depth at validation points, predicted from the other points.
 

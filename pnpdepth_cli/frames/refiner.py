@@ -86,7 +86,7 @@ class Refiner:
         self._asked = settings or Settings()
         self._uncertainty = uncertainty
         self._register = registration_to_make(registration, self._asked)
-        self._adapt = [frame_of_arrays(*pair, self._register, None) for pair in adapt]
+        self._adapt = [_frame_of_pair(pair, self._register) for pair in adapt]
         self._method: Method | None = None
         self._stack = ExitStack()
         self._lock = threading.Lock()
@@ -144,8 +144,11 @@ class Refiner:
 
         Args:
             frames: Frames (image, sparse) of the sequence, such as 16 spread over it.
+
+        Raises:
+            InputError: A frame is no such pair, or cannot be used.
         """
-        read = [frame_of_arrays(*pair, self._register, None) for pair in frames]
+        read = [_frame_of_pair(pair, self._register) for pair in frames]
         if read:
             with self._lock:
                 self._method_for(read[0]).share_registration(read)
@@ -244,6 +247,12 @@ def frame_of_arrays(
         one_view=register is None,
         notes=tuple(f"sparse: {n:,} points {why} are not used" for why, n in lost.items() if n),
     )
+
+
+def _frame_of_pair(pair: Pair, register: Register) -> Frame:
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise InputError(f"frames are pairs (image, sparse), not {type(pair).__name__}")
+    return frame_of_arrays(*pair, register)
 
 
 def _rgb(image: ArrayLike) -> NDArray[np.float32]:

@@ -72,7 +72,7 @@ class AlignedDepth:
             f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there; left"
             f" {lost:,} of {len(seen):,} sparse points there out of the loss"
         )
-        doubt = "; are the network's weights and input range (--normalise) right?"
+        doubt = "; are the network's weights and input range (normalise) right?"
         return (f"warning: {note}{doubt}" if lost > _MOST_LOST * len(seen) else note,)
 
     def _notes(self, fit: Alignment, raw: Tensor) -> tuple[str, ...]:
@@ -98,7 +98,8 @@ class AlignedDepth:
             notes.append(
                 f"warning: network {self._network.definition.name!r} says nothing about this scene:"
                 f" aligned, it is off by {fit.misfit:.1%} at the points, their median depth by"
-                f" {self._misfit_of_median():.1%}; check the network, --normalise and the image"
+                f" {self._misfit_of_median():.1%}; check the network, its input range"
+                " (normalise) and the image"
             )
         return tuple(notes)
 
@@ -112,6 +113,6 @@ class AlignedDepth:
         if ratio > 0 and abs(math.log(ratio)) < math.log(_OFF):
             return ()
         return (
-            f"warning: the prediction is {ratio:.3g} × the sparse depth at the median; --align auto"
+            f"warning: the prediction is {ratio:.3g} × the sparse depth at the median; align auto"
             " fits its scale (and shift) to the points",
         )

@@ -62,7 +62,7 @@ class CutPoint:
             near = difflib.get_close_matches(name.module, filter(None, modules), n=3, cutoff=0.5)
             hint = f"did you mean {', '.join(near)}?"
             if not near:
-                hint = "`pnpdepth layers --all` lists all of them"
+                hint = "its named_modules() are its layers; `pnpdepth layers --all` lists them"
             raise LayerError(f"layer {name.module!r} is not in this network; {hint}")
         return cls(
             layer=layer,
