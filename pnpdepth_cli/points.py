@@ -82,6 +82,14 @@ class SparsePoints(Generic[A]):
         xy, depth = (torch.as_tensor(array, device=device) for array in (self.xy, self.depth))
         return SparsePoints(xy=xy, depth=depth, size=self.size, dropped=self.dropped)
 
+    def known_in(self: SparsePoints[Tensor], depth: Tensor) -> Tensor:
+        """Returns (N,) bool, whether all pixels that a point is sampled from are known.
+
+        Args:
+            depth: (h, w), 0 = unknown.
+        """
+        return self.sample((depth > 0).float()) > 0.999  # of products of weights
+
     def sample(self: SparsePoints[Tensor], dense: Tensor) -> Tensor:
         """Returns the values (N,) of a dense map at the points, differentiable in `dense`.
 

@@ -126,7 +126,7 @@ def print_refinement(record: FrameRecord) -> None:
     console = _Console(stderr=True, highlight=False)
     if record.improved_fraction is not None:
         where = "held-out points" if HELD_OUT in errors else "points used"
-        where = "pixels with ground truth" if GT in errors else where
+        where = "scored pixels" if GT in errors else where
         console.print(f"improved: {record.improved_fraction:.1%} of the {where}")
     # Updates, times and files.
     parts = [", ".join(f"{stage} {spent:.2f} s" for stage, spent in record.seconds.items())]

@@ -125,7 +125,7 @@ def _stages_table(record: FrameRecord) -> Table:
     scored = "too few points to validate the result at some"
     if GT in errors:
         keys, stages = ["rmse", "mae", "mre", "delta1"], errors[GT]
-        scored = _describe_pixels(stages[LINEAR])
+        scored = _describe_pixels(stages[AFTER])
     elif stages:
         scored = f"at {stages[LINEAR]['points']:,} validation points, which the rows did not get"
     shown = [stage for stage in _STAGES if stage in stages]

@@ -181,8 +181,8 @@ def improvement(
 ) -> tuple[float, FigureRecord]:
     """Writes a PNG of where |depth - truth| fell and rose, as figure 4(d) of the paper.
 
-    Equal errors are neither better nor worse. The map has a pixel for each known one of the truth,
-    or a disc for each point.
+    Equal errors are neither better nor worse. The map has a pixel for each one where the truth and
+    the refined depth are known, or a disc for each point.
 
     Args:
         before: (H, W), or (N,) at the points, before refinement.
@@ -200,7 +200,8 @@ def improvement(
     Raises:
         OutputError: The file cannot be written.
     """
-    known = np.isfinite(truth) & (truth > 0)
+    has_truth = np.isfinite(truth) & (truth > 0)
+    known = has_truth & (after > 0)
     gain = _gain(before[known], after[known], truth[known])
     grey = None if image is None else grey_of(image)
     if xy is None:
@@ -217,7 +218,7 @@ def improvement(
         noun = "held-out points" if held_out else "points used"
         remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
     panel = Panel(title="Change of error", pixels=pixels, remark=remark)
-    unknown = "" if known.all() else "no ground truth"
+    unknown = "" if known.all() else "unknown" if (has_truth > known).any() else "no ground truth"
     amount = f"{strongest:.3g} {unit}"
     return save_gain_figure(path, panel, gain, amount=amount, noun=noun, unknown=unknown)
 

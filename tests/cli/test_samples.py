@@ -108,6 +108,7 @@ def test_depth_that_no_points_support_is_said_and_written_as_zero_if_asked(
     assert errors["after"]["mae"] == pytest.approx(np.abs(depth - truth)[known].mean(), abs=0.01)
     assert errors["after"]["coverage"] == pytest.approx(known.sum() / (truth > 0).sum())
     assert errors["linear"]["mae"] < kept["errors"]["ground_truth"]["linear"]["mae"]
+    assert f"of {known.sum():,} pixels improved" in zero["figures"]["improvement"]["footer"]
     # Without a mask, a note gives the part that lies outside of the scan.
     assert any("--unknown zero" in note for note in result(capsys, f"refine {scan}")["notes"])
 

@@ -30,6 +30,7 @@ from pnpdepth_cli.io.visualisation import (
     sigma_preview,
     write_mask,
 )
+from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels
 
@@ -80,7 +81,9 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
     if request.outputs.unknown == "zero" and frame.valid is not None:
         return replace(frame, after=np.where(frame.valid, frame.after, np.float32(0)))
     source = inputs.sources.get("sparse")
-    if frame.valid is not None or source is None or source.calibration is None:
+    if frame.valid is not None or source is None:
+        return frame
+    if not (source.calibration or scan_pattern(frame.used.xy, frame.used.size).has_scan_lines):
         return frame
     outside = 1 - float(in_hull(frame.used).double().mean())
     note = (
@@ -166,6 +169,7 @@ def _write_improvement(
     if inputs.gt is not None:
         return improvement(frame.before, frame.after, inputs.gt, path, image=image)
     points = frame.held_out if len(frame.held_out) else frame.used
+    points = points.select(points.known_in(torch.from_numpy(frame.after)))
     before, after = (
         points.sample(torch.from_numpy(depth)).numpy() for depth in (frame.before, frame.after)
     )

@@ -283,7 +283,7 @@ def _at_points(points: SparsePoints, maps: dict[str, DepthMap]) -> Stages:
     stages: Stages = {}
     for name, depth in maps.items():
         predicted = points.sample(torch.from_numpy(depth))
-        error = (predicted - points.depth)[predicted > 0].double()
+        error = (predicted - points.depth)[points.known_in(torch.from_numpy(depth))].double()
         if not len(error):
             continue
         mae, rmse = float(error.abs().mean()), float(error.square().mean().sqrt())
