@@ -111,8 +111,10 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
     counts = sum((Counter(summary.counts) for summary in summaries), Counter[str]())
     bad = [f"{counts[kind]:,} {kind}" for kind in ("failed", "diverged") if counts[kind]]
     if bad:
+        from pnpdepth_cli.commands.tables import count_of
+
         raise FramesFailedError(
-            f"{' and '.join(bad)} of {counts['frames']:,} frames; the reasons are in"
+            f"{' and '.join(bad)} of {count_of(counts['frames'], 'frame')}; the reasons are in"
             f" {values['output']}{'/*' if vary else ''}/summary.csv; run the same command to retry"
             " the failed frames"
         )
@@ -145,6 +147,7 @@ def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSumma
     """Returns the batch's summary, which it prints, and whether the batch was stopped."""
     from pnpdepth_cli.cli.printing import print_batch
     from pnpdepth_cli.commands.batch.run_batch import run_batch
+    from pnpdepth_cli.commands.tables import count_of
 
     with progress_bar("batch", "frame", stays=True) as show:
         progress = BatchProgress(show)
@@ -160,7 +163,7 @@ def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSumma
         say(f"wrote {request.html / 'index.html'}")
     stopped = progress.done < progress.to_do
     if stopped:
-        count = f"{progress.done:,} of {progress.to_do:,} frames"
+        count = f"{progress.done:,} of {count_of(progress.to_do, 'frame')}"
         say(f"stopped after {count}; run the same command to continue")
     return summary, stopped
 

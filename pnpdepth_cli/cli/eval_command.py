@@ -101,5 +101,6 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     if reasons := evaluation.describe_unscored():
         out, of = len(evaluation.frames) - len(evaluation.scored), len(evaluation.frames)
         raise FramesFailedError(
-            f"{out:,} of {of:,} frames were not scored ({reasons}); the means are over the others"
+            f"{out:,} of {of:,} frames were not scored ({reasons}); means and coverage are over the"
+            " others"
         )

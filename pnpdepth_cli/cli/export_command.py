@@ -35,10 +35,11 @@ def export(**values: Any) -> None:
     (`pnpdepth batch --layout colmap`). OUTPUT may be the project itself.
     """
     from pnpdepth_cli.commands.exports import export_results
+    from pnpdepth_cli.commands.tables import count_of
 
     with progress_bar("export", "frame") as show:
         record = export_results(**values, show=show)
     for note in record["notes"]:
         click.echo(note, err=True)
-    frames = f"{record['frames']:,} frame{'' if record['frames'] == 1 else 's'}"
+    frames = count_of(record["frames"], "frame")
     click.echo(f"wrote {frames} in {record['unit']}: {values['output']}")

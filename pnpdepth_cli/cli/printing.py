@@ -23,7 +23,7 @@ from pnpdepth_cli.commands.error_tables import (
     means_table,
     refinement_table,
 )
-from pnpdepth_cli.commands.tables import Cell, Table, write_text
+from pnpdepth_cli.commands.tables import Cell, Table, count_of, write_text
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.stages import GT, HELD_OUT
@@ -148,7 +148,7 @@ def print_batch(summary: BatchSummary) -> None:
     if has_baselines(errors):
         print_table(baselines_table(errors, summary.unit), err=True)
     # Counts of frames.
-    parts = [f"{counts['done']:,} of {counts['frames']:,} frames done"]
+    parts = [f"{counts['done']:,} of {count_of(counts['frames'], 'frame')} done"]
     for kind in ("diverged", "failed", "pending", "with_warnings"):
         if counts[kind]:
             parts.append(f"{counts[kind]:,} {kind.replace('_', ' ')}")
@@ -159,7 +159,7 @@ def print_batch(summary: BatchSummary) -> None:
     # Warnings of several frames, each once, weights and files.
     for each in summary.warnings:
         names = ", ".join([*each.first, *["…"] * (each.frames > len(each.first))])
-        count = "1 frame" if each.frames == 1 else f"{each.frames:,} frames"
+        count = count_of(each.frames, "frame")
         lines.append(f"warning in {count} ({names}): {each.note.removeprefix('warning: ')}")
     if summary.weights:
         lines.append(f"mean weights in the result: {mean_weights_text(summary.weights)}")

@@ -72,8 +72,8 @@ def error_table(
             name = _title(key) if basis == GT else start + _title(key)
             values = [side.get(key) for side in sides]
             before, after, linear = (format_error(key, value, unit) for value in values)
-            if basis == USED:  # a change there proves nothing
-                rows.append([name, before, after, "", "–", ""])
+            if basis == USED:  # which interpolation meets, and where a change proves nothing
+                rows.append([name, before, after, "", "", ""])
             else:
                 changes = [change(key, beside, values[1]) for beside in (values[0], values[2])]
                 rows.append([name, before, after, changes[0], linear, changes[1]])

@@ -92,6 +92,11 @@ def _in_latex(cell: str) -> str:
     return rf"\textbf{{{text}}}" if getattr(cell, "style", "") == "bold" else text
 
 
+def count_of(number: int, noun: str) -> str:
+    """Returns a text such as `1 frame` or `2,000 frames`."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def write_text(path: Path, text: str) -> None:
     """Writes the text whole or not at all; characters of a name that is not UTF-8 as escapes."""
     with atomic_path(path) as temporary:

@@ -60,7 +60,7 @@ def test_csv_has_a_line_for_each_frame_and_replaces_nothing_unasked(frames: Path
     assert code_of("eval", "out", "gt", "--csv", "scores.csv") == 7
     text = Path("scores.csv").read_bytes().decode()
     a, b, c, *_ = csv.DictReader(io.StringIO(text, newline=""))
-    assert (a["name"], a["rmse"], a["coverage"]) == ("a", "", "0.0")
+    assert (a["name"], a["rmse"], a["coverage"]) == ("a", "", "")
     assert a["error"]
     assert c["name"] == "c\nd"
     assert float(b["mre"]) == pytest.approx(0.1, rel=1e-5)

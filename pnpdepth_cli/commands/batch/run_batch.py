@@ -16,6 +16,7 @@ from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
 from pnpdepth_cli.commands.batch.sequence import note_of_poses, sequences_of
 from pnpdepth_cli.commands.batch.summary import BatchSummary, write_summary
 from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.tables import count_of
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder
@@ -156,7 +157,7 @@ def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
     frames, unmatched = found.frames, found.unmatched
     with_gt = sum(frame.gt is not None for frame in frames)
     guessed = " (guessed; --layout names another)" if request.layout is None else ""
-    count = _count(len(frames))
+    count = count_of(len(frames), "frame")
     yield f"layout: {found.layout}{guessed}: {count}, {with_gt:,} with ground truth"
     cut = sorted({str(frame.part) for frame in frames if frame.part != WHOLE})
     if request.protocol is not None and (note := find_protocol(request.protocol).note):
@@ -166,7 +167,7 @@ def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
     if poses := note_of_poses(frames):
         yield poses
     if len(found.chosen) < len(frames):
-        yield f"chosen: {_count(len(found.chosen))} of them"
+        yield f"chosen: {count_of(len(found.chosen), 'frame')} of them"
     for frame, why in found.refused:
         yield f"failed: {frame.name}: {why}"
     for each in unmatched[:_MAX_LISTED]:
@@ -178,12 +179,8 @@ def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
 def _plan(reasons: Sequence[str | None]) -> str:
     """How many of the frames are done, and why others are to do, given the reason of each."""
     kinds = Counter(reason.split(":")[0] for reason in reasons if reason)
-    frames, to_do = _count(len(reasons)), kinds.total()
+    frames, to_do = count_of(len(reasons), "frame"), kinds.total()
     if not to_do:
         return f"{frames}, all of them done already"
     counts = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
     return f"{frames}: {len(reasons) - to_do:,} done already, {to_do:,} to do ({counts})"
-
-
-def _count(frames: int) -> str:
-    return f"{frames:,} frame{'' if frames == 1 else 's'}"

@@ -23,7 +23,7 @@ from pnpdepth_cli.commands.statistics import (
     interval,
     swap_p_values,
 )
-from pnpdepth_cli.commands.tables import Cell, Style, Table
+from pnpdepth_cli.commands.tables import Cell, Style, Table, count_of
 from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
@@ -363,7 +363,7 @@ def comparison_table(comparison: Comparison) -> Table:
     swaps = "all" if comparison.exact_p_values else f"{PERMUTATIONS:,} random"
     return Table(
         title=(
-            f"{len(comparison.frames):,} shared frames; gains in per cent of the error of"
+            f"{count_of(len(comparison.frames), 'shared frame')}; gains in per cent of the error of"
             f" {first.name}, positive is better; intervals (95 %) and p-values, from {swaps}"
             f" swaps, {_describe_tests(comparison)}"
         ),
@@ -391,7 +391,7 @@ def methods_table(comparison: Comparison) -> Table:
             row.append(Cell(text + stars, "bold" if is_best else ""))
     return Table(
         title=(
-            f"means over {len(comparison.frames):,} frames, the best in bold; *, **, ***:"
+            f"means over {count_of(len(comparison.frames), 'frame')}, the best in bold; *, **, ***:"
             f" differs from {runs[0].name} with p < 0.05, 0.01, 0.001 {_describe_tests(comparison)}"
         ),
         columns=["", *comparison.measures],
@@ -401,6 +401,6 @@ def methods_table(comparison: Comparison) -> Table:
 
 def _describe_tests(comparison: Comparison) -> str:
     others, measures = len(comparison.runs) - 1, len(comparison.measures)
-    tests = f"{measures} measures" + (f" of {others} runs" if others > 1 else "")
+    tests = count_of(measures, "measure") + (f" of {others} runs" if others > 1 else "")
     tested = f"over {comparison.clusters.describe()}, p adjusted for {tests} (Holm)"
     return tested + WITHOUT_SPARSE * bool(comparison.scoring.get("exclude_sparse"))

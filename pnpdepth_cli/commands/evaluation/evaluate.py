@@ -17,14 +17,21 @@ from pnpdepth_cli.commands.evaluation.scoring import FILES, is_missing, score_pa
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.commands.statistics import LEVEL, MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.stopwatch import versions
-from pnpdepth_cli.commands.tables import Table
+from pnpdepth_cli.commands.tables import Table, count_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.text_files import plain
-from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, FrameMeans, Measure, choose_measures
+from pnpdepth_cli.measures import (
+    COVERAGE,
+    OF_SIGMA,
+    FrameMeans,
+    Measure,
+    by_depth,
+    choose_measures,
+)
 from pnpdepth_cli.points import METRES
 
 _LISTED = 3
@@ -59,14 +66,26 @@ class Evaluation:
 
     @property
     def pixels(self) -> int:
-        """Number of scored pixels of all frames."""
-        return int(sum(_numbers(self.frames, "pixels")))
+        """Number of scored pixels of all frames in the means."""
+        return int(sum(_numbers(self.scored, "pixels")))
 
     @property
     def coverage(self) -> float:
-        """Fraction of all ground truth, of frames without prediction too, that has a prediction."""
-        known = sum(_numbers(self.frames, "known"))
-        return sum(_numbers(self.frames, "predicted")) / known if known else math.nan
+        """Fraction of the ground truth of the frames in the means that has a prediction."""
+        known = sum(_numbers(self.scored, "known"))
+        return sum(_numbers(self.scored, "predicted")) / known if known else math.nan
+
+    def chosen(self, keys: Sequence[str] | None) -> tuple[Measure, ...]:
+        """Returns the measures with these keys, and those of their pixels by depth; all for None.
+
+        Raises:
+            UsageError: If one is unknown.
+        """
+        if keys is not None and self.request.depth_limits is not None:
+            parts = (measure.key for measure in by_depth(*self.request.depth_limits))
+            own = (key for key in parts if key.rpartition("_")[0] in keys)
+            keys = [*dict.fromkeys((*keys, *own))]
+        return choose_measures(self.measures, keys)
 
     def describe(self) -> str:
         """Returns the protocol and every scale of files that was assumed, on one line."""
@@ -202,7 +221,8 @@ def _notes_on_files(rows: Sequence[FrameRecord]) -> Iterator[str]:
             yield f"{side}: {some_names(texts)}"
     # Frames that are in no mean.
     if missing := [row.name for row in rows if is_missing(row)]:
-        yield f"warning: {len(missing):,} frames have no prediction: {some_names(missing)}"
+        count = count_of(len(missing), "frame")
+        yield f"warning: {count} without prediction: {some_names(missing)}"
     faulty = [row for row in rows if row.status == "failed" and not is_missing(row)]
     for row in faulty[:_LISTED]:
         yield f"warning: frame {one_line(row.name)} was not scored: {row.message}"
@@ -274,15 +294,18 @@ def _notes_on_scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
 
 def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
-    count, intervals = len(evaluation.scored), evaluation.interval
-    title = f"Means over {count:,} frame{'s' * (count != 1)}, {evaluation.pixels:,} pixels"
+    intervals, all_frames = evaluation.interval, count_of(len(evaluation.frames), "frame")
+    title, pixels = f"Means over {all_frames}", count_of(evaluation.pixels, "pixel")
+    if reasons := evaluation.describe_unscored():
+        title = f"Means and coverage over {len(evaluation.scored):,} of {all_frames} ({reasons})"
+    title += f", {pixels}"
     columns = ["", "mean"]
     if intervals is not None:
         columns.append("95 %")
         title += f"; 95 % interval over {evaluation.clusters.describe()}"
     rows = []
     mean = evaluation.mean | {COVERAGE.key: evaluation.coverage}
-    for measure in (*choose_measures(evaluation.measures, keys), COVERAGE):
+    for measure in (*evaluation.chosen(keys), COVERAGE):
         ends = [] if intervals is None else [intervals.get(measure.key, ())]
         texts = (" … ".join(map(measure.text, each)) for each in ends)
         rows.append([measure.heading, measure.text(mean[measure.key]), *texts])
@@ -292,7 +315,7 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
 
 def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
     """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
-    measures = choose_measures(evaluation.measures, keys)
+    measures = evaluation.chosen(keys)
     rows = []
     for frame in evaluation.frames:
         files, scores = (frame.inputs.get(name) for name in FILES), plain(scores_of(frame))

@@ -37,6 +37,7 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
     try:
         import matplotlib as mpl
         from matplotlib.figure import Figure
+        from matplotlib.lines import Line2D
     except ImportError:
         raise UsageError("--plot needs matplotlib: pip install 'pnpdepth[plot]'") from None
     # where each value lies, and the runs of each line in this order
@@ -59,15 +60,17 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
                 before, after = np.array(means, np.float64).T * measure.shown_factor
                 improved = gain(before, after, np.array(measure.sign, np.float64))
                 above.plot(x, before, f"C{number}--", linewidth=0.8)
-                above.plot(x, after, f"C{number}o-", label=label)
+                above.plot(x, after, f"C{number}o-", label=label or "after refinement")
                 below.plot(x, improved, f"C{number}o-")
             above.set_ylabel(measure.heading)
             below.set(ylabel=f"improvement of {measure.title} [%]", xlabel=across)
             below.set_xscale("log" if min(positions.values()) > 0 else "linear")
             below.set_xticks([*positions.values()], [*positions])
             below.set_xticks([], minor=True)
-        if any(lines):
-            figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center")
+        handles, labels = panels[0][0].get_legend_handles_labels()
+        handles.append(Line2D([], [], color="black", linestyle="--", linewidth=0.8))
+        labels.append("before refinement")
+        figure.legend(handles, labels, loc="outside lower center")
         with atomic_path(path) as temporary:
             metadata: dict[str, Any] = {_CHANGING[path.suffix]: None}
             figure.savefig(temporary, format=path.suffix[1:], metadata=metadata)

@@ -94,6 +94,8 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
         unit=pair.record.unit,
         inputs=inputs,
     )
+    if result is None:
+        return replace(record, status="failed", message="there is no prediction")
     try:
         frame = load_frame(pair, request)
     except PnpDepthError as error:
@@ -124,6 +126,7 @@ def scores_of(record: FrameRecord) -> Scores:
 
 def _score(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> tuple[Scores, str | None]:
     """The scores of a frame, and why they are counts alone or nothing."""
+    assert pair.result is not None
     depth, gt = frame.depth, frame.gt
     known, both = gt > 0, (gt > 0) & (depth > 0)
     if not known.any():
@@ -140,8 +143,6 @@ def _score(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> tuple[S
         "factor": factor,
         "shift": shift,
     }
-    if pair.result is None:
-        return counts, "there is no prediction"
     # Measures of sums over pixels, then those of whole images.
     of_sigma: Scores = {}
     if frame.sigma is not None:
@@ -198,7 +199,7 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
         predicted=np.zeros(gt.shape, bool),
         notes=notes,
     )
-    return loaded if pair.result is None else _with_prediction(loaded, pair, request)
+    return _with_prediction(loaded, pair, request)
 
 
 def _with_prediction(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> LoadedFrame:

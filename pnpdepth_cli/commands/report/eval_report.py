@@ -27,7 +27,7 @@ from pnpdepth_cli.io.report import (
     write_report,
 )
 from pnpdepth_cli.io.visualisation import error_map
-from pnpdepth_cli.measures import COVERAGE, Measure, choose_measures
+from pnpdepth_cli.measures import COVERAGE, Measure
 
 
 def check_eval_report(folder: Path, inputs: list[Path], *, overwrite: bool) -> None:
@@ -54,8 +54,8 @@ def write_eval_report(
         OutputError: If the report cannot be written; then the folder is as it was before.
     """
     # The columns of the frames, and what stands above them.
-    request, measures = evaluation.request, choose_measures(evaluation.measures, keys)
-    columns = [replace(each, main=each.main or keys is not None) for each in measures]
+    request, measures = evaluation.request, evaluation.chosen(keys)
+    columns = [replace(each, main=each.main or each.key in (keys or ())) for each in measures]
     columns.append(replace(COVERAGE, main=True))
     fill = " (filled in)" if request.is_devkit else ""
     head = Head(

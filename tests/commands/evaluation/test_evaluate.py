@@ -13,7 +13,7 @@ import pytest
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
-from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate, worst
+from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate, means_table, worst
 from pnpdepth_cli.commands.evaluation.scoring import is_missing, scores_of
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError
@@ -54,12 +54,22 @@ def test_each_image_counts_alike(two: Path) -> None:
     assert any(" 1 pixels (25.00%) of the ground truth have no pred" in n for n in per_image.notes)
 
 
-def test_a_frame_without_prediction_is_counted_and_lowers_the_coverage(two: Path) -> None:
+@pytest.mark.parametrize(("exclude_sparse", "pixels", "known"), [(False, 3, 4), (True, 2, 2)])
+def test_a_frame_without_prediction_is_counted_and_in_neither_means_nor_coverage(
+    two: Path, exclude_sparse: bool, pixels: int, known: int
+) -> None:
     depth_file(two / "gt" / "c.npy", [[1, 1]])
-    result = scored(two)
+    sparse = FileRecord(path=str(depth_file(two / "sparse.npy", [[0, 9]])))
+    for name in ("a", "ü b"):
+        FrameRecord(inputs={"sparse": sparse}).write(two / "out" / f"{name}.json")
+    result = scored(two, exclude_sparse=exclude_sparse)
     assert [frame.name for frame in result.frames if is_missing(frame)] == ["c"]
-    assert (result.mean["rmse"], result.coverage) == (2, 3 / 6)
+    assert (result.mean["rmse"], result.coverage) == (2, pixels / known)
     assert result.describe_unscored() == "1 without prediction"
+    assert result.describe_unscored() in means_table(result, None).title
+    counts = {"frames": 3, "scored": 2, "missing": 1}
+    of_pixels = {"pixels": pixels, "coverage": pixels / known}
+    assert result.to_json()["counts"] == counts | of_pixels
 
 
 FAULTS = [
@@ -366,3 +376,5 @@ def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
     assert math.isnan(second)  # a wall in 2 m has no far pixels
     assert more.mean["rmse_far"] == pytest.approx((first + third) / 2)
     assert scores_of(more.frames[1])["boundary_f1"] == 0
+    keys = [measure.key for measure in more.chosen(("mae", "irmse", "mae_far"))]
+    assert keys == ["mae", "irmse", "mae_far", "mae_near", "mae_middle"]

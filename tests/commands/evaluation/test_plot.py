@@ -52,6 +52,9 @@ def test_numbers_lie_along_the_axis_and_names_make_lines(
     assert lines["loss=y"] == [[20, 0.5], [100, 1.25]]
     gains = [line.get_ydata().tolist() for line in below.get_lines()]
     assert gains == [[25, 50], [50, -25]]
+    (legend,) = figures[0].legends
+    named = [text.get_text() for text in legend.get_texts()]
+    assert named == ["loss=x", "loss=y", "before refinement"]
 
 
 def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path, figures: list[Any]) -> None:
