@@ -158,6 +158,11 @@ def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -
             f"{without[0]} has no pose in its record, but others have; give --poses for all, or"
             " refine it again as the others"
         )
+    if len(without) > 1:
+        notes.append(
+            f"warning: {len(without):,} frames without poses: their points lie on each other; give"
+            " --poses"
+        )
     return poses
 
 

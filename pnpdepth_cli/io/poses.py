@@ -34,6 +34,8 @@ POSES_FILE = "poses.txt"
 PACKETS = "oxts/data"
 """Folder of the packets in a drive."""
 IMU_CALIBRATION = "calib_imu_to_velo.txt"
+_BAG_TIME = re.compile(r"(?<!\d)(0|[1-9]\d*)_(\d{6})$")
+"""End of the names that `pnpdepth frames` gives, seconds and microseconds."""
 _EARTH_RADIUS_M = 6378137.0
 _FIELDS = 30
 
@@ -59,9 +61,9 @@ def poses_of_frames(
     """Returns the poses (N, 3, 4) of the frames of these names, and how they were read.
 
     Those of a `transforms.json` are joined by the names of its images. Else, names that are times
-    in seconds take the row of the nearest time, at most LONGEST_GAP_S away, as evo joins
-    trajectories. Else there is a row for each frame, in their order; or, with more rows than
-    frames, the number in a name is the number of its row from 0.
+    in seconds (12.5, or 12_500000 as `pnpdepth frames` writes it) take the row of the nearest time,
+    at most LONGEST_GAP_S away, as evo joins trajectories. Else there is a row for each frame, in
+    their order; or, with more rows than frames, the number in a name is that of its row from 0.
 
     Args:
         path: A file of rows, or a transforms.json.
@@ -115,16 +117,18 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
 def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
     """The poses (N, 3, 4) of the frames of these names in a file of rows, and how they join."""
     rows, poses = _rows(path)
-    ends = [re.search(r"\d+(?:\.\d+)?$", name) for name in names]
-    numbers = np.array([float(end[0]) for end in ends if end is not None])
+    dotted = [_BAG_TIME.sub(r"\1.\2", name) for name in names]
+    times, numbers = _last_numbers(dotted), _last_numbers(names)
     # Names that are times take the row of the nearest time.
-    if len(numbers) == len(names) and rows.shape[1] == _TUM_COLUMNS:
+    if len(times) == len(names) and rows.shape[1] == _TUM_COLUMNS:
         order = np.argsort(rows[:, 0])
-        after = np.searchsorted(rows[order, 0], numbers).clip(1, max(1, len(rows) - 1))
+        after = np.searchsorted(rows[order, 0], times).clip(1, max(1, len(rows) - 1))
         pair = order[np.stack([after - 1, np.minimum(after, len(rows) - 1)])]
-        gaps = np.abs(rows[pair, 0] - numbers)
+        gaps = np.abs(rows[pair, 0] - times)
         nearest = np.where(gaps[0] <= gaps[1], *pair)
-        if (largest := float(gaps.min(axis=0).max())) <= LONGEST_GAP_S:
+        # frames 1_000001 and 1_000002 may be of sequence 1 as well
+        are_times = dotted == list(names) or len({*nearest}) == len({*times})
+        if are_times and (largest := float(gaps.min(axis=0).max())) <= LONGEST_GAP_S:
             return poses[nearest], f"joined by time, at most {1000 * largest:.0f} ms apart"
     # Else there is a row for each, or they are numbers of rows.
     if len(rows) == len(names):
@@ -133,6 +137,12 @@ def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
         return poses[numbers.astype(int)], "the number in a name is that of its row, from 0"
     fact = f"{path} has {len(rows)} poses for {len(names)} frames"
     raise InputError(f"{fact}; give one for each, in their order, or times that are their names")
+
+
+def _last_numbers(names: Sequence[str]) -> Floats:
+    """The numbers at the end of the names that end in one."""
+    ends = (re.search(r"\d+(?:\.\d+)?$", name) for name in names)
+    return np.array([float(end[0]) for end in ends if end is not None])
 
 
 def _rows(path: Path) -> tuple[Floats, Floats]:
@@ -198,6 +208,7 @@ def read_trajectory(path: Path) -> Trajectory:
 def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) -> Floats:
     """Returns the poses (N, 3, 4) of a drive's camera, from its coordinates to the world's, metres.
 
+    The world is x east, y north, z up, with the inertial system at its origin in the first packet.
     The calibration is the folder with KITTI's raw calibrations.
     """
     of_scanner = read_calibration(calibration, camera).scanner
@@ -207,7 +218,9 @@ def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) 
     from_camera = np.linalg.inv(of_scanner.square() @ of_imu.square())
     rows = [_packet(path) for path in packets]
     scale = math.cos(math.radians(rows[0][0]))
-    return np.stack([(_pose_of_packet(row, scale) @ from_camera)[:3] for row in rows])
+    poses = np.stack([_pose_of_packet(row, scale) for row in rows])
+    poses[:, :3, 3] -= poses[0, :3, 3]  # clouds have no digits for thousands of kilometres
+    return (poses @ from_camera)[:, :3]
 
 
 def _packet(path: Path) -> Floats:

@@ -94,8 +94,9 @@ class BatchRequest:
     )
     poses: Path | None = option(
         None,
-        "Camera poses of the frames: TUM rows are joined by time, KITTI rows by order,"
-        " transforms.json by name.  [default: the layout's or poses.txt, else estimated]",
+        "Camera poses of the frames, for --accumulate and the records, from which `cloud` takes"
+        " them: TUM rows are joined by time, KITTI rows by order, transforms.json by name."
+        "  [default: the layout's or poses.txt]",
         metavar="FILE",
     )
     pose_kind: str | None = option(
@@ -122,8 +123,6 @@ class BatchRequest:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
         if self.pose_kind is not None and self.poses is None:
             raise UsageError("--pose-kind is for --poses")
-        if self.poses is not None and not self.accumulate:
-            raise UsageError("--poses is for --accumulate; give --accumulate 2, say")
         choose_measures(MEASURES, self.columns)
 
     @property

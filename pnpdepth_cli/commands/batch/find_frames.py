@@ -10,13 +10,19 @@ from fnmatch import fnmatch, fnmatchcase
 from pathlib import Path
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.sequence import with_neighbours
+from pnpdepth_cli.commands.batch.sequence import (
+    ESTIMATED,
+    known_poses,
+    note_of_poses,
+    with_neighbours,
+)
 from pnpdepth_cli.commands.refinement.output_files import outputs_in
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
     Unmatched,
+    as_pose,
     file_of,
     name_problem,
 )
@@ -45,6 +51,8 @@ class BatchFrames:
     refused: Sequence[tuple[FrameFiles, str]]
     """Frames whose results would have no files of their own, and why."""
     unmatched: tuple[Unmatched, ...]
+    poses: str | None
+    """Where the poses of the frames are from, as a line; None without poses."""
 
 
 def unpack(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
@@ -97,12 +105,8 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f"{source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
         )
-    # Neighbours, of all frames.
-    if request.accumulate:
-        poses, beside = request.poses, source / POSES_FILE  # as `pnpdepth frames` writes it
-        if poses is None and not any(f.pose or f.oxts for f in frames) and beside.is_file():
-            poses = beside
-        frames = with_neighbours(frames, request.accumulate, poses, request.pose_kind)
+    # Poses and neighbours, of all frames.
+    frames, poses = _with_poses(request, frames)
     # The part of the frames that this run refines.
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
@@ -116,7 +120,30 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         chosen=chosen[:: request.every][: request.limit][number - 1 :: of],
         refused=refused,
         unmatched=tuple(unmatched),
+        poses=poses,
     )
+
+
+def _with_poses(
+    request: BatchRequest, frames: list[FrameFiles]
+) -> tuple[list[FrameFiles], str | None]:
+    """The frames with their poses and neighbours, and where the poses are from, as a line."""
+    path, beside = request.poses, request.source / POSES_FILE  # as `pnpdepth frames` writes it
+    if path is None and not any(f.pose or f.oxts for f in frames) and beside.is_file():
+        path = beside
+    try:
+        known = known_poses(frames, path, request.pose_kind)
+    except InputError as error:
+        if request.poses is not None or request.accumulate:
+            raise
+        return frames, f"note: {error}; records get no poses"
+    frames = [
+        frame if pose is None else replace(frame, pose=as_pose(pose[0]))
+        for frame, pose in zip(frames, known, strict=True)
+    ]
+    if request.accumulate:
+        return with_neighbours(frames, request.accumulate, known), note_of_poses(known, ESTIMATED)
+    return frames, note_of_poses(known, "unknown") if any(known) else None
 
 
 def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:

@@ -122,6 +122,8 @@ class Records:
     def _digest(self, request: RefineRequest) -> str:
         """The SHA-256 of the settings that decide the frame's result."""
         own = _settings_of(request, "files", "reading")  # by which frames of a batch differ
+        if request.files.pose is not None:  # to a micrometre, as processors round differently
+            own["pose"] = [[round(value, 6) + 0.0 for value in row] for row in request.files.pose]
         text = json.dumps(self.settings | own, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 

@@ -13,7 +13,7 @@ from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames, source_files
 from pnpdepth_cli.commands.batch.ray_workers import RayWorkers, ray_workers_of, refine_on_workers
 from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
-from pnpdepth_cli.commands.batch.sequence import note_of_poses, sequences_of
+from pnpdepth_cli.commands.batch.sequence import sequences_of
 from pnpdepth_cli.commands.batch.summary import BatchSummary, write_summary
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.tables import count_of
@@ -164,8 +164,8 @@ def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
         yield f"protocol {request.protocol}: {note}"
     elif cut and request.protocol is None:
         yield f"frames: {', '.join(cut)}; --protocol whole keeps all of them"
-    if poses := note_of_poses(frames):
-        yield poses
+    if found.poses is not None:
+        yield found.poses
     if len(found.chosen) < len(frames):
         yield f"chosen: {count_of(len(found.chosen), 'frame')} of them"
     for frame, why in found.refused:

@@ -16,6 +16,8 @@ from pnpdepth_cli.io.poses import poses_of_frames, read_oxts_poses
 
 KnownPose = tuple[NDArray[np.float64], str]
 """(3, 4) from the camera's coordinates to the world's in metres, and where it is from."""
+ESTIMATED = "estimated from the images"
+"""Where the motion of frames without poses is from."""
 
 
 def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
@@ -31,24 +33,51 @@ def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
     }
 
 
+def known_poses(
+    frames: Sequence[FrameFiles], path: Path | None = None, kind: str | None = None
+) -> list[KnownPose | None]:
+    """Returns the pose of each frame; None where it is unknown.
+
+    Args:
+        frames: All frames of the data set.
+        path: A file of `poses_of_frames`. None: the frames' own poses.
+        kind: What the poses of the file are, as `poses_of_frames` takes it.
+
+    Raises:
+        InputError: The file has another number of poses, or cannot be read.
+        UsageError: The frames have the poses of a COLMAP model, and a file is given.
+    """
+    if path is not None:
+        if any(frame.sparse is not None and frame.sparse.is_dir() for frame in frames):
+            raise UsageError("--poses: the COLMAP model has those of its images; leave it out")
+        rows, how = poses_of_frames(path, [frame.name for frame in frames], kind)
+        return [(row, f"{path}, {how}") for row in rows]
+    poses = [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
+    for sequence in sequences_of(frames).values():
+        packets = [frames[index].oxts for index in sequence]
+        first = frames[sequence[0]]
+        if first.calib is not None and None not in packets:
+            read = read_oxts_poses([p for p in packets if p], first.calib, first.camera)
+            for index, pose in zip(sequence, read, strict=True):
+                poses[index] = pose, "KITTI's inertial system"
+    return poses
+
+
 def with_neighbours(
-    frames: Sequence[FrameFiles], reach: int, poses: Path | None, kind: str | None = None
+    frames: Sequence[FrameFiles], reach: int, known: Sequence[KnownPose | None]
 ) -> list[FrameFiles]:
     """Returns the frames, each with those at most `reach` before and after it in its sequence.
 
     Args:
         frames: All frames of the data set.
         reach: Number of frames to each side.
-        poses: A file of `poses_of_frames`. None: the frames' own poses; where a frame has
-            none, the motion is to be estimated.
-        kind: What the poses of the file are, as `poses_of_frames` takes it.
+        known: The pose of each frame. None: the motion is to be estimated.
 
     Raises:
-        InputError: The file has another number of poses.
         UsageError: A frame has no points, or its points are those of all images already;
             or neither its pose nor its image is known.
     """
-    known, result = _poses(frames, poses, kind), list(frames)
+    result = list(frames)
     for sequence in sequences_of(frames).values():
         for number, index in enumerate(sequence):
             near = range(max(0, number - reach), min(len(sequence), number + reach + 1))
@@ -61,14 +90,13 @@ def with_neighbours(
     return result
 
 
-def note_of_poses(frames: Sequence[FrameFiles]) -> str | None:
-    """Returns which poses the neighbours of the frames have, as a line; None without neighbours."""
-    counts = Counter(each.poses for frame in frames for each in frame.neighbours)
-    if len(counts) < 2:
-        return next((f"poses: {poses}" for poses in counts), None)
-    total = sum(counts.values())
-    kinds = ", ".join(f"{poses} ({count:,} of {total:,})" for poses, count in counts.items())
-    return f"poses of neighbours: {kinds}"
+def note_of_poses(known: Sequence[KnownPose | None], otherwise: str) -> str:
+    """Returns where the poses of the frames are from, as a line."""
+    counts = Counter(otherwise if pose is None else pose[1] for pose in known)
+    if len(counts) == 1:
+        return f"poses: {next(iter(counts))}"
+    kinds = ", ".join(f"{poses} ({count:,} of {len(known):,})" for poses, count in counts.items())
+    return f"poses: {kinds}"
 
 
 def _neighbour(
@@ -84,27 +112,9 @@ def _neighbour(
             raise UsageError(
                 f"{other.name}: --accumulate needs the poses of frames without images; give --poses"
             )
-        return Neighbour(files=other, motion=None, poses="estimated from the images", apart=apart)
+        return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
     (matrix, source), (other_matrix, _) = pose, other_pose
     turn = matrix[:, :3].T @ other_matrix[:, :3]
     shift = matrix[:, :3].T @ (other_matrix[:, 3] - matrix[:, 3])
     motion = tuple(map(tuple, np.column_stack([turn, shift]).tolist()))
     return Neighbour(files=other, motion=motion, poses=source, apart=apart)
-
-
-def _poses(
-    frames: Sequence[FrameFiles], path: Path | None, kind: str | None
-) -> list[KnownPose | None]:
-    """The pose of each frame; None where it is unknown."""
-    if path is not None:
-        rows, how = poses_of_frames(path, [frame.name for frame in frames], kind)
-        return [(row, f"{path}, {how}") for row in rows]
-    poses = [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
-    for sequence in sequences_of(frames).values():
-        packets = [frames[index].oxts for index in sequence]
-        first = frames[sequence[0]]
-        if first.calib is not None and None not in packets:
-            read = read_oxts_poses([p for p in packets if p], first.calib, first.camera)
-            for index, pose in zip(sequence, read, strict=True):
-                poses[index] = pose, "KITTI's inertial system"
-    return poses

@@ -202,8 +202,8 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
         raise InputError(f"{result.depth} lacks {lacks}")
     if export.needs_pose and pose is None:
         raise InputError(
-            f"{result.depth} has no pose in its record; refine it with a COLMAP model, as"
-            " `batch --layout colmap` does"
+            f"{result.depth} has no pose in its record; refine it by `batch` with --poses, or"
+            " with a COLMAP model"
         )
     # The numbers and the name of the record must be usable.
     width, height = record.size or (0, 0)

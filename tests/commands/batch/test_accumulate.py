@@ -14,13 +14,20 @@ from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
-from pnpdepth_cli.commands.batch.sequence import note_of_poses, with_neighbours
+from pnpdepth_cli.commands.batch.sequence import (
+    ESTIMATED,
+    known_poses,
+    note_of_poses,
+    with_neighbours,
+)
+from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.samplers import SamplePattern
 from tests.commands.batches import RecordingListener, batch, depths, done
-from tests.commands.drives import drive_on_disk, without_results
+from tests.commands.drives import STEP_M, drive_on_disk, without_results
 from tests.commands.frames import frame_on_disk
 
 DRIVE = Path(__file__).parents[3] / "samples/drive"
@@ -86,7 +93,7 @@ def test_frames_of_another_sequence_or_camera_are_no_neighbours(tmp_path: Path) 
         FrameFiles(name=name, sparse=tmp_path / f"{name}_{camera}.png", camera=camera, pose=STILL)
         for name, camera in kinds
     ]
-    linked = with_neighbours(frames, 2, None)
+    linked = with_neighbours(frames, 2, known_poses(frames))
     assert [[each.files.sparse.stem for each in frame.neighbours] for frame in linked] == [
         ["a_2_2"], ["a_1_2"], [], ["a_2_3"], ["a_1_3"],
     ]  # fmt: skip
@@ -98,7 +105,9 @@ def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
         FrameFiles(name=f"a_{number}", sparse=Path("s.png"), pose=pose)
         for number, pose in enumerate((STILL, turned))
     ]
-    (of_turned,), (of_still,) = (each.neighbours for each in with_neighbours(frames, 1, None))
+    (of_turned,), (of_still,) = (
+        each.neighbours for each in with_neighbours(frames, 1, known_poses(frames))
+    )
     assert of_turned.motion == turned
     np.testing.assert_allclose(
         of_still.motion, [[0, 1, 0, 0], [-1, 0, 0, 4], [0, 0, 1, -1]], atol=1e-12
@@ -114,16 +123,15 @@ def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
 )
 def test_neighbours_need_points_and_images_or_poses(frame: FrameFiles, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        with_neighbours([frame, frame], 1, None)
+        with_neighbours([frame, frame], 1, known_poses([frame, frame]))
 
 
 def test_the_note_names_the_poses_that_are_used() -> None:
     own = FrameFiles(name="a_1", image=Path("i.png"), sparse=Path("s.png"), pose=STILL)
-    without = replace(own, name="a_2", pose=None)
-    assert note_of_poses([own]) is None
-    assert note_of_poses(with_neighbours([own, own], 1, None)) == "poses: the layout's"
-    assert note_of_poses(with_neighbours([own, own, without], 1, None)) == (
-        "poses of neighbours: the layout's (2 of 4), estimated from the images (2 of 4)"
+    known = known_poses([own, own, replace(own, pose=None)])
+    assert note_of_poses(known[:2], ESTIMATED) == "poses: the layout's"
+    assert note_of_poses(known, ESTIMATED) == (
+        "poses: the layout's (2 of 3), estimated from the images (1 of 3)"
     )
 
 
@@ -208,3 +216,28 @@ def test_poses_that_lie_beside_the_frames_are_used(tmp_path: Path) -> None:
     (tmp_path / "drive/poses.txt").unlink()
     (first, *_) = find_frames(request).frames[0].neighbours
     assert first.motion is None
+
+
+def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path) -> None:
+    root, listener = drive_on_disk(tmp_path / "drive", frames=2), RecordingListener()
+
+    def cloud(name: str) -> tuple[float, list[str]]:
+        """The depth of the farthest point along z, and the notes."""
+        record = write_depth_cloud(CloudRequest(depth=root / "out", output=tmp_path / name))
+        return float(read_scan(tmp_path / name).points[:, 2].max()), record["notes"]
+
+    # Poses of the folder; then of a file, with which all frames are done again.
+    batch(root, refine={"iterations": 0})
+    near, notes = cloud("near.ply")
+    assert record_of(root, "drive_001")["camera"]["pose"][2][3] == STEP_M
+    assert not any("warning" in note for note in notes)
+    rows = (root / "poses.txt").read_text().replace(f"1 {STEP_M}\n", "1 100\n")
+    (tmp_path / "other.txt").write_text(rows)
+    poses = {"poses": tmp_path / "other.txt", "refine": {"iterations": 0}}
+    assert done(root, **poses) == ["drive_001"]
+    assert cloud("far.ply")[0] > near + 50
+    # Poses that are of other frames are named; of a cloud without poses it is said.
+    (root / "poses.txt").write_text(rows.splitlines()[0])
+    assert done(root, listener, refine={"iterations": 0}) == ["drive_000", "drive_001"]
+    assert sum("records get no poses" in message for message in listener.messages) == 1
+    assert sum("2 frames without poses" in note for note in cloud("none.ply")[1]) == 1
