@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
+
+
+def what_applies(entries: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Returns the entries that are not None, false or empty, as `asdict` wants them."""
+    return {k: v for k, v in entries if v is not None and v is not False and v not in ({}, [])}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +64,7 @@ class FileRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Returns what applies, by name."""
-        return {name: v for name, v in asdict(self).items() if v not in (None, False, {})}
+        return asdict(self, dict_factory=what_applies)
 
 
 @dataclass(frozen=True, kw_only=True)

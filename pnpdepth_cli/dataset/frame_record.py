@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.file_record import FigureRecord, FileRecord
+from pnpdepth_cli.file_record import FigureRecord, FileRecord, what_applies
 from pnpdepth_cli.io.file_bytes import Fingerprint, one_line
 from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.points import METRES
@@ -39,8 +39,8 @@ class CameraRecord:
     intrinsics: list[list[float]]
     """(3, 3)"""
     lens: str
-    distortion: list[float]
-    pose: list[list[float]] | None
+    distortion: list[float] = field(default_factory=list)
+    pose: list[list[float]] | None = None
     """(3, 4) from the camera's coordinates to the world's. None: unknown."""
     source: str
 
@@ -78,8 +78,8 @@ class ModelRecord:
     name: str
     spec: str
     """What the user called it."""
-    checkpoint: str | None
-    checkpoint_sha256: str | None
+    checkpoint: str | None = None
+    checkpoint_sha256: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,12 +193,12 @@ class FrameRecord:
         return None
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the record in JSON's own types, without what is None or empty."""
-        entry = plain(asdict(self)) | {
-            "inputs": {name: file.to_json() for name, file in self.inputs.items()},
-            "neighbours": [file.to_json() for file in self.neighbours],
-        }
-        return {name: value for name, value in entry.items() if value not in (None, {}, [])}
+        """Returns the record in JSON's own types, without entries that are None, false or empty.
+
+        None stays where it is a value: in settings, alignment, loss and errors.
+        """
+        entry: dict[str, Any] = plain(asdict(self, dict_factory=what_applies))
+        return entry
 
     @classmethod
     def from_json(cls, entry: object, source: Path) -> FrameRecord:
