@@ -230,6 +230,7 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
     for to in ("colmap", "gaussian-splatting"):
         notes = "".join(export(folder, to, tmp_path / to)["notes"])
         assert " 3 of 3 images have lens distortion" in notes
+        assert ("sparse/0 has no model" in notes) == (to == "gaussian-splatting")
 
 
 @pytest.mark.parametrize(

@@ -60,8 +60,9 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     if scale == 0:
         raise InputError("no frame has a pixel with known depth; refine them again")
     masked, clipped, pixels = 0, 0, 0
+    model = _parameters(folder).parent
     if _needs_model(folder, frames):
-        _write_model(_parameters(folder).parent, frames)
+        _write_model(model, frames)
     # Depth, mask and image of each frame.
     for frame in frames:
         inverse, valid = _inverse(frame)
@@ -81,6 +82,14 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
             f"warning: {masked:,} pixels are unknown or not valid; they have the depth before"
             " the mask or that of the nearest pixel, as 3DGS reads no masks"
         )
+    if not model_files(model):
+        way_out = "poses are not known; refine a COLMAP project with `batch --layout colmap`"
+        if any(frame.camera.has_lens for frame in frames):
+            way_out = (
+                "3DGS reads no distorted cameras; run `colmap image_undistorter`, then batch and"
+                " export of its output"
+            )
+        notes.append(f"warning: sparse/0 has no model, which 3DGS needs to train: {way_out}")
     return [*notes, *distortion_note(frames, "3DGS")]
 
 
