@@ -29,7 +29,7 @@ def examine() -> dict[str, str | list[str]]:
     return {
         "pnpdepth": pnpdepth_cli.__version__,
         "python": f"{platform.python_version()}, {platform.system()} {platform.machine()}",
-        "packages": [f"{name} {_version(name)}" for name in required],
+        "packages": [f"{name} {_version(name) or 'not installed'}" for name in required],
         "extras": [f"{extra}: {_state(names)}" for extra, names in extras.items()],
         "devices": _devices(),
         "memory": f"{memory.available / 1e9:.1f} of {memory.total / 1e9:.1f} GB available",
@@ -38,7 +38,7 @@ def examine() -> dict[str, str | list[str]]:
 
 
 def _requirements() -> tuple[list[str], dict[str, list[str]]]:
-    """Names of the required packages that are installed, and of all packages of each extra."""
+    """Names of the required packages, and of the packages of each extra."""
     required, extras = [], dict[str, list[str]]()
     for line in metadata.requires("pnpdepth") or []:
         match = _REQUIREMENT.match(line)
@@ -46,7 +46,7 @@ def _requirements() -> tuple[list[str], dict[str, list[str]]]:
             required.append(re.split(r"[^\w.-]", line)[0])
         elif match[2] not in _DEVELOPERS:
             extras.setdefault(match[2], []).append(match[1])
-    return [name for name in required if _version(name)], extras
+    return required, extras
 
 
 def _version(package: str) -> str:

@@ -69,11 +69,12 @@ def test_doctor_reports_versions_devices_extras_and_a_refined_plane() -> None:
 def test_doctor_names_what_is_missing_and_fails_with_the_self_test(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    required = ["torch>=2.4", 'no-such-package>=1; extra == "plot"', 'pytest; extra == "test"']
-    monkeypatch.setattr(metadata, "requires", lambda _: required)
+    required = ["torch>=2.4", "none-such>=1"]
+    extras = ['no-such-package>=1; extra == "plot"', 'pytest; extra == "test"']
+    monkeypatch.setattr(metadata, "requires", lambda _: [*required, *extras])
     monkeypatch.setattr(doctor, "_self_test", lambda: "FAILED: the depth is wrong")
     report = doctor.examine()
-    assert report["packages"] == [f"torch {metadata.version('torch')}"]
+    assert report["packages"] == [f"torch {metadata.version('torch')}", "none-such not installed"]
     assert report["extras"] == ["plot: not installed (no-such-package)"]
     result = CliRunner().invoke(cli, ["doctor"])
     assert result.exit_code == 1
