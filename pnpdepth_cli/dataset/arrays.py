@@ -27,10 +27,11 @@ from pnpdepth_cli.io.file_bytes import (
     check_value_count,
     fingerprint,
     one_line,
+    read_bytes,
     size_of_regular_file,
 )
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.rgb import read_rgb, read_video_frame, sizes_of
+from pnpdepth_cli.io.rgb import read_exr_colour, read_rgb, read_video_frame, sizes_of
 
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
@@ -76,12 +77,13 @@ def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.floa
 def read_levels(path: Path) -> NDArray[Any]:
     """Returns the numbers (H, W) in the file of a mask or of the confidence of depth.
 
-    They are as stored; only an EXR is converted to 8 bits as a photo is. Of a pixel in colour it is
-    the largest channel.
+    They are as stored. Of a pixel in colour it is the largest channel.
 
     Raises:
         InputError: The file holds no such numbers.
     """
+    if path.suffix.lower() == ".exr":
+        return np.asarray(read_exr_colour(path, read_bytes(path)).max(axis=2))
     if path.suffix.lower() in IMAGE_SUFFIXES:
         image = read_rgb(path)
         return np.asarray(np.rint(image.values.max(axis=2) * image.white))
@@ -89,7 +91,7 @@ def read_levels(path: Path) -> NDArray[Any]:
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[:, :, 0]
     if values.ndim != 2:
-        raise FileFormatError(f"{path}: a mask is (H, W), not of shape {values.shape}")
+        raise FileFormatError(f"{path}: mask or confidence is (H, W), not of shape {values.shape}")
     return values
 
 

@@ -157,7 +157,7 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
 
 
 def _from_linear_light(path: Path, data: bytes) -> RgbImage:
-    linear = _colour_of(path, read_exr_channels(path, data)).astype(np.float32)
+    linear = read_exr_colour(path, data).astype(np.float32)
     np.nan_to_num(linear, copy=False, nan=0.0, posinf=1e9, neginf=0.0)
     outside = float(((linear > 1) | (linear < 0)).any(axis=2).mean())
     note = "EXR linear light, converted with the sRGB curve"
@@ -177,7 +177,13 @@ def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     return encoded.reshape(linear.shape)
 
 
-def _colour_of(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
+def read_exr_colour(path: Path, data: bytes) -> NDArray[Any]:
+    """Returns R, G and B (H, W, 3) as an EXR stores them; its only channel is repeated.
+
+    Raises:
+        FileFormatError: It is damaged, beyond the budget, or holds no single image.
+    """
+    channels = read_exr_channels(path, data)
     layers = [n[:-1] for n in channels if all(n[:-1] + letter in channels for letter in "RGB")]
     layers = [""] if "" in layers else sorted(set(layers))
     if len(layers) == 1:

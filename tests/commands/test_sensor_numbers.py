@@ -26,6 +26,7 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refiner import frame_of_arrays
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.samplers import SamplePattern
+from tests.exr_files import write_exr
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 INDOOR = STREET.parent / "indoor"
@@ -243,8 +244,9 @@ def indoor(sparse: Path, mask: Path | None, least: float | None = None, **option
     return read_frame(FrameFiles(image=INDOOR / "rgb.png", **asked, **options), ReadOptions())
 
 
-@pytest.mark.parametrize("suffix", [".png", ".npy"])
-@pytest.mark.parametrize("of", [2, 255])
+@pytest.mark.parametrize(
+    ("suffix", "of"), [(".png", 2), (".png", 255), (".npy", 2), (".npy", 255), (".exr", 1)]
+)
 def test_only_sparse_depth_of_enough_confidence_is_used(
     tmp_path: Path, suffix: str, of: int
 ) -> None:
@@ -253,9 +255,12 @@ def test_only_sparse_depth_of_enough_confidence_is_used(
     confidence = rng.integers(0, 3, small.shape)
     small[confidence < 2] *= rng.uniform(0.5, 2, (confidence < 2).sum())
     np.save(tmp_path / "sparse.npy", small.astype(np.float32))
-    stored = (confidence * of // 2).astype(np.uint8)
+    stored = (confidence * of / 2).astype(np.float32 if suffix == ".exr" else np.uint8)
     path = tmp_path / f"confidence{suffix}"
-    np.save(path, stored) if suffix == ".npy" else Image.fromarray(stored).save(path)
+    if suffix == ".exr":
+        write_exr(path, {"Z": stored})
+    else:
+        np.save(path, stored) if suffix == ".npy" else Image.fromarray(stored).save(path)
     frame = indoor(tmp_path / "sparse.npy", path, of)
     assert len(frame.points) == np.count_nonzero((confidence == 2) & (small > 0))
     column, row = frame.points.xy.numpy().round().astype(int).T
@@ -263,6 +268,8 @@ def test_only_sparse_depth_of_enough_confidence_is_used(
     np.testing.assert_allclose(frame.points.depth, expected, rtol=1e-6)
     count = np.count_nonzero(confidence > 0)
     assert len(indoor(tmp_path / "sparse.npy", path).points) == count
+    low = float(stored[stored > 0].min())
+    assert len(indoor(tmp_path / "sparse.npy", path, low).points) == count
     assert len(indoor(tmp_path / "sparse.npy", path, 0).points) == np.count_nonzero(small)
     assert any(f"{len(frame.points):,} of" in note for note in frame.notes)
     with pytest.raises(NoPointsError):
