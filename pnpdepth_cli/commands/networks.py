@@ -115,6 +115,11 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame, rgb)
         notes = [*network.notes, *network.verify(arguments)]
+        if "rgb" in definition.input_kind and definition.normalisation is None:
+            notes.append(
+                "input: rgb range 'unit' is assumed; refine compares the ranges at the points, and"
+                " --normalise states one"
+            )
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
         known = raw[raw.isfinite()]

@@ -58,8 +58,9 @@ def test_an_onnx_file_is_refined_and_checked(
     assert record["settings"]["layer"] == "Relu_d"
     assert any("agrees with onnxruntime" in note for note in record["notes"])
     assert run(["models", "check", net, "--image", str(frame.image), "--json"]) == 0
-    layers = json.loads(capsys.readouterr().out)
-    assert set(layers["layers"].values()) == {"ok"}
+    checked = json.loads(capsys.readouterr().out)
+    assert set(checked["layers"].values()) == {"ok"}
+    assert any("rgb range 'unit' is assumed" in note for note in checked["notes"])
 
 
 def test_max_pixels_refuses_and_allows_an_image_by_its_size(frame: FrameOnDisk) -> None:
