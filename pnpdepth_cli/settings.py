@@ -98,7 +98,7 @@ class Settings:
     )
     loss: str | None = option(None, "Loss at the sparse points.", choices=choices.LOSSES)
     update: str | None = option(
-        None, "Update rule; another than the network's resets --lr.", choices=choices.UPDATES
+        None, "Update rule; another than the network's resets lr.", choices=choices.UPDATES
     )
     schedule: str | None = None
     """Step size over the updates, "constant" or "linear" to 0. It has no option."""

@@ -91,7 +91,8 @@ class Refiner:
         self._stack = ExitStack()
         self._lock = threading.Lock()
         if len(self._networks) > 1 and self._asked.fixed_by:
-            raise UsageError(f"several networks are fused, but {self._asked.fixed_by} fixes one")
+            fixed = self._asked.fixed_by.replace("--", "")
+            raise UsageError(f"several networks are fused, but {fixed} fixes one")
 
     def __enter__(self) -> Refiner:
         return self
