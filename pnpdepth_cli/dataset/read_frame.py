@@ -174,8 +174,9 @@ def _read_ground_truth(
     values = apply_masks(values, files.masks)
     if files.gt_other_size and size is not None and values.shape != size:
         values = move_depth(file_of(source), values, size)
-    values, notes = plausible_map(values, reading, "gt", "gt_scale of a list", scale)
-    described = describe_range(values, reading, noun="pixels", option="gt_scale of a list")
+    option = "--depth-scale" if files.sparse is None else "gt_scale of a list"
+    values, notes = plausible_map(values, reading, "gt", option, scale)
+    described = describe_range(values, reading, noun="pixels", option=option)
     notes = [f"gt: {described}", *notes]
     return _pixels(files, values, record_of(source, reading), notes, reading)
 
@@ -295,10 +296,18 @@ def _compare(
         )
     if gt.shape != points.size:
         raise _size_error(files, gt.shape, points.size)
+    # Nothing decides a scale that is assumed of the ground truth, or of both alike.
+    notes, of_truth = list[str](), truth.reading
+    if of_truth and of_truth.assumed and (files.sparse is None or sparse.reading.assumed):
+        notes.append(
+            f"warning: the scale of the ground truth ({of_truth.source}) is assumed, and with it"
+            f" the metres of all errors; --depth-scale 1000 if it holds millimetres, --depth-scale"
+            f" {of_truth.scale:g} if it is right"
+        )
     if files.sparse is None:
-        return []
+        return notes
     depth, known = points.scatter()[0, 0].numpy(), int((gt > 0).sum())
-    leaked, notes = int(((gt > 0) & (depth == gt)).sum()), list[str]()
+    leaked = int(((gt > 0) & (depth == gt)).sum())
     if leaked >= _LEAK_FRACTION * known:
         notes.append(
             f"warning: {leaked:,} of {known:,} pixels ({leaked / known:.1%}) of the ground truth"
