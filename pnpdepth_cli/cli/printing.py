@@ -156,11 +156,12 @@ def print_batch(summary: BatchSummary) -> None:
         worse = f"{counts['worse']:,} of {counts['compared']:,}"
         parts.append(f"{worse} worse than linear interpolation")
     lines = [", ".join(parts)]
-    # Warnings of several frames, each once, weights and files.
-    for each in summary.warnings:
+    # Warnings and notes of several frames, each once, weights and files.
+    for each in (*summary.warnings, *summary.frame_notes):
         names = ", ".join([*each.first, *["…"] * (each.frames > len(each.first))])
         count = count_of(each.frames, "frame")
-        lines.append(f"warning in {count} ({names}): {each.note.removeprefix('warning: ')}")
+        kind = "warning" if each.is_warning else "note"
+        lines.append(f"{kind} in {count} ({names}): {each.note.removeprefix(f'{kind}: ')}")
     if summary.weights:
         lines.append(f"mean weights in the result: {mean_weights_text(summary.weights)}")
     lines.append(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")

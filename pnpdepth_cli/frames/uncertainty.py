@@ -87,11 +87,13 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
     of_sensor = torch.tensor(SENSOR_ERROR * is_map)
     sigma_m = of_points.hypot(of_sensor) * depth
     valid = valid_depth(points, depth, sigma_m)
+    notes = [*frame.notes, note, *[_OF_MATCHES] * of_matches, *[_OF_MAP] * is_map]
     # What it does not cover.
     if not bool(valid.all()):
         part = 100 * float((~valid).double().mean())
-        note += f"; {part:.0f} % of the depth is beyond what the points support, and not valid"
-    notes = [*frame.notes, note, *[_OF_MATCHES] * of_matches, *[_OF_MAP] * is_map]
+        notes.append(
+            f"note: {part:.0f} % of the depth is beyond what the points support, and not valid"
+        )
     of_depth, is_valid = (each.numpy() for each in (sigma_m, valid))
     return replace(frame, sigma=of_depth, valid=is_valid, notes=tuple(notes))
 

@@ -91,6 +91,7 @@ class Worker:
         self,
         records: Records,
         deciding: Sequence[FrameFiles],
+        shown: FrameFiles,
         versions: Mapping[str, str],
         shared: Sequence[Path],
         folder: Path,
@@ -107,7 +108,7 @@ class Worker:
         torch.set_num_threads(threads)
         cv2.setNumThreads(threads)
         set_max_pixels(max_pixels)
-        self._records, self._deciding = records, deciding
+        self._records, self._deciding, self._shown = records, deciding, shown
         self._versions, self._shared = versions, shared
         self._open = ExitStack()  # until the process ends
         self._method: Method | None = None
@@ -125,7 +126,7 @@ class Worker:
 
         own = self._records
         if self._method is None:
-            opened = open_method(own.request, self._deciding, self._notes.append)
+            opened = open_method(own.request, self._deciding, self._shown, self._notes.append)
             self._method = self._open.enter_context(opened)
         records = list(refine_frames(frames, self._method, own, settings_worked=settings_worked))
         notes, self._notes = self._notes, []
@@ -176,7 +177,7 @@ def refine_on_workers(
         say(f"Ray workers: starting {count:,}, each with {workers.each}")
         options = {"scheduling_strategy": "SPREAD", "max_restarts": _RESTARTS, **resources}
         actor, shared = ray.remote(Worker).options(**options), [request.source, *locks]
-        job = records, deciding, software(), shared, Path.cwd(), max_pixels_given()
+        job = records, deciding, to_do[0], software(), shared, Path.cwd(), max_pixels_given()
         actors = [actor.remote(*job, resources["num_cpus"]) for _ in range(count)]
         try:
             yield from refine_on_actors(

@@ -145,7 +145,7 @@ def _refine(
                 settings_worked=worked, say=listener.say, stopped=stopped,
             )  # fmt: skip
             continue
-        with running.open_method(records.request, deciding, listener.say) as method:
+        with running.open_method(records.request, deciding, wanted[0], listener.say) as method:
             begin()
             yield from running.refine_frames(
                 wanted, method, records, settings_worked=worked, stopped=stopped

@@ -51,13 +51,17 @@ def spread(count: int) -> list[int]:
 
 @contextmanager
 def open_method(
-    request: BatchRequest, deciding: Sequence[FrameFiles], say: Callable[[str], None]
+    request: BatchRequest,
+    deciding: Sequence[FrameFiles],
+    shown: FrameFiles,
+    say: Callable[[str], None],
 ) -> Iterator[Method | None]:
     """Yields the method, resolved on the frames that decide, open for any number of frames.
 
     Args:
         request: The batch.
         deciding: The frames of `deciding_frames`. Without any, there is no method.
+        shown: The frame whose notes are said, the first that is to be refined.
         say: Receives what was decided.
     """
     if not deciding:
@@ -66,8 +70,9 @@ def open_method(
     # The first frame.
     first_request = request_of(request, deciding[0])
     first = read_requested(first_request)
-    for note in first.notes:
-        say(f"{deciding[0].name}: {note}")
+    to_show = first if shown.name == deciding[0].name else _readable(request, shown)
+    for note in () if to_show is None else to_show.notes:
+        say(f"{shown.name}: {note}")
 
     # The method, resolved on it and, where a network states no input range, on two others.
     def readable(frames: Iterable[FrameFiles]) -> Iterator[Frame]:

@@ -32,18 +32,23 @@ _MAIN = tuple(measure.key for measure in MEASURES if measure.main)
 _RUN_STAGES = ("read", "refine", "write")
 _NUMBER = re.compile(r"\d[\d.,]*")
 _NAMED = 3
-"""Names of frames that are listed with a warning."""
+"""Names of frames that are listed with a warning or note."""
 
 
 @dataclass(kw_only=True)
-class Warned:
-    """The frames with one kind of warning."""
+class Noted:
+    """The frames with one kind of warning or note."""
 
     note: str
-    """The warning of the first frame."""
+    """The text of the first frame."""
     frames: int = 0
     first: list[str] = field(default_factory=list)
     """Names of the first frames."""
+
+    @property
+    def is_warning(self) -> bool:
+        """Whether it is a warning."""
+        return self.note.startswith("warning")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +74,9 @@ class BatchSummary:
     """Means over the frames that have the value, by basis and stage, with their number."""
     weights: dict[str, dict[str, float]]
     """Mean, least and largest weight of each expert of the default method, by name."""
-    warnings: list[Warned]
+    warnings: list[Noted]
+    frame_notes: list[Noted]
+    """Notes of frames that begin with "note"."""
     unsure: list[str]
     """What was guessed of the network and may be wrong."""
     unmatched: list[str]
@@ -88,7 +95,7 @@ class _Totals:
             dict.fromkeys(("done", "diverged", "failed", "with_warnings", "compared", "worse"), 0)
         )
         self.units, self.unsure = set[str](), dict[str, None]()
-        self.warnings = dict[str, Warned]()  # by the text without its numbers
+        self.noted = dict[str, Noted]()  # by the text without its numbers
         self.weights = defaultdict[str, list[float]](list)
         self.errors = defaultdict[tuple[str, str], FrameMeans](FrameMeans)  # by basis and stage
         self.with_truth = list[tuple[str, str | None, list[float | None]]]()
@@ -100,10 +107,12 @@ class _Totals:
         if record.status == "failed":
             return
         self.counts["with_warnings"] += bool(record.warnings)
-        for note in record.warnings:
-            warned = self.warnings.setdefault(_NUMBER.sub("", note), Warned(note=note))
-            warned.frames += 1
-            warned.first += [record.name] if len(warned.first) < _NAMED else []
+        for note in record.notes:
+            if not note.startswith(("warning", "note")):
+                continue
+            noted = self.noted.setdefault(_NUMBER.sub("", note), Noted(note=note))
+            noted.frames += 1
+            noted.first += [record.name] if len(noted.first) < _NAMED else []
         self.unsure |= dict.fromkeys(n for n in record.notes if ", unsure (" in n)
         self.units.add(record.unit)
         for basis, stages in record.errors.items():
@@ -157,7 +166,8 @@ def summarise(
             name: {"mean": sum(all_) / len(all_), "least": min(all_), "largest": max(all_)}
             for name, all_ in totals.weights.items()
         },
-        warnings=list(totals.warnings.values()),
+        warnings=[each for each in totals.noted.values() if each.is_warning],
+        frame_notes=[each for each in totals.noted.values() if not each.is_warning],
         unsure=list(totals.unsure),
         unmatched=[str(each) for each in found.unmatched],
         varied=dict(request.varied),

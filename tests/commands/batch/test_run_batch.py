@@ -313,7 +313,11 @@ def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: P
 
 
 def test_frames_are_chosen_by_name_then_by_step_then_by_number(root: Path) -> None:
-    assert done(root, names="[b-d]", every=2) == ["b", "d"]
+    listener = RecordingListener()
+    assert done(root, listener, names="[b-d]", every=2) == ["b", "d"]
+    told = {text.partition(":")[0] for text in listener.messages}
+    assert "b" in told
+    assert told.isdisjoint("acd")
     assert done(root, names="[a-c]", every=2, limit=1) == ["a"]
     assert summary(root)["counts"]["pending"] == 1
     with pytest.raises(UsageError, match="has a name like"):
@@ -354,17 +358,21 @@ def test_the_summary_counts_weights_warnings_by_kind_and_frames_that_are_indepen
     records = [
         FrameRecord(
             name=f"{'ab'[number % 2]}/{number:04}", errors=errors, weights={"net": weight},
-            notes=[f"warning: {number:,} of 9,000 pixels clipped"],
+            notes=[f"warning: {number:,} of 9,000 pixels clipped", f"note: {number} % sky"],
         )
         for number, weight in enumerate((0.1, 0.4, 0.1, 0.2))
     ]  # fmt: skip
     told = summary_of(root, records)
     assert told.weights == {"net": {"mean": pytest.approx(0.2), "least": 0.1, "largest": 0.4}}
     (warned,) = told.warnings
-    assert (warned.frames, warned.first) == (4, ["a/0000", "b/0001", "a/0002"])
+    (noted,) = told.frame_notes
+    for each in (warned, noted):
+        assert (each.frames, each.first) == (4, ["a/0000", "b/0001", "a/0002"])
     assert ["4 frames count as 2 groups of frames" in note for note in told.notes] == [True]
     print_batch(told)
-    assert "warning in 4 frames (a/0000, b/0001, a/0002, …): 0 of" in capsys.readouterr().err
+    printed = capsys.readouterr().err
+    assert "warning in 4 frames (a/0000, b/0001, a/0002, …): 0 of" in printed
+    assert "note in 4 frames (a/0000, b/0001, a/0002, …): 0 % sky" in printed
 
 
 DAMAGED = ('"errors": {"ground_truth": {"before": {}}}', '"seconds": 0.5', '"points": 0.5')
