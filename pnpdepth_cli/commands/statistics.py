@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.tables import count_of
+
 Floats = NDArray[np.float64]
 
 LEVEL = 0.95
@@ -48,7 +50,8 @@ class Clusters:
 
     def describe(self) -> str:
         """Returns text such as `12 groups of frames`."""
-        return f"{self.count:,} {self.unit}"
+        noun, space, of = self.unit.partition(" ")
+        return count_of(self.count, noun.removesuffix("s")) + space + of
 
     def notes(self) -> list[str]:
         """Returns that frames are not independent, unless each of them is a cluster."""

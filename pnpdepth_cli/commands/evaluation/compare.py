@@ -255,15 +255,16 @@ def _notes_on_frames(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]
     for run in runs:
         if unshared := [name for name in run.scores if name not in set(names)]:
             yield (
-                f"warning: {len(unshared):,} frames of {run.path} are not scored in all runs and"
+                f"warning: {count_of(len(unshared), 'frame')} of {run.path} not scored in all runs,"
                 f" left out: {some_names(unshared)}"
             )
     counts = {name: {run.counts(name) for run in runs} for name in names}
     other_truth = [name for name, of in counts.items() if len({known for _, known in of}) > 1]
     if other_truth:
         yield (
-            f"warning: {len(other_truth):,} frames have another number of pixels with ground truth"
-            f" in another run, so the runs were not scored on the same: {some_names(other_truth)}"
+            f"warning: {count_of(len(other_truth), 'frame')} with another number of pixels with"
+            " ground truth in another run, so the runs were not scored on the same:"
+            f" {some_names(other_truth)}"
         )
     elif any(len(of) > 1 for of in counts.values()):
         shares = ", ".join(f"{run.coverage(names):.2%} in {run.path}" for run in runs)

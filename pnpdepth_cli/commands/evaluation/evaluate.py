@@ -227,13 +227,13 @@ def _notes_on_files(rows: Sequence[FrameRecord]) -> Iterator[str]:
     for row in faulty[:_LISTED]:
         yield f"warning: frame {one_line(row.name)} was not scored: {row.message}"
     if (more := len(faulty) - _LISTED) > 0:
-        yield f"warning: {more:,} more frames were not scored"
+        yield f"warning: {count_of(more, 'more frame')} not scored"
     # What was made of ground truth that is none.
     noted = [row for row in rows if row.notes]
     for row in noted[:_LISTED]:
         yield from (f"frame {one_line(row.name)}: {note}" for note in row.notes)
     if (more := len(noted) - _LISTED) > 0:
-        yield f"{more:,} more frames have such ground truth"
+        yield f"{count_of(more, 'more frame')} with such ground truth"
 
 
 def _notes_on_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
@@ -246,15 +246,15 @@ def _notes_on_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
         treatment = "was filled in from its neighbours before scoring"
     if empty := known - sum(_numbers(scored, "predicted")):
         yield (
-            f"warning: {empty:,} pixels ({empty / known:.2%}) of the ground truth have no"
-            f" prediction; what is missing {treatment}"
+            f"warning: {count_of(round(empty), 'pixel')} ({empty / known:.2%}) of the ground truth"
+            f" without prediction; what is missing {treatment}"
         )
     holes = [row.name for row in scored if math.isnan(scores_of(row).get("log_mae") or 0.0)]
     if holes:
         yield (
-            f"warning: {len(holes):,} predictions have empty rows between filled ones, which the"
-            f" development kit sets to −1 m and scores (its logarithmic errors are then NaN):"
-            f" {some_names(holes)}"
+            f"warning: {count_of(len(holes), 'prediction')} with empty rows between filled ones,"
+            f" which the development kit sets to −1 m and scores (its logarithmic errors are then"
+            f" NaN): {some_names(holes)}"
         )
     given = round(sum(_numbers(scored, "given")))
     if given and not request.rules.exclude_sparse:
@@ -280,8 +280,8 @@ def _notes_on_scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
         )
     elif unscaled := [row.unit for row in scored if row.unit != METRES]:
         yield (
-            f"warning: {len(unscaled):,} predictions are in {unscaled[0]}, not in metres, so errors"
-            " against the ground truth show nothing; --scale-by median scales each image"
+            f"warning: {count_of(len(unscaled), 'prediction')} in {unscaled[0]}, not in metres, so"
+            " errors against the ground truth show nothing; --scale-by median scales each image"
         )
     ratios = _numbers(scored, "median_ratio") or [math.nan]
     by_option = {

@@ -51,7 +51,7 @@ def test_each_image_counts_alike(two: Path) -> None:
         [scores_of(frame)[count] for count in ("pixels", "known", "coverage")]
         for frame in per_image.frames
     ] == [[2, 2, 1.0], [1, 2, 0.5]]
-    assert any(" 1 pixels (25.00%) of the ground truth have no pred" in n for n in per_image.notes)
+    assert any(" 1 pixel (25.00%) of the ground truth without pred" in n for n in per_image.notes)
 
 
 @pytest.mark.parametrize(("exclude_sparse", "pixels", "known"), [(False, 3, 4), (True, 2, 2)])
@@ -270,7 +270,7 @@ def test_points_that_were_drawn_from_the_ground_truth_are_drawn_again_to_be_excl
 
 def test_a_prediction_in_model_units_is_warned_of_unless_it_is_scaled(two: Path) -> None:
     FrameRecord(unit="model units").write(two / "out" / "a.json")
-    warning = "warning: 1 predictions are in model units"
+    warning = "warning: 1 prediction in model units"
     assert any(note.startswith(warning) for note in scored(two).notes)
     depth_file(two / "out" / "ü b_depth.npy", [[8, 9]])
     notes = scored(two, scale_by="median").notes
