@@ -130,9 +130,6 @@ class Settings:
                 wanted = f"one of {', '.join(names)}"
             if not valid(value) or (names and not (isinstance(value, str) and value in names)):
                 raise UsageError(f"{name.replace('_', '-')} must be {wanted}, got {value!r}")
-        if self.method == "alone" and self.fixed_by:
-            fixed = self.fixed_by.replace("--", "")
-            raise UsageError(f"with {fixed}, the network is refined alone: leave out method alone")
         if self.lr is not None and not str(self.lr).strip().endswith("%"):
             object.__setattr__(self, "lr", float(self.lr))  # one spelling of a step
 

@@ -61,11 +61,6 @@ def test_a_value_that_refinement_could_not_use_is_refused_by_its_name(
         Settings(**{field: value})
 
 
-def test_alone_is_the_default_method_so_no_option_of_another_goes_with_it() -> None:
-    with pytest.raises(UsageError, match="layer"):
-        Settings(method="alone", layer="0")
-
-
 @pytest.mark.parametrize("lr", ["x%", "", "0%", "3 %", "3%", "0.5", 0.1, 1, np.float32(0.5)])
 def test_those_steps_are_taken_that_refinement_takes(lr: Any) -> None:
     try:

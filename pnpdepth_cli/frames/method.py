@@ -35,6 +35,19 @@ _TRIED = 3
 """After so many frames that tell nothing of the registration, no more are read."""
 
 
+def check_combination(asked: Settings, networks: int) -> None:
+    """Checks that settings that fix one network come neither with several nor with "alone".
+
+    Raises:
+        UsageError: They do.
+    """
+    fixed = asked.fixed_by.replace("--", "")
+    if fixed and networks > 1:
+        raise UsageError(f"several networks are fused, but {fixed} fixes one")
+    if fixed and asked.method == "alone":
+        raise UsageError(f"with {fixed}, the network is refined alone: leave out method alone")
+
+
 class Method:
     """Refines frames with one network, or several that are fused; a context manager.
 
@@ -70,9 +83,7 @@ class Method:
         """How images of a size are moved to their points, where several frames decided it."""
         self._stack = ExitStack()
         self._open: list[OpenNetwork] = []
-        if len(networks) > 1 and not self.is_default:
-            fixed = asked.fixed_by.replace("--", "")
-            raise UsageError(f"several networks are fused, but {fixed} fixes one")
+        check_combination(asked, len(networks))
         # What the definitions leave open is decided.
         first = first.registered()
         resolved = [

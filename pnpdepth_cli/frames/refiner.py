@@ -20,7 +20,7 @@ from pnpdepth_cli.frames.frame import (
     registration_to_make,
     tensor_of,
 )
-from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.frames.method import Method, check_combination
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import resolve_definition
 from pnpdepth_cli.models.network import Network
@@ -90,9 +90,7 @@ class Refiner:
         self._method: Method | None = None
         self._stack = ExitStack()
         self._lock = threading.Lock()
-        if len(self._networks) > 1 and self._asked.fixed_by:
-            fixed = self._asked.fixed_by.replace("--", "")
-            raise UsageError(f"several networks are fused, but {fixed} fixes one")
+        check_combination(self._asked, len(self._networks))
 
     def __enter__(self) -> Refiner:
         return self
