@@ -240,3 +240,14 @@ def test_wrong_arguments_are_usage_errors(wrong: Callable[[], Any]) -> None:
         wrong()
     with pytest.raises(pnp.SizeError, match=r"\(2, 2\) but ground truth is \(2, 3\)"):
         pnp.score(np.ones((2, 2)), np.ones((2, 3)))
+
+
+@pytest.mark.parametrize(
+    ("networks", "settings"),
+    [(1, pnp.Settings(method="alone", layer="0")), (2, pnp.Settings(iterations=3))],
+)
+def test_settings_of_one_network_go_neither_with_several_nor_with_alone(
+    networks: int, settings: pnp.Settings
+) -> None:
+    with pytest.raises(pnp.UsageError):
+        pnp.Refiner([pnp.load_network("compact")] * networks, settings)
