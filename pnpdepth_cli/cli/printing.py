@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.box import SIMPLE_HEAD
@@ -14,7 +14,6 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from pnpdepth_cli.cli.streams import printable
-from pnpdepth_cli.commands.batch.summary import BatchSummary
 from pnpdepth_cli.commands.error_tables import (
     baselines_table,
     error_table,
@@ -27,6 +26,9 @@ from pnpdepth_cli.commands.tables import Cell, Table, count_of, write_text
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.stages import GT, HELD_OUT
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.commands.batch.summary import BatchSummary
 
 _COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
 
