@@ -296,16 +296,17 @@ def _compare(
         )
     if gt.shape != points.size:
         raise _size_error(files, gt.shape, points.size)
-    # Nothing decides a scale that is assumed of the ground truth, or of both alike.
-    notes, of_truth = list[str](), truth.reading
-    if of_truth and of_truth.assumed and (files.sparse is None or sparse.reading.assumed):
-        notes.append(
+    if files.sparse is None:
+        # No file beside the ground truth decides a scale that is assumed.
+        of_truth = truth.reading
+        if of_truth is None or not of_truth.assumed:
+            return []
+        return [
             f"warning: the scale of the ground truth ({of_truth.source}) is assumed, and with it"
             f" the metres of all errors; --depth-scale 1000 if it holds millimetres, --depth-scale"
             f" {of_truth.scale:g} if it is right"
-        )
-    if files.sparse is None:
-        return notes
+        ]
+    notes = list[str]()
     depth, known = points.scatter()[0, 0].numpy(), int((gt > 0).sum())
     leaked = int(((gt > 0) & (depth == gt)).sum())
     if leaked >= _LEAK_FRACTION * known:
