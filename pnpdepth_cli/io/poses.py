@@ -80,14 +80,14 @@ def poses_of_frames(
         kind = kind or "opengl"
     else:
         poses, how = _poses_of_rows(path, names)
+    direction, axes = "from camera to world", "x right, y down, z forward"
     if kind == "opengl":
-        turned = poses * (1, -1, -1, 1)
-        return turned, f"{how}; taken as from camera to world, of axes y up and z back (OpenGL)"
-    if kind == "world-to-camera":
+        poses, axes = poses * (1, -1, -1, 1), "y up and z back (OpenGL)"
+    elif kind == "world-to-camera":
         turns = poses[:, :, :3].transpose(0, 2, 1)
         poses = np.concatenate([turns, -turns @ poses[:, :, 3:]], axis=2)
-        return poses, f"{how}; taken as from world to camera, of axes x right, y down, z forward"
-    return poses, f"{how}; taken as from camera to world, of axes x right, y down, z forward"
+        direction = "from world to camera"
+    return poses, f"{how}; taken as {direction}, of axes {axes}"
 
 
 def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:

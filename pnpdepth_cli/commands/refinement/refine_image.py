@@ -281,9 +281,9 @@ def _scores(depth: DepthMap, gt: DepthMap) -> Scores:
 def _at_points(points: SparsePoints, maps: dict[str, DepthMap]) -> Stages:
     """The errors of depth maps (H, W) at points of the same image, where both are known."""
     stages: Stages = {}
-    for name, depth in maps.items():
-        predicted = points.sample(torch.from_numpy(depth))
-        error = (predicted - points.depth)[points.known_in(torch.from_numpy(depth))].double()
+    for name, values in maps.items():
+        depth = torch.from_numpy(values)
+        error = (points.sample(depth) - points.depth)[points.known_in(depth)].double()
         if not len(error):
             continue
         mae, rmse = float(error.abs().mean()), float(error.square().mean().sqrt())
