@@ -102,7 +102,10 @@ def read_scan_points(
     points = project_velodyne(xyz, camera, scanner, size, keep_occluded=options.keep_occluded)
     warnings += _outside_warning(scanner.apply(xyz), camera, size)
     if image is not None and not calibration.rectified:
-        warnings += _better_reading(points, calibration, options, image)
+        visible = points  # an occluded point is no evidence about the edges of the image
+        if options.keep_occluded:
+            visible = project_velodyne(xyz, camera, scanner, size)
+        warnings += _better_reading(visible, calibration, options, image)
     # What a person should know, and what a record keeps.
     reading = Reading(f"{scan.source} of {len(xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
