@@ -11,11 +11,11 @@ import click
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.compare_command import columns
 from pnpdepth_cli.cli.progress import progress_bar
-from pnpdepth_cli.cli.streams import print_json, say
+from pnpdepth_cli.cli.streams import print_json
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.errors import FramesFailedError
 
-_OUTPUT = ("--csv", "--latex", "--columns", "--html", "--overwrite", "--json")
+_OUTPUT = ("--csv", "--latex", "--columns", "--overwrite", "--json")
 
 
 @click.command(
@@ -37,18 +37,12 @@ _OUTPUT = ("--csv", "--latex", "--columns", "--html", "--overwrite", "--json")
 @options.options_of_groups(EvalRequest)
 @options.table_files(csv="Write a row per frame.", latex="Write a tabular of the means.")
 @columns
-@click.option(
-    "--html",
-    type=options.FILE,
-    metavar="FOLDER",
-    help="Write an HTML report: every frame beside its ground truth, the worst first.",
-)
-def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: Any) -> None:
+def evaluate(prediction: Path, ground_truth: Path, **values: Any) -> None:
     """Score the depth in PRED against the ground truth in GT: two files, or two folders.
 
     \b
     pnpdepth eval pred.png gt.png
-    pnpdepth eval out/ gt/ --protocol kitti --csv scores.csv --html report/
+    pnpdepth eval out/ gt/ --protocol kitti --csv scores.csv
     pnpdepth eval out/ gt/ --json > runs/a.json
     pnpdepth eval out/ gt/ --protocol eigen --max-depth 50
 
@@ -70,15 +64,12 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
     """
     from pnpdepth_cli.cli.printing import TableFiles, print_notes, print_table
     from pnpdepth_cli.commands.evaluation import evaluate as command
-    from pnpdepth_cli.commands.report import eval_report as report_eval
     from pnpdepth_cli.measures import OF_SIGMA, choose_measures
 
     # All that can be wrong is found before anything is scored.
     files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
     files.check((prediction, ground_truth))
     keys = values.pop("columns")
-    if html is not None:
-        report_eval.check_eval_report(html, [prediction, ground_truth], overwrite=files.overwrite)
     request = EvalRequest(prediction=prediction, ground_truth=ground_truth, **values)
     choose_measures((*request.measures, *OF_SIGMA), keys)
     # The scores, as tables and as JSON.
@@ -94,10 +85,6 @@ def evaluate(prediction: Path, ground_truth: Path, html: Path | None, **values: 
         print_table(means)
         if len(evaluation.frames) > 1:
             print_table(command.worst_frames(evaluation, keys))
-    if html is not None:
-        with progress_bar("report", "frame") as show:
-            report_eval.write_eval_report(html, evaluation, keys, on_frame=show)
-        say(f"wrote {html / 'index.html'}")
     if reasons := evaluation.describe_unscored():
         out, of = len(evaluation.frames) - len(evaluation.scored), len(evaluation.frames)
         raise FramesFailedError(

@@ -26,11 +26,11 @@ UNKNOWN = 70
 
 _SIGNED = {
     "gain": ((25, 90, 190), (220, 105, 0)),
-    "error": ((220, 105, 0), (25, 90, 190)),
     "change": ((1, 102, 94), (118, 42, 131)),
 }
-"""Colours of 1 and -1: better and worse, too far and too near, farther and
-nearer. Blue and orange are told apart by colour-blind eyes."""
+"""Colours of 1 and -1: better and worse, farther and nearer.
+
+Blue and orange are told apart by colour-blind eyes."""
 
 LOGARITHMIC_FROM = 8.0
 """Ratio of far to near from which the scale is logarithmic.

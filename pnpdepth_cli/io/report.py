@@ -28,7 +28,7 @@ from pnpdepth_cli.io.atomic import (
     make_folder,
     remove_leftovers,
 )
-from pnpdepth_cli.io.figure import LOGARITHMIC_FROM, DepthScale, Pixels, hex_colours, resized
+from pnpdepth_cli.io.figure import LOGARITHMIC_FROM, DepthScale, hex_colours
 from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.measures import Measure
 
@@ -36,11 +36,8 @@ PAGE = "index.html"
 IMAGES = "images"
 VIEWER = "viewer.js"
 _MADE_OF = "report.json"
-_IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.(?:jpg|png|js)")
+_IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.(?:png|js)")
 _INVISIBLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-_VIEW_SIZE = 960  # of the longer side, at most
-_SMALL = 480  # smaller views are enlarged by a whole number, so that their pixels stay square
-_QUALITY = 85
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,26 +160,6 @@ def _write_page(
         file.writelines(parts)
     if viewer:
         _write_text(folder / VIEWER, _source("../three/three.min.js") + "\n" + _source(VIEWER))
-
-
-def save_views(images: Path, key: str, views: Mapping[str, Pixels]) -> dict[str, dict[str, str]]:
-    """Writes a JPEG of each (H, W, 3) view, at most 960 pixels long; returns the page's entries.
-
-    Args:
-        images: The report's folder for images.
-        key: Start of their names.
-        views: Pixels by the name of the view.
-    """
-    from PIL import Image
-
-    for name, pixels in views.items():
-        longest = max(pixels.shape[:2])
-        fit = _VIEW_SIZE // longest if longest < _SMALL else min(1.0, _VIEW_SIZE / longest)
-        with atomic_path(images / f"{key}_{name}.jpg") as temporary:
-            # Without chroma subsampling, which blurs edges between colours.
-            image = Image.fromarray(np.ascontiguousarray(resized(pixels, fit)))
-            image.save(temporary, "JPEG", quality=_QUALITY, subsampling=0)
-    return {name: {"src": f"{IMAGES}/{key}_{name}.jpg"} for name in views}
 
 
 def link_image(source: Path, target: Path) -> None:

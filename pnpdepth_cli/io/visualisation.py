@@ -114,24 +114,6 @@ def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
         Image.fromarray(np.where(mask, np.uint8(255), np.uint8(0))).save(temporary, "PNG")
 
 
-def error_map(
-    prediction: Depth, ground_truth: Depth, grey: NDArray[np.float32] | None
-) -> tuple[Pixels, float]:
-    """Returns a map (H, W, 3) of where the prediction is too far or too near.
-
-    Args:
-        prediction: (H, W) metres, 0 where there is none.
-        ground_truth: (H, W) metres, 0 where it is unknown or does not count.
-        grey: (H, W) in 0..1, the ground of the map; None for a uniform one.
-
-    Returns:
-        The colours, and the error in metres that has full colour.
-    """
-    both = (prediction > 0) & (ground_truth > 0)
-    error = prediction[both].astype(np.float64) - ground_truth[both]
-    return _paint(error, both, grey, "error")
-
-
 def _paint(
     values: NDArray[np.float64],
     where: NDArray[np.bool_],

@@ -141,14 +141,3 @@ def test_a_name_that_is_no_utf_8_is_scored_and_printed(
     for form in ("--json", "--csv -", "--latex -", "--columns rmse"):
         assert code_of("eval", "out", "gt", *form.split()) == 0
     assert b"\\udcff" in capfdbinary.readouterr().out
-
-
-def test_an_evaluation_replaces_a_report_only_if_asked(root: Path) -> None:
-    arguments = ("eval", "drive/gt", "drive/gt", "--html")
-    assert code_of(*arguments, "scores") == 0
-    before = Path("scores/index.html").stat().st_mtime_ns
-    assert code_of(*arguments, "scores") == 2
-    assert Path("scores/index.html").stat().st_mtime_ns == before
-    assert code_of(*arguments, "drive/net/my_net.py/report") == 2
-    assert code_of(*arguments, "scores", "--overwrite") == 0
-    assert Path("scores/index.html").stat().st_mtime_ns > before

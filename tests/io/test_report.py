@@ -82,16 +82,16 @@ def test_the_page_names_no_address_and_lets_nothing_run_but_itself(tmp_path: Pat
 def test_images_of_the_report_before_are_removed_and_nothing_else(tmp_path: Path) -> None:
     written(tmp_path, HEAD, [])
     kept, stale, images = image_key("a"), image_key("b"), tmp_path / "images"
-    for name in (f"{kept}_map.jpg", f"{stale}_map.jpg", "mine.jpg", f"{stale}.txt"):
+    for name in (f"{kept}_map.png", f"{stale}_map.png", "mine.png", f"{stale}.txt"):
         (images / name).write_bytes(b"x")
 
     def frames(images: Path) -> list[dict[str, Any]]:
-        (images / f"{kept}_map.jpg").write_bytes(b"y")
+        (images / f"{kept}_map.png").write_bytes(b"y")
         return []
 
     write_report(tmp_path, {}, HEAD, frames)
     left = {path.name: path.read_bytes() for path in images.iterdir()}
-    assert left == {f"{kept}_map.jpg": b"y", "mine.jpg": b"x", f"{stale}.txt": b"x"}
+    assert left == {f"{kept}_map.png": b"y", "mine.png": b"x", f"{stale}.txt": b"x"}
 
 
 def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from PIL import Image
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.figure import MARGIN, UNKNOWN, DepthScale, depth_scale, resized
 from pnpdepth_cli.io.visualisation import (
-    error_map,
     improvement,
     preview,
     sigma_preview,
@@ -130,18 +129,6 @@ def test_ticks_lie_within_the_scale_and_in_order(low: float, ratio: float) -> No
     positions = scale.position(np.array([low, *ticks, low * ratio]))
     assert (np.diff(positions) >= 0).all()
     assert (positions[0], positions[-1]) == (0, pytest.approx(1))
-
-
-def test_the_error_map_has_different_colours_for_too_far_and_too_near() -> None:
-    truth = np.full((1, 4), 2, np.float32)
-    pixels, strongest_m = error_map(np.array([[3, 1, 2, 0]], np.float32), truth, None)
-    assert strongest_m == 1
-    assert pixels[0, :2].tolist() == [ORANGE, BLUE]
-    right, none = pixels[0, 2].tolist(), pixels[0, 3].tolist()
-    assert len(set(right)) == len(set(none)) == 1
-    assert right[0] > 150 > 80 > none[0]
-    pixels, _ = error_map(truth, truth, np.full((1, 4), 0.5, np.float32))
-    assert (pixels == pixels[0, 0, 0]).all()
 
 
 def test_a_large_standard_deviation_is_warm(tmp_path: Path) -> None:

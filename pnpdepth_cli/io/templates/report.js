@@ -46,11 +46,10 @@ const titled = (column) => column.title + (column.unit ? ` [${column.unit}]` : "
 const noted = (note) =>
   make("li", { class: note.startsWith("warning") ? "warning" : "", text: visible(note) });
 
-// A view of a frame: its own file, or a panel (left, top, width, height) of a figure.
+// A view of a frame: a panel (left, top, width, height) of a figure.
 function picture(frame, view, attributes, ratio) {
   const { src, box, size } = frame.views[view];
   const image = make("img", { ...attributes, src }); // src last: nothing is read before it is in view
-  if (!box) return image;
   let [x, y, w, h] = box;
   if (ratio && w > h * ratio) [x, w] = [x + (w - h * ratio) / 2, h * ratio];
   else if (ratio) [y, h] = [y + (h - w / ratio) / 2, w / ratio];
