@@ -117,7 +117,7 @@ LOSSES = OpenList(
     in_file="loss",
     group="losses",
     noun="loss",
-    names=("l1", "l2", "huber", "berhu", "inverse", "log", "cauchy"),
+    names=("l1", "l2", "huber", "berhu", "cauchy"),
 )
 """L: (N,) predicted and (N,) measured depth to a scalar."""
 
@@ -126,7 +126,7 @@ UPDATES = OpenList(
     in_file="update_rule",
     group="updates",
     noun="update rule",
-    names=("sign", "sgd", "normalised", "momentum", "adam", "lbfgs"),
+    names=("sign", "sgd", "normalised", "momentum", "adam"),
 )
 """U: each entry creates a rule that turns gradients into directions of z."""
 
@@ -134,7 +134,7 @@ PROPAGATIONS = OpenList(
     "pnpdepth_cli.completion.propagation",
     group="propagations",
     noun="propagation",
-    names=("gp", "local", "diffusion"),
+    names=("gp", "local"),
 )
 """How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
 
@@ -143,7 +143,7 @@ BASELINES = OpenList(
     group="baselines",
     noun="baseline",
     names=(
-        *("nearest", "linear", "linear-log", "idw", "morphological", "median", "scale", "affine"),
+        *("nearest", "linear", "linear-log", "median", "scale", "affine"),
         *("scale-disparity", "affine-disparity", "local"),
     ),
 )

@@ -113,9 +113,8 @@ class Settings:
     )
     propagate: str | None = option(
         None,
-        "Propagate the residuals at the points to all pixels: by a Gaussian process, lines through"
-        " the nearest points, or edge-aware diffusion.  [default: none, with other options of the"
-        " method]",
+        "Propagate the residuals at the points to all pixels: by a Gaussian process, or lines"
+        " through the nearest points.  [default: none, with other options of the method]",
         choices=("none", *choices.PROPAGATIONS),
     )
     seed: int = option(

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.core.losses import MAD_TO_STD
 from pnpdepth_cli.errors import ModelError, NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
@@ -30,7 +31,6 @@ BEYOND = 10.0
 _PAIRS = 1024
 _SCORED = 1024
 _BIWEIGHT = 4.685  # of Tukey's weights: 95 % efficient for normal errors (Holland, Welsch 1977)
-_NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, normal errors
 _BEST = 0.7  # fraction of the points that `error` is measured on
 _MAX_ERROR = 1.0  # |log| error above which a point counts no more
 _MIN_ERROR = 1e-3  # relative errors below this do not distinguish alignments
@@ -169,7 +169,7 @@ def _fit(x: Tensor, d: Tensor, space: str, kind: str) -> Alignment | None:
     )
     off = (fit.depth(x).log() - d.log()).abs()
     error = float(off.sort().values[: max(1, round(_BEST * len(off)))].mean())
-    gross = max(3 * _NORMAL_MAD * float(off.median()), 0.05)
+    gross = max(3 * MAD_TO_STD * float(off.median()), 0.05)
     misfit = float(off.clamp_max(_MAX_ERROR).mean())
     return replace(fit, error=error, misfit=misfit, outliers=float((off > gross).double().mean()))
 
@@ -237,7 +237,7 @@ def _fit_reweighted(
     least = 1e-9 * float(y.abs().median()) + torch.finfo(y.dtype).tiny
     for _ in range(30):
         residual = (y - a * x - b).abs()
-        cutoff = _BIWEIGHT * max(_NORMAL_MAD * float(residual.median()), least)
+        cutoff = _BIWEIGHT * max(MAD_TO_STD * float(residual.median()), least)
         w = (1 - (residual / cutoff).square()).clamp_min(0).square()
         total = w.sum()
         mx, my = ((w * x).sum() / total, (w * y).sum() / total) if shifted else (0.0, 0.0)

@@ -15,13 +15,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import align, align_prediction, to_space, where_predicted
-from pnpdepth_cli.completion.interpolation import (
-    distinct,
-    inverse_distance,
-    linear,
-    morphological,
-    nearest,
-)
+from pnpdepth_cli.completion.interpolation import distinct, linear, nearest
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import local_lines
 from pnpdepth_cli.errors import UsageError
@@ -111,8 +105,6 @@ TABLE = {
         of_points=partial(linear, space="log"),
         pointwise=True,
     ),
-    "idw": Baseline(title="inverse distance weighting", of_points=inverse_distance, pointwise=True),
-    "morphological": Baseline(title="morphological fill (IP-Basic)", of_points=morphological),
     "median": _align_by("median of ratios", kind="median", space="depth"),
     "scale": _align_by("scale", kind="scale", space="depth"),
     "affine": _align_by("scale and shift", kind="affine", space="depth"),

@@ -9,14 +9,10 @@ everywhere. Without any, NoPointsError is raised.
 from __future__ import annotations
 
 import functools
-import math
-from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
@@ -26,18 +22,9 @@ from pnpdepth_cli.completion.alignment import from_space, to_space
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
-FILL_SHARE = 0.03
-"""Fraction of the pixels with a point for which the kernels of `morphological` are as published."""
-
 _MOST_REMEMBERED = 1 << 16  # coordinate pairs up to which a result is remembered
-_IDW_PIXELS = 1 << 18  # pixels looked up at once: what bounds the memory
-_IDW_NEIGHBOURS, _IDW_POWER = 6, 4.0
 _AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
 _WORTH_THREADS = 1 << 15  # neighbours; for fewer, threads cost more than they save
-_DIAMOND = np.array(
-    [[abs(x) + abs(y) <= 2 for x in range(-2, 3)] for y in range(-2, 3)], dtype=np.uint8
-)
-_BLUR_SIGMA = 1.1  # pixels; what OpenCV makes of the 5 × 5 Gaussian kernel of the paper's code
 
 
 def nearest(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
@@ -78,62 +65,6 @@ def in_hull(points: SparsePoints) -> Tensor:
     for x, y, offset in planes.tolist():
         inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
     return inside.reshape(points.size).to(points.depth.device)
-
-
-def inverse_distance(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
-    """Returns the mean log depth of the six nearest points, weighted by 1 / distance⁴, as depth.
-
-    Shepard, "A two-dimensional interpolation function for irregularly-spaced data", 1968, of the
-    nearest points only.
-    """
-    points = distinct(points)
-    value = points.depth.cpu().double().log()
-    pixels, means = _queries(points, xy), []
-    for some in torch.split(pixels, _IDW_PIXELS):
-        distance, number = nearest_points(points, some, min(_IDW_NEIGHBOURS, len(points)))
-        weight = distance.clamp_min(_AT_A_POINT).pow(-_IDW_POWER)
-        means.append((weight * value[number]).sum(dim=1) / weight.sum(dim=1))
-    return _reshape(torch.cat(means).exp(), points, xy)
-
-
-def morphological(points: SparsePoints) -> Tensor:
-    """Returns depth filled by morphology: near depth grows over far depth, holes are closed.
-
-    The steps are those of Ku, Harakeh, Waslander, "In Defense of Classical Image Processing: Fast
-    Depth Completion on the CPU", 2018: dilation by a 5 × 5 diamond, closing by 5 × 5, holes filled
-    by a 7 × 7 dilation, median and Gaussian blur of 5 × 5. The kernels are for a LiDAR's density;
-    with fewer points the grid is coarser in proportion. The paper fills other holes by a 31 × 31
-    dilation and by each column's topmost value. Here the nearest depth fills them, which is better.
-    """
-    from scipy.ndimage import distance_transform_edt
-
-    points = distinct(points)
-    height, width = points.size
-    shrink = min(1.0, math.sqrt(len(points) / (FILL_SHARE * height * width)))
-    coarse = points.resized(max(1, round(height * shrink)), max(1, round(width * shrink)))
-    # Points outside the image are moved onto its outermost pixels.
-    last = coarse.xy.new_tensor([coarse.size[1] - 1, coarse.size[0] - 1])
-    coarse = replace(coarse, xy=torch.minimum(coarse.xy.clamp_min(0), last))
-    sparse = coarse.scatter().cpu()[0, 0]
-    # Of minus depth the maximum is the nearest, and minus infinity is unknown.
-    value = torch.where(sparse > 0, -sparse, -torch.inf).numpy()
-    # Dilation, closing, and small holes.
-    five, seven = (np.ones((side, side), np.uint8) for side in (5, 7))
-    value = _dilate(value, _DIAMOND)
-    value = -_dilate(-_dilate(value, five), five)
-    value = np.where(np.isinf(value), _dilate(value, seven), value)
-    # The nearest depth in what is left.
-    nearest_known = distance_transform_edt(
-        np.isinf(value), return_distances=False, return_indices=True
-    )
-    smooth = torch.from_numpy(cv2.medianBlur(value[tuple(nearest_known)], 5))
-    # The blur, and the image's own size.
-    kernel = torch.exp(-0.5 * (torch.arange(-2.0, 3.0) / _BLUR_SIGMA) ** 2)
-    kernel = (kernel / kernel.sum()).reshape(1, 1, 1, 5)
-    padded = F.pad(smooth[None, None], (2, 2, 2, 2), mode="replicate")
-    dense = -F.conv2d(F.conv2d(padded, kernel), kernel.transpose(2, 3))
-    dense = F.interpolate(dense, points.size, mode="bilinear", align_corners=False)
-    return dense[0, 0].to(points.depth.device)
 
 
 def distinct(points: SparsePoints) -> SparsePoints:
@@ -216,8 +147,3 @@ def _bytes_of(points: SparsePoints) -> bytes:
 
 def _coordinates(values: bytes) -> NDArray[np.float64]:
     return np.frombuffer(values).reshape(-1, 2)
-
-
-def _dilate(value: NDArray[np.float32], kernel: NDArray[np.uint8]) -> NDArray[np.float32]:
-    # What lies outside has no effect: a replicated pixel is below the kernel itself.
-    return np.asarray(cv2.dilate(value, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)

@@ -13,6 +13,7 @@ from torch import Tensor
 from pnpdepth_cli.completion.gaussian_process import leave_one_out, neighbourhoods
 from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.completion.residual_field import ResidualField, residual_field
+from pnpdepth_cli.core.losses import MAD_TO_STD
 from pnpdepth_cli.points import SparsePoints
 
 ALONE = 10.0
@@ -23,7 +24,6 @@ FAR = 0.2
 _COMPARED = 8  # neighbours that a point is compared with,
 _AGREEING = 2  # of which so many must agree with it
 _MIN_DISAGREEMENT = 0.005  # of log depth; less is none
-_NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
 
 _PASSES = 3  # without the worst outliers, others stand out
 _MIN_POINTS = 5  # fewer do not predict each other
@@ -95,7 +95,7 @@ def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
     xy = points.xy.double()
     _, near = nearest_points(points, xy, min(_COMPARED + 1, len(points)))
     apart = (residual[near[:, 1:]] - residual[:, None]).abs().sort(dim=1).values[:, _AGREEING - 1]
-    typical = max(_NORMAL_MEDIAN * float(apart.median()), _MIN_DISAGREEMENT)
+    typical = max(MAD_TO_STD * float(apart.median()), _MIN_DISAGREEMENT)
     return (1 - (apart / (ALONE * typical)).square()).clamp_min(0).square()
 
 
@@ -111,7 +111,7 @@ def inlier_mask(field: ResidualField) -> Tensor:
         for cutoff in _CUTOFFS:
             error, variance = leave_one_out(field, near, weight)
             ratio = error[0].abs() / variance[0].sqrt()
-            typical = max(_NORMAL_MEDIAN * float(ratio.median()), _MIN_ERROR)
+            typical = max(MAD_TO_STD * float(ratio.median()), _MIN_ERROR)
             weight = (1 - (ratio / (cutoff * typical)).square()).clamp_min(0).square()
     inliers = weight > _MIN_WEIGHT
     inliers = inliers | _suspected_together(field.points, ~inliers)

@@ -16,15 +16,6 @@ These are moving least squares (Lancaster and Salkauskas 1981) of the depth agai
 as in locally weighted alignment of monocular depth (Xu et al. 2022). Instead of a bandwidth, the
 weights make the lines go through the points, which was far better on rendered frames from 20 points
 to LiDAR.
-
-"diffusion" diffuses r over the image up to the edges. With c the correction on a grid of nodes,
-
-    min over c of  Σ_points (c(p) − r_p)² + λ·Σ_edges w_ij·(c_i − c_j)² + ε·Σ_i (c_i − median r)²,
-
-w_ij = 1 / (position² + (u_i − u_j)² + (colour_i − colour_j)²), each over its length: one sparse
-linear system, as in Levin, Lischinski, Weiss, "Colorization using optimization", 2004, with the
-weights of Perona and Malik 1990. The fewer the points, the coarser the grid: each node between two
-points counts as one more step, so that on a fine grid the residual stays close to the points.
 """
 
 from __future__ import annotations
@@ -32,7 +23,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -50,16 +40,9 @@ NEIGHBOURS = 12
 POWER = 3.0
 RIDGE = 0.03
 """Against the variance of x among the points of a pixel, in units of its variance among all."""
-STIFFNESS = 1e-4
-"""λ of diffusion, with the weights at 1 where neighbours look the same."""
-EDGE_DEPTH, EDGE_COLOUR = 0.1, 0.5
-"""Differences of neighbouring nodes, in standard deviations of the image, that halve a weight."""
-
 _LINES = 400_000  # that are fitted; with more pixels, lines are interpolated
 _AT_A_POINT = 0.5  # pixels; closer than this, a point is as close as can be
 _OUTLIER_WEIGHT = 1e-6  # what an outlier counts where no other point is near
-_NODES_PER_POINT, _MIN_NODES, _MAX_NODES = 10, 2_000, 30_000
-_REGULARISATION = 1e-9  # ε: for nodes that no point reaches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,57 +168,6 @@ def _residual_by_lines(field: ResidualField, queries: SparsePoints | None = None
     return (shift + slope * depth).float()
 
 
-def diffuse(field: ResidualField) -> Tensor:
-    """Returns the residual (H, W) float32 at every pixel."""
-    from scipy.sparse import coo_array, csc_array, eye_array
-    from scipy.sparse.csgraph import laplacian
-    from scipy.sparse.linalg import splu
-
-    height, width = field.points.size
-    wanted = min(max(_NODES_PER_POINT * len(field.points), _MIN_NODES), _MAX_NODES)
-    shrink = min(1.0, math.sqrt(wanted / (height * width)))
-    rows, columns = max(1, round(height * shrink)), max(1, round(width * shrink))
-    nodes = F.interpolate(torch.stack(field.features)[None], (rows, columns), mode="area")[0]
-    number = torch.arange(rows * columns).reshape(rows, columns)
-    first = torch.cat([number[:, :-1].flatten(), number[:-1].flatten()])
-    second = torch.cat([number[:, 1:].flatten(), number[1:].flatten()])
-    node_features = nodes.flatten(1).t().double()
-    step = node_features[first] - node_features[second]
-    apart = (step[:, 2] / EDGE_DEPTH).square()
-    apart = apart + (step[:, 3:] / EDGE_COLOUR).square().sum(dim=1)
-    weight = STIFFNESS / (1 + apart)
-    total = rows * columns
-    ends = torch.cat([first, second]).numpy(), torch.cat([second, first]).numpy()
-    adjacent = coo_array((weight.repeat(2).numpy(), ends), shape=(total, total)).tocsr()
-    reads = _readings(field, rows, columns)
-    middle = float(field.residual.median())
-    system = reads.T @ reads + laplacian(adjacent) + _REGULARISATION * eye_array(total)
-    right = reads.T @ (field.residual - middle).numpy()
-    # The matrix is positive definite: diagonal pivots are stable, and keep the factors sparse.
-    mode = {"SymmetricMode": True}
-    order = "MMD_AT_PLUS_A"
-    factors = splu(csc_array(system), permc_spec=order, diag_pivot_thresh=0.0, options=mode)
-    solution = torch.from_numpy(factors.solve(right)).float()
-    correction = solution.reshape(1, 1, rows, columns) + middle
-    return F.interpolate(correction, (height, width), mode="bilinear", align_corners=False)[0, 0]
-
-
-def _readings(field: ResidualField, rows: int, columns: int) -> Any:
-    """The sparse matrix (N, nodes) that reads a map of the nodes at the points, bilinearly."""
-    from scipy.sparse import coo_array
-
-    xy = field.points.resized(rows, columns).xy.double()
-    x, y = xy[:, 0].clamp(0, columns - 1), xy[:, 1].clamp(0, rows - 1)
-    left, top = x.floor(), y.floor()
-    fx, fy = x - left, y - top
-    right, bottom = x.ceil(), y.ceil()
-    nodes = torch.stack([row * columns + x for row in (top, bottom) for x in (left, right)])
-    weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
-    which = torch.arange(len(xy)).repeat(4, 1)
-    values = (weights.flatten().numpy(), (which.flatten().numpy(), nodes.long().flatten().numpy()))
-    return coo_array(values, shape=(len(xy), rows * columns)).tocsr()
-
-
 TABLE = {
     "gp": Propagation(
         title="Gaussian process",
@@ -250,6 +182,5 @@ TABLE = {
         dense=_residual_by_lines,
         at=_residual_by_lines,
     ),
-    "diffusion": Propagation(title="edge-aware diffusion", dense=diffuse),
 }
 """The propagations by name, as in `choices.PROPAGATIONS`."""

@@ -22,7 +22,7 @@ TABLE: dict[str, Loss] = {}
 """The losses by name."""
 
 MIN_DEPTH = 1e-3
-"""Metres; losses of inverse and log depth clamp the prediction to at least this."""
+"""Metres; a prediction is at least this before its logarithm is taken."""
 
 MAD_TO_STD = 1.4826
 """Standard deviation over the median of |e|, for normally distributed e."""
@@ -79,18 +79,6 @@ def berhu(predicted: Tensor, true: Tensor) -> Tensor:
     error = (predicted - true).abs()
     c = (0.2 * error.detach().max()).clamp_min(torch.finfo(error.dtype).tiny)
     return torch.where(error <= c, error, (error.square() + c.square()) / (2 * c)).mean()
-
-
-@loss("inverse")
-def inverse(predicted: Tensor, true: Tensor) -> Tensor:
-    """Mean |1/p − 1/d| (Jaritz et al. 2018)."""
-    return (predicted.clamp_min(MIN_DEPTH).reciprocal() - true.reciprocal()).abs().mean()
-
-
-@loss("log")
-def log(predicted: Tensor, true: Tensor) -> Tensor:
-    """Mean |log p − log d|."""
-    return (predicted.clamp_min(MIN_DEPTH).log() - true.log()).abs().mean()
 
 
 @loss("cauchy")

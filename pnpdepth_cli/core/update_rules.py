@@ -7,7 +7,6 @@ order, and returns a direction of the same shape; z moves by −α × direction.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -22,9 +21,6 @@ Rule = TypeVar("Rule", bound=Callable[..., Update])
 
 TABLE: dict[str, Callable[[], Update]] = {}
 """Functions that make a rule, by name."""
-
-MAX_RMS = 10.0
-"""Largest root mean square of an L-BFGS direction; that of the first direction is 1."""
 
 
 def update_rule(name: str) -> Callable[[Rule], Rule]:
@@ -102,55 +98,6 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
         return (first / (1 - beta1**step)) / ((second / (1 - beta2**step)).sqrt() + eps)
 
     return update
-
-
-@update_rule("lbfgs")
-def lbfgs(memory: int = 10) -> Update:
-    """Returns limited-memory BFGS, the two-loop recursion (Nocedal & Wright 2006, algorithm 7.4).
-
-    Not torch.optim.LBFGS: its strong-Wolfe search evaluates loss and gradient several times per
-    step, whereas here each of the K updates has exactly one rear pass and one gradient. The first
-    direction is the normalised gradient.
-
-    After the first update, the displacement of z does not depend on α. The rule takes its last
-    direction for the displacement of z, which is too large by 1/α. So its inverse Hessian is too
-    large by 1/α, and the step α cancels that. Pairs of negative curvature are skipped, and
-    directions are shortened to MAX_RMS.
-
-    Args:
-        memory: Number of the last pairs of displacement and gradient change that are used.
-    """
-    pairs: deque[tuple[Tensor, Tensor]] = deque(maxlen=memory)  # of −direction and the change of g
-    last: tuple[Tensor, Tensor] | None = None  # gradient and direction
-    first = normalised()
-
-    def update(gradient: Tensor) -> Tensor:
-        nonlocal last
-        if last is not None:
-            step, change = -last[1], gradient - last[0]
-            if (step * change).sum() > 0:
-                pairs.append((step, change))
-        direction = _two_loops(gradient, pairs) if pairs else first(gradient)
-        last = gradient, direction
-        return direction
-
-    return update
-
-
-def _two_loops(gradient: Tensor, pairs: deque[tuple[Tensor, Tensor]]) -> Tensor:
-    """The product of the approximate inverse Hessian and the gradient, at most MAX_RMS long."""
-    direction, alphas = gradient, []
-    for step, change in reversed(pairs):
-        alpha = (step * direction).sum() / (step * change).sum()
-        alphas.append(alpha)
-        direction = direction - alpha * change
-    step, change = pairs[-1]
-    direction = direction * ((step * change).sum() / change.square().sum())
-    for (step, change), alpha in zip(pairs, reversed(alphas), strict=True):
-        beta = (change * direction).sum() / (step * change).sum()
-        direction = direction + (alpha - beta) * step
-    rms = direction.square().mean().sqrt()
-    return direction * (MAX_RMS / rms.clamp_min(MAX_RMS))
 
 
 SCHEDULES: dict[str, Callable[[float], float]] = {

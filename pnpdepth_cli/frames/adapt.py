@@ -1,8 +1,8 @@
 """Weights that learn from the points of a sequence, without ground truth: `--adapt`.
 
 A network that is given the points as an input fits them already. So it is asked for points that it
-is not given. Half of a frame's points, m ⊂ D_s, are hidden from the input. The loss L is taken at
-these, and Adam updates the weights θ:
+is not given. Half of a frame's points, m ⊂ D_s, are hidden from the input. The loss L, the mean
+error of log depth, is taken at these, and Adam updates the weights θ:
 
     θ_{k+1} = θ_k − α·Adam(∂L(f_θ(x, D_s ∖ m_k), m_k) / ∂θ_k)
 
@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from pnpdepth_cli.completion.outliers import outliers
-from pnpdepth_cli.core.losses import checked_loss
+from pnpdepth_cli.core.losses import MIN_DEPTH
 from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError
 from pnpdepth_cli.frames.frame import Frame, is_dense
@@ -45,7 +45,6 @@ LEAST_FRAMES = 8
 """Least number of frames of a sequence; fewer teach too little."""
 SIGNIFICANT = 0.05
 """Level of the one-sided paired t test over the frames for validation."""
-_LOSS = "log"
 
 Weights = Mapping[str, Tensor]
 """Values of parameters in float32, by name."""
@@ -197,7 +196,8 @@ class _Lesson:
             output = functional_call(module, values, arguments)
         predicted = asked.sample(reader(output))
         known = predicted.isfinite()  # unknown where the network says so, such as in the sky
-        return checked_loss(_LOSS)(predicted[known], asked.depth[known])
+        log_error = predicted[known].clamp_min(MIN_DEPTH).log() - asked.depth[known].log()
+        return log_error.abs().mean()
 
 
 def _weights_that_learn(network: Network) -> dict[str, Tensor]:

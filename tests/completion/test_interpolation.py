@@ -12,13 +12,7 @@ from torch import Tensor
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import from_space
-from pnpdepth_cli.completion.interpolation import (
-    in_hull,
-    inverse_distance,
-    linear,
-    morphological,
-    nearest,
-)
+from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
@@ -26,8 +20,6 @@ FILLS: dict[str, Callable[[SparsePoints], Tensor]] = {
     "nearest": nearest,
     "linear": linear,
     "linear log": partial(linear, space="log"),
-    "idw": inverse_distance,
-    "morphological": morphological,
 }
 
 
@@ -49,11 +41,6 @@ def scattered(
 def pixels(size: tuple[int, int]) -> Tensor:
     y, x = torch.meshgrid(*(torch.arange(float(n)) for n in size), indexing="ij")
     return torch.stack([x, y], dim=-1)
-
-
-def distances(points: SparsePoints) -> Tensor:
-    """(H, W, N) of every pixel to every point."""
-    return (pixels(points.size)[:, :, None].double() - points.xy.double()).norm(dim=-1)
 
 
 @pytest.mark.parametrize("name", FILLS)
@@ -142,25 +129,3 @@ def test_the_hull_holds_the_pixels_between_three_points_and_none_of_fewer_or_of_
     points = points_at(xy, [1.0] * len(xy), (3, 4))
     expected = torch.tensor([[(x, y) in inside for x in range(4)] for y in range(3)])
     assert torch.equal(in_hull(points), expected)
-
-
-def test_inverse_distance_is_shepards_mean_of_the_nearest_points(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    points = scattered(60)
-    distance, number = distances(points).clamp_min(0.25).sort(dim=-1)
-    weight = distance[..., :6].pow(-4.0)
-    mean = (weight * points.depth[number[..., :6]].double().log()).sum(-1) / weight.sum(-1)
-    monkeypatch.setattr("pnpdepth_cli.completion.interpolation._IDW_PIXELS", 97)
-    assert torch.allclose(inverse_distance(points), mean.exp().float(), rtol=1e-6)
-
-
-def test_morphological_lets_what_is_near_grow_over_what_is_far() -> None:
-    size = (40, 60)
-    grid = pixels(size)[1::3, 1::3].reshape(-1, 2)
-    near = (grid[:, 0] - 30).abs() < 6
-    points = SparsePoints(xy=grid, depth=torch.where(near, 2.0, 10.0), size=size)
-    filled = morphological(points)
-    assert float((filled[20] < 6).sum()) > float((linear(points)[20] < 6).sum())
-    assert bool((filled[20, 26:35] < 2.01).all())
-    assert bool((filled[:, :18] > 9.9).all())

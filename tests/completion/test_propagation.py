@@ -1,18 +1,10 @@
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
 from pnpdepth_cli.choices import PROPAGATIONS
-from pnpdepth_cli.completion.propagation import (
-    EDGE_DEPTH,
-    STIFFNESS,
-    diffuse,
-    propagate,
-    propagate_at,
-)
-from pnpdepth_cli.completion.residual_field import ResidualField, features_of
+from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene
 
@@ -124,42 +116,3 @@ def test_depth_at_positions_equals_the_dense_depth(kind: str) -> None:
     depth = propagate(prediction, points, rgb, kind=kind)
     at_positions = propagate_at(prediction, points, rgb, positions, kind=kind)
     assert torch.allclose(at_positions, queries.sample(depth), rtol=1e-4)
-
-
-@pytest.mark.parametrize(
-    "xy",
-    [
-        [(1.0, 1.0), (6.0, 4.0), (2.0, 5.0)],
-        [(1.25, 1.0), (6.0, 3.5), (2.75, 4.125), (2.5, 4.75)],  # between nodes
-        [(-2.0, 0.5), (7.5, 5.5), (3.25, 9.0)],  # outside: moved to the outermost nodes
-    ],
-)
-def test_diffusion_is_the_least_squares_solution(
-    xy: list[tuple[float, float]],
-) -> None:
-    log_depth = torch.zeros(6, 8)
-    log_depth[:, 4:] = 1.0
-    points = SparsePoints(xy=torch.tensor(xy), depth=torch.ones(len(xy)), size=(6, 8))
-    residuals = ResidualField(
-        features=features_of(log_depth, None),
-        points=points,
-        at=torch.zeros(len(xy), 3),
-        residual=torch.tensor([0.3, -0.2, 0.1, -0.4][: len(xy)]).double(),
-    )
-    u = residuals.features[2].double().numpy()
-    number = np.arange(48).reshape((6, 8))
-    lines, right = [], []
-    for (x, y), r in zip(xy, residuals.residual.tolist(), strict=True):
-        across = np.clip(1 - abs(np.clip(x, 0, 7) - np.arange(8)), 0, 1)
-        down = np.clip(1 - abs(np.clip(y, 0, 5) - np.arange(6)), 0, 1)
-        lines.append(np.outer(down, across).ravel())
-        right.append(r)
-    for a, b in [
-        *zip(number[:, :-1].flat, number[:, 1:].flat, strict=True),
-        *zip(number[:-1].flat, number[1:].flat, strict=True),
-    ]:
-        weight = STIFFNESS / (1 + ((u.flat[a] - u.flat[b]) / EDGE_DEPTH) ** 2)
-        lines.append(np.sqrt(weight) * (np.eye(48)[a] - np.eye(48)[b]))
-        right.append(0.0)
-    expected = np.linalg.lstsq(np.array(lines), np.array(right), rcond=None)[0]
-    assert np.allclose(diffuse(residuals).numpy(), expected.reshape((6, 8)), atol=1e-3)

@@ -10,17 +10,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import UPDATES
-from pnpdepth_cli.core import update_rules
-from pnpdepth_cli.core.update_rules import (
-    Update,
-    adam,
-    blur,
-    lbfgs,
-    momentum,
-    normalised,
-    sgd,
-    step_size,
-)
+from pnpdepth_cli.core.update_rules import Update, adam, blur, momentum, normalised, sgd, step_size
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 
@@ -79,47 +69,6 @@ def test_a_normalised_gradient_keeps_its_direction_and_has_a_root_mean_square_of
     update = normalised()(torch.tensor([[1.0, -7.0], [0.0, 5.0]]) * scale)
     assert update.flatten().tolist() == pytest.approx([x / 75**0.5 * 2 for x in (1, -7, 0, 5)])
     assert normalised()(torch.zeros(3)).tolist() == [0, 0, 0]
-
-
-@pytest.mark.parametrize("alpha", [0.05, 1.0, 3.0])
-def test_l_bfgs_moves_as_dense_bfgs_does_whatever_the_step(
-    alpha: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(update_rules, "MAX_RMS", 1e6)
-    torch.manual_seed(0)
-    curved = torch.randn(6, 6, dtype=torch.float64)
-    curved = curved @ curved.T + torch.eye(6, dtype=torch.float64)
-    z, update = torch.randn(6, dtype=torch.float64), lbfgs()
-    steps: list[Tensor] = []
-    changes: list[Tensor] = []
-    for count in range(6):
-        gradient = curved @ z
-        moved = -alpha * update(gradient)
-        if count:
-            torch.testing.assert_close(moved, -dense_bfgs(steps, changes) @ gradient)
-        steps.append(moved)
-        changes.append(curved @ (z + moved) - gradient)
-        z = z + moved
-
-
-def dense_bfgs(steps: list[Tensor], changes: list[Tensor]) -> Tensor:
-    """The inverse Hessian by Nocedal & Wright's equations 6.17 and 6.20."""
-    one = torch.eye(len(steps[0]), dtype=torch.float64)
-    inverse = (steps[-1] @ changes[-1]) / (changes[-1] @ changes[-1]) * one
-    for s, y in zip(steps, changes, strict=True):
-        left = one - torch.outer(s, y) / (s @ y)
-        inverse = left @ inverse @ left.T + torch.outer(s, s) / (s @ y)
-    return inverse
-
-
-def test_l_bfgs_takes_no_direction_from_a_loss_that_curves_down_and_none_that_is_too_long() -> None:
-    update = lbfgs()
-    first = update(torch.tensor([1.0, 1.0]))
-    assert torch.equal(first, normalised()(torch.tensor([1.0, 1.0])))
-    steeper = torch.tensor([2.0, 2.0])  # z went down by the first direction and it got steeper
-    assert torch.equal(update(steeper), normalised()(steeper))
-    nearly_flat = torch.tensor([1.999, 1.999])
-    assert update(nearly_flat).tolist() == pytest.approx([10, 10])
 
 
 def count_of_points(count: int, size: tuple[int, int]) -> SparsePoints:
