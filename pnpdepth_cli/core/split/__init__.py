@@ -128,8 +128,6 @@ class Split:
             raise self._cut.never_ran(ran, replay.calls[self._cut.module])
 
     def _record_front(self, arguments: Sequence[Any]) -> Replay:
-        assert self._interception is not None
-        self._interception.only(None)
         while True:
             replay = Replay(self._cut, arguments)
             watch = Watch(
@@ -154,18 +152,16 @@ class Split:
         return replay.has_front
 
     def _record_rear(self, replay: Replay) -> Any:
-        assert self._interception is not None
         saved = [output for output in replay.outputs if output is not None]
         tensors = (replay.arguments, *saved, *self._state.tensors)
-        watch = Watch(tensors, reads=True, escapes=not self._promised_static)
+        watch = Watch(tensors, escapes=not self._promised_static)
         recorder = Recorder(self._cut, watch, replay, self._uncacheable)
         try:
             output = self._run(replay, recorder)
-            recorder.finish_rear(output, promised_static=self._promised_static)
+            recorder.finish_rear(promised_static=self._promised_static)
         except BaseException:
             recorder.abandon()
             raise
-        self._interception.only(replay.recording.intercepted())
         return output
 
     def _run(self, replay: Replay, recorder: Recorder | None = None) -> Any:

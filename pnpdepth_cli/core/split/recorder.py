@@ -3,33 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from torch import nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
 from pnpdepth_cli.core.split.replay import RecordedCall, Recording, Replay, shapes_of
 from pnpdepth_cli.core.split.tensors import SavedTensors, tensors_in
 from pnpdepth_cli.core.split.watch import Watch
-
-
-@dataclass(eq=False)
-class _Call:
-    """A call as the recorder goes along; `saved` is None unless it can be cached."""
-
-    module: nn.Module
-    saved: SavedTensors | None = None
-    unread: frozenset[tuple[str, ...]] = field(default_factory=frozenset)
-
-    def recorded(self) -> RecordedCall:
-        return RecordedCall(
-            module=self.module,
-            cached=self.saved is not None,
-            copied=self.saved is not None and self.saved.copied,
-            unread=self.unread,
-        )
 
 
 class Recorder:
@@ -48,14 +29,13 @@ class Recorder:
     ) -> None:
         self.watch, self.ran = watch, set[nn.Module]()
         self._cut, self._replay, self._uncacheable = cut, replay, uncacheable
-        known = zip(replay.recording.calls, replay.outputs, strict=True)
-        self._calls = [_Call(call.module, saved) for call, saved in known]
+        self._calls = [call.module for call in replay.recording.calls]
+        self._saved = list(replay.outputs)  # of each call; None where it cannot be cached
         self._known = len(self._calls)  # before this pass; in the rear's, those up to the cut
         self._inside_one = False  # in a submodule that is to be cached as a whole
 
-    def run(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
+    def run(self, module: nn.Module, run: Callable[[], Any]) -> Any:
         """Runs a submodule, watched."""
-        self.watch.note_reads(inputs)
         with self.watch.seeing_escapes_of(module):
             return run()
 
@@ -64,8 +44,9 @@ class Recorder:
         if self._inside_one and module is not self._cut.module:
             return run()
         self.ran.add(module)
-        call, index, since = _Call(module), len(self._calls), self.watch.now()
-        self._calls.append(call)
+        index, since = len(self._calls), self.watch.now()
+        self._calls.append(module)
+        self._saved.append(None)
         before = list(tensors_in(inputs))
         outer, self._inside_one = self._inside_one, self._may_be_one(module)
         try:
@@ -82,8 +63,8 @@ class Recorder:
             == [(path, id(t)) for path, t in tensors_in(inputs)]
         ):
             self._drop_from(index + 1)
-            call.saved = RecordedCall(module=module, cached=True).save(output)
-            self.watch.protect(call.saved)
+            self._saved[index] = saved = SavedTensors.of(output)
+            self.watch.protect(saved)
         elif tried and next(module.children(), None) is not None:
             self._uncacheable.add(module)
         if self._is_cut(module):
@@ -97,17 +78,15 @@ class Recorder:
         """Gives the replay the recording up to the cut."""
         self._finish(promised_static or not self.watch.escaped, complete=False)
 
-    def finish_rear(self, output: Any, *, promised_static: bool) -> None:
-        """Gives the replay the whole recording, whose last pass returned `output`.
+    def finish_rear(self, *, promised_static: bool) -> None:
+        """Gives the replay the whole recording.
 
         Args:
-            output: What the network returned.
             promised_static: Whether the same calls are promised for all arguments of these shapes.
 
         Raises:
             LayerError: The cut is ambiguous, or its output cannot be replaced.
         """
-        self.watch.note_reads(output)
         calls = self._replay.calls[self._cut.module]
         if self._cut.name.call is None and calls > 1:
             raise self._cut.several_calls(calls)
@@ -117,11 +96,9 @@ class Recorder:
         # no call there is recorded, and saved outputs stay whole, as it may read or change them.
         if self.watch.data_dependent and not promised_static:
             self._drop_from(self._known)
-            for call in self._calls:
-                if call.saved is not None:
-                    call.saved.copied = True
-        else:
-            self._release_unread()
+            for saved in self._saved:
+                if saved is not None:
+                    saved.copied = True
         # It holds for other arguments if no value reached Python in front of the cut or behind it.
         static = self._replay.recording.static_graph
         self._finish(static and (promised_static or not self.watch.escaped), complete=True)
@@ -132,9 +109,14 @@ class Recorder:
 
     def _finish(self, static_graph: bool, *, complete: bool) -> None:
         replay = self._replay
-        replay.outputs = [call.saved for call in self._calls]
+        replay.outputs = self._saved
         replay.recording = Recording(
-            calls=tuple(call.recorded() for call in self._calls),
+            calls=tuple(
+                RecordedCall(
+                    module=module, cached=saved is not None, copied=bool(saved and saved.copied)
+                )
+                for module, saved in zip(self._calls, self._saved, strict=True)
+            ),
             cut=replay.recording.cut,
             path=replay.recording.path,
             shapes=shapes_of(replay.arguments.value),
@@ -152,25 +134,8 @@ class Recorder:
         apart = (self._cut.containers, self._cut.around_hooks, self._uncacheable)
         return self._replay.recording.cut is None and not any(module in group for group in apart)
 
-    def _release_unread(self) -> None:
-        """Saved outputs that only go into other cached submodules lose their memory.
-
-        An expanded number of the same shape replaces them; every pass reads the same tensors.
-        """
-        for call in self._calls:
-            if call.saved is None or call.saved.copied:  # copies were handed out and may be read
-                continue
-            call.unread = frozenset(
-                path
-                for path, tensor in tensors_in(call.saved.value)
-                if not self.watch.was_read(tensor)
-                and not tensor.is_inference()
-                and tensor.layout == torch.strided
-            )
-            call.saved.value = call.recorded().save(call.saved.value).value
-
     def _drop_from(self, first: int) -> None:
-        for call in self._calls[first:]:
-            if call.saved is not None:
-                call.saved.value = None  # the watch would hold its tensors
-        del self._calls[first:]
+        for saved in self._saved[first:]:
+            if saved is not None:
+                saved.value = None  # the watch would hold its tensors
+        del self._calls[first:], self._saved[first:]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -25,30 +25,24 @@ Handler = Callable[[nn.Module, Any, Callable[[], Any]], Any]
 
 
 class Interception:
-    """Replaces `forward` of chosen submodules, and puts their own back.
+    """Replaces `forward` of submodules, and puts their own back.
 
     Args:
-        modules: All submodules that may be intercepted, each once.
+        modules: The submodules, each once.
     """
 
     def __init__(self, modules: Iterable[nn.Module]) -> None:
         self._handler: Handler = _run_only
         self._own = {module: module.__dict__.get("forward") for module in modules}
-        self._stand_ins = {module: self._stand_in(module, module.forward) for module in self._own}
-
-    def only(self, modules: Collection[nn.Module] | None) -> None:
-        """Intercepts the calls of these submodules and of no others; None: of all."""
-        for module, own_forward in self._own.items():
-            if modules is None or module in modules:
-                module.__dict__["forward"] = self._stand_ins[module]
-            elif own_forward is None:
-                module.__dict__.pop("forward", None)
-            else:
-                module.__dict__["forward"] = own_forward
+        for module in self._own:
+            module.__dict__["forward"] = self._stand_in(module, module.forward)
 
     def close(self) -> None:
         """Gives every submodule its own forward back, and lets go of the handler."""
-        self.only(())
+        for module, own_forward in self._own.items():
+            module.__dict__["forward"] = own_forward
+            if own_forward is None:
+                del module.__dict__["forward"]
         self._handler = _run_only
 
     @contextmanager
@@ -79,18 +73,6 @@ class RecordedCall:
     module: nn.Module
     cached: bool  # whether later passes return its saved output instead of running it
     copied: bool = False  # whether the network changes that output in place
-    unread: frozenset[tuple[str, ...]] = frozenset()
-    """Paths of the output's tensors whose values nobody reads; only their shapes are saved."""
-
-    def save(self, output: Any) -> SavedTensors:
-        """Returns the output as it is to be saved; of unread tensors only one number."""
-
-        def kept(path: tuple[str, ...], tensor: Tensor) -> Tensor:
-            if path in self.unread:
-                return tensor.new_empty(()).expand(tensor.shape)
-            return tensor.clone() if self.copied else tensor
-
-        return SavedTensors(map_tensors(output, kept), self.copied)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,12 +95,6 @@ class Recording:
     def holds_for(self, arguments: Sequence[Any]) -> bool:
         """Whether a pass with these arguments makes the same calls."""
         return self.complete and self.static_graph and self.shapes == shapes_of(arguments)
-
-    def intercepted(self) -> set[nn.Module]:
-        """Returns the submodules whose calls later passes must intercept."""
-        return {
-            call.module for index, call in enumerate(self.calls) if call.cached or index == self.cut
-        }
 
     @functools.cached_property
     def _indices(self) -> dict[nn.Module, list[int]]:
@@ -182,7 +158,7 @@ class Replay:
         if self.has_front:
             raise self.end_of_front()
         if self.recorder is not None:
-            run = functools.partial(self.recorder.run, module, inputs, run)
+            run = functools.partial(self.recorder.run, module, run)
         index = self.recording.index(module, self.calls[module])
         self.calls[module] += 1
         if index is None:
@@ -217,7 +193,7 @@ class Replay:
             output = run()
         finally:
             self._fills = False
-        self.outputs[index] = call.save(output)
+        self.outputs[index] = SavedTensors.of(output, copied=call.copied)
         return output
 
     def _output_with_z(self, run: Callable[[], Any]) -> Any:

@@ -79,6 +79,11 @@ class SavedTensors:
     copied: bool = False
     """Whether the network changes them in place, so that `fresh` returns clones."""
 
+    @classmethod
+    def of(cls, output: Any, *, copied: bool = False) -> SavedTensors:
+        """Returns the tensors of an output in new containers, clones if they are `copied`."""
+        return cls(map_tensors(output, lambda _, t: t.clone() if copied else t), copied)
+
     def fresh(self) -> Any:
         """Returns the tensors in new containers; whatever is done to them leaves `value` as is."""
         return map_tensors(

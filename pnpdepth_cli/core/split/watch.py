@@ -59,20 +59,16 @@ class Watch(TorchDispatchMode):
         # the whole compiler, a second in every run of the program.
         return False
 
-    def __init__(
-        self, saved: Iterable[SavedTensors], *, reads: bool = False, escapes: bool = True
-    ) -> None:
+    def __init__(self, saved: Iterable[SavedTensors], *, escapes: bool) -> None:
         """Begins with all counts at 0; sets and keys below are numbers of storages.
 
         Args:
             saved: Tensors to protect from in-place operations.
-            reads: Whether reads of tensors are noted.
             escapes: Whether values that reach Python are noted, which takes time.
         """
         super().__init__()  # type: ignore[no-untyped-call]
         self.data_dependent = self.escaped = self.torn = False
         self._operations = self._touches = 0
-        self._reads: set[int] | None = set() if reads else None
         self._writes: list[int] = []  # per change in place, the storage's creator; 0: none
         self._created: dict[int, int] = {}  # operation that created a storage
         self._marked: set[int] = set()  # storages that depend on z
@@ -175,10 +171,7 @@ class Watch(TorchDispatchMode):
         kwargs = kwargs or {}
         facts = _facts(func)
         self._operations += 1
-        inputs: list[Tensor] = []
-        if not facts.fresh or self._reads is not None:
-            inputs = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
-            self.note_reads(inputs)
+        inputs = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
         self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in inputs)
         written = [
             tensor
@@ -200,15 +193,6 @@ class Watch(TorchDispatchMode):
             self.data_dependent |= facts.escapes
         self.escaped |= facts.escapes
         return result
-
-    def note_reads(self, structure: Any) -> None:
-        """Notes that these tensors are read, if reads are noted at all."""
-        if self._reads is not None:
-            self._reads.update(_storage(tensor) for _, tensor in tensors_in(structure))
-
-    def was_read(self, tensor: Tensor) -> bool:
-        """Whether an operation or anything else may have read the tensor's values."""
-        return self._reads is None or _storage(tensor) in self._reads
 
     def _before_write(self, tensor: Tensor) -> None:
         storage = _storage(tensor)
@@ -256,7 +240,6 @@ class _Facts:
     """What an operation may do, by its schema and tags."""
 
     writes: tuple[tuple[int, str], ...]  # index and name of the arguments that it changes in place
-    fresh: bool  # whether its results are always new memory
     escapes: bool  # whether it gives values, or shapes that depend on values, to Python
 
 
@@ -269,7 +252,6 @@ def _facts(func: Any) -> _Facts:
             for index, argument in enumerate(schema.arguments)
             if argument.alias_info is not None and argument.alias_info.is_write
         ),
-        fresh=func.namespace == "aten" and all(r.alias_info is None for r in schema.returns),
         escapes=torch.Tag.data_dependent_output in func.tags
         or torch.Tag.dynamic_output_shape in func.tags,
     )
