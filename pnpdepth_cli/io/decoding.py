@@ -1,25 +1,15 @@
-"""Images opened by Pillow or decoded by OpenCV, after what they claim is checked, in silence.
-
-On damaged files OpenEXR's binding prints to sys.stdout, where data of a command belongs, Pillow
-warns, and OpenCV, OpenEXR, libpng and libtiff print to the standard error of the process.
-"""
+"""Images opened by Pillow, after what they claim is checked."""
 
 from __future__ import annotations
 
 import io
-import os
 import struct
-import sys
-import threading
 import warnings
 import zlib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 
@@ -35,6 +25,8 @@ IMAGE_ERRORS = (
 """What Pillow and its plugins raise on damaged files."""
 _END_OF_PNG = b"\xaeB`\x82"
 """The checksum of the last chunk, which Pillow does not read."""
+
+warnings.filterwarnings("ignore", module=r"PIL\.")  # of damaged files, which are errors here
 
 
 def check_tags(data: bytes) -> None:
@@ -77,8 +69,8 @@ def check_exif(image: PIL.Image.Image) -> None:
 def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
     """Yields the image of a file, not yet decoded; errors inside the block become ours.
 
-    The checksums of a PNG and the size that the header claims are checked. The kind is "PNG",
-    "JPEG", "TIFF", "WEBP" or "HEIF".
+    The tags of a TIFF, the checksums of a PNG and the size that the header claims are checked. The
+    kind is "PNG", "JPEG", "TIFF", "WEBP" or "HEIF".
 
     Raises:
         FileFormatError: The file is damaged or cut short, or exceeds the budget.
@@ -87,24 +79,25 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
 
     stream = io.BytesIO(data)
     try:
-        with silence():
-            if kind == "PNG":
-                with Image.open(stream, formats=[kind]) as image:
-                    image.verify()
-                if stream.read(4) != _END_OF_PNG:
-                    raise damaged(path, kind, f"is cut short after {len(data):,} bytes")
+        if kind == "TIFF":
+            check_tags(data)
+        if kind == "PNG":
             with Image.open(stream, formats=[kind]) as image:
-                # Pillow decodes three channels into four bytes
-                channels = 1 if len(image.getbands()) == 1 else 4
-                value_bytes = 4 if image.mode in "IF" else 2 if ";16" in raw_mode(image) else 1
-                check_pixel_count(
-                    path, *image.size, channels=channels, value_bytes=value_bytes,
-                    file_bytes=len(data),
-                )  # fmt: skip
-                yield image
-    except IMAGE_ERRORS as error:
+                image.verify()
+            if stream.read(4) != _END_OF_PNG:
+                raise damaged(path, kind, f"is cut short after {len(data):,} bytes")
+        with Image.open(stream, formats=[kind]) as image:
+            # Pillow decodes three channels into four bytes
+            channels = 1 if len(image.getbands()) == 1 else 4
+            value_bytes = 4 if image.mode in "IF" else 2 if ";16" in raw_mode(image) else 1
+            check_pixel_count(
+                path, *image.size, channels=channels, value_bytes=value_bytes,
+                file_bytes=len(data),
+            )  # fmt: skip
+            yield image
+    except (*IMAGE_ERRORS, Image.DecompressionBombError) as error:
         # Pillow names the in-memory buffer, which means nothing to a reader
-        reason = "unknown content" if "BytesIO" in str(error) else error
+        reason = "unknown content or type of pixels" if "BytesIO" in str(error) else error
         raise damaged(path, kind, f"cannot be decoded ({reason})") from error
 
 
@@ -124,101 +117,3 @@ def orientation_of(image: PIL.Image.Image) -> int:
         return int(image.getexif().get(Base.Orientation, 1))
     except IMAGE_ERRORS:  # unreadable EXIF in a valid image says nothing of its rotation
         return 1
-
-
-def decode_with_opencv(path: Path, data: bytes, kind: str) -> NDArray[Any]:
-    """Returns the pixels in the file's own type, (H, W) or (H, W, C) with blue first.
-
-    Pillow cuts colours of 16 bits to 8.
-
-    Raises:
-        FileFormatError: OpenCV cannot decode it.
-    """
-    import cv2
-
-    buffer = np.frombuffer(data, dtype=np.uint8)
-    try:
-        with silence():
-            pixels = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise damaged(path, kind, f"cannot be decoded ({error})") from error
-    if pixels is None:
-        raise damaged(path, kind, "cannot be decoded")
-    return pixels
-
-
-_lock = threading.Lock()
-_silent: list[int] = []
-"""Identifiers of the silent threads, as often as each has entered."""
-_before = ExitStack()
-"""What the last of them restores."""
-
-
-@contextmanager
-def silence() -> Iterator[None]:
-    """Drops what libraries say inside the block, in any number of threads; may be nested.
-
-    What they print to standard error is dropped only while no other thread runs, because theirs
-    would be lost too. Pillow accepts images of any size, which the budget bounds.
-    """
-    with _lock:
-        if not _silent:
-            _before.enter_context(_state_for_silence())
-        _silent.append(threading.get_ident())
-    try:
-        with _without_standard_error():
-            yield
-    finally:
-        with _lock:
-            _silent.remove(threading.get_ident())
-            if not _silent:
-                _before.close()
-
-
-@contextmanager
-def _state_for_silence() -> Iterator[None]:
-    """Sets what all threads share: sys.stdout, warnings, limits and log levels."""
-    import cv2
-    from PIL import Image
-
-    stdout, limit = sys.stdout, Image.MAX_IMAGE_PIXELS
-    log: Any = getattr(cv2.utils, "logging", cv2)  # cv2 itself before OpenCV 4.13
-    level = log.setLogLevel(0)
-    ours: Any = _OthersOnly(stdout)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        sys.stdout, Image.MAX_IMAGE_PIXELS = ours, None
-        try:
-            yield
-        finally:
-            Image.MAX_IMAGE_PIXELS = limit
-            if sys.stdout is ours:
-                sys.stdout = stdout
-            log.setLogLevel(level)
-
-
-class _OthersOnly:
-    """A stream that passes on what all but the silent threads write."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        return len(text) if threading.get_ident() in _silent else int(self._stream.write(text))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-
-@contextmanager
-def _without_standard_error() -> Iterator[None]:
-    with ExitStack() as after:
-        if threading.active_count() == 1:
-            with suppress(OSError):  # it is closed
-                kept = os.dup(2)
-                after.callback(os.close, kept)
-                after.callback(os.dup2, kept, 2)
-                nothing = os.open(os.devnull, os.O_WRONLY)
-                after.callback(os.close, nothing)
-                os.dup2(nothing, 2)
-        yield

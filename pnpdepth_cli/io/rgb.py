@@ -8,7 +8,6 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +16,9 @@ from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.decoding import (
     IMAGE_ERRORS,
     check_exif,
-    decode_with_opencv,
     open_image,
     orientation_of,
     raw_mode,
-    silence,
 )
 from pnpdepth_cli.io.file_bytes import (
     check_pixel_count,
@@ -30,11 +27,9 @@ from pnpdepth_cli.io.file_bytes import (
     size_of_regular_file,
 )
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.images import read_exr_channels, read_tiff_facts
+from pnpdepth_cli.io.formats.images import read_exr_channels
 
-_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
-_BLOCK = 1 << 20  # values that are converted at a time
 _PLAUSIBLE = (0.2, 50.0)
 """Focal length as a multiple of the image's longer side: fields of view of 136° to 1°."""
 _FRAMES_IN_MEMORY = 8
@@ -70,16 +65,12 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
         kind = "HEIF"
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF"):
         raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
-    if kind == "TIFF":
-        facts = read_tiff_facts(path, data)
-        if facts.number != "uint" or facts.bits > 16:
-            kind = f"{facts.bits}-bit {facts.number} TIFF"
-            raise FileFormatError(f"{path} is a {kind}; save the image with 8 or 16 bits")
     note, white = None, 255.0
     with open_image(path, data, kind) as image:
-        wide = ";16" in raw_mode(image)  # until the EXIF of a PNG is asked for, which decodes it
-        if not wide:
-            image.load()  # which applies the orientation of a TIFF
+        if kind == "TIFF" and image.mode in ("I", "F"):
+            raise FileFormatError(f"{path} is no image; save it with 8 or 16 bits, none below 0")
+        wide = ";16" in raw_mode(image)
+        image.load()  # which applies the orientation of a TIFF
         orientation = orientation_of(image)
         if wide:
             values, white = _decode_16_bit(path, data, kind)
@@ -121,11 +112,11 @@ def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     from PIL import Image
 
     try:
-        with silence(), Image.open(path) as image:
+        with Image.open(path) as image:
             width, height = image.size
             upright = (width, height) if orientation_of(image) >= 5 else (height, width)
             return upright, (height, width)
-    except OSError:  # an EXR, say
+    except (OSError, Image.DecompressionBombError):  # an EXR, say
         height, width, _ = read_rgb(path).values.shape
         return (height, width), (height, width)
 
@@ -135,13 +126,17 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
 
     That is 255 where no number is larger: other such images would be black.
     """
-    pixels = decode_with_opencv(path, data, kind)
+    import cv2
+
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise damaged(path, kind, "cannot be decoded")
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.shape[2] in (1, 2):
         pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
     rgb = pixels[:, :, 2::-1]  # OpenCV has blue first
-    white = 255 if 1 < rgb.max() <= 255 else int(np.iinfo(pixels.dtype).max)
+    white = 255 if 1 < rgb.max() <= 255 else 65535
     return np.asarray(np.divide(rgb, np.float32(white), dtype=np.float32)), float(white)
 
 
@@ -168,16 +163,15 @@ def _from_linear_light(path: Path, data: bytes) -> RgbImage:
 
 def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     """Returns linear light in 0..1 of any shape, sRGB-encoded (IEC 61966-2-1)."""
-    encoded = np.empty(linear.size, np.float32)
-    for start in range(0, linear.size, _BLOCK):
+    encoded = np.empty(linear.shape, np.float32)
+    for row, light in zip(encoded, linear.astype(np.float64), strict=True):
         # In float32 white would come out just below 1.
-        light = linear.reshape(-1)[start : start + _BLOCK].astype(np.float64)
         curve = 1.055 * np.power(light, 1 / 2.4) - 0.055
-        encoded[start : start + _BLOCK] = np.where(light <= 0.0031308, 12.92 * light, curve)
-    return encoded.reshape(linear.shape)
+        row[:] = np.where(light <= 0.0031308, 12.92 * light, curve)
+    return encoded
 
 
-def read_exr_colour(path: Path, data: bytes) -> NDArray[Any]:
+def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
     """Returns R, G and B (H, W, 3) as an EXR stores them; its only channel is repeated.
 
     Raises:
@@ -201,51 +195,22 @@ def read_focal_length(path: Path, size: tuple[int, int]) -> tuple[float, str] | 
 
     None if there is none that a camera can have.
 
-    The 35 mm equivalent is preferred. It is taken as one of equal diagonal field of view, which is
-    how CIPA DCG-001 has it. Else the focal length and the resolution of the sensor are used
-    (Exif 2.32, tags 0x920A, 0xA20E, 0xA210). The image is used at the size (H, W).
+    It is the 35 mm equivalent, taken as one of equal diagonal field of view, which is how CIPA
+    DCG-001 has it. The image is used at the size (H, W).
     """
-    from PIL.ExifTags import Base
-
-    values = _tags(path)
-    film_mm, focal_mm = values.get(Base.FocalLengthIn35mmFilm), values.get(Base.FocalLength)
-    resolution = values.get(Base.FocalPlaneXResolution)
-    unit_mm = _UNIT_MM.get(int(values.get(Base.FocalPlaneResolutionUnit, 2)))
-    if film_mm:
-        pixels = film_mm / _FILM_DIAGONAL_MM * math.hypot(*size)
-        source = f"EXIF, equivalent to {film_mm:g} mm on film"
-    elif focal_mm and resolution and unit_mm:
-        sides = (values.get(side, 0) for side in (Base.ExifImageWidth, Base.ExifImageHeight))
-        taken = max(sides) or max(size)
-        pixels = focal_mm * resolution / unit_mm * max(size) / taken
-        source = f"EXIF, {focal_mm:g} mm and the sensor's pixels"
-    else:
-        return None
-    if not _PLAUSIBLE[0] <= pixels / max(size) <= _PLAUSIBLE[1]:
-        return None
-    return pixels, source
-
-
-def _tags(path: Path) -> dict[int, float]:
-    """The numbers among the EXIF tags; none if they cannot be read."""
     from PIL import Image
-    from PIL.ExifTags import IFD
+    from PIL.ExifTags import IFD, Base
 
     try:
-        with silence(), Image.open(path) as image:
+        with Image.open(path) as image:
             check_exif(image)
-            folder = image.getexif().get_ifd(IFD.Exif)
-    except IMAGE_ERRORS:  # damaged EXIF gives no focal length
-        return {}
-    numbers = {}
-    for tag, value in folder.items():
-        try:
-            number = float(value)
-        except (TypeError, ValueError, ZeroDivisionError):
-            continue
-        if math.isfinite(number) and number > 0:
-            numbers[tag] = number
-    return numbers
+            film_mm = float(image.getexif().get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm, 0))
+    except (*IMAGE_ERRORS, TypeError):  # damaged EXIF gives no focal length
+        return None
+    pixels = film_mm / _FILM_DIAGONAL_MM * math.hypot(*size)
+    if not _PLAUSIBLE[0] <= pixels / max(size) <= _PLAUSIBLE[1]:
+        return None
+    return pixels, f"EXIF, equivalent to {film_mm:g} mm on film"
 
 
 def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
@@ -257,7 +222,7 @@ def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
     """
     size_of_regular_file(path)
     opened = path, path.stat().st_mtime_ns
-    with _VIDEO_LOCK, silence():
+    with _VIDEO_LOCK:
         if index < _open_video(*opened).first:
             _open_video.cache_clear()
         bgr = _open_video(*opened).frame(index)

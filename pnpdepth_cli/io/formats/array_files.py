@@ -21,7 +21,6 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.decoding import silence
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged, one_line
 from pnpdepth_cli.io.formats import DepthFile, DepthFormat, Reading
 
@@ -63,7 +62,7 @@ def _npy_header(
     """Shape, order ("C" or "F"), dtype, and the position of the data, of numbers alone."""
     stream = io.BytesIO(data)
     try:
-        with _LOCK, silence():  # numpy warns of headers that Python 2 wrote
+        with _LOCK:
             shape, is_fortran, dtype = _HEADERS[npy.read_magic(stream)](stream)
         if min(shape, default=0) < 0 or any(isinstance(side, bool) for side in shape):
             raise ValueError(f"a shape of {shape}")
