@@ -24,6 +24,21 @@ HOST_INPUTS: dict[str, tuple[int, ...]] = {}
 """Indices of an operator's inputs that are read as Python numbers; they stay on the CPU."""
 
 
+ONLY: dict[str, Any] = {
+    "antialias": 0,
+    "batch_dims": 0,
+    "detect_negative": 1,
+    "detect_positive": 1,
+    "exclude_outside": 0,
+    "keep_aspect_ratio_policy": "stretch",
+    "noop_with_empty_axes": 0,
+    "reduction": "none",
+    "select_last_index": 0,
+    "training_mode": 0,
+}
+"""Attributes that must have this value, the standard's default, if they are there."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Node:
     """A node of the graph; its name is unique there, and `outputs` counts those that are used."""

@@ -18,14 +18,11 @@ from pnpdepth_cli.models.onnx import (
     optional,
     register,
     stated,
-    whole_numbers,
 )
-from pnpdepth_cli.models.steps import Unsupported
 
 _UNARY = (
     *("Relu", "Sigmoid", "Tanh", "Erf", "Exp", "Log", "Sqrt", "Reciprocal", "Abs", "Neg", "Floor"),
-    *("Ceil", "Round", "Sign", "Sin", "Cos", "Tan", "Asin", "Acos", "Atan", "Sinh", "Cosh"),
-    *("IsNaN", "Softplus", "Softsign", "HardSwish", "Mish"),
+    *("Ceil", "Round", "Sign", "Sin", "Cos", "IsNaN", "IsInf", "Softplus", "HardSwish", "Mish"),
 )
 """Named as in torch, but for capitals."""
 
@@ -37,7 +34,7 @@ def _divide(a: Tensor, b: Tensor) -> Tensor:
 _BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Equal": torch.eq, "Greater": torch.gt,
     "Less": torch.lt, "GreaterOrEqual": torch.ge, "LessOrEqual": torch.le,
-    "And": torch.logical_and, "Or": torch.logical_or, "Xor": torch.logical_xor, "Div": _divide,
+    "And": torch.logical_and, "Or": torch.logical_or, "Div": _divide,
     "Pow": lambda base, exponent: torch.pow(base, exponent).to(base.dtype),
 }  # fmt: skip
 
@@ -66,19 +63,13 @@ register({name: _binary(function) for name, function in _BINARY.items()})
 register({name: _fold(function) for name, function in _FOLDED.items()})
 register(
     {
-        "Identity": lambda _, i: i[0].clone(),
+        **dict.fromkeys(("Identity", "Dropout"), lambda _, i: i[0].clone()),
         "Not": lambda _, i: torch.logical_not(i[0]),
-        "Mean": lambda _, i: functools.reduce(torch.add, i) / len(i),
         "Mod": lambda node, i: (torch.fmod if node.get("fmod", 0) else torch.remainder)(i[0], i[1]),
         "Where": lambda _, i: torch.where(i[0], i[1], i[2]),
         "LeakyRelu": lambda node, i: F.leaky_relu(i[0], node.get("alpha", 0.01)),
         "Elu": lambda node, i: F.elu(i[0], node.get("alpha", 1.0)),
-        "Celu": lambda node, i: F.celu(i[0], node.get("alpha", 1.0)),
-        "Selu": lambda node, i: torch.mul(
-            F.elu(i[0], node.get("alpha", 1.6732632423543772)),
-            node.get("gamma", 1.0507009873554805),
-        ),
-        "ThresholdedRelu": lambda node, i: F.threshold(i[0], node.get("alpha", 1.0), 0.0),
+        "Einsum": lambda node, i: torch.einsum(node.get("equation"), *i),
         "HardSigmoid": lambda node, i: torch.add(
             torch.mul(i[0], node.get("alpha", 0.2)), node.get("beta", 0.5)
         ).clamp(0, 1),
@@ -86,19 +77,6 @@ register(
         "MatMul": lambda _, i: torch.matmul(i[0], i[1]),
     }
 )
-
-
-@operator("Einsum")
-def einsum(node: Node, inputs: Inputs) -> Tensor:
-    if len(inputs) > 2:  # the products of two of them may be far larger than the result
-        raise Unsupported("more than two inputs")
-    return torch.einsum(node.get("equation"), *inputs)
-
-
-@operator("IsInf")
-def is_infinite(node: Node, inputs: Inputs) -> Tensor:
-    above = torch.isposinf(inputs[0]) & bool(node.get("detect_positive", 1))
-    return above | (torch.isneginf(inputs[0]) & bool(node.get("detect_negative", 1)))
 
 
 @operator("Clip")
@@ -139,25 +117,12 @@ def gemm(node: Node, inputs: Inputs) -> Tensor:
     return product if c is None else product + node.get("beta", 1.0) * c
 
 
-@operator("CumSum", host=(1,))
-def cumsum(node: Node, inputs: Inputs) -> Tensor:
-    x, axis = inputs[0], whole_numbers(inputs[1])[0]
-    x = x.flip(axis) if node.get("reverse", 0) else x
-    total = x.cumsum(axis, dtype=x.dtype)
-    total = total - x if node.get("exclusive", 0) else total
-    return total.flip(axis) if node.get("reverse", 0) else total
-
-
 _REDUCTIONS: dict[str, Callable[[Tensor, list[int], bool], Tensor]] = {
     "ReduceMean": lambda x, axes, keep: x.mean(axes, keepdim=keep),
     "ReduceSum": lambda x, axes, keep: x.sum(axes, keepdim=keep, dtype=x.dtype),
     "ReduceMax": lambda x, axes, keep: x.amax(axes, keepdim=keep),
     "ReduceMin": lambda x, axes, keep: x.amin(axes, keepdim=keep),
-    "ReduceL1": lambda x, axes, keep: x.abs().sum(axes, keepdim=keep),
     "ReduceL2": lambda x, axes, keep: x.square().sum(axes, keepdim=keep).sqrt(),
-    "ReduceSumSquare": lambda x, axes, keep: x.square().sum(axes, keepdim=keep),
-    "ReduceLogSum": lambda x, axes, keep: x.sum(axes, keepdim=keep).log(),
-    "ReduceLogSumExp": lambda x, axes, keep: x.logsumexp(axes, keepdim=keep),
     "ReduceProd": lambda x, axes, keep: functools.reduce(
         lambda y, axis: y.prod(axis, keepdim=keep, dtype=x.dtype),
         sorted((a % x.ndim for a in axes), reverse=True),
@@ -169,17 +134,11 @@ _REDUCTIONS: dict[str, Callable[[Tensor, list[int], bool], Tensor]] = {
 @operator(*_REDUCTIONS, host=(1,))
 def reduce(node: Node, inputs: Inputs) -> Tensor:
     axes = stated(node, "axes", inputs, 1)
-    if not axes:
-        if node.get("noop_with_empty_axes", 0):
-            # Nothing is summed, but the function of each element is still applied.
-            return _REDUCTIONS[node.op](inputs[0][..., None], [-1], False)
-        axes = list(range(inputs[0].ndim))
-    return _REDUCTIONS[node.op](inputs[0], list(axes), bool(node.get("keepdims", 1)))
+    axes = axes or list(range(inputs[0].ndim))
+    return _REDUCTIONS[node.op](inputs[0], axes, bool(node.get("keepdims", 1)))
 
 
 @operator("ArgMax", "ArgMin")
 def arg_extreme(node: Node, inputs: Inputs) -> Tensor:
-    if node.get("select_last_index", 0):
-        raise Unsupported("select_last_index")
     function = torch.argmax if node.op == "ArgMax" else torch.argmin
     return function(inputs[0], node.get("axis", 0), keepdim=bool(node.get("keepdims", 1)))

@@ -31,11 +31,11 @@ register(
         "Shape": lambda node, i: torch.tensor(
             i[0].shape[node.get("start", 0) : node.get("end")], dtype=torch.int64
         ),
-        "Size": lambda _, i: torch.tensor(i[0].numel()),
         "Transpose": lambda node, i: i[0].permute(node.get("perm", [*range(i[0].ndim)][::-1])),
         "Concat": lambda node, i: torch.cat(i, node.get("axis", 1)),
-        "CastLike": lambda _, i: i[0].to(i[1].dtype),
         "Flatten": lambda node, i: i[0].reshape(math.prod(i[0].shape[: node.get("axis", 1)]), -1),
+        "GatherND": lambda _, i: i[0][tuple(i[1].long().unbind(-1))],
+        "ScatterND": lambda _, i: i[0].index_put(tuple(i[1].long().unbind(-1)), i[2]),
         "GatherElements": lambda node, i: i[0].gather(
             node.get("axis", 0), _from_start(i[1], i[0].shape[node.get("axis", 0)])
         ),
@@ -45,9 +45,6 @@ register(
     {
         "Tile": lambda _, i: i[0].repeat(whole_numbers(i[1])),
         "Squeeze": lambda node, i: i[0].squeeze(stated(node, "axes", i, 1) or [*range(i[0].ndim)]),
-        "Trilu": lambda node, i: (torch.triu if node.get("upper", 1) else torch.tril)(
-            i[0], 0 if optional(i, 1) is None else whole_numbers(i[1])[0]
-        ),
     },
     host=(1,),
 )
@@ -91,22 +88,21 @@ def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     return torch.split(x, sizes, axis)
 
 
-@operator("Pad", host=(1, 2, 3))
+@operator("Pad", host=(1, 2))
 def pad(node: Node, inputs: Inputs) -> Tensor:
     x, mode = inputs[0], node.get("mode", "constant")
-    flat = stated(node, "pads", inputs, 1) or node.get("paddings")
-    value = node.get("value", 0.0) if optional(inputs, 2) is None else inputs[2].item()
-    axes = whole_numbers(inputs[3]) if optional(inputs, 3) is not None else [*range(x.ndim)]
-    pairs = zip(flat[: len(axes)], flat[len(axes) :], strict=True)
-    sides = dict(zip((a % x.ndim for a in axes), pairs, strict=True))
+    if optional(inputs, 3) is not None:
+        raise Unsupported("axes")
+    flat = stated(node, "pads", inputs, 1)
+    assert flat is not None
+    sides = list(zip(flat[: x.ndim], flat[x.ndim :], strict=True))
     if mode == "constant":
-        each = [sides.get(axis, (0, 0)) for axis in reversed(range(x.ndim))]
-        return F.pad(x, [n for pair in each for n in pair], value=value)
-    for axis, (begin, end) in sides.items():
+        value = node.get("value", 0.0) if optional(inputs, 2) is None else inputs[2].item()
+        return F.pad(x, [n for pair in reversed(sides) for n in pair], value=value)
+    for axis, (begin, end) in enumerate(sides):
         if begin or end:
-            x = x.index_select(
-                axis, _indices_of_padding(mode, x.shape[axis], begin, end).to(x.device)
-            )
+            index = _indices_of_padding(mode, x.shape[axis], begin, end)
+            x = x.index_select(axis, index.to(x.device))
     return x
 
 
@@ -115,14 +111,10 @@ def _indices_of_padding(mode: str, size: int, begin: int, end: int) -> Tensor:
     index = torch.arange(-begin, size + end)
     if mode == "edge":
         return index.clamp(0, size - 1)
-    if mode == "wrap":
-        return index.remainder(size)
-    if mode != "reflect":
-        raise Unsupported(f"mode {mode}")
-    if size == 1:  # as onnxruntime
-        raise Unsupported("mode reflect of 1 element")
-    around = index.remainder(2 * size - 2)
-    return torch.minimum(around, 2 * size - 2 - around)
+    if mode != "reflect" or size <= max(begin, end):
+        raise Unsupported(f"mode {mode} of {size} element(s)")
+    index = index.abs()
+    return torch.minimum(index, 2 * size - 2 - index)
 
 
 @operator("DepthToSpace")
@@ -133,13 +125,6 @@ def depth_to_space(node: Node, inputs: Inputs) -> Tensor:
         return F.pixel_shuffle(x, b)
     x = x.reshape(n, b, b, c // b**2, h, w).permute(0, 3, 4, 1, 5, 2)
     return x.reshape(n, c // b**2, h * b, w * b)
-
-
-@operator("Dropout")
-def dropout(node: Node, inputs: Inputs) -> Tensor:
-    if node.outputs > 1:
-        raise Unsupported("its second output, the mask")
-    return inputs[0].clone()
 
 
 @operator("SpaceToDepth")
@@ -213,47 +198,3 @@ def gather(node: Node, inputs: Inputs) -> Tensor:
 def _from_start(index: Tensor, size: int) -> Tensor:
     """The index with negative elements counted from the start, too."""
     return torch.where(index < 0, index + size, index).long()
-
-
-@operator("GatherND")
-def gather_nd(node: Node, inputs: Inputs) -> Tensor:
-    if node.get("batch_dims", 0):
-        raise Unsupported("batch_dims")
-    return inputs[0][tuple(inputs[1].long().unbind(-1))]
-
-
-@operator("ScatterND")
-def scatter_nd(node: Node, inputs: Inputs) -> Tensor:
-    if node.get("reduction", "none") not in ("none", "add"):
-        raise Unsupported(f"reduction {node.get('reduction')}")
-    index = tuple(inputs[1].long().unbind(-1))
-    return inputs[0].index_put(index, inputs[2], accumulate=node.get("reduction") == "add")
-
-
-@operator("ScatterElements")
-def scatter_elements(node: Node, inputs: Inputs) -> Tensor:
-    if node.get("reduction", "none") != "none":
-        raise Unsupported(f"reduction {node.get('reduction')}")
-    x, axis = inputs[0], node.get("axis", 0)
-    return x.scatter(axis, _from_start(inputs[1], x.shape[axis]), inputs[2])
-
-
-@operator("TopK", host=(1,))
-def top_k(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
-    k = node.get("k") if "k" in node.attributes else whole_numbers(inputs[1])[0]
-    largest = inputs[0].topk(
-        k, node.get("axis", -1), bool(node.get("largest", 1)), bool(node.get("sorted", 1))
-    )
-    return largest.values, largest.indices
-
-
-@operator("GridSample")
-def grid_sample(node: Node, inputs: Inputs) -> Tensor:
-    mode = {"linear": "bilinear", "cubic": "bicubic"}.get(node.get("mode", "bilinear"))
-    return F.grid_sample(
-        inputs[0],
-        inputs[1],
-        mode=mode or node.get("mode", "bilinear"),
-        padding_mode=node.get("padding_mode", "zeros"),
-        align_corners=bool(node.get("align_corners", 0)),
-    )

@@ -1,7 +1,7 @@
 """Convolutions and pooling with every padding of the standard, normalisations, resizing.
 
 Resize is a weighted sum: along one axis each output element is Σ_k weight[k]·x[index[k]], one
-element for nearest, two for linear, four for cubic, more where an antialiasing filter is asked for.
+element for nearest, two for linear, four for cubic.
 """
 
 from __future__ import annotations
@@ -57,6 +57,8 @@ def _pads(
 @operator("Conv")
 def conv(node: Node, inputs: Inputs) -> Tensor:
     x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
+    if x.dtype == torch.float64:  # computed with a copy of the pixels below each kernel position
+        raise Unsupported("double precision")
     rank = x.ndim - 2
     stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
     pads = _pads(node, x.shape[2:], weight.shape[2:], stride, dilation)
@@ -119,8 +121,6 @@ def _pooling(node: Node, x: Tensor) -> tuple[list[int], list[int], list[int], Pa
 
 @operator("MaxPool")
 def max_pool(node: Node, inputs: Inputs) -> Tensor:
-    if node.outputs > 1:
-        raise Unsupported("its second output, the indices")
     x = inputs[0]
     kernel, stride, dilation, _, padded = _pooling(node, x)
     if any(n for pair in padded for n in pair):
@@ -152,29 +152,18 @@ register(
         "InstanceNormalization": lambda node, i: F.instance_norm(
             i[0], weight=i[1], bias=i[2], eps=node.get("epsilon", 1e-5)
         ),
-        "LRN": lambda node, i: F.local_response_norm(
-            i[0],
-            node.get("size"),
-            node.get("alpha", 1e-4),
-            node.get("beta", 0.75),
-            node.get("bias", 1.0),
-        ),
     }
 )
 
 
 @operator("BatchNormalization")
 def batch_norm(node: Node, inputs: Inputs) -> Tensor:
-    if node.get("training_mode", 0):
-        raise Unsupported("training_mode; export the network in eval mode")
     x, weight, bias, mean, variance = inputs[:5]
     return F.batch_norm(x, mean, variance, weight, bias, eps=node.get("epsilon", 1e-5))
 
 
 @operator("LayerNormalization")
 def layer_norm(node: Node, inputs: Inputs) -> Tensor:
-    if node.outputs > 1:
-        raise Unsupported("its second and third output")
     x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
     shape = list(x.shape[node.get("axis", -1) % x.ndim :])
     bias = None if bias is None else bias.expand(shape)
@@ -184,49 +173,31 @@ def layer_norm(node: Node, inputs: Inputs) -> Tensor:
 @operator("GroupNormalization")
 def group_norm(node: Node, inputs: Inputs) -> Tensor:
     x, weight, bias = inputs
-    groups = node.get("num_groups")
-    if node.opset < 21:  # one weight per group
-        weight, bias = (v.repeat_interleave(x.shape[1] // groups) for v in (weight, bias))
-    return F.group_norm(x, groups, weight, bias, node.get("epsilon", 1e-5))
-
-
-@operator("DequantizeLinear")
-def dequantize(node: Node, inputs: Inputs) -> Tensor:
-    x, scale, zero = inputs[0], inputs[1], optional(inputs, 2)
-    if node.get("block_size", 0):
-        raise Unsupported("blocks")
-    if scale.numel() > 1:
-        shape = [1] * x.ndim
-        shape[node.get("axis", 1)] = -1
-        scale = scale.reshape(shape)
-        zero = None if zero is None else zero.reshape(shape)
-    centred = x.to(scale.dtype) if zero is None else x.to(scale.dtype) - zero.to(scale.dtype)
-    return centred * scale
+    return F.group_norm(x, node.get("num_groups"), weight, bias, node.get("epsilon", 1e-5))
 
 
 @operator("Upsample", "Resize", host=(1, 2, 3))
 def resize(node: Node, inputs: Inputs) -> Tensor:
     x, scales, sizes = inputs[0], optional(inputs, 2), optional(inputs, 3)
-    if node.op == "Upsample" or node.opset < 11:
-        mode = {"bilinear": "linear"}.get(node.get("mode"), node.get("mode", "nearest"))
-        more = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "simple"}
-        factors = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
-        return _resize(x, replace(node, attributes={"mode": mode, **more}), factors, None)
-    if node.get("keep_aspect_ratio_policy", "stretch") != "stretch":
-        raise Unsupported("keep_aspect_ratio_policy")
-    axes = [a % x.ndim for a in node.get("axes", range(x.ndim))]
+    if "axes" in node.attributes:
+        raise Unsupported("axes")
     if sizes is not None and sizes.numel():
-        wanted = dict(zip(axes, whole_numbers(sizes), strict=True))
-        out = [wanted.get(a, n) for a, n in enumerate(x.shape)]
-        return _resize(x, node, [size / n for size, n in zip(out, x.shape, strict=True)], out)
-    if scales is None:
+        wanted = whole_numbers(sizes)
+        return _resize(x, node, [size / n for size, n in zip(wanted, x.shape, strict=True)], wanted)
+    if node.op == "Upsample" or node.opset < 11:
+        factors = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
+        mode = {"bilinear": "linear"}.get(node.get("mode"), node.get("mode", "nearest"))
+        more = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+        node = replace(node, attributes={"mode": mode, **more})
+    elif scales is None:
         raise Unsupported("neither scales nor sizes")
-    by_axis = dict(zip(axes, scales.tolist(), strict=True))
-    return _resize(x, node, [by_axis.get(a, 1.0) for a in range(x.ndim)], None)
+    else:
+        factors = scales.tolist()
+    wanted = [math.floor(n * factor) for n, factor in zip(x.shape, factors, strict=True)]
+    return _resize(x, node, factors, wanted)
 
 
-def _resize(x: Tensor, node: Node, factors: list[float], sizes: list[int] | None) -> Tensor:
-    sizes = sizes or [math.floor(n * s) for n, s in zip(x.shape, factors, strict=True)]
+def _resize(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> Tensor:
     fast = _by_torch(x, node, factors, sizes)
     if fast is not None:
         return fast
@@ -240,12 +211,12 @@ def _by_torch(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> 
     """The result of torch's own resize if it computes the same; else None."""
     exact = all(n * f == s for n, f, s in zip(x.shape, factors, sizes, strict=True))
     is_image = x.ndim == 4 and list(x.shape[:2]) == sizes[:2] and exact
-    if not is_image or node.get("antialias") or not x.is_floating_point():
+    if not is_image or not x.is_floating_point():
         return None
     size, mode = (sizes[2], sizes[3]), node.get("mode", "nearest")
     coordinates = node.get("coordinate_transformation_mode", "half_pixel")
     whole = all(f >= 1 and f == int(f) for f in factors)
-    if mode == "nearest" and whole and node.get("nearest_mode") in ("simple", "floor"):
+    if mode == "nearest" and whole and node.get("nearest_mode") == "floor":
         return F.interpolate(x, size) if coordinates == "asymmetric" else None
     corners = coordinates == "align_corners"
     half = coordinates in ("half_pixel", "pytorch_half_pixel") and min(size) > 1
@@ -275,26 +246,19 @@ def _taps(node: Node, size: int, out: int, factor: float) -> tuple[Tensor, Tenso
         out: Number of the output's.
         factor: Scale of the axis: about out / size.
     """
-    mode, antialias = node.get("mode", "nearest"), node.get("antialias", 0)
+    mode = node.get("mode", "nearest")
     coordinates = node.get("coordinate_transformation_mode", "half_pixel")
     position = _coordinates(coordinates, size, out, factor)
     if mode == "nearest":
-        rounding = _ROUNDING[node.get("nearest_mode", "round_prefer_floor")]
-        index = rounding(position, factor).long().clamp(0, size - 1)
-        return index[:, None], torch.ones(out, 1)
+        index = _ROUNDING[node.get("nearest_mode", "round_prefer_floor")](position).long()
+        return index.clamp(0, size - 1)[:, None], torch.ones(out, 1)
     if mode not in ("linear", "cubic"):
         raise Unsupported(f"mode {mode}")
-    linear = mode == "linear"
-    shrink = min(1.0, factor) if antialias else 1.0
-    reach = math.ceil((1 if linear else 2) / shrink)
+    reach = 1 if mode == "linear" else 2
     index = position.floor().long()[:, None] + torch.arange(1 - reach, reach + 1)
-    distance = (index - position[:, None]) * shrink
+    distance = (index - position[:, None]).abs()
     a = node.get("cubic_coeff_a", -0.75)
-    weight = (1 - distance.abs()).clamp_min(0) if linear else _cubic(distance, a)
-    if node.get("exclude_outside", 0):
-        weight = weight.masked_fill((index < 0) | (index > size - 1), 0)
-    if node.get("exclude_outside", 0) or antialias:
-        weight = weight / weight.sum(dim=1, keepdim=True)
+    weight = (1 - distance).clamp_min(0) if mode == "linear" else _cubic(distance, a)
     return index.clamp(0, size - 1), weight
 
 
@@ -318,18 +282,16 @@ def _coordinates(mode: str, size: int, out: int, factor: float) -> Tensor:
     raise Unsupported(f"coordinate_transformation_mode {mode}")
 
 
-_ROUNDING: dict[str, Callable[[Tensor, float], Tensor]] = {
-    "round_prefer_floor": lambda p, _: (p - 0.5).ceil(),
-    "round_prefer_ceil": lambda p, _: (p + 0.5).floor(),
-    "floor": lambda p, _: p.floor(),
-    "ceil": lambda p, _: p.ceil(),
-    "simple": lambda p, factor: p.ceil() if factor < 1 else p.floor(),
+_ROUNDING: dict[str, Callable[[Tensor], Tensor]] = {
+    "round_prefer_floor": lambda p: (p - 0.5).ceil(),
+    "round_prefer_ceil": lambda p: (p + 0.5).floor(),
+    "floor": torch.floor,
+    "ceil": torch.ceil,
 }
 
 
-def _cubic(distance: Tensor, a: float) -> Tensor:
-    """The cubic convolution kernel (Keys 1981)."""
-    t = distance.abs()
+def _cubic(t: Tensor, a: float) -> Tensor:
+    """The cubic convolution kernel at distances t (Keys 1981)."""
     near = ((a + 2) * t - (a + 3)) * t * t + 1
     far = ((a * t - 5 * a) * t + 8 * a) * t - 4 * a
     return torch.where(t <= 1, near, torch.where(t < 2, far, torch.zeros_like(t)))

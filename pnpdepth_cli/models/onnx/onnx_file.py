@@ -8,9 +8,6 @@ from __future__ import annotations
 
 import functools
 import graphlib
-import re
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +23,13 @@ from pnpdepth_cli.models.definition import (
     graph_definition,
 )
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
-from pnpdepth_cli.models.onnx.runtime import FirstImageCheck, Quantised
+from pnpdepth_cli.models.onnx.runtime import FirstImageCheck
 
 _OPSETS = range(7, 25)  # onnxruntime runs none that is older
 _MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
 _MAX_WRITTEN_OUT = 1 << 28  # bytes
 _NODE_BYTES = 1 << 12  # that a node takes in memory at least; depth networks have up to 10,000
 _SHARED = 2  # tensors that may have the same bytes of a file beside the model
-_QUANTISES = re.compile("Quantize|QLinear|QGemm|Integer")  # not DequantizeLinear of weights
-_ENDLESS = ("Loop", "Scan")
 
 
 def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> ModelDefinition:
@@ -55,7 +50,7 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
     is_part = _prune(model, _choose_output(model, output, file), file)
     # From the file, onnxruntime reads weights that lie beside it.
     source = model.SerializeToString() if is_part else str(file)
-    definition = graph_definition(
+    return graph_definition(
         list(inputs.values()), file, stated,
         size=Multiple(_patch_size(model) or ASSUMED_MULTIPLE),
         build=lambda: OnnxGraph(model, file),
@@ -63,21 +58,6 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
         output=_as_map,
         verify=FirstImageCheck(source, file),
     )  # fmt: skip
-    if not any(_QUANTISES.search(node.op_type) for node in model.graph.node):
-        return definition
-    # A quantised network is left to onnxruntime.
-    if len(inputs) > 1 or any(n.op_type in _ENDLESS for n in _nodes_in(model.graph.node)):
-        raise ModelError(f"ONNX file {file} is quantised and has several inputs or loops")
-    stored = sum(tensor.ByteSize() for tensor in model.graph.initializer)
-    return replace(
-        definition,
-        build=lambda: Quantised(source, file, stored, next(iter(inputs))),
-        verify=None,
-        layers=("output",),
-        defaults=replace(definition.defaults, iterations=0),
-        assumed="its activations are quantised, which leaves no gradient; onnxruntime predicts, and"
-        " z is not updated",
-    )
 
 
 def _read(file: Path) -> Any:
@@ -108,6 +88,10 @@ def _read(file: Path) -> Any:
         words = (node.name, node.op_type, node.domain, *node.input, *node.output)
         if not all(isinstance(word, str) for word in words):
             raise ModelError(f"ONNX file {file} cannot be read: its names are not text in UTF-8")
+        if any(attribute.graphs or attribute.HasField("g") for attribute in node.attribute):
+            raise ModelError(
+                f"ONNX file {file}: {node.op_type}, with a graph of its own, is not covered"
+            )
     if _opset(model) not in _OPSETS:
         raise ModelError(
             f"ONNX file {file} is of opset {_opset(model)}; export it with one from"
@@ -141,14 +125,14 @@ def _inlined(model: Any, file: Path) -> Any:
     """The model without functions of its own, which may call each other and become endless."""
     if not model.functions:
         return model
-    functions = {(f.domain, f.name, getattr(f, "overload", "")): f for f in model.functions}
+    functions = {(f.domain, f.name, f.overload): f for f in model.functions}
 
     @functools.cache
     def size_of_function(key: tuple[str, str, str]) -> int:
         return int(functions[key].ByteSize()) + size(functions[key])
 
     def size(graph: Any) -> int:
-        calls = [(n.domain, n.op_type, getattr(n, "overload", "")) for n in _nodes_in(graph.node)]
+        calls = [(n.domain, n.op_type, n.overload) for n in graph.node]
         return sum(size_of_function(call) if call in functions else _NODE_BYTES for call in calls)
 
     try:
@@ -160,15 +144,6 @@ def _inlined(model: Any, file: Path) -> Any:
     from onnx import inliner
 
     return inliner.inline_local_functions(model)
-
-
-def _nodes_in(nodes: Sequence[Any]) -> Iterator[Any]:
-    """The nodes, and those in the graphs that are their attributes."""
-    for node in nodes:
-        yield node
-        for attribute in node.attribute:
-            for graph in (*attribute.graphs, attribute.g):
-                yield from _nodes_in(graph.node)
 
 
 def _opset(model: Any) -> int:

@@ -18,15 +18,12 @@ pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
 import onnx
 from onnx import helper, numpy_helper
 
-from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import LayerError, ModelError
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models import steps
 from pnpdepth_cli.models.definition import Multiple
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.onnx import OPERATORS, graph
-from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import ClosedSettings
 from tests.models.onnx.onnx_files import write_network
 from tests.models.weights.files import little
 
@@ -128,45 +125,14 @@ def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
         assert message in refused(path)
     node = helper.make_node("NonZero", ["depth"], ["where"])
     refused(write_network(path, nodes=(node,), outputs=("where",)))
+    quantised = helper.make_node("DynamicQuantizeLinear", ["depth"], ["q", "scale", "zero"])
+    message = refused(write_network(path, nodes=(quantised,), outputs=("scale",)))
+    assert "DynamicQuantizeLinear" in message
     assert "com.microsoft.Add" in refused(write_network(path, domain="com.microsoft"))
     refused(write_network(path, opset=99))
     refused(write_network(path, shape=(1, 4, "h", None)))
     for shape in ((1, 4, 32, 48), (2, 3, 32, 48), (1, 3, 32)):
         assert "×".join(map(str, shape)) in refused(write_network(path, shape=shape))
-
-
-@pytest.mark.parametrize("kind", ["QuantizeLinear", "DynamicQuantizeLinear"])
-def test_a_quantised_network_predicts_by_onnxruntime_and_z_is_not_updated(
-    tmp_path: Path, kind: str
-) -> None:
-    after = {
-        "QuantizeLinear": [
-            helper.make_node("QuantizeLinear", ["depth", "one"], ["q"]),
-            helper.make_node("DequantizeLinear", ["q", "one"], ["out"]),
-        ],
-        "DynamicQuantizeLinear": [
-            helper.make_node("DynamicQuantizeLinear", ["depth"], ["q", "scale", "zero"]),
-            helper.make_node("DequantizeLinear", ["q", "scale", "zero"], ["out"]),
-        ],
-    }
-    path = write_network(tmp_path / "net.onnx", nodes=tuple(after[kind]), outputs=("out",))
-    network = load_network(str(path), None)
-    assert "z is not updated" in network.notes[0]
-    rgb = torch.cat([image(1, 3, 32, 48), image(1, 3, 32, 48).flip(3)])
-    predicted = network.module(rgb)  # two frames, of a graph for one
-    expected = load_network(str(write_network(tmp_path / "float.onnx")), None).module(rgb[1:])
-    step = 0.5 if kind == "QuantizeLinear" else float(expected.max()) / 510
-    assert float((predicted[1:] - expected).abs().max()) < 1.02 * step
-    points = SparsePoints(
-        xy=torch.tensor([[1.0, 2.0], [40.0, 20.0]]), depth=torch.tensor([1.0, 2.0]), size=(32, 48)
-    )
-    with Split(network.module, network.definition.layers[0]) as split:
-        settings = network.definition.defaults
-        result = refine(split, (rgb[:1],), points, settings, depth_of=network.depth_of)
-        assert torch.equal(result.after, predicted[:1])
-        once = ClosedSettings(iterations=1)
-        with pytest.raises(LayerError):
-            refine(split, (rgb[:1],), points, once, depth_of=network.depth_of)
 
 
 def test_several_outputs_are_listed_and_one_can_be_named(tmp_path: Path) -> None:
@@ -215,7 +181,7 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
     assert network.verify((image(1, 3, 32, 48),))
 
 
-# ------------------------------------------------------------------ half precision, quantised
+# ------------------------------------------------------------------ half precision
 
 
 @pytest.mark.parametrize("keep_io_types", [True, False])
@@ -354,8 +320,7 @@ def test_arithmetic_on_constants_is_bounded(kind: str, tmp_path: Path) -> None:
     last = helper.make_node("Add", ["depth", "big"], ["out"])
     path = write_network(tmp_path / "x.onnx", nodes=(*CONSTANT_WORK[kind], last), outputs=("out",))
     with little(megabytes=500, seconds=4):
-        message = refused(path)
-    assert ("two inputs" if kind == "Einsum" else "more arithmetic on constants") in message
+        refused(path)
 
 
 def beside(path: Path, *, copies: int = 0, dims: Any = (8, 3, 3, 3), **entry: object) -> Path:

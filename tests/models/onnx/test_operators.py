@@ -24,18 +24,17 @@ from pnpdepth_cli.models.onnx.graph import OnnxGraph  # noqa: E402
 
 F32, I64 = np.float32, np.int64
 KINDS = {np.dtype(kind) for kind in ("f4", "f8", "i1", "i4", "i8", "u1", "?")}
-WITHOUT_CASES = {"Cast", "CastLike", "Constant", "LayerNormalization"}
-PARTLY_COVERED = {"ArgMax", "ArgMin", "AveragePool", "DequantizeLinear", "Dropout", "GatherND"}
-PARTLY_COVERED |= {"MaxPool", "Resize", "ScatterElements", "ScatterND"}
+WITHOUT_CASES = {"Cast", "Constant", "LayerNormalization"}
+PARTLY_COVERED = {"ArgMax", "ArgMin", "AveragePool", "Dropout", "GatherND", "IsInf", "MaxPool"}
+PARTLY_COVERED |= {"Pad", "ReduceSum", "Resize", "ScatterND"}
 """Operators some of whose attributes are refused."""
 OTHERWISE = {
     *("test_convtranspose_output_shape", "test_maxpool_2d_uint8"),
     "test_resize_downsample_scales_linear_align_corners",
     "test_resize_downsample_scales_cubic_align_corners",
     *(f"test_reduce_{kind}" for kind in ("max_empty_set", "max_empty_set_bool", "min_empty_set")),
-    *(f"test_top_k_same_values{more}" for more in ("", "_2d", "_largest")),
 }
-"""Cases that onnxruntime computes otherwise, of nothing, and of ties."""
+"""Cases that onnxruntime computes otherwise, and of nothing."""
 
 
 @functools.cache
@@ -93,13 +92,12 @@ def model_of(
     """One node whose first input is the graph's and whose others are constants."""
     names = [f"in{n}" if value is not None else "" for n, value in enumerate(inputs)]
     node = helper.make_node(op, names, [f"out{n}" for n in range(outputs)], **attributes)
-    kinds = {np.dtype(F32): TensorProto.FLOAT, np.dtype(I64): TensorProto.INT64,
-             np.dtype(bool): TensorProto.BOOL}  # fmt: skip
     assert inputs[0] is not None
+    kind = helper.np_dtype_to_tensor_dtype(inputs[0].dtype)
     graph = helper.make_graph(
         [node],
         "g",
-        [helper.make_tensor_value_info("in0", kinds[inputs[0].dtype], inputs[0].shape)],
+        [helper.make_tensor_value_info("in0", kind, inputs[0].shape)],
         [onnx.ValueInfoProto(name=f"out{n}") for n in range(outputs)],
         [numpy_helper.from_array(v, f"in{n}") for n, v in enumerate(inputs) if n and v is not None],
     )
@@ -147,7 +145,6 @@ CASES = [
     case("BatchNormalization", 7, X, np.abs(normal(4)), *STATISTICS),
     case("LayerNormalization", 17, X, normal(6), normal(6)),
     case("LayerNormalization", 17, X, normal(7, 6), axis=2, epsilon=1e-3),
-    case("GroupNormalization", 18, X, normal(2), normal(2), num_groups=2),
     case("Squeeze", 11, normal(1, 3, 1)),
     case("Unsqueeze", 11, normal(3, 2), axes=[1, 3]),
     case("Split", 11, normal(6, 2), outputs=3, axis=0),
@@ -155,14 +152,13 @@ CASES = [
     case("Slice", 9, X, starts=[1, 0], ends=[3, -1], axes=[2, 3]),
     case("Slice", 9, X, starts=[0, 1], ends=[1, 3]),
     case("Cast", 17, X, to=TensorProto.INT64),
-    case("CastLike", 17, X, ints(1)),
     case("Conv", 17, normal(1, 2, 4, 5, 6), normal(3, 2, 3, 3, 3)),
     case("Pad", 10, X, mode="reflect", pads=[0, 0, 2, 1, 0, 0, 1, 3]),
     case("Pad", 13, X, ints(0, 0, -1, 0, 0, 0, 0, -2)),
     *(
         case(op, 11, np.abs(X) + 0.1, **how)
         for op in sorted(OPERATORS)
-        if op.startswith("Reduce") and op not in ("ReduceLogSum", "ReduceSumSquare")
+        if op.startswith("Reduce")
         for how in ({}, {"axes": [2, -1], "keepdims": 0})
     ),
 ]
@@ -209,35 +205,12 @@ def test_transposed_convolutions(attributes: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("mode", ["nearest", "linear"])
-@pytest.mark.parametrize("scales", [(2, 2), (1.5, 1.5), (0.5, 0.7)])
+@pytest.mark.parametrize("scales", [(2, 2), (1.5, 1.5)])
 def test_upsample_and_the_first_resize(mode: str, scales: tuple[float, float]) -> None:
     factors = np.array([1, 1, *scales], F32)
     check("Resize", [X, factors], opset=10, mode=mode)
-    if min(scales) >= 1:
-        check("Upsample", [X, factors], opset=9, mode=mode)
-        check("Upsample", [X], opset=7, mode=mode, scales=factors.tolist())
-
-
-@pytest.mark.parametrize(
-    ("size", "scales", "axis"), [((3, 4), (1, 4), 1), ((3, 4), (3, 1), 0), ((3,), (), 1)]
-)
-def test_dequantised_weights_are_folded_into_numbers(
-    size: tuple[int, ...], scales: tuple[int, ...], axis: int
-) -> None:
-    x, quantised = normal(1, 3), np.random.default_rng(0).integers(-9, 9, size).astype(np.int8)
-    scale = np.abs(normal(*scales)).astype(F32) + F32(0.01)
-    zero = np.arange(scale.size, dtype=np.int8).reshape(scales)
-    model = model_of("MatMul", [x, None], 13, 1)
-    dequantise = helper.make_node("DequantizeLinear", ["q", "s", "z"], ["w"], axis=axis)
-    model.graph.node[0].input[1] = "w"
-    model.graph.node.insert(0, dequantise)
-    flat = -1 if scales else ()
-    for value, name in ((quantised, "q"), (scale.reshape(flat), "s"), (zero.reshape(flat), "z")):
-        model.graph.initializer.append(numpy_helper.from_array(value, name))
-    module = OnnxGraph(model, Path("x.onnx"))
-    assert [name for name, _ in module.named_children()] == ["MatMul_out0"]
-    expected = x @ ((quantised - zero).astype(F32) * scale)
-    np.testing.assert_allclose(module(torch.from_numpy(x)).numpy(), expected, rtol=1e-5, atol=1e-5)
+    check("Upsample", [X, factors], opset=9, mode=mode)
+    check("Upsample", [X], opset=7, mode=mode, scales=factors.tolist())
 
 
 INDEX = np.array([[0, 1]], I64)
@@ -254,12 +227,13 @@ INDEX = np.array([[0, 1]], I64)
         ("LayerNormalization", [X, normal(6)], 2, {}),
         ("Resize", [X, None, None], 1, {}),
         ("Resize", [X, None, np.full(4, 2, F32)], 1, {"mode": "area"}),
-        ("Pad", [X, np.ones(8, I64)], 1, {"mode": "mirror"}),
+        ("Pad", [X, np.ones(8, I64)], 1, {"mode": "wrap"}),
         ("Pad", [normal(2, 1), np.ones(4, I64)], 1, {"mode": "reflect"}),
         ("Cast", [X], 1, {"to": TensorProto.STRING}),
         ("GatherND", [X, INDEX], 1, {"batch_dims": 1}),
         ("ScatterND", [X, INDEX, normal(1, 7, 6)], 1, {"reduction": "mul"}),
-        ("ScatterElements", [normal(4, 2), INDEX, X], 1, {"reduction": "add"}),
+        ("Resize", [X, None, np.full(4, 2, F32)], 1, {"mode": "linear", "antialias": 1}),
+        ("Conv", [X.astype(np.float64), normal(4, 4, 3, 3).astype(np.float64)], 1, {}),
     ],
 )
 def test_what_an_operator_does_not_cover_is_refused_by_its_name(
