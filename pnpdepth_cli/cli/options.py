@@ -58,9 +58,9 @@ def _type_of(declared: Option) -> Any:
         return declared.parse
     if declared.least is not None or declared.most is not None:
         return click.IntRange(declared.least, declared.most)
-    if declared.type == "tuple[float, float]":
-        return (float, float)
-    return {"int": int, "float": float, "str": str, "bool": bool, "Path": FILE}[declared.type]
+    pairs = {"tuple[float, float]": (float, float), "tuple[int, int]": (int, int)}
+    plain = {"int": int, "float": float, "str": str, "bool": bool, "Path": FILE}
+    return (pairs | plain)[declared.type]
 
 
 def options_of_groups(*groups: type, without: Collection[str] = ()) -> Callable[[Any], Any]:

@@ -11,6 +11,7 @@ from pnpdepth_cli.choices import SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.streams import say
 from pnpdepth_cli.commands.refinement.refine_request import parse_sample
+from pnpdepth_cli.commands.requests import FramesRequest
 from pnpdepth_cli.dataset.read_options import ScanOptions
 
 
@@ -74,7 +75,7 @@ def sample(depth: Path, count: str, output: Path, overwrite: bool, **values: Any
     lines      all known pixels of N evenly spaced rows
     features   the N strongest ORB corners, as in structure from motion
 
-    The settings, with the seed, are stored in the file (PNG, CSV) and in a JSON file beside it.
+    A JSON file beside the output records the settings.
     """
     from pnpdepth_cli.cli.printing import print_sparse
     from pnpdepth_cli.commands.sparse import make
@@ -150,35 +151,7 @@ def simulate(
     help="Topic of the images, of the points (PointCloud2 or depth images), or of the poses; may be"
     " given for each.  [default: the only one]",
 )
-@click.option(
-    "--tolerance",
-    type=float,
-    default=0.05,
-    show_default=True,
-    metavar="SECONDS",
-    help="Largest time between an image and its scan.",
-)
-@click.option(
-    "--clock-offset",
-    type=float,
-    metavar="SECONDS",
-    help="Added to the times of the points.  [default: 0; by the times of the log if above 1 s]",
-)
-@click.option(
-    "--between",
-    type=click.IntRange(0),
-    nargs=2,
-    metavar="FIRST LAST",
-    help="Only the frames of these numbers, from 0.",
-)
-@click.option(
-    "--every",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Only every N-th of these.",
-)
+@options.options_of_groups(FramesRequest)
 @options.overwrite
 def frames(bag: Path, output: Path, **values: Any) -> None:
     """Write the images of a BAG and the scans nearest in time as files.
@@ -192,7 +165,7 @@ def frames(bag: Path, output: Path, **values: Any) -> None:
     gets rgb/, sparse/ (PLY or EXR), calib.txt from camera_info and tf_static, and poses.txt from
     odometry.
     """
-    from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, write_frames
+    from pnpdepth_cli.commands.sparse.bag_frames import write_frames
 
     request = FramesRequest(bag=bag, output=output, **values)
     record = write_frames(request, say)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,12 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import image_of_size
 from pnpdepth_cli.dataset.frame_camera import (
     camera_of_exif,
     camera_of_file,
-    camera_of_fov,
     describe_pinhole,
 )
 from pnpdepth_cli.dataset.frame_record import Pose
@@ -42,37 +41,6 @@ _IN_MEMORY = 12
 """Depth maps of neighbouring views that are kept, with their points."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CloudRequest:
-    """What the user asks of a cloud."""
-
-    depth: Path
-    """A depth file, or a folder with files NAME_depth.SUFFIX, as `refine` and `batch` write."""
-    output: Path
-    """The PLY file to write."""
-    image: Path | None = None
-    """The colours. None: the image that the record NAME.json beside the depth names, if any."""
-    calib: Path | None = None
-    """Calibration of the camera. None: `fov_deg`, else the record's camera, else EXIF."""
-    fov_deg: float | None = None
-    """Horizontal field of view of a camera without distortion, instead of `calib`."""
-    poses: Path | None = None
-    """Poses of the depth files, in their order. None: those of the records, if they have any. With
-    poses, the cloud is in the world's coordinates."""
-    pose_kind: str | None = None
-    """What `poses` are, as `poses_of_frames` takes it."""
-    depth_scale: float | None = None
-    """Integer depth files hold metres × this."""
-    max_depth: float = math.inf
-    max_sigma: float | None = None
-    """Largest standard deviation of a pixel, as a fraction of its depth."""
-    min_views: int = 1
-    """Views that have to agree on a pixel, its own included; see `consistent_depth`."""
-    voxel: float | None = None
-    """Side of the cubes in which points are merged. None: all points are kept."""
-    overwrite: bool = False
-
-
 def write_depth_cloud(
     request: CloudRequest, show: Callable[[int, int], None] = lambda done, of: None
 ) -> dict[str, Any]:
@@ -86,7 +54,10 @@ def write_depth_cloud(
         PnpDepthError: An input or output is at fault; then nothing is written.
     """
     # The frames, with poses where views must agree.
-    _check(request)
+    beside = record_path(request.output)
+    for path in (request.output, beside):
+        if path.exists() and not request.overwrite:
+            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
     frames = result_frames(request.depth)
     notes: list[str] = []
     poses = _poses(request, frames, notes)
@@ -119,29 +90,13 @@ def write_depth_cloud(
         "notes": notes,
         "frame": "camera" if poses[0] is None else "world",
     }
-    write_json(record_path(request.output), record)
+    write_json(beside, record)
     return record
 
 
 def record_path(output: Path) -> Path:
     """Returns the path of the record of a cloud; NAME.json may be that of a refinement."""
     return output.with_name(f"{output.name}.json")
-
-
-def _check(request: CloudRequest) -> None:
-    if request.output.suffix.lower() != ".ply":
-        raise OutputError(f"{request.output}: a cloud is written as PLY; name it NAME.ply")
-    for path in (request.output, record_path(request.output)):
-        if path.exists() and not request.overwrite:
-            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
-    if request.calib is not None and request.fov_deg is not None:
-        raise UsageError("--calib and --fov both give the camera; leave one out")
-    if request.pose_kind is not None and request.poses is None:
-        raise UsageError("--pose-kind is for --poses")
-    if request.image is not None and request.depth.is_dir():
-        raise UsageError("--image is for one depth file; records name the images of a folder")
-    if request.voxel is not None and not 0 < request.voxel < math.inf:
-        raise UsageError(f"--voxel must be a length above 0, got {request.voxel:g}")
 
 
 def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -> list[Pose | None]:
@@ -242,9 +197,6 @@ def _camera(
     """
     if request.calib is not None:
         return camera_of_file(request.calib, None, size, frame.depth)
-    if request.fov_deg is not None:
-        camera = camera_of_fov(request.fov_deg, size)
-        return camera, [describe_pinhole(camera)]
     of_record, _ = frame.camera_and_pose
     if of_record is not None:
         if frame.record.size != (size[1], size[0]):
@@ -257,7 +209,6 @@ def _camera(
     of_exif = camera_of_exif(image, size) if isinstance(image, Path) else None
     if of_exif is None:
         raise UsageError(
-            f"a cloud needs the camera, and neither a record nor EXIF gives that of {frame.depth};"
-            " give --calib or --fov"
+            f"neither a record nor EXIF gives the camera of {frame.depth}; give --calib"
         )
     return of_exif, [describe_pinhole(of_exif)]

@@ -1,8 +1,7 @@
-"""The camera of a frame: from the sparse depth, a calibration, a field of view, or EXIF."""
+"""The camera of a frame: from the sparse depth, a calibration, or EXIF."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.rgb import read_focal_length
 
-_MAX_FOV_DEG = 170.0
 _OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
 
 
@@ -100,33 +98,18 @@ def check_size(
     return []
 
 
-def camera_of_fov(fov_deg: float, size: tuple[int, int]) -> Camera:
-    """Returns a camera without distortion of this horizontal field of view, for (H, W) pixels.
-
-    Raises:
-        UsageError: No such camera exists.
-    """
-    if not 0 < fov_deg <= _MAX_FOV_DEG:
-        raise UsageError(f"--fov is {fov_deg:g} degrees; give 0 to {_MAX_FOV_DEG:g}")
-    focal_px = size[1] / 2 / math.tan(math.radians(fov_deg) / 2)
-    return _pinhole(focal_px, size, f"--fov {fov_deg:g}")
-
-
 def camera_of_exif(image: Path, size: tuple[int, int]) -> Camera | None:
     """Returns the camera of an image's EXIF, without distortion; None if EXIF does not give it."""
-    focal = read_focal_length(image, size)
-    return None if focal is None else _pinhole(focal[0], size, focal[1])
-
-
-def describe_pinhole(camera: Camera) -> str:
-    """Returns a line on a camera of a field of view or of EXIF, for a person."""
-    focal_px = camera.intrinsics[0, 0]
-    return f"camera: {focal_px:.1f} pixels of focal length, no distortion ({camera.source})"
-
-
-def _pinhole(focal_px: float, size: tuple[int, int], source: str) -> Camera:
-    height, width = size
+    if (focal := read_focal_length(image, size)) is None:
+        return None
+    (focal_px, source), (height, width) = focal, size
     intrinsics = np.array(
         [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
     )
     return Camera(intrinsics=intrinsics, size=size, source=source)
+
+
+def describe_pinhole(camera: Camera) -> str:
+    """Returns a line on a camera of EXIF, for a person."""
+    focal_px = camera.intrinsics[0, 0]
+    return f"camera: {focal_px:.1f} pixels of focal length, no distortion ({camera.source})"

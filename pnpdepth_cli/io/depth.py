@@ -133,16 +133,10 @@ def _as_image(path: Path, values: NDArray[Any]) -> NDArray[Any]:
     return image
 
 
-def write_depth(
-    path: Path,
-    depth: NDArray[np.float32],
-    *,
-    scale: float = KITTI_SCALE,
-    text: Mapping[str, str] | None = None,
-) -> None:
+def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_SCALE) -> None:
     """Writes depth in the format that the suffix names; not finite or <= 0 becomes 0, unknown.
 
-    Depth is (H, W) metres. A PNG has `scale` codes per metre, which it keeps as text, as `text`.
+    Depth is (H, W) metres. A PNG has `scale` codes per metre, which it keeps as text.
 
     Raises:
         OutputError: The suffix is unknown, the file cannot be written, or a depth is too large for
@@ -155,11 +149,12 @@ def write_depth(
     if depth.ndim != 2 or 0 in depth.shape:
         raise SizeError(f"{path}: depth of shape {depth.shape} is no image; give (H, W)")
     values: NDArray[Any] = known_metres(depth)
+    text = dict[str, str]()
     if depth_format.integer:
         values = _codes(path, values, scale)
-        text = {SCALE_KEY: repr(float(scale)).removesuffix(".0"), **(text or {})}
+        text[SCALE_KEY] = repr(float(scale)).removesuffix(".0")
     with atomic_path(path) as temporary:
-        depth_format.write(temporary, values, text or {})
+        depth_format.write(temporary, values, text)
 
 
 def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.uint16]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +23,6 @@ from pnpdepth_cli.points import SparsePoints
 
 SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
 """What `write_sparse` can write; .csv keeps coordinates between pixel centres."""
-
-_PROVENANCE_KEY = "pnpdepth:made"
-"""Key of the text in a PNG or CSV that says how its sparse depth was made."""
 
 Points = SparsePoints[NDArray[np.float32]]
 
@@ -129,23 +124,15 @@ def holds_scan(path: Path) -> bool:
 
 
 def write_sparse(
-    path: Path,
-    xy: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    image: NDArray[np.float32],
-    *,
-    provenance: Mapping[str, object],
+    path: Path, xy: NDArray[np.float32], depth: NDArray[np.float32], image: NDArray[np.float32]
 ) -> None:
     """Writes N points, of pixels (N, 2) and metres (N,), in the format that the suffix names.
 
-    Every format but .csv holds the image, the same points as (H, W) metres. A PNG and a CSV keep
-    the provenance: how the points were made.
+    Every format but .csv holds the image, the same points as (H, W) metres.
     """
-    text = json.dumps(provenance, sort_keys=True)
     if path.suffix.lower() != ".csv":
-        write_depth(path, image, scale=KITTI_SCALE, text={_PROVENANCE_KEY: text})
+        write_depth(path, image, scale=KITTI_SCALE)
         return
     rows = [f"{x:.9g},{y:.9g},{z:.9g}" for (x, y), z in zip(xy, depth, strict=True)]
     with atomic_path(path) as temporary:
-        content = "\n".join([f"# {_PROVENANCE_KEY} {text}", "x,y,depth", *rows]) + "\n"
-        temporary.write_text(content, encoding="utf-8", newline="\n")
+        temporary.write_text("\n".join(["x,y,depth", *rows]) + "\n", encoding="utf-8", newline="\n")

@@ -22,11 +22,13 @@ def test_the_points_of_a_cloud_are_counted_and_the_camera_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_depth(tmp_path / "d.exr", np.full((24, 32), 2, np.float32))
-    arguments = ["cloud", str(tmp_path / "d.exr"), "--fov", "60", "-o", str(tmp_path / "d.ply")]
+    (tmp_path / "k.txt").write_text("30 0 16 0 30 12 0 0 1")
+    arguments = ["cloud", str(tmp_path / "d.exr"), "--calib", str(tmp_path / "k.txt")]
+    arguments += ["-o", str(tmp_path / "d.ply")]
     assert run(arguments) == 0
     out, err = capsys.readouterr()
     assert "wrote 768 points, without colours (no image is known)" in out
-    assert "camera: 27.7 pixels of focal length" in err
+    assert err == ""
     assert json.loads((tmp_path / "d.ply.json").read_text())["points"] == 768
 
 

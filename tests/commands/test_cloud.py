@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
+from pnpdepth_cli.commands.cloud import write_depth_cloud
+from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord
@@ -36,8 +37,11 @@ def frame(
 
 
 def written(path: Path, output: Path, **values: Any) -> dict[str, Any]:
-    request = {"fov_deg": 60.0} | values
-    return write_depth_cloud(CloudRequest(depth=path, output=output, **request))
+    calib = output.parent / "k.txt"
+    calib.write_text(f"30 0 {WIDTH / 2} 0 30 {HEIGHT / 2} 0 0 1\n")
+    return write_depth_cloud(
+        CloudRequest(**({"depth": path, "output": output, "calib": calib} | values))
+    )
 
 
 def points_of(path: Path) -> np.ndarray:
@@ -53,13 +57,8 @@ def test_the_colours_come_from_the_image_that_the_record_names(tmp_path: Path) -
     assert json.loads((tmp_path / "a.ply.json").read_text()) == record
 
 
-def test_the_field_of_view_or_a_calibration_file_gives_the_camera(tmp_path: Path) -> None:
-    path = frame(tmp_path, "a")
-    written(path, tmp_path / "a.ply", fov_deg=90.0)
-    x = points_of(tmp_path / "a.ply")[:, 0]
-    assert x.max() == pytest.approx(2 * (WIDTH - 1) / WIDTH, rel=1e-5)
-    (tmp_path / "k.txt").write_text(f"30 0 {WIDTH / 2} 0 30 {HEIGHT / 2} 0 0 1\n")
-    written(path, tmp_path / "b.ply", fov_deg=None, calib=tmp_path / "k.txt")
+def test_a_calibration_file_gives_the_camera(tmp_path: Path) -> None:
+    written(frame(tmp_path, "a"), tmp_path / "b.ply")
     points = points_of(tmp_path / "b.ply")
     assert points[0] == pytest.approx([-WIDTH / 2 / 15, -HEIGHT / 2 / 15, 2], rel=1e-5)
 
@@ -79,7 +78,7 @@ def with_camera(path: Path, pose: list[list[float]] | None) -> Path:
 def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
     pose = [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]
     path = with_camera(frame(tmp_path, "a"), pose)
-    record = written(path, tmp_path / "a.ply", fov_deg=None)
+    record = written(path, tmp_path / "a.ply", calib=None)
     assert (record["frame"], record["unit"]) == ("world", "model units")
     assert record["notes"] == ["camera: made up (from the record)"]
     assert points_of(tmp_path / "a.ply")[-1] == pytest.approx(
@@ -92,7 +91,7 @@ def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path
     with_camera(frame(out, "a"), [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]])
     path = with_camera(frame(out, "b"), None)
     with pytest.raises(InputError, match=r"b_depth\.png has no pose in its record"):
-        written(out, cloud, fov_deg=None)
+        written(out, cloud, calib=None)
     (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
     with pytest.raises(UsageError, match="--image is for one depth file"):
         written(out, cloud, image=tmp_path / "a.png")
@@ -103,7 +102,7 @@ def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path
         written(path, cloud, image=tmp_path / "big.png")
     write_depth(path, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))
     with pytest.raises(SizeError, match="unlike its record"):
-        written(path, cloud, fov_deg=None)
+        written(path, cloud, calib=None)
 
 
 def test_pixels_beyond_the_limit_and_of_a_far_plane_are_left_out(tmp_path: Path) -> None:
@@ -168,9 +167,7 @@ def test_pixels_that_too_few_views_agree_on_are_left_out(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("values", "error", "message"),
     [
-        ({"fov_deg": None}, UsageError, "give --calib or --fov"),
-        ({"calib": Path("k.txt")}, UsageError, "--calib and --fov both"),
-        ({"fov_deg": 0.0}, UsageError, "--fov is 0"),
+        ({"calib": None}, UsageError, "give --calib"),
         ({"voxel": 0.0}, UsageError, "--voxel"),
         ({"max_depth": 0.5}, InputError, "no pixel is left"),
         ({"min_views": 2}, UsageError, "--min-views 2 needs"),

@@ -18,6 +18,7 @@ from pnpdepth_cli.commands.batch.sequence import (
 )
 from pnpdepth_cli.commands.refinement.output_files import outputs_in
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.requests import FramesRequest
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
@@ -62,7 +63,7 @@ def unpack(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     """
     if not is_bag(request.source):
         return request
-    from pnpdepth_cli.commands.sparse.bag_frames import FramesRequest, has_frames, write_frames
+    from pnpdepth_cli.commands.sparse.bag_frames import has_frames, write_frames
 
     folder = request.output.with_name(f"{request.output.name}_frames")
     whole = request.limit is None or request.names is not None

@@ -6,7 +6,6 @@ holds an `Export` called `EXPORT`.
 
 from __future__ import annotations
 
-import filecmp
 import itertools
 import shutil
 from collections.abc import Callable, Sequence
@@ -22,7 +21,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import image_of_size, read_image
-from pnpdepth_cli.dataset.frame_files import ImageSource, file_of
+from pnpdepth_cli.dataset.frame_files import ImageSource
 from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
@@ -33,8 +32,6 @@ from pnpdepth_cli.sensors.point_cloud import PointCloud, cloud_from_depth
 
 _START_POINTS = 200_000
 """Number of points of all frames together that a splatting program begins with."""
-_LONGEST_NAME = 200
-"""Most bytes of a record's name that becomes a path."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +49,6 @@ class ExportFrame:
     """Pose in the unit of the result. None: unknown."""
     unit_scale: float
     """Units of the depth per unit of the COLMAP model; 1 without a model."""
-    farthest: float
 
     @property
     def stem(self) -> str:
@@ -66,28 +62,24 @@ class ExportFrame:
 
     def image_in(self, folder: Path) -> Path:
         """Returns the image in this folder, or where it is copied to: programs read it there."""
-        inside = file_of(self.image).resolve().is_relative_to(folder.resolve())
-        if inside and isinstance(self.image, Path):
-            return self.image
+        image = self.image
+        if isinstance(image, Path) and image.resolve().is_relative_to(folder.resolve()):
+            return image
         return folder / "images" / self.image_name
-
-    def is_in(self, folder: Path) -> bool:
-        """Returns whether the image lies there already, itself or, in a copied project, a copy."""
-        path = self.image_in(folder)
-        if path == self.image or not path.is_file():
-            return path == self.image
-        return isinstance(self.image, Path) and filecmp.cmp(path, self.image, shallow=False)
 
     def copy_image(self, folder: Path) -> None:
         """Copies the image into the folder, unless it lies there."""
-        if self.is_in(folder):
+        from PIL import Image
+
+        path, image = self.image_in(folder), self.image
+        if path == image:
             return
-        if isinstance(self.image, Path):
-            with atomic_path(self.image_in(folder)) as temporary:
-                shutil.copyfile(self.image, temporary)
-        else:
-            pixels = np.rint(255 * read_image(self.image)).astype(np.uint8)
-            save_png(self.image_in(folder), pixels)
+        with atomic_path(path) as temporary:
+            if isinstance(image, Path):
+                shutil.copyfile(image, temporary)
+            else:
+                pixels = np.rint(255 * read_image(image)).astype(np.uint8)
+                Image.fromarray(pixels).save(temporary, "PNG")
 
     def start_points(self, frames: int) -> PointCloud:
         """Returns the frame's share of the points to begin with, in the world's coordinates."""
@@ -100,11 +92,6 @@ class ExportFrame:
         return cloud.transform(self.pose)
 
 
-def unit_of_model(frames: Sequence[ExportFrame]) -> str:
-    """Returns the unit of files that are in that of the COLMAP model, if there is one."""
-    return frames[0].result.unit if frames[0].unit_scale == 1 else MODEL_UNITS
-
-
 @dataclass(frozen=True, kw_only=True)
 class Export:
     """How depth is written for a program."""
@@ -114,15 +101,14 @@ class Export:
     write: Callable[[Path, Sequence[ExportFrame], Callable[[], None]], list[str]]
     """Writes them, calls the function after each frame, and returns notes. Raises PnpDepthError.
     The folders of the files are there."""
-    unit: Callable[[Sequence[ExportFrame]], str] = unit_of_model
+    in_model_units: bool = True
+    """Whether the files are in units of the COLMAP model, if there is one; else in those of the
+    results."""
 
 
-def save_png(path: Path, pixels: NDArray[np.uint16] | NDArray[np.uint8]) -> None:
-    """Writes pixels (H, W) or (H, W, 3)."""
-    from PIL import Image
-
-    with atomic_path(path) as temporary:
-        Image.fromarray(pixels).save(temporary, "PNG")
+def copied_images(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
+    """Returns where images are copied to, of those that do not lie in the folder."""
+    return [path for f in frames if (path := f.image_in(folder)) != f.image]
 
 
 def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
@@ -173,6 +159,7 @@ def export_results(
         if path.exists() and not overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another folder")
     # The record begins, and all files are written or none.
+    of_model = export.in_model_units and frames[0].unit_scale != 1
     for folder in {path.parent for path in written}:
         make_folder(folder)
     record: dict[str, Any] = {
@@ -181,7 +168,7 @@ def export_results(
         "to": to,
         "results": str(results),
         "frames": len(frames),
-        "unit": export.unit(frames),
+        "unit": MODEL_UNITS if of_model else frames[0].result.unit,
     }
     numbers = itertools.count(1)
     show(0, len(frames))
@@ -195,23 +182,21 @@ def export_results(
 def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     record, image, (camera, pose) = result.record, result.image, result.camera_and_pose
     # What the program needs must be in the record.
-    if camera is None or image is None:
-        lacks = "its image; run this in the folder where it was refined, or refine it again"
-        if camera is None:
-            lacks = "a record with its camera; refine it with a COLMAP model or --calib"
-        raise InputError(f"{result.depth} lacks {lacks}")
-    if export.needs_pose and pose is None:
+    if camera is None:
         raise InputError(
-            f"{result.depth} has no pose in its record; refine it by `batch` with --poses, or"
-            " with a COLMAP model"
+            f"{result.depth} lacks a record with its camera; refine it with a COLMAP model or"
+            " --calib"
         )
-    # The numbers and the name of the record must be usable.
-    width, height = record.size or (0, 0)
-    sparse, points = record.inputs.get("sparse"), record.points
-    numbers = (points.farthest if points else 0.0, (sparse and sparse.unit_scale) or 1.0)
+    if image is None:
+        raise InputError(f"{result.depth} lacks its image; run this in the folder of `refine`")
+    if export.needs_pose and pose is None:
+        raise InputError(f"{result.depth} lacks a pose in its record; refine with --poses")
+    # The scale and the name of the record must be usable.
+    (width, height), sparse = record.size or (0, 0), record.inputs.get("sparse")
+    scale = (sparse and sparse.unit_scale) or 1.0
     own = image.name if isinstance(image, Path) else f"{PurePosixPath(result.name).name}.png"
     name = (sparse and sparse.image) or (PurePosixPath(result.name).parent / own).as_posix()
-    if not all(1e-9 < number < 1e9 for number in numbers) or not _is_fit(name):
+    if not 1e-9 < scale < 1e9 or not _is_fit(name):
         raise FileFormatError(f"{result.depth}: the record beside it is damaged; refine it again")
     # The depth must be of the whole image.
     if isinstance(image, Path) and (height, width) not in sizes_of(image):
@@ -226,14 +211,12 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
         size=(height, width),
         camera=camera,
         pose=pose,
-        unit_scale=numbers[1],
-        farthest=numbers[0],
+        unit_scale=scale,
     )
 
 
 def _is_fit(name: str) -> bool:
-    """Whether a name of a record is fit for a file: relative, inside, printable, not long."""
+    """Whether a name of a record is fit for a file: relative, inside, and printable."""
     path = PurePosixPath(name)
     inside = path.parts and not path.is_absolute() and ".." not in path.parts
-    long = len(name.encode("utf-8", "surrogateescape")) > _LONGEST_NAME
-    return bool(inside) and name.isprintable() and "\\" not in name and not long
+    return bool(inside) and name.isprintable() and "\\" not in name

@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note, save_png
+from pnpdepth_cli.commands.exports import Export, ExportFrame, copied_images, distortion_note
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colmap_model import MODEL_PARTS, model_files
+from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.text_files import write_json
 
 _CODES = 2**16
@@ -42,9 +44,9 @@ def _parameters(folder: Path) -> Path:
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
     images = [_depth_image(folder, frame) for frame in frames]
-    copies = [frame.image_in(folder) for frame in frames if not frame.is_in(folder)]
     model = [_parameters(folder).with_name(f"{part}.txt") for part in MODEL_PARTS]
-    return [*copies, *images, _parameters(folder), *(model if _needs_model(folder, frames) else [])]
+    written = [*copied_images(folder, frames), *images, _parameters(folder)]
+    return [*written, *model] if _needs_model(folder, frames) else written
 
 
 def _needs_model(folder: Path, frames: Sequence[ExportFrame]) -> bool:
@@ -59,37 +61,33 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     scale = max(np.percentile(_inverse(frame)[0], _NEAREST_PERCENTILE) for frame in frames)
     if scale == 0:
         raise InputError("no frame has a pixel with known depth; refine them again")
-    masked, clipped, pixels = 0, 0, 0
     model = _parameters(folder).parent
     if _needs_model(folder, frames):
         _write_model(model, frames)
-    # Depth, mask and image of each frame.
+    # Depth and image of each frame.
+    masked, clipped, largest = 0, 0, scale * LARGEST_CODE / _CODES
     for frame in frames:
         inverse, valid = _inverse(frame)
-        codes = np.rint(inverse / scale * _CODES)
         masked += int((~valid).sum())
-        clipped += int((codes > _CODES - 1).sum())
-        pixels += codes.size
-        save_png(_depth_image(folder, frame), np.minimum(codes, _CODES - 1).astype(np.uint16))
+        clipped += int((inverse > largest).sum())
+        fitting = np.clip(inverse, scale / _CODES, largest).astype(np.float32)
+        write_depth(_depth_image(folder, frame), fitting, scale=_CODES / scale)
         frame.copy_image(folder)
         done()
     # What the program reads the codes with.
     parameters = {"scale": float(scale), "offset": 0.0}
     write_json(_parameters(folder), {frame.stem: parameters for frame in frames})
-    notes = [f"depth: {clipped:,} of {pixels:,} pixels are nearer than 1/{scale:.4g}, and clipped"]
+    notes = [f"depth: {clipped:,} pixels are nearer than 1/{scale:.4g}, and clipped"]
     if masked:
         notes.append(
             f"warning: {masked:,} pixels are unknown or not valid; they have the depth before"
             " the mask or that of the nearest pixel, as 3DGS reads no masks"
         )
     if not model_files(model):
-        way_out = "poses are not known; refine a COLMAP project with `batch --layout colmap`"
-        if any(frame.camera.has_lens for frame in frames):
-            way_out = (
-                "3DGS reads no distorted cameras; run `colmap image_undistorter`, then batch and"
-                " export of its output"
-            )
-        notes.append(f"warning: sparse/0 has no model, which 3DGS needs to train: {way_out}")
+        notes.append(
+            "warning: sparse/0 has no model, which 3DGS needs to train; refine undistorted images"
+            " with poses"
+        )
     return [*notes, *distortion_note(frames, "3DGS")]
 
 

@@ -2,30 +2,29 @@
 
 The data conventions are Nerfstudio's. Camera axes are x right, y up, z backwards. Principal points
 count from the image's corner, so pixel centres are at .5. A depth is PNG code × 0.001 in the unit
-of the poses. Instant-NGP reads the same file; it takes that factor from `integer_depth_scale`.
-Splatting begins with the points of start.ply, in the coordinates and unit of the poses.
+of the poses, that of the results. Instant-NGP reads the same file; it takes that factor from
+`integer_depth_scale`. Splatting begins with the points of start.ply, in the coordinates of the
+poses.
 """
 
 from __future__ import annotations
 
-import math
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame
+from pnpdepth_cli.commands.exports import Export, ExportFrame, copied_images
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.scans import write_cloud
 from pnpdepth_cli.io.text_files import write_json
-from pnpdepth_cli.points import METRES
 
 _CODES_PER_UNIT = 1000.0
 _START = "start.ply"
-_BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _COEFFICIENTS = {
     "radial-tangential": ("k1", "k2", "p1", "p2", "k3", "k4"),
     "fisheye": ("k1", "k2", "k3", "k4"),
@@ -38,9 +37,8 @@ def _depth_image(folder: Path, frame: ExportFrame) -> Path:
 
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
-    copies = [frame.image_in(folder) for frame in frames if not frame.is_in(folder)]
     depths = [_depth_image(folder, frame) for frame in frames]
-    return [*copies, *depths, folder / _START, folder / "transforms.json"]
+    return [*copied_images(folder, frames), *depths, folder / _START, folder / "transforms.json"]
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
@@ -51,15 +49,12 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
             f"the cameras have lenses of different kinds ({', '.join(lenses)}), but Nerfstudio"
             " takes one; undistort the images first"
         )
-    factor = _factor(frames)
     # Depth, points and image of each frame.
     clipped, entries, start = 0, [], []
     for frame in frames:
-        entries.append(_entry(folder, frame, factor))
+        entries.append(_entry(folder, frame))
+        start.append(frame.start_points(len(frames)))
         depth = frame.valid_depth()
-        points = frame.start_points(len(frames))
-        start.append(points._replace(xyz=points.xyz * np.float32(factor)))
-        depth *= np.float32(factor)
         fits = np.rint(depth * _CODES_PER_UNIT) <= LARGEST_CODE
         clipped += int((~fits).sum())
         write_depth(_depth_image(folder, frame), np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
@@ -75,27 +70,13 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         "frames": entries,
     }
     write_json(folder / "transforms.json", content)
-    # What a person should know.
-    notes = []
-    if clipped:
-        limit = LARGEST_CODE / _CODES_PER_UNIT / factor
-        notes.append(
-            f"depth: {clipped:,} pixels beyond {limit:.4g} {frames[0].result.unit} are unknown"
-        )
-    if factor != 1:
-        notes.append(f"unit: poses, depth and start are × {factor:g}, so that depth fits 16 bits")
-    return notes
+    if not clipped:
+        return []
+    limit = f"{LARGEST_CODE / _CODES_PER_UNIT:.4g} {frames[0].result.unit}"
+    return [f"depth: {clipped:,} pixels beyond {limit}, the largest of 16 bits, are unknown"]
 
 
-def _factor(frames: Sequence[ExportFrame]) -> float:
-    """What poses and depths in model units are multiplied by, a power of two; 1 for metres."""
-    if frames[0].result.unit == METRES:
-        return 1.0
-    farthest = _BEYOND_POINTS * max(frame.farthest for frame in frames)
-    return float(2.0 ** math.floor(math.log2(LARGEST_CODE / _CODES_PER_UNIT / farthest)))
-
-
-def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
+def _entry(folder: Path, frame: ExportFrame) -> dict[str, Any]:
     """The frame's entry in transforms.json."""
     # The coefficients of the lens, if the program has all of them.
     camera, pose = frame.camera, frame.pose
@@ -111,7 +92,6 @@ def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
     depth = _relative(_depth_image(folder, frame), folder)
     matrix = np.eye(4)
     matrix[:3] = pose
-    matrix[:3, 3] *= factor
     matrix[:3, 1:3] *= -1
     # Principal points count from the image's corner.
     intrinsics = camera.intrinsics
@@ -131,14 +111,7 @@ def _entry(folder: Path, frame: ExportFrame, factor: float) -> dict[str, Any]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    if not path.is_relative_to(folder):
-        path, folder = path.resolve(), folder.resolve()
-    return path.relative_to(folder).as_posix()
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-def _unit(frames: Sequence[ExportFrame]) -> str:
-    factor = _factor(frames)
-    return frames[0].result.unit if factor == 1 else f"{frames[0].result.unit} × {factor:g}"
-
-
-EXPORT = Export(needs_pose=True, files=_files, write=_write, unit=_unit)
+EXPORT = Export(needs_pose=True, files=_files, write=_write, in_model_units=False)

@@ -7,25 +7,25 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pnpdepth_cli.commands.requests import FramesRequest
 from pnpdepth_cli.commands.sparse.bag_sensors import (
     Say,
     Sensors,
     clock_offset,
-    first_times,
     measurement,
     sensors_of,
     stream,
 )
 from pnpdepth_cli.dataset.scan_points import choose_camera
-from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, UsageError
+from pnpdepth_cli.errors import InputError, NoPointsError, OutputError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.bags import (
     CLOUDS,
@@ -64,36 +64,13 @@ _LONGEST_GAP_S = 0.5
 """Longest time between two poses that one is interpolated from."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FramesRequest:
-    """Which bag to write as files, and where."""
-
-    bag: Path
-    output: Path
-    """The folder for rgb/, sparse/, calib.txt, poses.txt and frames.json."""
-    topics: tuple[str, ...] = ()
-    """Topics of images, of points (PointCloud2) and of poses; else the only one of its kind."""
-    tolerance: float = 0.05
-    """Largest time between an image and its scan, seconds."""
-    clock_offset: float | None = None
-    """Seconds that are added to the times of scans. None: by the log, where it is large."""
-    between: tuple[int, int] | None = None
-    """Numbers of the first and the last frame, from 0. None: all."""
-    every: int = 1
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        if self.between is not None and self.between[0] > self.between[1]:
-            raise UsageError("--between {} {} has no frame; give FIRST LAST".format(*self.between))
-        if not self.tolerance >= 0:
-            raise UsageError(f"--tolerance must be >= 0, got {self.tolerance:g}")
-
-    def identity(self) -> dict[str, Any]:
-        """Returns the beginning of the record, which is the same for the same frames."""
-        paths = sorted(self.bag.iterdir()) if self.bag.is_dir() else [self.bag]
-        stated = {name: value for name, value in vars(self).items() if name not in _NOT_IN_RECORD}
-        files = {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths}
-        return {"command": "frames", **stated, "bag": str(self.bag), "bag_files": files}
+def _identity(request: FramesRequest) -> dict[str, Any]:
+    """The beginning of the record, which is the same for the same frames."""
+    bag = request.bag
+    paths = sorted(bag.iterdir()) if bag.is_dir() else [bag]
+    stated = {name: value for name, value in vars(request).items() if name not in _NOT_IN_RECORD}
+    files = {p.name: [p.stat().st_size, p.stat().st_mtime_ns] for p in paths}
+    return {"command": "frames", **stated, "bag": str(bag), "bag_files": files}
 
 
 def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
@@ -117,30 +94,29 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         if offset is None:
             offset = clock_offset(bag, sensors, say)
         # The frames.
-        written = _write_pairs(request, bag, sensors, offset)
-        if written.dropped:
-            say(f"points: dropped {describe_dropped(written.dropped)}")
-        if written.lost:
+        times, lost, dropped = _write_pairs(request, bag, sensors, offset)
+        if dropped:
+            say(f"points: dropped {describe_dropped(dropped)}")
+        if lost:
             within = f"{request.tolerance:g} s"
-            say(f"warning: {written.lost:,} images have no scan with points within {within}")
-        if not written.times:
+            say(f"warning: {lost:,} images have no scan with points within {within}")
+        if not times:
             raise InputError(
                 f"{bag.path}: no image of {sensors.images} has a scan of {sensors.points} within"
-                f" {request.tolerance:g} s; {first_times(bag, sensors)}; if their clocks differ,"
-                " give --clock-offset, else a larger --tolerance"
+                f" {request.tolerance:g} s; give --clock-offset, or a larger --tolerance"
             )
         # Calibration and poses.
         camera = _write_calibration(request, bag, sensors, say)
-        poses = _write_poses(request, bag, camera, written.times, say)
+        poses = _write_poses(request, bag, camera, times, say)
     # The record, which is complete now.
-    record = request.identity() | {
+    record = _identity(request) | {
         "image_topic": sensors.images,
         "points_topic": sensors.points,
         "seconds_added_to_points": offset,
         "complete": True,
-        "frames": len(written.times),
+        "frames": len(times),
         "poses": poses,
-        "images_without_scan": written.lost,
+        "images_without_scan": lost,
     }
     write_json(request.output / RECORD, record)
     return record
@@ -151,7 +127,7 @@ def has_frames(request: FramesRequest) -> bool:
     path = request.output / RECORD
     if not path.is_file():
         return False
-    identity, record = plain(request.identity() | {"complete": True}), read_json(path)
+    identity, record = plain(_identity(request) | {"complete": True}), read_json(path)
     return all(record.get(name) == value for name, value in identity.items())
 
 
@@ -173,21 +149,17 @@ def _clear(request: FramesRequest) -> None:
             path.unlink()
     for name in ("calib.txt", POSES_FILE):
         (request.output / name).unlink(missing_ok=True)
-    write_json(request.output / RECORD, request.identity() | {"complete": False})
+    write_json(request.output / RECORD, _identity(request) | {"complete": False})
 
 
-class _Written(NamedTuple):
-    """What was written."""
+def _write_pairs(
+    request: FramesRequest, bag: Bag, sensors: Sensors, offset: float
+) -> tuple[list[float], int, Counter[str]]:
+    """Writes each image that is asked for with the scan nearest in time.
 
-    times: list[float]
-    """Time of each image, seconds."""
-    lost: int
-    """Number of images without a scan."""
-    dropped: Counter[str]
-
-
-def _write_pairs(request: FramesRequest, bag: Bag, sensors: Sensors, offset: float) -> _Written:
-    """Writes each image that is asked for with the scan nearest in time."""
+    Returns the time of each image in seconds, the number of images without a scan, and counts of
+    dropped points.
+    """
     lost, times, dropped = 0, list[float](), Counter[str]()
     first, last = request.between or (0, math.inf)
     numbers = itertools.count()
@@ -207,7 +179,7 @@ def _write_pairs(request: FramesRequest, bag: Bag, sensors: Sensors, offset: flo
         dropped.update(counts)
         _write_frame(request.output, sensors, image, values)
         times.append(image.time_s)
-    return _Written(times, lost, dropped)
+    return times, lost, dropped
 
 
 def _write_frame(

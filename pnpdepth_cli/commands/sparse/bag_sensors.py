@@ -84,19 +84,20 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
     same = Sensors(images=images, points=points, is_depth=True)
     # They may be of a camera of their own.
     infos = camera_info_topic(bag, images), camera_info_topic(bag, points)
-    of_images, of_depth = (None if info is None else camera_of_bag(bag, info) for info in infos)
+    found_cameras = (None if info is None else camera_of_bag(bag, info) for info in infos)
+    of_images, of_depth = (None if each is None else each[0].camera for each in found_cameras)
     if of_depth is None or infos[0] == infos[1]:
         if points not in registered and of_depth is None:
             say(f"warning: {points} has no camera_info; its pixels are taken for the images'")
         return same
-    if points in registered and of_images is not None:
-        own, other = of_images[0].camera, of_depth[0].camera
-        if own.size == other.size and np.allclose(own.intrinsics, other.intrinsics, rtol=_SAME_K):
-            return same
-        say(
-            f"{points} is of another camera than {images}, but has its frame_id: no offset is known"
-        )
-    return replace(same, depth_camera=of_depth[0].camera)
+    if (
+        points in registered
+        and of_images is not None
+        and of_images.size == of_depth.size
+        and np.allclose(of_images.intrinsics, of_depth.intrinsics, rtol=_SAME_K)
+    ):
+        return same
+    return replace(same, depth_camera=of_depth)
 
 
 def measurement(sensors: Sensors, message: Any) -> tuple[NDArray[np.float32], dict[str, int]]:
@@ -153,14 +154,3 @@ def clock_offset(bag: Bag, sensors: Sensors, say: Say) -> float:
         f" {offset:+.3f} s are added to the times of points (--clock-offset gives another number)"
     )
     return offset
-
-
-def first_times(bag: Bag, sensors: Sensors) -> str:
-    """Returns when the images and the points begin, for a person."""
-    first = dict[bool, float]()
-    for is_image, each in stream(bag, sensors):
-        first.setdefault(is_image, each.time_s)
-        if len(first) == 2:
-            break
-    kinds = {True: "images", False: "points"}
-    return ", ".join(f"{kinds[key]} begin at {time:.3f} s" for key, time in first.items())

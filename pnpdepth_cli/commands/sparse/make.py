@@ -40,11 +40,6 @@ class SparseTarget:
     overwrite: bool = False
 
     @property
-    def record(self) -> Path:
-        """The JSON."""
-        return self.output.with_suffix(".json")
-
-    @property
     def overlay(self) -> Path:
         """The image with the points, of a scan that is projected."""
         return self.output.with_name(f"{self.output.stem}_overlay.png")
@@ -56,7 +51,7 @@ class SparseTarget:
                 f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
             )
         taken = {p.resolve() for p in inputs if p is not None}
-        for path in (self.output, self.record, *[self.overlay] * drawn):
+        for path in (self.output, self.output.with_suffix(".json"), *[self.overlay] * drawn):
             if path.resolve() in taken:
                 raise OutputError(f"{path} is an input or named twice; give another output")
             if path.exists() and not self.overwrite:
@@ -78,22 +73,24 @@ class SparseTarget:
         Args:
             command: Name of the command that made the points.
             points: The sparse depth.
-            settings: Settings of the command; kept in a PNG or CSV too.
+            settings: Settings of the command.
             inputs: What a record keeps of each file, by its part.
             notes: Lines for a person.
             rgb: (H, W, 3) in 0..1, the image of the overlay. None: there is none.
         """
-        # The points, as a map or a list.
-        provenance = {"command": command, "version": __version__, **settings}
+        # The points, as a map or a list, and over the image.
         make_folder(self.output.parent)
         image = as_depth_image(points)
-        write_sparse(self.output, points.xy, points.depth, image, provenance=provenance)
-        # The points over the image.
+        write_sparse(self.output, points.xy, points.depth, image)
         if rgb is not None:
             overlay(rgb, points.xy, points.depth, self.overlay)
         # The record.
+        path = self.output.with_suffix(".json")
+        drawn = None if rgb is None else str(self.overlay)
         record = {
-            **provenance,
+            "command": command,
+            "version": __version__,
+            **settings,
             "inputs": {name: part.to_json() for name, part in inputs.items()},
             "points": {
                 "count": len(points),
@@ -104,13 +101,9 @@ class SparseTarget:
             },
             "size": [points.size[1], points.size[0]],
             "notes": list(notes),
-            "outputs": {
-                "sparse": str(self.output),
-                "overlay": None if rgb is None else str(self.overlay),
-                "record": str(self.record),
-            },
+            "outputs": {"sparse": str(self.output), "overlay": drawn, "record": str(path)},
         }
-        write_json(self.record, record)
+        write_json(path, record)
         return record
 
 
@@ -166,16 +159,15 @@ def sample_depth(
     """
     target.check((depth, image))
     dense, notes = _dense(depth, scale)
-    rgb = None if image is None else read_rgb(image).values
+    rgb, inputs = None, {"depth": record_of(depth)}
+    if image is not None:
+        rgb, inputs["image"] = read_rgb(image).values, record_of(image)
     points = sample_points(dense, pattern, seed, image=rgb)
     wanted = pattern.wanted(int(np.count_nonzero(dense)))
     if pattern.kind == "features" and len(points) < wanted:
         notes.append(f"warning: the image has {len(points):,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
     settings = {"pattern": asdict(pattern), "seed": seed}
-    inputs = {"depth": record_of(depth)}
-    if image is not None:
-        inputs["image"] = record_of(image)
     return target.write("sample", points, settings, inputs=inputs, notes=notes)
 
 

@@ -20,8 +20,9 @@ from pnpdepth_cli.commands.batch.sequence import (
     note_of_poses,
     with_neighbours,
 )
-from pnpdepth_cli.commands.cloud import CloudRequest, write_depth_cloud
+from pnpdepth_cli.commands.cloud import write_depth_cloud
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.scans import read_scan

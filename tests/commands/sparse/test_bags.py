@@ -16,8 +16,9 @@ from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames, unpack
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.requests import FramesRequest
 from pnpdepth_cli.commands.sparse import bag_frames
-from pnpdepth_cli.commands.sparse.bag_frames import RECORD, FramesRequest, write_frames
+from pnpdepth_cli.commands.sparse.bag_frames import RECORD, write_frames
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import FileFormatError, OutputError, PnpDepthError, UsageError
@@ -123,7 +124,7 @@ def test_a_batch_takes_a_bag_and_writes_its_frames_once(
 
 def test_topics_can_be_named_and_images_without_a_scan_in_time_are_none(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "drive.mcap")
-    with pytest.raises(PnpDepthError, match=r"within 0\.001 s; images begin at 1700000000"):
+    with pytest.raises(PnpDepthError, match=r"within 0\.001 s"):
         written(bag, tmp_path / "none", tolerance=0.001)
     with pytest.raises(UsageError, match="--tolerance must be >= 0, got -1"):
         FramesRequest(bag=bag, output=tmp_path, tolerance=-1)
