@@ -14,7 +14,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.alignment import align, align_prediction, to_space, where_predicted
+from pnpdepth_cli.completion.alignment import align, align_prediction, where_predicted
 from pnpdepth_cli.completion.interpolation import distinct, linear, nearest
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import local_lines
@@ -30,8 +30,6 @@ class Baseline:
     of_points: Callable[..., Tensor] | None = None  # depth from the points alone
     of_prediction: Callable[..., Tensor] | None = None
     """Depth from a prediction (H, W), up to scale and shift with 0 unknown, and the points."""
-    pointwise: bool = False
-    """Whether the function takes `xy` (M, 2), so that few pixels cost less than all."""
 
     def depth(self, points: SparsePoints, prediction: Tensor | None = None) -> Tensor:
         """Returns the depth (H, W) metres, 0 = unknown.
@@ -45,34 +43,18 @@ class Baseline:
             raise UsageError(f"baseline {self.title!r} needs a network's prediction")
         return self.of_prediction(prediction, points)
 
-    def at(self, xy: Tensor, points: SparsePoints, prediction: Tensor | None = None) -> Tensor:
-        """Returns the depth (M,) metres at pixel coordinates (M, 2); errors as of `depth`."""
-        if not self.pointwise:
-            queries = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size)
-            return queries.sample(self.depth(points, prediction))
-        bound = replace(
-            self,
-            of_points=self.of_points and partial(self.of_points, xy=xy),
-            of_prediction=self.of_prediction and partial(self.of_prediction, xy=xy),
-        )
-        return bound.depth(points, prediction)
-
 
 def _align_by(title: str, kind: str, space: str) -> Baseline:
     return Baseline(title=title, of_prediction=partial(align_prediction, kind=kind, space=space))
 
 
-def align_locally(
-    prediction: Tensor, points: SparsePoints, xy: Tensor | None = None, *, space: str = "depth"
-) -> Tensor:
+def align_locally(prediction: Tensor, points: SparsePoints) -> Tensor:
     """Returns the locally aligned depth (H, W) float32 metres, within a global alignment's bounds.
 
     Args:
         prediction: (H, W) depth, metric or not; not positive or not finite is unknown, and 0 in the
             result.
         points: Sparse depth of the same image.
-        xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel.
-        space: Quantity in which the lines are fitted, one of `choices.SPACES`.
 
     Raises:
         NoPointsError: No point has a prediction.
@@ -80,37 +62,30 @@ def align_locally(
     device, prediction, points = prediction.device, prediction.detach().cpu(), points.tensors()
     known, points = where_predicted(prediction, points)
     points = distinct(points)
-    x = to_space(torch.where(known, prediction, 1.0).double(), space)
-    aligned = align(points.sample(x), points, (space,), "auto")
+    x = torch.where(known, prediction, 1.0).double()
+    aligned = align(points.sample(x), points, ("depth",), "auto")
     start, reading = aligned.scale * x + aligned.shift, replace(aligned, scale=1.0, shift=0.0)
     at_points = points.sample(start)
     std = at_points.std(correction=0) + 1e-9 * at_points.abs().mean()
     z, z_at_points = ((y - at_points.mean()) / std for y in (start, at_points))
-    residual = to_space(points.depth.double(), space) - at_points
+    residual = points.depth.double() - at_points
     weights = inlier_weights(points, points.depth.double().log() - reading.depth(at_points).log())
-    if xy is not None:
-        queries = SparsePoints(xy=xy.cpu(), depth=torch.ones(len(xy)), size=points.size)
-        known = queries.sample(torch.where(known, 1.0, torch.nan)).isfinite()
-        start, z = queries.sample(start), queries.sample(z)
-    shift, slope = local_lines(points, xy, residual, z_at_points, weights)
+    shift, slope = local_lines(points, None, residual, z_at_points, weights)
     depth = reading.depth(start + shift + slope * z)
     return torch.where(known, depth, 0.0).float().to(device)
 
 
 TABLE = {
-    "nearest": Baseline(title="nearest point", of_points=nearest, pointwise=True),
-    "linear": Baseline(title="linear between points (Delaunay)", of_points=linear, pointwise=True),
+    "nearest": Baseline(title="nearest point", of_points=nearest),
+    "linear": Baseline(title="linear between points (Delaunay)", of_points=linear),
     "linear-log": Baseline(
         title="linear between points, in log depth",
         of_points=partial(linear, space="log"),
-        pointwise=True,
     ),
     "median": _align_by("median of ratios", kind="median", space="depth"),
     "scale": _align_by("scale", kind="scale", space="depth"),
     "affine": _align_by("scale and shift", kind="affine", space="depth"),
     "scale-disparity": _align_by("scale, in disparity", kind="scale", space="inverse"),
     "affine-disparity": _align_by("scale and shift, in disparity", kind="affine", space="inverse"),
-    "local": Baseline(
-        title="scale and shift around each pixel", of_prediction=align_locally, pointwise=True
-    ),
+    "local": Baseline(title="scale and shift around each pixel", of_prediction=align_locally),
 }

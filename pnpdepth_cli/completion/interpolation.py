@@ -1,37 +1,32 @@
 """Dense depth from sparse points alone: what a network has to beat.
 
-Each function takes points at any coordinates and returns positive depth (H, W) float32 metres of
-their frame, or with `xy` (M, 2) depth (M,) at those pixel coordinates. Of points at the same
-coordinates the nearest counts; the order of the points has no effect. One point gives its depth
-everywhere. Without any, NoPointsError is raised.
+`nearest` and `linear` take points at any coordinates and return positive depth (H, W) float32
+metres of their frame. Of points at the same coordinates the nearest counts; the order of the points
+has no effect. One point gives its depth everywhere. Without any, NoPointsError is raised.
 """
 
 from __future__ import annotations
 
-import functools
-from typing import Any
+from contextlib import suppress
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import from_space, to_space
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
-_MOST_REMEMBERED = 1 << 16  # coordinate pairs up to which a result is remembered
 _AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
-_WORTH_THREADS = 1 << 15  # neighbours; for fewer, threads cost more than they save
 
 
-def nearest(points: SparsePoints, xy: Tensor | None = None) -> Tensor:
+def nearest(points: SparsePoints) -> Tensor:
     """Returns the depth of the nearest point in the image."""
     points = distinct(points)
-    _, number = nearest_points(points, _queries(points, xy), 1)
-    return _reshape(points.depth.cpu()[number[:, 0]], points, xy)
+    _, number = nearest_points(points, pixels_of(points.size), 1)
+    return points.depth[number[:, 0].to(points.depth.device)].reshape(points.size)
 
 
 def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "depth") -> Tensor:
@@ -39,19 +34,26 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
 
     The quantity that is linear is `space`, one of `choices.SPACES`. The nearest point's depth is
     taken outside the points' hull, and everywhere if all are on one line.
+
+    Args:
+        points: Sparse depth.
+        xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel.
+        space: Quantity that is linear.
     """
     points = distinct(points)
-    pixels = _queries(points, xy)
+    pixels = pixels_of(points.size) if xy is None else xy.cpu().double()
+    depth = points.depth.cpu().double()
     dense = torch.full((len(pixels),), torch.nan, dtype=torch.float64)
-    triangles = _triangles(_bytes_of(points))
-    if triangles is not None:
-        value = to_space(points.depth.cpu().double(), space)
-        within = LinearNDInterpolator(triangles, value.numpy())
+    with suppress(QhullError):  # fewer than three points, or all on one line
+        within = LinearNDInterpolator(
+            points.xy.cpu().double().numpy(), to_space(depth, space).numpy()
+        )
         dense = from_space(torch.from_numpy(within(pixels.numpy())), space)
     outside = dense.isnan()
     _, number = nearest_points(points, pixels[outside], 1)
-    dense[outside] = points.depth.cpu().double()[number[:, 0]]
-    return _reshape(dense, points, xy)
+    dense[outside] = depth[number[:, 0]]
+    shape = points.size if xy is None else (len(xy),)
+    return dense.float().reshape(shape).to(points.depth.device)
 
 
 def in_hull(points: SparsePoints) -> Tensor:
@@ -87,63 +89,17 @@ def distinct(points: SparsePoints) -> SparsePoints:
     )
 
 
-def _queries(points: SparsePoints, xy: Tensor | None) -> Tensor:
-    """(M, 2) float64: the coordinates, or those of every pixel of the frame."""
-    return pixels_of(points.size) if xy is None else xy.cpu().double()
-
-
 def pixels_of(size: tuple[int, int]) -> Tensor:
     """Returns x and y of every pixel of a frame (H, W), row after row, (HW, 2) float64."""
     rows, columns = (torch.arange(n, dtype=torch.float64) for n in size)
     return torch.cartesian_prod(rows, columns).flip(1)
 
 
-def _reshape(values: Tensor, points: SparsePoints, xy: Tensor | None) -> Tensor:
-    """The values (M,) in the shape that was asked for, on the points' device."""
-    shape = points.size if xy is None else (len(xy),)
-    return values.float().reshape(shape).to(points.depth.device)
-
-
 def nearest_points(points: SparsePoints, xy: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Returns distance in pixels and number, (M, count) each, of the points nearest to xy (M, 2).
 
-    The nearest point comes first. The results are shared with other calls and must not be changed.
+    The nearest point comes first.
     """
-    find = _nearest if len(points) + len(xy) <= _MOST_REMEMBERED else _nearest.__wrapped__
-    distance, number = find(_bytes_of(points), xy.numpy().tobytes(), count)
+    tree = cKDTree(points.xy.cpu().double().numpy())
+    distance, number = tree.query(xy.numpy(), np.arange(1, count + 1), workers=-1)
     return torch.from_numpy(distance), torch.from_numpy(number)
-
-
-# The default method asks several times for the same neighbours and triangles, which are remembered
-# by the bytes of coordinates (N, 2) float64.
-
-
-@functools.lru_cache(8)
-def _nearest(points: bytes, xy: bytes, count: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Distances and numbers of the points nearest to xy."""
-    many = len(xy) // 16 * count > _WORTH_THREADS
-    among, workers = np.arange(1, count + 1), -1 if many else 1
-    distance, number = _tree(points).query(_coordinates(xy), among, workers=workers)
-    return distance, number
-
-
-@functools.lru_cache(2)
-def _tree(points: bytes) -> cKDTree:
-    return cKDTree(_coordinates(points))
-
-
-@functools.lru_cache(2)
-def _triangles(points: bytes) -> Delaunay | None:
-    """The points' triangulation; None if there is no triangle."""
-    try:
-        return Delaunay(_coordinates(points))
-    except QhullError:  # fewer than three points, or all on one line
-        return None
-
-
-def _bytes_of(points: SparsePoints) -> bytes:
-    return points.xy.cpu().double().numpy().tobytes()
-
-
-def _coordinates(values: bytes) -> NDArray[np.float64]:
-    return np.frombuffer(values).reshape(-1, 2)

@@ -77,8 +77,7 @@ def propagate(
     known = prediction.isfinite() & (prediction > 0)
     if kind == "none":
         return torch.where(known, prediction, 0.0).float()
-    propagation: Propagation = PROPAGATIONS[kind]
-    field = propagation.fit(without_outliers(residual_field(prediction, points, rgb)))
+    propagation, field = _fitted(kind, prediction, points, rgb)
     factor = _clamp(propagation.dense(field), field).exp().to(prediction.device)
     return torch.where(known, prediction * factor, 0.0).float()
 
@@ -98,17 +97,25 @@ def propagate_at(
     Raises:
         NoPointsError: No point has a prediction.
     """
-    propagation: Propagation = PROPAGATIONS[kind]
     queries = SparsePoints(xy=xy, depth=torch.ones_like(xy[:, 0]), size=points.size)
     known = prediction.isfinite() & (prediction > 0)
     predicted = queries.sample(torch.where(known, prediction, torch.nan)).nan_to_num(0.0)
-    field = propagation.fit(without_outliers(residual_field(prediction, points, rgb)))
+    propagation, field = _fitted(kind, prediction, points, rgb)
     queries = queries.tensors()
     if propagation.at is None:
         residual = queries.sample(propagation.dense(field))
     else:
         residual = propagation.at(field, queries)
     return (predicted * _clamp(residual, field).exp().to(predicted.device)).float()
+
+
+def _fitted(
+    kind: str, prediction: Tensor, points: SparsePoints, rgb: Tensor | None
+) -> tuple[Propagation, ResidualField]:
+    """The propagation, and its residual field without outliers."""
+    propagation: Propagation = PROPAGATIONS[kind]
+    field = without_outliers(residual_field(prediction, points, rgb))
+    return propagation, propagation.fit(field)
 
 
 def _clamp(residual: Tensor, field: ResidualField) -> Tensor:

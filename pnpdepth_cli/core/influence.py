@@ -8,7 +8,7 @@ Both senses of the paper's term are measured: the patch of z that the gradient o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,8 +21,7 @@ _POSITIONS = ((0.5, 0.5), (0.35, 0.4), (0.65, 0.6))
 one position."""
 
 
-@dataclass(frozen=True)
-class InfluentialField:
+class InfluentialField(NamedTuple):
     """The sizes of both patches, (height, width)."""
 
     in_z: tuple[int, int] | None
@@ -50,32 +49,27 @@ def influential_field(
     z = z.detach().requires_grad_(True)
     with torch.enable_grad():
         depth = depth_of(split.rear(z))
-    in_z, in_output = (0, 0), (0, 0)
-    for position in _POSITIONS:
-        gradient = _gradient_of_point(z, depth, position)
+    in_z, in_output = [], []
+    for down, right in _POSITIONS:
+        # ∂depth/∂z of one point; the graph of the depth is kept for the next one.
+        with torch.enable_grad():
+            point = depth[..., int(depth.shape[-2] * down), int(depth.shape[-1] * right)].sum()
+        z.grad = None
+        if point.requires_grad:
+            with wrap_user_errors("the gradient of the network"):
+                point.backward(retain_graph=True)  # type: ignore[no-untyped-call]
+        gradient = torch.zeros_like(z) if z.grad is None else z.grad
         moved = z.detach() + z.detach().std(correction=0) * gradient.sign()
         # With gradients both times: without, torch may take a kernel that rounds differently.
         with torch.enable_grad():
             changed = depth_of(split.rear(moved.requires_grad_(True))).detach() != depth.detach()
-        in_output = _larger(in_output, _extent(changed))
+        in_output.append(_extent(changed))
         if z.ndim == 4:
-            in_z = _larger(in_z, _extent(gradient != 0))
-        width = min(in_output)
+            in_z.append(_extent(gradient != 0))
+        width = min(_largest(in_output))
         if enough is not None and (width >= enough or 0 < width < enough / 2):
             break
-    return InfluentialField(in_z if z.ndim == 4 else None, in_output)
-
-
-def _gradient_of_point(z: Tensor, depth: Tensor, position: tuple[float, float]) -> Tensor:
-    """∂depth/∂z at a position; the graph of `depth` is kept for the next one."""
-    height, width = depth.shape[-2:]
-    with torch.enable_grad():
-        point = depth[..., int(height * position[0]), int(width * position[1])].sum()
-    z.grad = None
-    if point.requires_grad:
-        with wrap_user_errors("the gradient of the network"):
-            point.backward(retain_graph=True)  # type: ignore[no-untyped-call]
-    return torch.zeros_like(z) if z.grad is None else z.grad
+    return InfluentialField(_largest(in_z) if in_z else None, _largest(in_output))
 
 
 def _extent(mask: Tensor) -> tuple[int, int]:
@@ -87,5 +81,5 @@ def _extent(mask: Tensor) -> tuple[int, int]:
     return int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
 
 
-def _larger(patch: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
-    return max(patch[0], other[0]), max(patch[1], other[1])
+def _largest(patches: list[tuple[int, int]]) -> tuple[int, int]:
+    return max(height for height, _ in patches), max(width for _, width in patches)

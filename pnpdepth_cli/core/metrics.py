@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,7 +48,7 @@ class Scores:
             raise AttributeError(f"there is no measure {key!r}")
         return values[key]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, float]:
         """Returns the measures, the number of pixels and the coverage by their names."""
         return {**self.values, "pixels": self.pixels, "coverage": self.coverage}
 
@@ -118,13 +117,18 @@ def measures_of(sums: Tensor, measures: Sequence[Measure] = MEASURES) -> Tensor:
         measures: Measures, of which the M with a `Formula` count.
     """
     place = {term: number for number, term in enumerate(_terms_of(measures), start=1)}
-    formulas = [each.formula for each in measures if isinstance(each.formula, Formula)]
-    values = [f.of_sums(*(sums[..., place[term]] for term in f.terms)) for f in formulas]
+    values = [
+        formula.of_sums(*(sums[..., place[term]] for term in formula.terms))
+        for formula in _formulas_of(measures)
+    ]
     return torch.stack(values, dim=-1)
+
+
+def _formulas_of(measures: Sequence[Measure]) -> list[Formula]:
+    return [each.formula for each in measures if isinstance(each.formula, Formula)]
 
 
 def _terms_of(measures: Sequence[Measure]) -> list[Term]:
     """What is summed over pixels, each once, the number of pixels first."""
-    formulas = [each.formula for each in measures if isinstance(each.formula, Formula)]
-    terms = {pixel_count: None} | {term: None for each in formulas for term in each.terms}
-    return list(terms)
+    terms = [term for formula in _formulas_of(measures) for term in formula.terms]
+    return list(dict.fromkeys([pixel_count, *terms]))

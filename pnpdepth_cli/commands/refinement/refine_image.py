@@ -298,7 +298,7 @@ def _at_validation_points(refined: Refined, *, with_baselines: bool) -> Stages:
         return {}
     predicted, count = dict(validation.predicted), len(validation.points)
     if with_baselines:
-        xy, kept, network = validation.points.xy, validation.kept, validation.network
-        others = _each_baseline(lambda baseline: baseline.at(xy, kept, network))
-        predicted |= {name: at for name, at in others if name not in predicted}
+        kept, network = validation.kept, validation.network
+        others = _each_baseline(lambda baseline: baseline.depth(kept, network))
+        predicted |= {name: validation.points.sample(d) for name, d in others if name != LINEAR}
     return {name: {"mae": validation.error(at), "points": count} for name, at in predicted.items()}
