@@ -48,7 +48,7 @@ class Scores:
             raise AttributeError(f"there is no measure {key!r}")
         return values[key]
 
-    def to_json(self) -> dict[str, float]:
+    def to_json(self) -> dict[str, int | float | None]:
         """Returns the measures, the number of pixels and the coverage by their names."""
         return {**self.values, "pixels": self.pixels, "coverage": self.coverage}
 

@@ -7,17 +7,18 @@ input; `Member` is a network as the method uses it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import OnIteration, Refinement, refine
 from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split.replay import Interception
 from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.errors import DivergedError, NoPointsError
 from pnpdepth_cli.frames.frame import Frame
@@ -256,19 +257,15 @@ def encoding_once(network: Network, encoded: dict[str, Any]) -> Iterator[None]:
     if name is None:
         yield
         return
-    encoder = network.module.get_submodule(name)
-    run, own = encoder.forward, encoder.__dict__.get("forward")
 
-    def forward(*inputs: Any, **options: Any) -> Any:
+    def encode(_module: nn.Module, _inputs: Any, run: Callable[[], Any]) -> Any:
         if name not in encoded:
-            encoded[name] = run(*inputs, **options)
+            encoded[name] = run()
         return encoded[name]
 
-    encoder.__dict__["forward"] = forward
+    encoder = Interception([network.module.get_submodule(name)])
     try:
-        yield
+        with encoder.handled_by(encode, encode):
+            yield
     finally:
-        if own is None:
-            encoder.__dict__.pop("forward", None)
-        else:
-            encoder.__dict__["forward"] = own
+        encoder.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, Literal
@@ -36,10 +36,6 @@ UNITS = {"m": 1.0, "mm": 1000.0}
 
 FARTHEST_MEDIAN_M = 200.0
 """No frame has half of its depths farther than this; a larger median is in another unit."""
-
-_CHANNELS = (1, 3, 4)  # grey, RGB, RGBA
-_OVERSHOOT = 2.0
-"""An image in 0..1 that was resized may exceed 1, but not this; one in 0..255 does."""
 
 Pair = tuple[ArrayLike | None, ArrayLike | SparsePoints]
 """An image and its sparse depth; see `Refiner.refine`."""
@@ -86,7 +82,7 @@ class Refiner:
         self._asked = settings or Settings()
         self._uncertainty = uncertainty
         self._register = registration_to_make(registration, self._asked)
-        self._adapt = [_frame_of_pair(pair, self._register) for pair in adapt]
+        self._adapt = [frame_of_arrays(*pair, self._register) for pair in adapt]
         self._method: Method | None = None
         self._stack = ExitStack()
         self._lock = threading.Lock()
@@ -116,8 +112,8 @@ class Refiner:
         """Returns one frame of arrays refined.
 
         Args:
-            image: RGB (H, W, 3), uint8, uint16, or in 0..1 or 0..255; also grey (H, W), with alpha,
-                or channels first. None for a network that takes sparse depth only.
+            image: RGB (H, W, 3) or grey (H, W), uint8, uint16, or float in 0..1. None for a network
+                that takes sparse depth only.
             sparse: Depth map (H, W) in metres with 0 for unknown, rows (N, 3) of x, y and depth
                 (pixel centres at whole numbers), or SparsePoints.
             unit: Unit of the depth of an array, "m" or "mm"; needed for integers, and where half of
@@ -136,36 +132,14 @@ class Refiner:
             raise DivergedError(str(refined.diverged), refined)
         return refined
 
-    def share_registration(self, frames: Iterable[Pair]) -> None:
-        """Decides by some frames together how the images of a sequence are moved to the points.
-
-        Images of the size of the first one are then all moved alike; else each decides alone.
-
-        Args:
-            frames: Frames (image, sparse) of the sequence, such as 16 spread over it.
-
-        Raises:
-            InputError: A frame is no such pair, or cannot be used.
-        """
-        read = [_frame_of_pair(pair, self._register) for pair in frames]
-        if read:
-            with self._lock:
-                self._method_for(read[0]).share_registration(read)
-
     def _method_for(self, first: Frame) -> Method:
         """The method, which this frame decides if it is the first."""
         if self._method is None:
             networks = list(self._networks)
             if self._adapt:
-                networks[0] = self._adapt_network(
-                    resolve_definition(networks[0], first.registered())
-                )
-            method = Method(
-                networks,
-                self._asked,
-                first,
-                uncertainty=self._uncertainty,
-            )
+                resolved = resolve_definition(networks[0], first.registered())
+                networks[0] = self._adapt_network(resolved)
+            method = Method(networks, self._asked, first, uncertainty=self._uncertainty)
             self._method = self._stack.enter_context(method)
         return self._method
 
@@ -248,34 +222,18 @@ def frame_of_arrays(
     )
 
 
-def _frame_of_pair(pair: Pair, register: Register) -> Frame:
-    if not isinstance(pair, tuple | list) or len(pair) != 2:
-        raise InputError(f"frames are pairs (image, sparse), not {type(pair).__name__}")
-    return frame_of_arrays(*pair, register)
-
-
 def _rgb(image: ArrayLike) -> NDArray[np.float32]:
+    """The image as (H, W, 3) in 0…1."""
     values = _numbers(image, "an image")
-    shape = values.shape
-    if values.ndim == 4 and shape[0] == 1:
-        values = values[0]
     if values.ndim == 2:
-        values = values[:, :, None]
-    if values.ndim == 3 and values.shape[2] not in _CHANNELS and values.shape[0] in _CHANNELS:
-        values = values.transpose(1, 2, 0)
-    if values.ndim != 3 or values.shape[2] not in _CHANNELS or not values.size:
-        raise InputError(
-            "an image has shape (H, W), (H, W, C) or (C, H, W) with 1, 3 or 4 channels, not"
-            f" {shape}"
-        )
-    values = values[:, :, :3].repeat(3 if values.shape[2] == 1 else 1, axis=2)
-    if values.dtype in FULL_SCALE and (values.dtype == np.uint8 or values.max() > 255):
+        values = values[:, :, None].repeat(3, axis=2)
+    if values.ndim != 3 or values.shape[2] != 3 or not values.size:
+        raise InputError(f"an image has shape (H, W, 3) or (H, W), not {np.shape(image)}")
+    if values.dtype in FULL_SCALE:
         return (values / FULL_SCALE[values.dtype]).astype(np.float32)
-    if values.min() >= 0 and _OVERSHOOT < values.max() <= 255:
-        return (values / 255).astype(np.float32)
     if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
         raise InputError(
-            f"an image is uint8, uint16, or in 0..1 or 0..255; this one is {values.dtype} in"
+            f"an image is uint8, uint16, or float in 0..1; this one is {values.dtype} in"
             f" {values.min()}..{values.max()}"
         )
     return values.astype(np.float32)
@@ -288,16 +246,11 @@ def _points(
 
     Points of a map have the map's size, rows of x, y and depth the image's.
     """
-    unknown = 0
     if isinstance(sparse, SparsePoints):
-        return sparse.tensors(), unknown
-    # Axes of length 1, such as a batch's, go.
-    values = _numbers(sparse, "sparse depth")
-    shape = values.shape
-    if values.ndim in (3, 4):
-        values = values.reshape([side for side in shape if side != 1])
+        return sparse.tensors(), 0
+    values, unknown = _numbers(sparse, "sparse depth"), 0
     if values.ndim != 2:
-        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {shape}")
+        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
     # Three columns are rows of x, y and depth, unless the image is as narrow as that.
     if values.shape[1] == 3 and values.shape != size:
         if size is None:
@@ -310,10 +263,8 @@ def _points(
         # Anything else is a depth map, of which the known pixels are points.
         if size is not None and values.shape != size:
             raise SizeError(f"the sparse depth map is {values.shape} but the image is {size}")
-        size, values = (
-            (values.shape[0], values.shape[1]),
-            in_metres(values, "the sparse depth", unit),
-        )
+        size = values.shape[0], values.shape[1]
+        values = in_metres(values, "the sparse depth", unit)
         rows, columns = np.nonzero(np.isfinite(values) & (values > 0))
         xy = np.stack([columns, rows], axis=1).astype(np.float32)
         depth = values[rows, columns]
