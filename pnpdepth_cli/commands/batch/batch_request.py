@@ -108,7 +108,7 @@ class BatchRequest:
     ray: str | None = option(
         None,
         "Run on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT. Without an address, on all"
-        " devices of this machine. Needs the extra ray.",
+        " cores of this machine, with --device cuda on all GPUs. Needs the extra ray.",
         metavar="[ADDRESS]",
         parse=parse_address,
         value_if_bare=LOCAL,
@@ -123,6 +123,8 @@ class BatchRequest:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
         if self.pose_kind is not None and self.poses is None:
             raise UsageError("--pose-kind is for --poses")
+        if self.ray is not None and self.refine.network.device not in ("cpu", "cuda"):
+            raise UsageError("--ray computes on --device cpu, or on all GPUs with --device cuda")
         choose_measures(MEASURES, self.columns)
 
     @property

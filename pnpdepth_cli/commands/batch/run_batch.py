@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from typing import Protocol
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames, source_files
-from pnpdepth_cli.commands.batch.ray_workers import RayWorkers, ray_workers_of, refine_on_workers
 from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
 from pnpdepth_cli.commands.batch.sequence import sequences_of
 from pnpdepth_cli.commands.batch.summary import BatchSummary, write_summary
@@ -35,7 +33,7 @@ class Listener(Protocol):
         """Receives a note or a warning, one line."""
 
     def begin(self, to_do: int) -> None:
-        """Called once the network is loaded, with the number of frames to do."""
+        """Called with the number of frames to do."""
 
     def frame(self, record: FrameRecord) -> None:
         """Called with the record of each frame that is done or has failed."""
@@ -58,11 +56,8 @@ def run_batch(
         PnpDepthError: For what concerns all frames, such as a network that cannot be loaded, or a
             full disk.
     """
-    # How frames are refined, where, and which.
-    workers = ray_workers_of(request.refine.network.device, request.ray)
+    # Which frames are refined, and how.
     refine = request.refine.with_fields(view_3d=request.html_3d)
-    if workers is not None:
-        refine = refine.with_fields(device=workers.device)
     request = replace(request, refine=refine)
     found, own = find_frames(request), Records(request)
     if request.html is not None:
@@ -90,9 +85,12 @@ def run_batch(
         to_do = [frame for frame in found.chosen if why[frame.name]]
         listener.say(_plan([*why.values()]))
         if to_do:
-            with closing(_refine(to_do, found, records_of, workers, listener, stopped)) as records:
-                for record in records:
-                    listener.frame(record)
+            listener.begin(len(to_do))
+            worked = len(to_do) < len(found.chosen)
+            with closing(
+                _refine(to_do, found.frames, records_of, worked, listener, stopped)
+            ) as records:
+                _follow(records, listener)
         # All that are done are summed up; the summary of the shard that ends last stays.
         known = in_order(lambda f: records_of(f).record_of(f), found.frames, _READERS)
         with in_turn(request.output):
@@ -119,37 +117,51 @@ def _adapt(
 
 def _refine(
     to_do: Sequence[FrameFiles],
-    found: BatchFrames,
+    frames: Sequence[FrameFiles],
     records_of: Callable[[FrameFiles], Records],
-    workers: RayWorkers | None,
+    worked: bool,
     listener: Listener,
     stopped: Callable[[], bool],
 ) -> Generator[FrameRecord, None, None]:
     """Refines frames in this process or on Ray workers; yields the record of each."""
-    # this imports torch, which a run with nothing to do does not need
-    from pnpdepth_cli.commands.batch import running
+    # these import torch, which a run with nothing to do does not need
+    from pnpdepth_cli.commands.batch.ray_workers import refine_on_workers
+    from pnpdepth_cli.commands.batch.running import open_method, refine_frames, spread
 
-    begin = functools.cache(lambda: listener.begin(len(to_do)))
-    worked = len(to_do) < len(found.chosen)
     for number, records in enumerate(dict.fromkeys(map(records_of, to_do))):
         if number and stopped():
             return
-        # The frames that are refined alike, and those of them that decide.
+        # The frames that are refined alike. Some of all decide for every run and shard.
         wanted = [frame for frame in to_do if records_of(frame) is records]
-        alike = [frame for frame in found.frames if records_of(frame) is records]
-        deciding = running.deciding_frames(records.request, alike)
-        if deciding and workers is not None:
-            begin()
+        alike = [frame for frame in frames if records_of(frame) is records]
+        deciding = [alike[number] for number in spread(len(alike))]
+        if records.request.ray is not None:
             yield from refine_on_workers(
-                workers, deciding, wanted, records,
-                settings_worked=worked, say=listener.say, stopped=stopped,
-            )  # fmt: skip
+                deciding, wanted, records, worked=worked, say=listener.say, stopped=stopped
+            )
             continue
-        with running.open_method(records.request, deciding, wanted[0], listener.say) as method:
-            begin()
-            yield from running.refine_frames(
+        with open_method(records.request, deciding) as method:
+            yield from refine_frames(
                 wanted, method, records, settings_worked=worked, stopped=stopped
             )
+
+
+def _follow(records: Iterable[FrameRecord], listener: Listener) -> None:
+    """Tells the listener of each record, and of the first result how it was made."""
+    is_first = True
+    for record in records:
+        listener.frame(record)
+        if not is_first or record.method is None or record.model is None:
+            continue
+        is_first = False
+        if record.method.kind == "default":
+            how = f"the default, with {' and '.join(record.method.networks)}"
+        else:
+            own = record.settings
+            how = f"{record.model.name} cut at {own['layer']}, {own['iterations']} updates of z"
+        listener.say(f"method: {how}")
+        for note in record.notes:
+            listener.say(f"{record.name}: {note}")
 
 
 def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:

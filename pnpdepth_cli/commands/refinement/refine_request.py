@@ -46,7 +46,7 @@ class NetworkChoice:
     )
     device: str = option(
         "cpu",
-        "cpu, cuda, cuda:1, mps, …; batch also takes several, cuda:0,cuda:1, or all.",
+        "cpu, cuda, cuda:1, mps, …",
         metavar="NAME",
         show_default=True,
     )

@@ -1,209 +1,152 @@
-"""How frames are handed out and errors are treated, with calls that run at once instead of Ray."""
+"""Batches on a real Ray cluster of three nodes, and what is wrong with one."""
 
 from __future__ import annotations
 
+import os
+import shutil
 import socket
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.batch.batch_request import LOCAL, parse_address
-from pnpdepth_cli.commands.batch.ray_workers import (
-    check_node,
-    connect_workers,
-    ray_workers_of,
-    reason_of,
-    refine_on_actors,
-    software,
-)
+from pnpdepth_cli.commands.batch import ray_workers
+from pnpdepth_cli.commands.batch.batch_request import parse_address
+from pnpdepth_cli.commands.batch.records import remove_all_leftovers
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.errors import ClusterError, ModelError, StorageError, UsageError
+from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
+from tests.commands.batches import RecordingListener, add_frame, batch, pairs_on_disk, results
 
-Refine = Callable[[Sequence[int], bool], list[FrameRecord]]
-
-
-class RayError(Exception):
-    """A worker or its node died."""
-
-
-class RayTaskError(RayError):
-    """A call raised `cause`."""
-
-    def __init__(self, cause: Exception) -> None:
-        super().__init__(str(cause))
-        self.cause = cause
+NAMES = tuple(f"f{number:02}" for number in range(12))
+DEADLY = "        if float(rgb.mean()) > 0.99:\n            import os\n            os._exit(1)\n"
+on_a_cluster = pytest.mark.skipif(sys.platform != "linux", reason="nodes are loopback addresses")
 
 
-class Calls:
-    """Ray's functions; a call runs when its result is wanted."""
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Three nodes of one CPU each, which are addresses of loopback."""
+    pytest.importorskip("ray")
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    from ray.cluster_utils import Cluster
 
-    exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
-
-    def wait(self, references: list[Any], *, timeout: float | None) -> Any:
-        return references[:1], references[1:]
-
-    def get(self, reference: Callable[[], Any]) -> Any:
-        try:
-            return reference()
-        except SystemExit:
-            raise RayError("exited") from None
-        except Exception as error:
-            raise RayTaskError(error) from None
-
-
-def dies() -> None:
-    raise SystemExit
+    node = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
+    head = {**node, "node_ip_address": "127.0.0.2", "include_dashboard": False}
+    nodes = Cluster(initialize_head=True, head_node_args=head)
+    for number in (3, 4):
+        nodes.add_node(**node, node_ip_address=f"127.0.0.{number}")
+    yield nodes
+    nodes.shutdown()
 
 
-def results(
-    refine: Refine,
-    count: int,
-    *,
-    worked: bool = False,
-    starts: Callable[[], None] = lambda: None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> tuple[dict[int, FrameRecord], list[str]]:
-    """The record of each frame, which is a number, and the messages."""
-    messages: list[str] = []
-    to_do: Any = range(count)
-    ready = SimpleNamespace(options=lambda **_: SimpleNamespace(remote=lambda: lambda: starts()))
-    refining = SimpleNamespace(remote=lambda *given: lambda: (refine(*given), ["note"]))
-    records = list(
-        refine_on_actors(
-            Calls(), [SimpleNamespace(ready=ready, refine=refining) for _ in range(3)], to_do,
-            worked=worked, say=messages.append, stopped=stopped,
-            lost=lambda frame, why: record_of(frame, "failed", why),
-        )
-    )  # fmt: skip
-    by_frame = {int(record.name): record for record in records}
-    assert len(records) == len(by_frame), "a frame was reported twice"
-    return by_frame, messages
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = pairs_on_disk(tmp_path_factory.mktemp("frames") / "drive", NAMES)
+    batch(root)
+    (root / "out").rename(root / "plain")
+    return root
 
 
-def record_of(frame: Any, status: Any = "done", message: str | None = None) -> FrameRecord:
-    return FrameRecord(name=str(frame), status=status, message=message)
+@pytest.fixture
+def root(frames: Path) -> Iterator[Path]:
+    yield frames
+    shutil.rmtree(frames / "out", ignore_errors=True)
 
 
-def records_of(frames: Sequence[int], failed: Sequence[int] = ()) -> list[FrameRecord]:
-    return [record_of(frame, "failed" if frame in failed else "done") for frame in frames]
+class Doing(RecordingListener):
+    """Does something at a record."""
+
+    def __init__(self, number: int, what: Callable[[], Any]) -> None:
+        super().__init__()
+        self._number, self._what = number, what
+
+    def frame(self, record: FrameRecord) -> None:
+        super().frame(record)
+        if len(self.records) == self._number:
+            self._what()
 
 
-def test_a_frame_that_kills_its_workers_is_lost_and_no_other_and_a_note_is_said_once() -> None:
-    records, messages = results(
-        lambda frames, _: dies() if 17 in frames else records_of(frames), 40
-    )
-    assert (records.pop(17).message or "").startswith("its worker died 3 times")
-    assert sorted(records) == [number for number in range(40) if number != 17]
+@pytest.mark.slow
+@on_a_cluster
+def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, root: Path) -> None:
+    lost = cluster.worker_nodes.copy().pop()
+    listener = Doing(2, lambda: cluster.remove_node(lost, allow_graceful=False))
+    result = batch(root, listener, ray=cluster.address)
+    cluster.add_node(num_cpus=1, node_ip_address="127.0.0.5")
+    cluster.wait_for_nodes(timeout=120)  # until the lost one counts as dead
+    assert sorted(listener.names) == list(NAMES)
+    assert result.counts["done"] == len(NAMES)
+    remove_all_leftovers(root / "out")  # of the worker that died, as the next run does
+    assert results(root / "out") == results(root / "plain")
+
+
+@pytest.mark.slow
+@on_a_cluster
+def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
+    cluster: Any, tmp_path: Path
+) -> None:
+    root = pairs_on_disk(tmp_path / "drive", tuple(f"f{number:02}" for number in range(30)))
+    add_frame(root, "bad", np.full((46, 62, 3), 255, np.uint8))
+    model = root / "net" / "my_net.py"
+    start = "    def forward(self, rgb):\n"
+    model.write_text(model.read_text().replace(start, start + DEADLY))
+    listener = RecordingListener()
+    batch(root, listener, ray=cluster.address, names="[bf]*[d05]")
+    records = {record.name: record for record in listener.records}
+    assert len(records) == len(listener.records) == 7
+    bad = records.pop("bad")
+    assert bad.status == "failed"
+    assert "worker died" in (bad.message or "")
     assert {record.status for record in records.values()} == {"done"}
-    assert sum("Ray starts another one" in text for text in messages) == 4
-    assert messages.count("note") == 1
 
 
-def raising(bad: Sequence[int], error: Exception) -> Refine:
-    def refine(frames: Sequence[int], worked: bool) -> list[FrameRecord]:
-        if set(frames) & set(bad) and (not worked or isinstance(error, StorageError)):
-            raise error
-        return records_of(frames, failed=bad)
-
-    return refine
-
-
-def test_an_error_of_the_settings_is_of_its_frame_alone_once_others_succeeded() -> None:
-    with pytest.raises(ModelError, match="bad"):
-        results(raising(range(40), ModelError("bad")), 40)
-    for worked, bad in ((False, [4]), (True, range(9))):
-        records, _ = results(raising(bad, ModelError("bad")), 9, worked=worked)
-        failed = [number for number in sorted(records) if records[number].status == "failed"]
-        assert failed == list(bad)
-    with pytest.raises(StorageError, match="full"):
-        results(raising([5], StorageError("full")), 9, worked=True)
+@pytest.mark.slow
+@on_a_cluster
+def test_what_is_wrong_with_all_frames_ends_the_batch(
+    cluster: Any, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ClusterError, match="device cuda"):
+        batch(root, ray=cluster.address, refine={"device": "cuda"})
+    with pytest.raises(ModelError, match="nowhere"):
+        batch(root, ray=cluster.address, refine={"layer": "nowhere"})
+    with monkeypatch.context() as changed, pytest.raises(ClusterError, match="torch"):
+        changed.setattr(ray_workers, "versions", lambda: {"torch": "1.0"})
+        batch(root, ray=cluster.address)
+    assert not results(root / "out")
 
 
-def test_nothing_is_handed_out_once_stopped() -> None:
-    begun: list[int] = []
-
-    def refine(frames: Sequence[int], worked: bool) -> list[FrameRecord]:
-        begun.extend(frames)
-        return records_of(frames)
-
-    records, _ = results(refine, 1000, stopped=lambda: len(begun) > 3)
-    assert 3 < len(records) < 1000
-    assert sorted(records) == sorted(begun)
+@pytest.mark.slow
+@on_a_cluster
+def test_a_stopped_batch_ends_with_the_frames_that_are_begun(cluster: Any, root: Path) -> None:
+    listener = RecordingListener()
+    batch(root, listener, stopped=lambda: bool(listener.records), ray=cluster.address)
+    assert 1 <= len(listener.records) < len(NAMES)
+    assert {path.stem for path in (root / "out").glob("f*.json")} == set(listener.names)
 
 
-def test_workers_that_do_not_start_end_the_run() -> None:
-    with pytest.raises(ClusterError, match="a worker died 100 times"):
-        results(raising((), OSError()), 1, starts=dies)
-
-
-def test_a_node_must_have_the_versions_of_the_driver_and_see_its_files(tmp_path: Path) -> None:
-    check_node(software(), [tmp_path])
-    with pytest.raises(ClusterError, match=r"has torch .*, and the driver has 1\.0; install"):
-        check_node({"torch": "1.0"}, [])
-    for path, name in ((Path("frames"), "frames"), (Path("o/.batch.lock"), "the output folder")):
-        with pytest.raises(ClusterError, match=f"does not see {name}; name a folder"):
-            check_node({}, [path])
-
-
-def test_the_death_of_a_worker_is_one_line_of_what_ray_says() -> None:
-    creation = "The actor died because of an error raised in its creation task,\nImportError: no\n"
-    assert reason_of(RuntimeError(creation)) == "ImportError: no"
-    assert reason_of(RuntimeError("The actor died: OOM.\nand more")) == "The actor died: OOM."
-
-
-def connect(address: str) -> None:
-    workers = ray_workers_of("cpu", address)
-    assert workers is not None
-    with connect_workers(workers):
-        raise AssertionError("there is no cluster")
-
-
-def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ray_the_extra_is_named(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UsageError, match=r"--ray needs Ray: pip install 'pnpdepth\[ray\]'"):
-        connect(LOCAL)
+    with pytest.raises(UsageError, match=r"pnpdepth\[ray\]"):
+        batch(root, ray="local")
 
 
 @pytest.mark.parametrize("scheme", ["", "ray://"])
-def test_an_address_where_nothing_answers_is_an_error_at_once(scheme: str) -> None:
+def test_an_address_where_nothing_answers_is_an_error_at_once(scheme: str, root: Path) -> None:
     pytest.importorskip("ray")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-        with pytest.raises(ClusterError, match=r"cannot be used: Connection refused; check the"):
-            connect(f"{scheme}127.0.0.1:{port}")
+        address = f"{scheme}127.0.0.1:{free.getsockname()[1]}"
+        with pytest.raises(ClusterError, match=address):
+            batch(root, ray=address)
 
 
-def test_addresses_of_clusters_and_what_is_none() -> None:
+def test_addresses_of_clusters_and_what_is_none(root: Path) -> None:
     for text in ("auto", "local", "host:6379", "ray://host:10001", "[::1]:6379"):
         assert parse_address(text) == text
     for text in ("frames/", "out", "ray://host", "a/b:1"):
-        with pytest.raises(UsageError, match="is no address of a Ray cluster"):
+        with pytest.raises(UsageError, match=text):
             parse_address(text)
-
-
-@pytest.mark.parametrize(
-    ("device", "ray", "expected"),
-    [
-        ("cuda:1", None, None),
-        ("cuda:0,cuda:2", None, (LOCAL, "cuda", (0, 2))),
-        ("all", None, (LOCAL, "cuda", ())),
-        ("cpu", "auto", ("auto", "cpu", ())),
-        ("cuda:0,cuda:0", None, "name each GPU once"),
-        ("cuda,cuda", None, "name each GPU once"),
-        ("cpu,cuda:0", None, "workers run on cpu, cuda"),
-        ("mps,mps", None, "workers run on cpu, cuda"),
-        ("cuda:0,cuda:1", "auto", "take --device cuda"),
-    ],
-)
-def test_which_devices_are_workers(device: str, ray: str | None, expected: Any) -> None:
-    if isinstance(expected, str):
-        with pytest.raises(UsageError, match=expected):
-            ray_workers_of(device, ray)
-        return
-    workers = ray_workers_of(device, ray)
-    assert (workers and (workers.address, workers.device, workers.indices)) == expected
+    with pytest.raises(UsageError, match="--device"):
+        batch(root, ray="auto", refine={"device": "cuda:1"})
