@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.progress import BatchProgress, progress_bar
-from pnpdepth_cli.cli.streams import INTERRUPTED, say
+from pnpdepth_cli.cli.terminal import INTERRUPTED, BatchProgress, progress_bar, say
 from pnpdepth_cli.cli.vary import Combination, combinations_of
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine_request import (
@@ -149,7 +148,7 @@ def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSumma
     from pnpdepth_cli.commands.batch.run_batch import run_batch
     from pnpdepth_cli.commands.tables import count_of
 
-    with progress_bar("batch", "frame", stays=True) as show:
+    with progress_bar("batch", "frame") as show:
         progress = BatchProgress(show)
         try:
             summary = run_batch(request, progress, pressed)

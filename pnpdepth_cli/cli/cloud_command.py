@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.cli.terminal import progress_bar
 from pnpdepth_cli.commands.requests import CloudRequest
 
 

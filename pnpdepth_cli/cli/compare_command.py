@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.streams import print_json
+from pnpdepth_cli.cli.terminal import print_json
 from pnpdepth_cli.measures import parse_keys
 
 _LABEL_LETTERS = 36

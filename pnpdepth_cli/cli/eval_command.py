@@ -10,8 +10,7 @@ import click
 
 from pnpdepth_cli.cli import grouped_help, options
 from pnpdepth_cli.cli.compare_command import columns
-from pnpdepth_cli.cli.progress import progress_bar
-from pnpdepth_cli.cli.streams import print_json
+from pnpdepth_cli.cli.terminal import print_json, progress_bar
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.errors import FramesFailedError
 

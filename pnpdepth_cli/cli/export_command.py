@@ -8,7 +8,7 @@ import click
 
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.progress import progress_bar
+from pnpdepth_cli.cli.terminal import progress_bar
 
 
 @click.command(short_help="Write depth for COLMAP, Nerfstudio or 3DGS.")

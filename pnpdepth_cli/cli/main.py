@@ -7,17 +7,15 @@ import gc
 import importlib
 import io
 import os
-import shlex
 import sys
-import tempfile
-from traceback import format_exception
+import traceback
 from typing import NoReturn
 
 import click
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.cli.streams import INTERRUPTED, printable, say, shorten
+from pnpdepth_cli.cli.terminal import INTERRUPTED, printable, say
 from pnpdepth_cli.errors import DeviceError, InputError, OutputError, PnpDepthError
 
 _EXIT_CODES = """\b
@@ -25,11 +23,11 @@ Exit codes: 0 done · 1 a bug of this program · 2 wrong usage or output · 3 in
 layer or checkpoint · 5 refinement diverged · 6 device or memory · 7 some frames failed ·
 130 interrupted. Networks in .py files are code and are run."""
 
-_COMPLETION = "_PNPDEPTH_COMPLETE"
-"""Set by the shell that asks for completions."""
-
 _MEMORY_MESSAGES = ("allocate memory", "failed to map segment", "bad_alloc")
 """Parts of the messages of torch and of the loader when memory is exhausted."""
+
+_LONGEST = 2000
+"""Most characters of a message; a longer one loses its middle."""
 
 _NO_MEMORY = "memory is exhausted; use a smaller image"
 
@@ -94,61 +92,34 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def run(arguments: list[str]) -> int:
-    """Returns the exit code. Every error becomes one line on stderr."""
+    """Returns the exit code. Every error becomes one line on stderr, a bug its traceback too."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal without σ still shows the rest
     try:
-        return _run_command(arguments)
+        return cli.main(arguments, prog_name="pnpdepth", standalone_mode=False) or 0
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
     except PnpDepthError as error:
         return _end(error, error.exit_code)
-    except BrokenPipeError:  # as in `pnpdepth models | head -1`
-        sys.stdout = None
+    except SystemExit:  # after a completion, or of a reader that stopped: `pnpdepth models | head`
         return 0
-    except KeyboardInterrupt:
+    except click.Abort:
         return _end("interrupted", INTERRUPTED)
     except MemoryError:
         return _end(_NO_MEMORY, DeviceError.exit_code)
     except OSError as error:
+        reason = error.strerror or str(error)
         full = error.errno in _OUTPUT_ERRORS
-        return _end(_describe(error), (OutputError if full else InputError).exit_code)
+        named = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return _end(named + reason, (OutputError if full else InputError).exit_code)
     except Exception as error:
         exhausted = any(text in str(error) for text in _MEMORY_MESSAGES)
         if exhausted and isinstance(error, ImportError | RuntimeError):
             return _end(_NO_MEMORY, DeviceError.exit_code)
-        return _end(_bug(error, arguments), PnpDepthError.exit_code)
-
-
-def _bug(error: Exception, arguments: list[str]) -> str:
-    """Writes the traceback to a new file, for a bug report. Returns the message that names it."""
-    versions = f"pnpdepth {__version__}, Python {sys.version}, {sys.platform}"
-    text = f"{versions}\npnpdepth {shlex.join(arguments)}\n\n" + "".join(format_exception(error))
-    fact = f"internal error ({type(error).__name__}: {error})"
-    try:
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="pnpdepth-", suffix=".txt", encoding="utf-8", errors="replace", delete=False
-        ) as file:
-            file.write(text)
-    except OSError:  # nowhere to write
-        sys.stderr.write(text)
-        return f"{fact}; it is a bug of this program, please report it"
-    return f"{fact}; it is a bug of this program, please report it with {file.name}"
-
-
-def _run_command(arguments: list[str]) -> int:
-    """Runs the command of these arguments. Returns its exit code."""
-    if _COMPLETION in os.environ:
-        cli.main(arguments, prog_name="pnpdepth", complete_var=_COMPLETION)
-    try:
-        with cli.make_context("pnpdepth", list(arguments)) as context:
-            cli.invoke(context)
-    except click.exceptions.Exit as stop:
-        return stop.exit_code
-    except click.ClickException as error:
-        error.show()
-        return error.exit_code
-    except click.Abort:
-        raise KeyboardInterrupt from None
-    return 0
+        traceback.print_exception(error)
+        fact = f"internal error ({type(error).__name__}: {error})"
+        return _end(f"{fact}; it is a bug of this program, please report it", 1)
 
 
 def _end(message: object, code: int) -> int:
@@ -158,10 +129,6 @@ def _end(message: object, code: int) -> int:
             sys.stdout.flush()
     except OSError:  # it is full
         sys.stdout = None
-    say(f"pnpdepth: {shorten(printable(message))}")
+    text, half = printable(message), _LONGEST // 2
+    say(f"pnpdepth: {text if len(text) <= _LONGEST else f'{text[:half]} … {text[-half:]}'}")
     return code
-
-
-def _describe(error: OSError) -> str:
-    reason = error.strerror or str(error)
-    return reason if error.filename is None else f"{os.fsdecode(error.filename)}: {reason}"

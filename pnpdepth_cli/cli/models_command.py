@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,33 +9,22 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.progress import progress_bar
-from pnpdepth_cli.cli.streams import print_json, say
+from pnpdepth_cli.cli.terminal import print_json, progress_bar
 from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice
 
 
-class _Models(click.Group):
-    """Lists the networks where no subcommand is named."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        named = args and (not args[0].startswith("-") or args[0] in ("-h", "--help"))
-        return super().parse_args(ctx, args if named else ["list", *args])
-
-
-@click.group(short_help="List or check networks.", cls=_Models)
-def models() -> None:
-    """List or check networks; without a subcommand, list them.
+@click.group(short_help="List or check networks.", invoke_without_command=True)
+@options.as_json
+@click.pass_context
+def models(context: click.Context, as_json: bool) -> None:
+    """List the networks that --model takes by name, with their inputs, outputs and defaults.
 
     \b
     pnpdepth models
     pnpdepth models check net.onnx --image img.png
     """
-
-
-@models.command(name="list", short_help="List the networks that --model takes by name.")
-@options.as_json
-def list_command(as_json: bool) -> None:
-    """List the networks that --model takes by name, with their inputs, outputs and defaults."""
+    if context.invoked_subcommand is not None:
+        return
     from pnpdepth_cli.commands.networks import list_models
 
     listed = list_models()
@@ -65,30 +53,14 @@ def list_command(as_json: bool) -> None:
 @click.argument("network", metavar="NAME|FILE|FOLDER")
 @click.option("--image", type=options.FILE, help="Image to run the network on.")
 @options.checkpoint
-@options.as_json
-def check(network: str, image: Path | None, checkpoint: Path | None, as_json: bool) -> None:
-    """Load a network, run it, and cut it at its layers.
+def check(network: str, image: Path | None, checkpoint: Path | None) -> None:
+    """Load a network, run it, and cut it at its layers; print what was found as JSON.
 
     A .py file is Python code and is run.
     """
     from pnpdepth_cli.commands.networks import check_model
 
-    show = print_json if as_json else _print
-    show(check_model(network, checkpoint, image))
-
-
-def _print(record: Mapping[str, Any]) -> None:
-    """Prints the record to stdout, but its `notes` to stderr."""
-    for key, value in record.items():
-        if key == "notes":
-            for note in value:
-                say(note)
-        elif isinstance(value, dict):
-            click.echo(f"{key}:")
-            for name, text in value.items():
-                click.echo(f"  {name}: {text}")
-        else:
-            click.echo(f"{key}: {' '.join(map(str, value)) if isinstance(value, list) else value}")
+    print_json(check_model(network, checkpoint, image))
 
 
 @click.command(short_help="List the layers a network can be cut at.")

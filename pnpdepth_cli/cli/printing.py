@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from pnpdepth_cli.cli.streams import printable
+from pnpdepth_cli.cli.terminal import printable, say
 from pnpdepth_cli.commands.error_tables import (
     baselines_table,
     error_table,
@@ -105,10 +105,10 @@ def _markup(cell: str) -> str:
 
 def print_notes(notes: Sequence[str]) -> None:
     """Prints a line for each on stderr, warnings in a colour."""
-    console = _Console(stderr=True, highlight=False)
     for note in notes:
-        style = "yellow" if note.startswith("warning") else "dim"
-        console.print(escape(printable(note)), style=style, soft_wrap=True)
+        is_warning = note.startswith("warning")
+        colour = "yellow" if is_warning else None
+        click.secho(printable(note), err=True, fg=colour, dim=not is_warning)
 
 
 def print_refinement(record: FrameRecord) -> None:
@@ -125,11 +125,10 @@ def print_refinement(record: FrameRecord) -> None:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
     if has_baselines(errors):
         print_table(baselines_table(errors, record.unit), err=True)
-    console = _Console(stderr=True, highlight=False)
     if record.improved_fraction is not None:
         where = "held-out points" if HELD_OUT in errors else "points used"
         where = "scored pixels" if GT in errors else where
-        console.print(f"improved: {record.improved_fraction:.1%} of the {where}")
+        say(f"improved: {record.improved_fraction:.1%} of the {where}")
     # Updates, times and files.
     parts = [", ".join(f"{stage} {spent:.2f} s" for stage, spent in record.seconds.items())]
     parts.append(f"peak {record.peak_memory_mb['process']:,.0f} MB")
@@ -137,8 +136,8 @@ def print_refinement(record: FrameRecord) -> None:
         settings = record.settings
         how = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
         parts.insert(0, f"{settings['iterations']} updates ({how})")
-    console.print(" · ".join(parts), soft_wrap=True)
-    console.print(f"wrote {escape('  '.join(record.outputs.values()))}", soft_wrap=True)
+    say(" · ".join(parts))
+    say(f"wrote {'  '.join(record.outputs.values())}")
 
 
 def print_batch(summary: BatchSummary) -> None:
@@ -157,19 +156,16 @@ def print_batch(summary: BatchSummary) -> None:
     if counts["compared"]:
         worse = f"{counts['worse']:,} of {counts['compared']:,}"
         parts.append(f"{worse} worse than linear interpolation")
-    lines = [", ".join(parts)]
+    say(", ".join(parts))
     # Warnings and notes of several frames, each once, weights and files.
     for each in (*summary.warnings, *summary.frame_notes):
         names = ", ".join([*each.first, *["…"] * (each.frames > len(each.first))])
         count = count_of(each.frames, "frame")
         kind = "warning" if each.is_warning else "note"
-        lines.append(f"{kind} in {count} ({names}): {each.note.removeprefix(f'{kind}: ')}")
+        say(f"{kind} in {count} ({names}): {each.note.removeprefix(f'{kind}: ')}")
     if summary.weights:
-        lines.append(f"mean weights in the result: {mean_weights_text(summary.weights)}")
-    lines.append(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")
-    console = _Console(stderr=True, highlight=False)
-    for line in lines:
-        console.print(escape(line), soft_wrap=True)
+        say(f"mean weights in the result: {mean_weights_text(summary.weights)}")
+    say(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")
 
 
 def print_sparse(record: Mapping[str, Any]) -> None:
@@ -178,5 +174,4 @@ def print_sparse(record: Mapping[str, Any]) -> None:
     points, (width, height) = record["points"], record["size"]
     share = f"{points['fraction_of_pixels']:.2%} of {width}×{height} pixels"
     paths = "  ".join(path for path in record["outputs"].values() if path)
-    line = f"wrote {points['count']:,} points, {share}: {escape(paths)}"
-    _Console(stderr=True, highlight=False).print(line, soft_wrap=True)
+    say(f"wrote {points['count']:,} points, {share}: {paths}")

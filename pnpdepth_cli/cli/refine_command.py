@@ -7,8 +7,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.progress import progress_bar
-from pnpdepth_cli.cli.streams import print_json
+from pnpdepth_cli.cli.terminal import print_json, progress_bar
 from pnpdepth_cli.commands.refinement.refine_request import HoldOut, NetworkChoice, OutputOptions
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import DivergedError

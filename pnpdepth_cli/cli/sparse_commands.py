@@ -9,7 +9,7 @@ import click
 
 from pnpdepth_cli.choices import SENSORS
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.streams import say
+from pnpdepth_cli.cli.terminal import say
 from pnpdepth_cli.commands.refinement.refine_request import parse_sample
 from pnpdepth_cli.commands.requests import FramesRequest
 from pnpdepth_cli.dataset.read_options import ScanOptions

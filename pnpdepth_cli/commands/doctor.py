@@ -1,10 +1,11 @@
-"""What `pnpdepth doctor` reports: versions, devices, memory, extras, and a refined frame."""
+"""What `pnpdepth doctor` reports: versions, packages, devices, memory, and a refined frame."""
 
 from __future__ import annotations
 
 import platform
 import re
 import time
+from collections.abc import Iterator
 from importlib import metadata
 
 import numpy as np
@@ -13,7 +14,6 @@ import torch
 
 import pnpdepth_cli
 
-_REQUIREMENT = re.compile(r"^([\w.-]+).*extra == ['\"]([\w-]+)['\"]")
 _DEVELOPERS = ("test", "docs", "train")
 """Extras that no command needs."""
 
@@ -24,44 +24,29 @@ def examine() -> dict[str, str | list[str]]:
     Raises:
         PnpDepthError: The small frame cannot be refined.
     """
-    required, extras = _requirements()
     memory = psutil.virtual_memory()
     return {
         "pnpdepth": pnpdepth_cli.__version__,
         "python": f"{platform.python_version()}, {platform.system()} {platform.machine()}",
-        "packages": [f"{name} {_version(name) or 'not installed'}" for name in required],
-        "extras": [f"{extra}: {_state(names)}" for extra, names in extras.items()],
+        "packages": list(_packages()),
         "devices": _devices(),
         "memory": f"{memory.available / 1e9:.1f} of {memory.total / 1e9:.1f} GB available",
         "self-test": _self_test(),
     }
 
 
-def _requirements() -> tuple[list[str], dict[str, list[str]]]:
-    """Names of the required packages, and of the packages of each extra."""
-    required, extras = [], dict[str, list[str]]()
+def _packages() -> Iterator[str]:
+    """The required packages, and those of each extra, with their versions."""
     for line in metadata.requires("pnpdepth") or []:
-        match = _REQUIREMENT.match(line)
-        if match is None:
-            required.append(re.split(r"[^\w.-]", line)[0])
-        elif match[2] not in _DEVELOPERS:
-            extras.setdefault(match[2], []).append(match[1])
-    return required, extras
-
-
-def _version(package: str) -> str:
-    """Returns the installed version; empty if there is none."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return ""
-
-
-def _state(packages: list[str]) -> str:
-    missing = [name for name in packages if not _version(name)]
-    if missing:
-        return f"not installed ({', '.join(missing)})"
-    return ", ".join(f"{name} {_version(name)}" for name in packages)
+        name = re.split(r"[^\w.-]", line)[0]
+        extra = re.search(r"extra == ['\"]([\w-]+)", line)
+        if extra is not None and extra[1] in _DEVELOPERS:
+            continue
+        try:
+            version = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            version = "not installed"
+        yield f"{name} {version}" + (f", of the extra {extra[1]}" if extra else "")
 
 
 def _devices() -> list[str]:

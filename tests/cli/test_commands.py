@@ -57,7 +57,7 @@ def test_an_onnx_file_is_refined_and_checked(
     record = json.loads(capsys.readouterr().out)
     assert record["settings"]["layer"] == "Relu_d"
     assert any("agrees with onnxruntime" in note for note in record["notes"])
-    assert run(["models", "check", net, "--image", str(frame.image), "--json"]) == 0
+    assert run(["models", "check", net, "--image", str(frame.image)]) == 0
     checked = json.loads(capsys.readouterr().out)
     assert set(checked["layers"].values()) == {"ok"}
     assert any("rgb range 'unit' is assumed" in note for note in checked["notes"])

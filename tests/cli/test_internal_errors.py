@@ -1,4 +1,4 @@
-"""A bug ends with code 1 and a file with its traceback; no reader calls the user's file damaged."""
+"""A bug ends with code 1 and its traceback; no reader calls the user's file damaged."""
 
 from __future__ import annotations
 
@@ -97,24 +97,15 @@ def test_a_library_without_a_function_is_no_damaged_file(
         read(tmp_path / name)
 
 
-@pytest.mark.parametrize("folder", ["tmp", "missing"])
-def test_a_bug_ends_with_code_1_and_its_traceback_in_a_file_or_on_stderr(
-    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_bug_ends_with_code_1_and_its_traceback_on_stderr(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     depth(tmp_path / "d.png")
     monkeypatch.setattr("PIL.Image.open", broken)
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / folder))
     assert run(["sample", str(tmp_path / "d.png"), "--count", "3", "-o", "s.png"]) == 1
-    err = text = capsys.readouterr().err
+    err = capsys.readouterr().err
     assert "AttributeError" in err.splitlines()[-1]
-    if folder == "tmp":
-        (report,) = (tmp_path / "tmp").iterdir()
-        assert str(report) in err
-        assert err.count("\n") == 1
-        text = report.read_text()
-    assert "pnpdepth sample " in text
-    assert "in broken" in text
+    assert "in broken" in err
 
 
 @pytest.mark.parametrize("record", [{"frames": [3]}, {"frames": [{"name": "a", "scores": 3}]}])

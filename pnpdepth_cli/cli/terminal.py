@@ -1,14 +1,16 @@
-"""Progress: bars on a terminal, a line per minute elsewhere."""
+"""Lines, JSON and progress on a terminal."""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from pnpdepth_cli.cli.streams import printable, say
+import click
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -17,16 +19,34 @@ if TYPE_CHECKING:
 
 _LINE_EVERY_S = 60.0
 _SHOWN_AFTER_S = 1.0
+INTERRUPTED = 128 + signal.SIGINT
+"""The exit code after Ctrl-C."""
 
 
-@contextmanager
-def progress_bar(title: str, unit: str, *, stays: bool = False) -> Iterator[Callable[..., None]]:
+def printable(text: object) -> str:
+    """Returns the text with unprintable characters, such as line breaks, as escapes."""
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text)
+    )
+
+
+def say(text: object) -> None:
+    """Prints a line on stderr; work goes on where nobody reads it."""
+    with contextlib.suppress(OSError):
+        click.echo(printable(text), err=True)
+
+
+def print_json(value: Any) -> None:
+    """Prints a value of JSON's own types on stdout."""
+    click.echo(json.dumps(value, indent=2))
+
+
+@contextlib.contextmanager
+def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
     """Yields `show(done, total, text="")`, which draws a bar for work of more than a second.
 
     Not on a terminal, it prints a line per minute. The time counts from the first call of `show`.
-    A bar that stays is drawn from the beginning, and left at the end.
     """
-    # The bar begins with the first call of `show`.
     bar: tqdm[Any] | None = None
     began = printed_at = 0.0
 
@@ -38,8 +58,8 @@ def progress_bar(title: str, unit: str, *, stays: bool = False) -> Iterator[Call
         if bar is None:
             tqdm.monitor_interval = 0  # without its thread, image libraries can be silenced
             bar = tqdm(
-                desc=title, unit=unit, total=total, disable=None, dynamic_ncols=True,
-                leave=stays, delay=0 if stays else _SHOWN_AFTER_S,
+                desc=title, unit=unit, total=total, disable=None, dynamic_ncols=True, leave=False,
+                delay=_SHOWN_AFTER_S,
             )  # fmt: skip
             began = printed_at = now
         if bar.disable and done and now - printed_at >= _LINE_EVERY_S:
