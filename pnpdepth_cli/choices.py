@@ -173,9 +173,9 @@ LAYOUTS = OpenList(
     group="layouts",
     noun="layout",
     names=(
-        *("manifest", "nyu-mat", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
+        *("manifest", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
         *("tum", "7scenes", "eth3d", "colmap", "void", "diode", "ibims", "scannet"),
-        *("arkitscenes", "stray-scanner", "record3d", "pairs", "image-depth", "nyu-h5"),
+        *("arkitscenes", "stray-scanner", "record3d", "pairs", "image-depth"),
     ),
 )
 """Data set layouts, in the order in which they are guessed (`dataset.layouts.Layout`)."""

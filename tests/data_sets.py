@@ -8,13 +8,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
-from pnpdepth_cli.dataset.arrays import depth_of
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.depth import write_depth
 from tests.colmap_models import write_text_model
 from tests.empty_files import touch, tree
 
@@ -171,25 +169,6 @@ def colmap(root: Path) -> None:
     touch(root / "images/left/a.png", root / "images/b.png")
 
 
-def nyu_h5(root: Path) -> None:
-    h5py = pytest.importorskip("h5py")
-    (root / "official").mkdir(parents=True)
-    for number in (1, 9):
-        with h5py.File(root / "official" / f"{number:05}.h5", "w") as file:
-            file["rgb"] = np.full((3, 480, 640), number, np.uint8)
-            file["depth"] = np.full((480, 640), float(number), np.float32)
-
-
-def nyu_mat(root: Path) -> None:
-    h5py = pytest.importorskip("h5py")
-    root.mkdir(exist_ok=True)
-    with h5py.File(root / "nyu_depth_v2_labeled.mat", "w") as file:
-        # MATLAB's column order: frames, channels, columns, rows
-        numbers = np.arange(4, dtype=np.uint8)[:, None, None, None]
-        file["images"] = numbers * np.ones((1, 3, 640, 480), np.uint8)
-        file["depths"] = np.tile(np.arange(640, dtype=np.float32)[:, None] + 1, (4, 1, 480))
-
-
 def eth3d(root: Path, height: int = HEIGHT, width: int = WIDTH) -> None:
     """A frame of 2 m in the left half, without a return in the right one."""
     image(root / "office/images/dslr_images/DSC_0219.JPG", height, width)
@@ -206,14 +185,6 @@ def read_frames(root: Path, name: str | None = None) -> list[FrameFiles]:
     if unmatched and not frames:
         raise InputError(str(unmatched[0]))
     return frames
-
-
-def ground_truth(frame: FrameFiles) -> np.ndarray:
-    """The ground truth (H, W) of a frame in metres, cut as its protocol says."""
-    assert frame.gt is not None
-    if not isinstance(frame.gt, Path):
-        return frame.part.apply(depth_of(frame.gt))
-    return frame.part.apply(read_depth(frame.gt, scale=frame.gt_scale).values)
 
 
 Maker = Callable[[Path], None]
@@ -236,6 +207,4 @@ MAKERS: dict[str, tuple[Maker, list[str]]] = {
     "record3d": (record3d, ["0", "1", "2"]),
     "tum": (tum, ["1.000", "1.033"]),
     "colmap": (colmap, ["b", "left/a"]),
-    "nyu-h5": (nyu_h5, ["official_00001", "official_00009"]),
-    "nyu-mat": (nyu_mat, ["0001", "0002", "0003", "0004"]),
 }

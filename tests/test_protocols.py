@@ -22,9 +22,16 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS, FramePart
 from pnpdepth_cli.sensors.projection import behind_foreground
-from tests.data_sets import SELECTED, eth3d, image, nyu_h5, void
+from tests.data_sets import SELECTED, eth3d, image, void
 
 KITTI = (352, 1216)
+
+
+def nyu(root: Path) -> None:
+    (root / "depth").mkdir(parents=True)
+    for name in ("0001", "0009"):
+        image(root / f"image/{name}.png", 480, 640)
+        np.save(root / f"depth/{name}.npy", np.full((480, 640), 2.0, np.float32))
 
 
 def ibims(root: Path) -> None:
@@ -67,8 +74,8 @@ def kitti(root: Path) -> None:
 
 # by protocol: the data set, its frames, the points and the scored pixels of each frame
 BY_HAND: dict[str, tuple[Callable[[Path], None], int, int, int]] = {
-    "marigold-dc-nyu": (nyu_h5, 2, 500, 304 * 228),
-    "omni-dc-nyu": (nyu_h5, 2, 500, 304 * 228),
+    "marigold-dc-nyu": (nyu, 2, 500, 304 * 228),
+    "omni-dc-nyu": (nyu, 2, 500, 304 * 228),
     "marigold-dc-ibims": (ibims, 2, 1000, 480 * 320),
     "marigold-dc-scannet": (scannet, 1, 500, 480 * 640),
     "marigold-dc-void": (void, 1, 6 * 8, 24 * 32),

@@ -74,7 +74,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 @options.refinement(without=["camera"])
 @click.pass_context
 def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> None:
-    """Refine all frames of FOLDER, of a LIST of them (CSV or JSON lines), or of a ROS BAG.
+    """Refine all frames of FOLDER, of a LIST of them (CSV), or of a ROS BAG.
 
     \b
     pnpdepth batch drive_0001/ -o out/

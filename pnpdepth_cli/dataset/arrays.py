@@ -1,32 +1,21 @@
-"""Parts of a frame from their files: images, masked depth, arrays of HDF5 files."""
+"""Parts of a frame from their files: images, masks, and depth of an image's view."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.dataset.frame_files import (
-    IMAGE_SUFFIXES,
-    Hdf5Array,
-    ImageSource,
-    RawDepth,
-    VideoFrame,
-    file_of,
-)
-from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
+from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, ImageSource, file_of
+from pnpdepth_cli.errors import FileFormatError, SizeError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import (
     check_value_count,
     fingerprint,
-    one_line,
     read_bytes,
     size_of_regular_file,
 )
@@ -37,7 +26,7 @@ _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
 
 
-def record_of(source: ImageSource | RawDepth, reading: Reading | None = None) -> FileRecord:
+def record_of(source: ImageSource, reading: Reading | None = None) -> FileRecord:
     """Returns what a record keeps of a file, and of how it was read."""
     record = FileRecord(path=str(source), sha256=fingerprint(file_of(source)).sha256)
     if reading is None:
@@ -46,15 +35,10 @@ def record_of(source: ImageSource | RawDepth, reading: Reading | None = None) ->
 
 
 def read_image(source: ImageSource) -> NDArray[np.float32]:
-    """Returns (H, W, 3) float32 in 0..1. Raises InputError for a file or array that is no image."""
+    """Returns (H, W, 3) float32 in 0..1. Raises InputError for a file that is no image."""
     if isinstance(source, Path):
         return read_rgb(source).values
-    if isinstance(source, VideoFrame):
-        return read_video_frame(source.path, source.index)
-    pixels = _read(source)
-    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise FileFormatError(f"{source} is {pixels.dtype} of shape {pixels.shape}, not an image")
-    return pixels.astype(np.float32) / np.float32(255)
+    return read_video_frame(source.path, source.index)
 
 
 def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.float32]:
@@ -74,7 +58,7 @@ def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.floa
     return rgb
 
 
-def read_levels(path: Path) -> NDArray[Any]:
+def read_levels(path: Path) -> NDArray[np.floating | np.integer]:
     """Returns the numbers (H, W) in the file of a mask or of the confidence of depth.
 
     They are as stored. Of a pixel in colour it is the largest channel.
@@ -146,61 +130,15 @@ def move_depth(
     return np.where(np.isinf(moved), np.float32(0), moved)
 
 
-def shape_of(path: Path, name: str) -> tuple[int, ...]:
-    """Returns the shape of an array of the file. Raises InputError if it has none."""
-    with _open_array(path, name) as array:
-        return tuple(array.shape)
+def raw_depth(path: Path, image: ImageSource | None) -> NDArray[np.float32] | None:
+    """Returns depth (H, W) of a file without a header, as ETH3D has it; None for other files.
 
-
-def depth_of(source: Hdf5Array | RawDepth) -> NDArray[np.float32]:
-    """Returns (H, W) float32 metres, 0 where unknown, of floats. Raises InputError for others."""
-    if isinstance(source, RawDepth):
-        _, size = sizes_of(source.image)
-        if size_of_regular_file(source.path) != 4 * math.prod(size):
-            raise FileFormatError(
-                f"{source} does not hold 4 bytes for each pixel of {source.image}; unpack it again"
-            )
-        check_value_count(source.path, math.prod(size), value_bytes=4)
-        return known_metres(np.fromfile(source.path, "<f4").reshape(size))
-    metres = _read(source)
-    if metres.dtype.kind != "f" or metres.ndim != 2:
-        raise FileFormatError(f"{source} is {metres.dtype} of shape {metres.shape}, not depth")
-    return known_metres(metres)
-
-
-def _read(source: Hdf5Array) -> NDArray[Any]:
-    with _open_array(source.path, source.name) as array:
-        if array.dtype.kind not in "fiu":
-            raise FileFormatError(f"{source} holds {array.dtype} values, not numbers")
-        one = array.shape if source.index is None else array.shape[1:]
-        check_value_count(source.path, math.prod(one), size_of_regular_file(source.path))
-        if source.index is not None and source.index >= array.shape[0]:
-            raise FileFormatError(f"{source}: there are only {array.shape[0]}")
-        values = np.asarray(array[()] if source.index is None else array[source.index])
-    if values.ndim != len(source.axes):
-        raise FileFormatError(f"{source} has {values.ndim} axes instead of {len(source.axes)}")
-    return values.transpose(source.axes)
-
-
-@contextmanager
-def _open_array(path: Path, name: str) -> Iterator[Any]:
-    """An array of an HDF5 file, which lies in the file itself."""
-    try:
-        import h5py
-    except ImportError:
-        raise UsageError(f"reading {path} needs h5py: pip install 'pnpdepth[nyu]'") from None
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; check the path")
-    try:
-        with h5py.File(path, "r") as file:
-            link = file.get(name, getlink=True)
-            if link is None:
-                raise FileFormatError(f"{path} has no array {name}; it is of another kind")
-            array = file[name] if isinstance(link, h5py.HardLink) else None
-            if array is None or array.external or array.is_virtual:
-                raise FileFormatError(
-                    f"{path}: {name} is stored outside the file; copy its values into this one"
-                )
-            yield array
-    except (OSError, RuntimeError, ValueError, LookupError, TypeError) as error:  # as h5py has it
-        raise FileFormatError(f"{path} cannot be read as HDF5 ({one_line(error)})") from error
+    It holds float32 metres, row by row, of its image's size, and is named as that, *.JPG.
+    """
+    if path.suffix.lower() != ".jpg" or not isinstance(image, Path):
+        return None
+    _, size = sizes_of(image)
+    if size_of_regular_file(path) != 4 * math.prod(size):
+        return None
+    check_value_count(path, math.prod(size), value_bytes=4)
+    return known_metres(np.fromfile(path, "<f4").reshape(size))

@@ -27,31 +27,6 @@ _DRIVE = re.compile(r"[A-Za-z]:")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hdf5Array:
-    """An array in an HDF5 or MATLAB 7.3 file."""
-
-    path: Path
-    name: str
-    axes: tuple[int, ...]
-    """Order of the axes that makes the array, without its indexed axis, (H, W) or (H, W, 3)."""
-    index: int | None = None  # which element of the first axis; None for the whole array
-
-    def __str__(self) -> str:
-        return f"{self.path}[{self.name}{'' if self.index is None else f', {self.index}'}]"
-
-
-@dataclass(frozen=True, kw_only=True)
-class RawDepth:
-    """Float32 metres, row by row, of the size of an image, in a file without a header (ETH3D)."""
-
-    path: Path
-    image: Path
-
-    def __str__(self) -> str:
-        return str(self.path)
-
-
-@dataclass(frozen=True, kw_only=True)
 class VideoFrame:
     """A frame of a video."""
 
@@ -63,8 +38,7 @@ class VideoFrame:
         return f"{self.path}[{self.index}]"
 
 
-Source = Path | Hdf5Array
-ImageSource = Source | VideoFrame
+ImageSource = Path | VideoFrame
 
 
 def source_of(text: str) -> Path | VideoFrame:
@@ -75,7 +49,7 @@ def source_of(text: str) -> Path | VideoFrame:
     return VideoFrame(path=Path(found[1]), index=int(found[2]))
 
 
-def file_of(source: ImageSource | RawDepth) -> Path:
+def file_of(source: ImageSource) -> Path:
     """Returns the file that a source lies in."""
     return source if isinstance(source, Path) else source.path
 
@@ -112,7 +86,7 @@ class FrameFiles:
     sparse_mask: Path | None = None
     """An image or array, how sure each pixel of `sparse` or of the image is; 0 is no depth."""
     min_confidence: float | None = None  # least value of `sparse_mask` whose depth is used
-    gt: Source | RawDepth | None = None
+    gt: Path | None = None
     calib: Path | None = None  # the calibration, as `read_calibration` takes it
     camera: int | None = None  # which camera of the calibration
     sparse_scale: float | None = None  # codes per metre of integer sparse depth
@@ -138,7 +112,7 @@ class FrameFiles:
 
     @property
     def image_file(self) -> Path | None:
-        """The file of the image; None for none, or for one in a data set's file."""
+        """The file of the image; None for none, or for a frame of a video."""
         return self.image if isinstance(self.image, Path) else None
 
 

@@ -10,17 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.dataset.arrays import apply_masks, depth_of, move_depth, read_image, record_of
+from pnpdepth_cli.dataset.arrays import apply_masks, move_depth, raw_depth, read_image, record_of
 from pnpdepth_cli.dataset.colmap_points import read_colmap_points
 from pnpdepth_cli.dataset.frame_camera import camera_of_frame
-from pnpdepth_cli.dataset.frame_files import (
-    SCAN_ONLY_SUFFIXES,
-    FrameFiles,
-    ImageSource,
-    RawDepth,
-    Source,
-    file_of,
-)
+from pnpdepth_cli.dataset.frame_files import SCAN_ONLY_SUFFIXES, FrameFiles, ImageSource
 from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
@@ -150,30 +143,27 @@ def _read_image(files: FrameFiles, source: ImageSource) -> _Pixels:
 
 
 def _read_ground_truth(
-    files: FrameFiles,
-    options: ReadOptions,
-    source: Source | RawDepth,
-    size: tuple[int, int] | None,
+    files: FrameFiles, options: ReadOptions, source: Path, size: tuple[int, int] | None
 ) -> _Pixels:
-    """The ground truth of an image (H, W): a projected scan, a depth map, or an array."""
+    """The ground truth of an image (H, W): a projected scan, or a depth map."""
     scale, of_scan = options.depth_scale or files.gt_scale, options.scan.over(files)
-    if isinstance(source, Path) and source.suffix.lower() in SCAN_ONLY_SUFFIXES:
+    if source.suffix.lower() in SCAN_ONLY_SUFFIXES:
         scan = read_scan_points(source, of_scan, size, files.image_file, scale=scale)
         notes = [note.replace("sparse:", "gt:", 1) for note in scan.notes]
         return _pixels(files, as_depth_image(scan.points), scan.record, notes, scan.reading)
     # The option is the scale of the scan, if there is one, unless the map has none of its own.
-    if isinstance(source, Path):
+    if (raw := raw_depth(source, files.image)) is not None:
+        values, reading = raw, Reading("float32 without a header")
+    else:
         file = read_depth(source, scale=scale)
         if options.depth_scale and files.sparse is not None and of_scan.describes(files.sparse):
             own = read_depth(source, scale=files.gt_scale)
             file = file if own.reading.assumed else own
         values, reading = file.values, file.reading
-    else:
-        values, reading = depth_of(source), Reading(f"{source.path.suffix} array")
     # Pixels that a mask or the gate rules out are unknown.
     values = apply_masks(values, files.masks)
     if files.gt_other_size and size is not None and values.shape != size:
-        values = move_depth(file_of(source), values, size)
+        values = move_depth(source, values, size)
     option = "--depth-scale" if files.sparse is None else "gt_scale of a list"
     values, notes = plausible_map(values, reading, "gt", option, scale)
     described = describe_range(values, reading, noun="pixels", option=option)

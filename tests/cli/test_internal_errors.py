@@ -14,8 +14,6 @@ from safetensors.torch import save_file
 from torch import nn
 
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.dataset.arrays import depth_of
-from pnpdepth_cli.dataset.frame_files import Hdf5Array
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
@@ -33,11 +31,6 @@ def bag(path: Path) -> None:
     from tests.bags import write_bag
 
     write_bag(path)
-
-
-def hdf5(path: Path) -> None:
-    with pytest.importorskip("h5py").File(path, "w") as file:
-        file["depth"] = np.ones((4, 5), np.float32)
 
 
 def onnx(path: Path) -> None:
@@ -63,10 +56,6 @@ READERS: list[tuple[str, str, Callable[[Path], object], Callable[[Path], object]
     ("d.npy", "numpy.lib.format.read_magic", depth, read_depth),
     ("d.npz", "zipfile.ZipFile", depth, read_depth),
     ("i.jpg", "PIL.Image.open", lambda path: Image.new("RGB", (5, 4)).save(path), read_rgb),
-    (
-        "d.h5", "h5py.File", hdf5,
-        lambda path: depth_of(Hdf5Array(path=path, name="depth", axes=(0, 1))),
-    ),
     ("d.mcap", "rosbags.rosbag2.Reader.open", bag, lambda path: open_bag(path).__enter__()),
     ("c.yaml", "yaml.load_all", Path.touch, lambda path: parse_yaml(path, "a: 1")),
     ("n.onnx", "onnx.load", onnx, lambda path: load_network(str(path), None)),

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 pytestmark = pytest.mark.slow
-for package in ("h5py", "onnx", "onnxruntime", "resource", "rosbags"):
+for package in ("onnx", "onnxruntime", "resource", "rosbags"):
     pytest.importorskip(package)
 
 from pnpdepth_cli.cli.main import main  # noqa: E402

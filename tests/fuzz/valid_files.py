@@ -120,7 +120,6 @@ def _data_sets(depth: np.ndarray) -> dict[str, str]:
     """What a batch reads before its first frame."""
     write_depth(Path("sparse.png"), depth)
     Path("frames.csv").write_text("image,sparse,gt,name\nrgb.png,sparse.png,depth.npy,a\n")
-    Path("frames.jsonl").write_text('{"image": "rgb.png", "sparse": "sparse.png"}\n')
     write_text_model(Path("photos/sparse/0"))
     write_binary_model(Path("binary/sparse/0"))
     images = ("photos/images/a.png", "photos/images/b.png", "photos/images/c.png")
@@ -133,7 +132,7 @@ def _data_sets(depth: np.ndarray) -> dict[str, str]:
     tum(Path("tum"))
     models = [path for root in ("photos", "binary") for path in Path(root, "sparse/0").iterdir()]
     return {
-        **{name: f"batch {name} {LISTING}" for name in ("frames.csv", "frames.jsonl")},
+        "frames.csv": f"batch frames.csv {LISTING}",
         **{path.as_posix(): f"batch {path.parts[0]} {LISTING}" for path in models},
         **{f"tum/{name}.txt": f"batch tum {LISTING} --sample 20" for name in ("rgb", "depth")},
     }

@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.core.metrics import error_sums, measures_of
-from pnpdepth_cli.dataset.arrays import apply_masks, depth_of, read_image
+from pnpdepth_cli.dataset.arrays import apply_masks, raw_depth, read_image
 from pnpdepth_cli.dataset.frame_camera import camera_of_file
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
@@ -172,10 +172,10 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
     # The ground truth, in the part of the frame that the protocol keeps.
     scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
     assert frame.gt is not None
-    if isinstance(frame.gt, Path):
-        values, reading = _read(frame.gt, scale, request)
+    if (raw := raw_depth(frame.gt, frame.image)) is not None:
+        values, reading = raw, Reading("float32 without a header")
     else:
-        values, reading = depth_of(frame.gt), Reading(f"{frame.gt.path.suffix} array")
+        values, reading = _read(frame.gt, scale, request)
     values = apply_masks(values, frame.masks)
     values, notes = plausible_map(values, reading, "gt", "--gt-scale", scale)
     gt = np.ascontiguousarray(frame.part.apply(values))

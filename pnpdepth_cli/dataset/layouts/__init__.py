@@ -23,7 +23,6 @@ __all__ = ["LAYOUTS", "Layout", "list_frames"]
 TABLE: dict[str, Layout] = {
     **rows.ROWS,
     "manifest": manifest.MANIFEST,
-    "nyu-mat": rows.NYU_MAT,
     "kitti-odometry": kitti.ODOMETRY,
     "kitti-depth": kitti.DEPTH,
     "kitti-raw": kitti.RAW,

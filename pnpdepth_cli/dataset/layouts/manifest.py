@@ -1,6 +1,6 @@
-"""`manifest`: a CSV with a header line, or JSON lines, of frames whose files lie anywhere.
+"""`manifest`: a CSV with a header line, of frames whose files lie anywhere.
 
-Columns or keys: image, sparse, sparse_mask, gt, calib, mask, camera, sparse_scale, min_confidence,
+Columns: image, sparse, sparse_mask, gt, calib, mask, camera, sparse_scale, min_confidence,
 gt_scale, gt_size_ok, name, group, protocol; all may be left out or empty but one of image and
 sparse. Paths are relative to the manifest. Sparse depth is used where its sparse_mask is at least
 min_confidence, else above 0. Where the mask is 0, the ground truth is unknown; with gt_size_ok, it
@@ -13,12 +13,10 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
 from pnpdepth_cli.dataset.layouts.layout import Layout
@@ -27,48 +25,26 @@ from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 _PATHS = ("image", "sparse", "sparse_mask", "gt", "calib", "mask")
+_OTHERS = ("camera", "sparse_scale", "min_confidence", "gt_scale", "gt_size_ok", "name", "group")
+_COLUMNS = (*_PATHS, *_OTHERS, "protocol")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-
-
-def _flag(text: str) -> bool:
-    if text.lower() not in _FLAGS:
-        raise ValueError(f"gt_size_ok is {text[:20]!r}, not true or false")
-    return _FLAGS[text.lower()]
-
-
-_VALUES: dict[str, Callable[[str], Any]] = {
-    "camera": int,
-    "sparse_scale": float,
-    "min_confidence": float,
-    "gt_scale": float,
-    "gt_size_ok": _flag,
-    "name": lambda text: PurePosixPath(text).as_posix(),
-    "group": str,
-    "protocol": lambda text: find_protocol(text).part or WHOLE,
-}
-"""How a column's text is read, by column. ValueError and our errors say what is wrong with it."""
 
 
 def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     """A frame for each line of the file; missing files are unmatched."""
-    try:
-        text = read_bytes(root).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{root} is not a text file; give CSV or JSON lines") from error
     # The frame of each line.
-    rows = _csv_rows if root.suffix.lower() == ".csv" else _json_rows
     frames: dict[int, FrameFiles] = {}
     broken = []
-    for number, row in rows(root, text):
-        files, values = _parts(root.parent, f"{root}, line {number}", row)
-        for path in files.values():
+    for number, row in _rows(root):
+        paths = {column: root.parent / row[column] for column in _PATHS if column in row}
+        try:
+            frames[number] = _frame(row, paths)
+        except (ValueError, OverflowError, UsageError) as error:
+            raise FileFormatError(f"{root}, line {number}: {one_line(error)}") from error
+        for path in paths.values():
             if not path.exists():
                 why = f"does not exist; correct line {number} of {root}"
                 broken.append(Unmatched(path=path, why=why))
-        masks = (files.pop("mask"),) if "mask" in files else ()
-        values["gt_other_size"] = values.pop("gt_size_ok", False)
-        values["part"] = values.pop("protocol", WHOLE)
-        frames[number] = FrameFiles(**{"name": "", "masks": masks, **files, **values})
     # No two frames may share a name, on file systems that ignore capitals either.
     named = _name_frames(list(frames.values()))
     first: dict[str, FrameFiles] = {}
@@ -81,44 +57,51 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     return [*broken, *named]
 
 
-def _csv_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
+def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    """The number of each line, and its texts by column."""
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path} is not a text file; give CSV") from error
     reader = csv.DictReader(io.StringIO(text, newline="\n"), restkey="more than the header has")
     try:
         for row in reader:
-            yield reader.line_num, {str(k).strip(): v for k, v in row.items()}
+            texts = {str(k).strip(): str(v).strip() for k, v in row.items() if v is not None}
+            yield reader.line_num, {k: v for k, v in texts.items() if v}
     except csv.Error as error:
         raise FileFormatError(f"{path}, line {reader.line_num}: {one_line(error)}") from error
 
 
-def _json_rows(path: Path, text: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    for number, line in enumerate(io.StringIO(text, newline="\n"), start=1):
-        if not line.strip():
-            continue
-        try:
-            row = json.loads(line)
-        except (ValueError, RecursionError) as error:
-            raise FileFormatError(f"{path}, line {number}: {one_line(error)}") from error
-        if not isinstance(row, dict):
-            raise FileFormatError(f"{path}, line {number}: not a JSON object")
-        yield number, row
-
-
-def _parts(folder: Path, where: str, row: dict[str, Any]) -> tuple[dict[str, Path], dict[str, Any]]:
-    """The files and the other values of a row, by column."""
-    texts = {k: str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
-    unknown = sorted(set(texts) - {*_PATHS, *_VALUES})
-    if unknown:
+def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
+    """The frame of a line; ValueError and our errors say what is wrong with it."""
+    if unknown := sorted(row.keys() - {*_COLUMNS}):
         commas = "; columns are parted by commas" if ";" in unknown[0] else ""
-        keys = ", ".join((*_PATHS, *_VALUES))
-        raise FileFormatError(f"{where}: column {unknown[0]!r} is not one of {keys}{commas}")
-    if "image" not in texts and "sparse" not in texts:
-        raise FileFormatError(f"{where}: has neither image nor sparse; give one")
-    try:
-        files = {key: folder / texts[key] for key in _PATHS if key in texts}
-        values = {key: value(texts[key]) for key, value in _VALUES.items() if key in texts}
-    except (ValueError, OverflowError, UsageError) as error:
-        raise FileFormatError(f"{where}: {one_line(error)}") from error
-    return files, values
+        raise ValueError(f"column {unknown[0]!r} is not one of {', '.join(_COLUMNS)}{commas}")
+    if "image" not in row and "sparse" not in row:
+        raise ValueError("has neither image nor sparse; give one")
+    if (flag := row.get("gt_size_ok", "no")).lower() not in _FLAGS:
+        raise ValueError(f"gt_size_ok is {flag[:20]!r}, not true or false")
+    part = find_protocol(row["protocol"]).part if "protocol" in row else None
+    return FrameFiles(
+        name=PurePosixPath(row["name"]).as_posix() if "name" in row else "",
+        image=paths.get("image"),
+        sparse=paths.get("sparse"),
+        sparse_mask=paths.get("sparse_mask"),
+        min_confidence=_number(row, "min_confidence"),
+        gt=paths.get("gt"),
+        calib=paths.get("calib"),
+        camera=int(row["camera"]) if "camera" in row else None,
+        sparse_scale=_number(row, "sparse_scale"),
+        gt_scale=_number(row, "gt_scale"),
+        part=part or WHOLE,
+        masks=(paths["mask"],) if "mask" in row else (),
+        gt_other_size=_FLAGS[flag.lower()],
+        group=row.get("group"),
+    )
+
+
+def _number(row: dict[str, str], column: str) -> float | None:
+    return float(row[column]) if column in row else None
 
 
 def _name_frames(frames: list[FrameFiles]) -> list[FrameFiles]:
@@ -135,6 +118,5 @@ def _name_frames(frames: list[FrameFiles]) -> list[FrameFiles]:
 
 
 MANIFEST = Layout(
-    matches=lambda root: root.is_file() and root.suffix.lower() in (".csv", ".jsonl"),
-    frames=_frames,
+    matches=lambda root: root.is_file() and root.suffix.lower() == ".csv", frames=_frames
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -17,8 +16,8 @@ from tests.empty_files import touch
 
 def frames_named(folder: Path, *names: str) -> list[FrameFiles]:
     (folder / "i.png").touch()
-    path = folder / "m.jsonl"
-    path.write_text("".join(json.dumps({"image": "i.png", "name": n}) + "\n" for n in names))
+    path = folder / "m.csv"
+    path.write_text("".join(["image,name\n", *(f"i.png,{name}\n" for name in names)]))
     return read_frames(path)
 
 
@@ -29,11 +28,8 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
         "sparse_scale": "", "gt_scale": 1000, "name": "first", "protocol": "kitti-odometry",
         "mask": "m.png", "gt_size_ok": "yes", "group": "room",
     }  # fmt: skip
-    (tmp_path / "m.jsonl").write_text(json.dumps(row) + "\n\n")
     (tmp_path / "m.csv").write_text(f"{','.join(row)}\n{','.join(map(str, row.values()))}\n")
-    from_json, from_csv = (read_frames(tmp_path / name) for name in ("m.jsonl", "m.csv"))
-    assert from_json == from_csv
-    assert from_csv == [
+    assert read_frames(tmp_path / "m.csv") == [
         FrameFiles(
             name="first",
             image=tmp_path / "i.png",
@@ -92,11 +88,7 @@ def test_frames_of_one_stem_are_named_by_their_folders(tmp_path: Path) -> None:
 def test_a_manifest_may_name_files_with_new_lines(tmp_path: Path) -> None:
     touch(tmp_path / "a\nb.png", tmp_path / "c\u2028d.png")
     (tmp_path / "m.csv").write_text('image\n"a\nb.png"\nc\u2028d.png\n', encoding="utf-8")
-    (tmp_path / "m.jsonl").write_text(
-        '{"image": "a\\nb.png"}\n{"image": "c\u2028d.png"}\n', encoding="utf-8"
-    )
-    for name in ("m.csv", "m.jsonl"):
-        assert [f.name for f in read_frames(tmp_path / name)] == ["a\nb", "c\u2028d"]
+    assert [f.name for f in read_frames(tmp_path / "m.csv")] == ["a\nb", "c\u2028d"]
 
 
 @pytest.mark.parametrize(
@@ -104,7 +96,7 @@ def test_a_manifest_may_name_files_with_new_lines(tmp_path: Path) -> None:
     [("a", "./a"), ("x/y", "x//y"), ("x/y", "x/./y"), ("Frame", "frame"), ("ß", "SS")],
 )
 def test_two_names_of_one_file_are_refused(tmp_path: Path, first: str, second: str) -> None:
-    with pytest.raises(FileFormatError, match="line 2: a second frame"):
+    with pytest.raises(FileFormatError, match="line 3: a second frame"):
         frames_named(tmp_path, first, second)
 
 
