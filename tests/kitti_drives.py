@@ -1,4 +1,4 @@
-"""Calibrations and packets of a KITTI raw drive, for tests."""
+"""Calibrations of a KITTI raw drive, for tests."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 def write_calibrations(
     folder: Path, *, focal_px: float = 60.0, size: tuple[int, int] = (48, 64)
 ) -> None:
-    """The scanner and the inertial system at the camera: x forward, y left, z up."""
+    """The scanner at the camera: x forward, y left, z up."""
     folder.mkdir(parents=True, exist_ok=True)
     height, width = size
     intrinsics = f"{focal_px} 0 {(width - 1) / 2} 0 0 {focal_px} {(height - 1) / 2} 0 0 0 1 0"
@@ -16,10 +16,3 @@ def write_calibrations(
         f"P_rect_02: {intrinsics}\nR_rect_00: 1 0 0 0 1 0 0 0 1\nS_rect_02: {width} {height}\n"
     )
     (folder / "calib_velo_to_cam.txt").write_text("R: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 0\n")
-    (folder / "calib_imu_to_velo.txt").write_text("R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n")
-
-
-def write_packet(path: Path, latitude: float, longitude: float, *, yaw: float) -> None:
-    """A packet at this position, level, with the yaw in radians; 0 looks to the east."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(" ".join(map(str, [latitude, longitude, 100.0, 0.0, 0.0, yaw, *[0] * 24])))

@@ -94,7 +94,6 @@ class FrameFiles:
     part: FramePart = WHOLE
     pose: Pose | None = None
     """x_world = pose · (x, 1) for x in the camera's coordinates, in KITTI odometry camera 0's."""
-    oxts: Path | None = None  # the packet of KITTI's inertial system that gives the pose
     neighbours: tuple[Neighbour, ...] = ()
     masks: tuple[Path, ...] = ()
     """Images or arrays of the ground truth's size; where one is 0, the ground truth is unknown."""

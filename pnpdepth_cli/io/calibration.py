@@ -160,11 +160,6 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     return _single(fields, camera, source)
 
 
-def read_rigid_motion(path: Path) -> Extrinsics:
-    """Returns (rotation (3, 3), translation (3,) metres) of KITTI's raw files with R and T."""
-    return _named_values(path, _text(path)).pose("T")
-
-
 def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibration:
     """Returns a camera of the content of a YAML file of OpenCV, ROS or Kalibr.
 
@@ -246,7 +241,7 @@ def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
     if scanner.is_file() and is_360:
         pose = pose_of_matrix(scanner, "the matrix", numbers_in(_text(scanner)) or []).inverse()
     elif scanner.is_file():
-        pose = read_rigid_motion(scanner)
+        pose = _named_values(scanner, _text(scanner)).pose("T")
     # The camera. The development kit of the raw data rotates each by camera 0's rectification.
     fields = _named_values(cameras, _text(cameras))
     number = _camera(fields, 0 if is_360 and camera is None else camera, r"P_rect_(\d\d)")

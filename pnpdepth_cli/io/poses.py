@@ -1,14 +1,7 @@
-"""Camera poses: of KITTI odometry, TUM RGB-D and Nerfstudio, KITTI's packets, between two times.
-
-A packet (oxts/data/*.txt of KITTI's raw drives) begins with latitude, longitude (degrees), altitude
-(metres), roll, pitch and yaw (radians) of the inertial system, which is x forward, y left, z up. As
-in the data set's development kit, positions are in a Mercator projection, scaled at the latitude of
-the first packet.
-"""
+"""Camera poses: of KITTI odometry, TUM RGB-D and Nerfstudio, and between two times."""
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.calibration import read_calibration, read_rigid_motion
 from pnpdepth_cli.io.extrinsics import is_rotation, rotation_of
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.io.text_files import read_json, read_rows
@@ -31,13 +22,8 @@ LONGEST_GAP_S = 0.02
 """Longest gap between a frame and its pose, as in the tools of the TUM RGB-D benchmark."""
 POSES_FILE = "poses.txt"
 """What `pnpdepth frames` writes: TUM rows, one for each frame in the order of their names."""
-PACKETS = "oxts/data"
-"""Folder of the packets in a drive."""
-IMU_CALIBRATION = "calib_imu_to_velo.txt"
 _BAG_TIME = re.compile(r"(?<!\d)(0|[1-9]\d*)_(\d{6})$")
 """End of the names that `pnpdepth frames` gives, seconds and microseconds."""
-_EARTH_RADIUS_M = 6378137.0
-_FIELDS = 30
 
 Floats = NDArray[np.float64]
 
@@ -203,40 +189,3 @@ def read_trajectory(path: Path) -> Trajectory:
     if rows.shape[1] != _TUM_COLUMNS or not np.isfinite(rows[:, 0]).all():
         raise FileFormatError(f"{path} has no rows of time, position and quaternion x y z w")
     return trajectory_of(rows[:, 0], poses)
-
-
-def read_oxts_poses(packets: list[Path], calibration: Path, camera: int | None) -> Floats:
-    """Returns the poses (N, 3, 4) of a drive's camera, from its coordinates to the world's, metres.
-
-    The world is x east, y north, z up, with the inertial system at its origin in the first packet.
-    The calibration is the folder with KITTI's raw calibrations.
-    """
-    of_scanner = read_calibration(calibration, camera).scanner
-    if of_scanner is None:
-        raise FileFormatError(f"{calibration} has no pose of the scanner; add its calibration")
-    of_imu = read_rigid_motion(calibration / IMU_CALIBRATION)
-    from_camera = np.linalg.inv(of_scanner.square() @ of_imu.square())
-    rows = [_packet(path) for path in packets]
-    scale = math.cos(math.radians(rows[0][0]))
-    poses = np.stack([_pose_of_packet(row, scale) for row in rows])
-    poses[:, :3, 3] -= poses[0, :3, 3]  # clouds have no digits for thousands of kilometres
-    return (poses @ from_camera)[:, :3]
-
-
-def _packet(path: Path) -> Floats:
-    rows, _ = read_rows(path, read_bytes(path))
-    if rows.shape != (1, _FIELDS) or not np.isfinite(rows).all() or abs(rows[0, 0]) >= 90:
-        raise FileFormatError(f"{path} is no packet of KITTI's inertial system; copy it again")
-    return np.asarray(rows[0])
-
-
-def _pose_of_packet(packet: Floats, scale: float) -> Floats:
-    """(4, 4) from the inertial system's coordinates to the world's."""
-    from scipy.spatial.transform import Rotation
-
-    latitude, longitude, altitude = packet[:3]
-    radius = scale * _EARTH_RADIUS_M
-    east = radius * math.radians(longitude)
-    north = radius * math.log(math.tan(math.pi / 4 + math.radians(latitude) / 2))
-    turn = Rotation.from_euler("xyz", packet[3:6]).as_matrix()  # roll, pitch, yaw
-    return Extrinsics(turn, np.array([east, north, altitude])).square()

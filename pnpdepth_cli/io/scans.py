@@ -296,18 +296,18 @@ def _xyz(
 
 
 def _table(path: Path, kind: str, number: int, body: bytes, width: int) -> NDArray[np.float64]:
-    """The numbers (N, width) of lines of text; a PLY may continue with faces, a PCD not."""
-    lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
-    if len(lines) < number or (kind == "PCD" and len(lines) > number):
-        raise damaged(path, kind, f"has {len(lines):,} lines for {number:,} points")
+    """The numbers (N, width) of the first lines of text; a PLY may continue with faces."""
     if not number:
         return np.empty((0, width))
+    most = min(number, len(body) // (2 * width) + 1)  # for which memory is taken
     try:
-        table = np.loadtxt(lines[:number], np.float64, comments=None, ndmin=2)
+        table = np.loadtxt(io.BytesIO(body), comments=None, ndmin=2, max_rows=most)
     except ValueError as error:
         raise damaged(path, kind, f"has a line that is not made of numbers ({error})") from error
-    if table.shape[1] != width:
-        raise damaged(path, kind, f"has {table.shape[1]} numbers in a line instead of {width}")
+    if table.shape != (number, width):
+        rows, columns = table.shape
+        fact = f"has {rows:,} lines of {columns} numbers instead of {number:,} of {width}"
+        raise damaged(path, kind, fact)
     return table
 
 

@@ -17,7 +17,7 @@ from pnpdepth_cli.io.depth import (
     write_depth,
 )
 from pnpdepth_cli.io.file_bytes import read_bytes
-from pnpdepth_cli.io.formats import KITTI_SCALE, Reading, check_scale, kind_of
+from pnpdepth_cli.io.formats import Reading, check_scale, kind_of
 from pnpdepth_cli.io.text_files import PIXELS, read_rows
 from pnpdepth_cli.points import SparsePoints
 
@@ -131,7 +131,7 @@ def write_sparse(
     Every format but .csv holds the image, the same points as (H, W) metres.
     """
     if path.suffix.lower() != ".csv":
-        write_depth(path, image, scale=KITTI_SCALE)
+        write_depth(path, image)
         return
     rows = [f"{x:.9g},{y:.9g},{z:.9g}" for (x, y), z in zip(xy, depth, strict=True)]
     with atomic_path(path) as temporary:

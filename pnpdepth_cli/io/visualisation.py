@@ -22,7 +22,8 @@ from pnpdepth_cli.io.figure import (
     paint_signed,
     resized,
     save_depth_figure,
-    save_gain_figure,
+    save_figure,
+    signed_bar,
 )
 
 Depth = NDArray[np.float32]
@@ -30,7 +31,6 @@ Depth = NDArray[np.float32]
 # Wider images than this (KITTI is 3.3 : 1) are stacked; two in a row would be too small.
 _WIDE = 2.0
 _STRONGEST_PERCENTILE = 95.0
-_GAIN = "|before - ground truth| - |after - ground truth|"
 
 
 def preview(
@@ -62,17 +62,9 @@ def preview(
     """
     height, width = before.shape
     columns = 1 if width > _WIDE * height else 2
-    factor = magnification(before.shape, columns=columns, legend=True)
-    scale = depth_scale(sparse_depth, before, after)
-    # Without an image, the depth in grey is the ground of the points.
-    grey = grey_of(rgb) if rgb is not None else (1 - scale.position(after)).astype(np.float32)
-    first = rgb if rgb is not None else np.repeat(0.25 + 0.65 * grey[:, :, None], 3, axis=2)
+    factor = magnification(before.shape, columns=columns)
+    scale, grey = depth_scale(sparse_depth, before, after), grey_of(rgb, before.shape)
     panels = [
-        Panel(
-            title="Image" if rgb is not None else "No image",
-            pixels=resized(_bytes(first), factor, smooth=True),
-            remark="" if rgb is not None else "depth in grey",
-        ),
         _points_panel(grey, sparse_xy, sparse_depth, scale, factor),
         *(
             Panel(title=title, pixels=resized(scale.paint(depth), factor), remark=remark)
@@ -82,6 +74,9 @@ def preview(
         ),
         _change_panel(before, after, grey, factor),
     ]
+    if rgb is not None:
+        image = np.rint(255 * np.clip(np.nan_to_num(rgb), 0, 1)).astype(np.uint8)
+        panels.insert(0, Panel(title="Image", pixels=resized(image, factor, smooth=True)))
     return save_depth_figure(path, panels, scale, unit, columns=columns)
 
 
@@ -92,18 +87,16 @@ def overlay(
 
     The image is (H, W, 3) in 0..1, the points are (N, 2) pixel coordinates and (N,) metres.
     """
-    scale = depth_scale(depth)
-    factor = magnification(rgb.shape, columns=1, legend=True)
-    panel = _points_panel(grey_of(rgb), xy, depth, scale, factor)
+    scale, grey = depth_scale(depth), grey_of(rgb, rgb.shape)
+    panel = _points_panel(grey, xy, depth, scale, magnification(rgb.shape))
     save_depth_figure(path, [panel], scale)
 
 
 def sigma_preview(sigma: Depth, path: Path, unit: str = "m") -> None:
     """Writes a PNG of a standard deviation (H, W) in `unit`."""
     scale = replace(depth_scale(sigma), warm_is_far=True)
-    factor = magnification(sigma.shape, columns=1, legend=True)
-    panel = Panel(title="Standard deviation", pixels=resized(scale.paint(sigma), factor))
-    save_depth_figure(path, [panel], scale, unit)
+    pixels = resized(scale.paint(sigma), magnification(sigma.shape))
+    save_depth_figure(path, [Panel(title="Standard deviation", pixels=pixels)], scale, unit)
 
 
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
@@ -115,15 +108,11 @@ def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
 
 
 def _paint(
-    values: NDArray[np.float64],
-    where: NDArray[np.bool_],
-    grey: NDArray[np.float32] | None,
-    colors: str,
+    values: NDArray[np.float64], where: NDArray[np.bool_], grey: NDArray[np.float32], colors: str
 ) -> tuple[Pixels, float]:
     """A map of signed values in colours on the dark grey image, and the value of full colour."""
-    ground = np.full(where.shape, 0.3, np.float32) if grey is None else grey
-    pixels, strongest = dim(np.asarray(0.6 * ground, np.float32)), _strongest(values)
-    pixels[where] = paint_signed(values / strongest, 0.66 + 0.3 * ground[where], colors)
+    pixels, strongest = dim(np.asarray(0.6 * grey, np.float32)), _strongest(values)
+    pixels[where] = paint_signed(values / strongest, 0.66 + 0.3 * grey[where], colors)
     return pixels, strongest
 
 
@@ -156,7 +145,8 @@ def improvement(
     truth: Depth,
     path: Path,
     *,
-    image: NDArray[np.float32] | None = None,
+    image: NDArray[np.float32] | None,
+    size: tuple[int, int],
     xy: NDArray[np.float32] | None = None,
     held_out: bool = False,
     unit: str = "m",
@@ -171,7 +161,8 @@ def improvement(
         after: The same after refinement.
         truth: The same as measured, some of it known.
         path: The PNG.
-        image: (H, W, 3) or (H, W) in 0..1, the ground of the map; needed for points.
+        image: (H, W, 3) in 0..1, the ground of the map, if there is one.
+        size: (H, W) of the map.
         xy: (N, 2) pixel coordinates of the points; None for maps.
         held_out: Whether the points were held out of the refinement, which the PNG says.
         unit: Name of the unit of depth.
@@ -185,24 +176,27 @@ def improvement(
     has_truth = np.isfinite(truth) & (truth > 0)
     known = has_truth & (after > 0)
     gain = _gain(before[known], after[known], truth[known])
-    grey = None if image is None else grey_of(image)
+    grey, factor = grey_of(image, size), magnification(size)
+    # A map, or the points with the largest changes on top.
     if xy is None:
-        pixels, strongest = _paint(gain, known, grey, "gain")
-        pixels = resized(pixels, magnification(truth.shape, columns=1, legend=False))
-        noun, remark = "pixels", _GAIN
+        painted, strongest = _paint(gain, known, grey, "gain")
+        pixels, noun = resized(painted, factor), "pixels"
     else:
-        assert grey is not None
-        strongest = _strongest(gain)
+        strongest, noun = _strongest(gain), "held-out points" if held_out else "points used"
         colours = paint_signed(gain / strongest, np.full(len(gain), 0.92), "gain")
         weakest_first = np.argsort(np.abs(gain), kind="stable")
-        factor = magnification(grey.shape, columns=1, legend=False)
         pixels = draw_discs(0.8 * grey, xy[known], colours, factor, weakest_first)
-        noun = "held-out points" if held_out else "points used"
-        remark = f"at {len(gain):,} {noun}" if held_out else f"at the {len(gain):,} sparse {noun}"
+    # The figure, and its texts for a report.
+    improved, worse = float((gain > 0).mean()), 100 * float((gain < 0).mean())
+    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {worse:.1f} % worse"
+    unknown = None if known.all() else "unknown" if (has_truth > known).any() else "no ground truth"
+    remark = footer + (f"; dark: {unknown}" if unknown else "")
     panel = Panel(title="Change of error", pixels=pixels, remark=remark)
-    unknown = "" if known.all() else "unknown" if (has_truth > known).any() else "no ground truth"
-    amount = f"{strongest:.3g} {unit}"
-    return save_gain_figure(path, panel, gain, amount=amount, noun=noun, unknown=unknown)
+    labels = [f"{share * strongest:+.3g}" for share in (-1, -0.5, 0, 0.5, 1)]
+    figure = save_figure(path, [panel], signed_bar("gain", 256), labels, f"gain, {unit}")
+    amount = f"by {strongest:.3g} {unit} or more"
+    ends = f"worse {amount}", f"better {amount}"
+    return improved, replace(figure, ends=ends, unknown=unknown, footer=footer)
 
 
 def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:
@@ -216,7 +210,3 @@ def _strongest(gain: NDArray[np.float64]) -> float:
     """The change in metres that has full colour."""
     changed = np.abs(gain[gain != 0])
     return float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
-
-
-def _bytes(image: NDArray[np.floating]) -> NDArray[np.uint8]:
-    return np.asarray(np.rint(255 * np.clip(np.nan_to_num(image), 0, 1)), dtype=np.uint8)

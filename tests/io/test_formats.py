@@ -187,7 +187,7 @@ def test_ambiguous_channels_or_arrays_are_refused_and_listed(
     tmp_path: Path, names: tuple[str, ...], suffix: str
 ) -> None:
     path = save(tmp_path / f"d{suffix}", ones(*names))
-    listing = ", ".join(sorted(names) if suffix == ".exr" else names)
+    listing = ", ".join(sorted(names) if suffix == ".exr" else (f"{n}.npy" for n in names))
     with pytest.raises(FileFormatError, match=re.escape(f"({listing}); ")):
         read_depth(path)
 

@@ -1,4 +1,4 @@
-"""Poses of KITTI and TUM files, between their rows, and of KITTI's inertial system."""
+"""Poses of KITTI and TUM files, and between their rows."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.poses import poses_of_frames, read_oxts_poses, read_poses, read_trajectory
-from tests.kitti_drives import write_calibrations, write_packet
+from pnpdepth_cli.io.poses import poses_of_frames, read_poses, read_trajectory
 
 HALF = float(np.sqrt(0.5))
 
@@ -139,20 +138,3 @@ def test_a_pose_between_two_is_interpolated_unless_they_are_far_apart(tmp_path: 
     assert at_row.tolist() == np.eye(4)[:3].tolist()
     outside = ((9.99, 1.0), (10.51, 1.0), (10.25, 0.49))
     assert [trajectory.at(*time_and_gap) for time_and_gap in outside] == [None] * 3
-
-
-def test_a_drive_to_the_east_moves_the_camera_forward_and_a_left_turn_turns_it(
-    tmp_path: Path,
-) -> None:
-    write_calibrations(tmp_path)
-    east = np.degrees(2.0 / (6378137 * np.cos(np.radians(49.0))))
-    packets = [tmp_path / f"{number}.txt" for number in range(3)]
-    write_packet(packets[0], 49.0, 8.0, yaw=0.0)
-    write_packet(packets[1], 49.0, 8.0 + east, yaw=0.0)
-    write_packet(packets[2], 49.0, 8.0, yaw=0.1)
-    first, second, third = read_oxts_poses(packets, tmp_path, 2)
-    motion = first[:, :3].T @ (second[:, 3] - first[:, 3])  # in the first camera's frame
-    np.testing.assert_allclose(motion, [0, 0, 2.0], atol=1e-6)
-    np.testing.assert_allclose(second[:, :3], first[:, :3])
-    forward = (first[:, :3].T @ third[:, :3])[:, 2]  # where the third camera looks
-    np.testing.assert_allclose(forward, [-np.sin(0.1), 0, np.cos(0.1)], atol=1e-9)

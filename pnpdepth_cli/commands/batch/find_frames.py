@@ -130,7 +130,7 @@ def _with_poses(
 ) -> tuple[list[FrameFiles], str | None]:
     """The frames with their poses and neighbours, and where the poses are from, as a line."""
     path, beside = request.poses, request.source / POSES_FILE  # as `pnpdepth frames` writes it
-    if path is None and not any(f.pose or f.oxts for f in frames) and beside.is_file():
+    if path is None and not any(f.pose for f in frames) and beside.is_file():
         path = beside
     try:
         known = known_poses(frames, path, request.pose_kind)

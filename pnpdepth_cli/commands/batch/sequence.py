@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Neighbour, groups_by_name
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.poses import poses_of_frames, read_oxts_poses
+from pnpdepth_cli.io.poses import poses_of_frames
 
 KnownPose = tuple[NDArray[np.float64], str]
 """(3, 4) from the camera's coordinates to the world's in metres, and where it is from."""
@@ -52,15 +52,7 @@ def known_poses(
             raise UsageError("--poses: the COLMAP model has those of its images; leave it out")
         rows, how = poses_of_frames(path, [frame.name for frame in frames], kind)
         return [(row, f"{path}, {how}") for row in rows]
-    poses = [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
-    for sequence in sequences_of(frames).values():
-        packets = [frames[index].oxts for index in sequence]
-        first = frames[sequence[0]]
-        if first.calib is not None and None not in packets:
-            read = read_oxts_poses([p for p in packets if p], first.calib, first.camera)
-            for index, pose in zip(sequence, read, strict=True):
-                poses[index] = pose, "KITTI's inertial system"
-    return poses
+    return [None if f.pose is None else (np.array(f.pose), "the layout's") for f in frames]
 
 
 def with_neighbours(

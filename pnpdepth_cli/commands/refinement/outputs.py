@@ -166,8 +166,9 @@ def _write_sigma(path: Path, sigma: Image) -> None:
 def _write_improvement(
     path: Path, image: Image | None, inputs: Frame, frame: Refined
 ) -> tuple[float, FigureRecord]:
+    size = frame.after.shape
     if inputs.gt is not None:
-        return improvement(frame.before, frame.after, inputs.gt, path, image=image)
+        return improvement(frame.before, frame.after, inputs.gt, path, image=image, size=size)
     points = frame.held_out if len(frame.held_out) else frame.used
     points = points.select(points.known_in(torch.from_numpy(frame.after)))
     before, after = (
@@ -178,7 +179,8 @@ def _write_improvement(
         after,
         points.depth.numpy(),
         path,
-        image=image if image is not None else frame.before,
+        image=image,
+        size=size,
         xy=points.xy.numpy(),
         held_out=bool(len(frame.held_out)),
         unit=inputs.unit,

@@ -87,7 +87,7 @@ class OutputOptions:
 
 _NOT_IN_DIGEST = frozenset(
     {
-        *("name", "group", "image", "sparse", "gt", "calib", "pose", "oxts", "masks"),
+        *("name", "group", "image", "sparse", "gt", "calib", "pose", "masks"),
         "sparse_mask",
         *("model", "checkpoint", "output", "overwrite", "view_3d"),
     }

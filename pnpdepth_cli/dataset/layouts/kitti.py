@@ -25,7 +25,7 @@ from typing import Any
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, as_pose
 from pnpdepth_cli.dataset.layouts.layout import Layout, Part, join_parts, row
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.poses import PACKETS, read_poses
+from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.protocols import ODOMETRY_PART
 
 _CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
@@ -152,7 +152,6 @@ def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
             "image": Part(camera / "data", "*.IMAGE"),
             "sparse": Part(drive / _SCANS, "*.bin"),
             "gt": Part(_truth_of(drive, camera.name), "*.png?"),
-            "oxts": Part(drive / PACKETS, "*.txt?"),
         }
         yield from _frames_of_camera(drive, camera.name, parts, calib=calibration, gt_scale=256.0)
 

@@ -14,17 +14,16 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged, one_line
 from pnpdepth_cli.io.formats import DepthFile, DepthFormat, Reading
 
-_LONGEST_HEADER = 1 << 14
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _HEADER_ERRORS = (
     *(ValueError, TypeError, LookupError, SyntaxError, ArithmeticError, EOFError, struct.error),
@@ -43,23 +42,12 @@ _LOCK = threading.Lock()
 """NumPy evaluates a header as Python, and threads of CPython 3.11 that do so at once may fail."""
 
 
-def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[Any]:
+def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]:
     """Returns the array of an NPY file, of any shape; numbers only, never pickled objects.
 
     Messages name `path` and `kind`. Raises FileFormatError if it is damaged or holds no numbers.
     """
-    shape, order, dtype, start = _npy_header(path, data, kind)
-    count = math.prod(shape)
-    if len(data) - start < count * dtype.itemsize:
-        fact = f"{len(data) - start:,} bytes of data instead of {count * dtype.itemsize:,}"
-        raise damaged(path, kind, f"cannot be read ({fact})")
-    return np.frombuffer(data, dtype, count=count, offset=start).reshape(shape, order=order)
-
-
-def _npy_header(
-    path: Path, data: bytes, kind: str
-) -> tuple[tuple[int, ...], Any, np.dtype[Any], int]:
-    """Shape, order ("C" or "F"), dtype, and the position of the data, of numbers alone."""
+    # The header.
     stream = io.BytesIO(data)
     try:
         with _LOCK:
@@ -74,12 +62,18 @@ def _npy_header(
         raise FileFormatError(f"{path} holds pickled objects; save numbers with allow_pickle=False")
     if dtype.kind not in "fiu":
         raise FileFormatError(f"{path} holds {dtype} values; depth is float or integer, save it so")
-    return shape, "F" if is_fortran else "C", dtype, stream.tell()
+    # The numbers that it claims.
+    count, start = math.prod(shape), stream.tell()
+    check_value_count(path, count, value_bytes=dtype.itemsize)
+    if len(data) - start < count * dtype.itemsize:
+        fact = f"{len(data) - start:,} bytes of data instead of {count * dtype.itemsize:,}"
+        raise damaged(path, kind, f"cannot be read ({fact})")
+    array = np.frombuffer(data, dtype, count=count, offset=start)
+    return array.reshape(shape, order="F" if is_fortran else "C")
 
 
 def _read_npy(path: Path, data: bytes) -> DepthFile:
     array = parse_npy(path, data)
-    check_value_count(path, array.size)
     return DepthFile(values=array, reading=Reading(f"{array.dtype} NPY"), is_image=False)
 
 
@@ -101,32 +95,21 @@ def _read_npz(path: Path, data: bytes) -> DepthFile:
     """The only array of an archive."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            members = archive.infolist()
             if len(members) != 1:
-                listing = one_line(", ".join(members)) or "none"
+                listing = one_line(", ".join(each.filename for each in members)) or "none"
                 raise FileFormatError(f"{path} holds several arrays or none ({listing}); save one")
-            (name,) = members
-            if members[name].compress_type not in COMPRESSIONS:
+            (member,) = members
+            if member.compress_type not in COMPRESSIONS:
                 raise FileFormatError(f"{path} is compressed; save it by numpy.savez_compressed")
-            with archive.open(members[name]) as member:
-                array = _array(path, name, member, len(data))
+            claim, most = f"{path} holds {member.file_size:,} bytes", budget().max_image_bytes
+            check_claim(claim, member.file_size, most, way_out="create it again")
+            array = parse_npy(path, archive.read(member), "NPZ")
     except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
+    name = member.filename.removesuffix(".npy")
     reading = Reading(f"{array.dtype} NPZ array {name}")
     return DepthFile(values=array, reading=reading, is_image=False)
-
-
-def _array(path: Path, name: str, member: IO[bytes], file_bytes: int) -> NDArray[Any]:
-    """The array of a member, after its claimed size is checked."""
-    beginning = member.read(_LONGEST_HEADER)
-    if not beginning.startswith(b"\x93NUMPY"):
-        raise FileFormatError(f"{path}: {name} is not an array; save it with numpy.savez")
-    shape, _, dtype, start = _npy_header(path, beginning, "NPZ")
-    check_value_count(path, math.prod(shape), file_bytes, value_bytes=dtype.itemsize)
-    needed = start + math.prod(shape) * dtype.itemsize
-    content = beginning + member.read(max(0, needed - len(beginning)))
-    member.read(1)  # at the end of the member, its checksum is compared
-    return parse_npy(path, content, "NPZ")
 
 
 def _write_npz(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
@@ -143,24 +126,17 @@ NPZ = DepthFormat(
 )
 
 
-_PFM_HEADER = re.compile(rb"(Pf|PF)\s+(\d{1,9})\s+(\d{1,9})\s+([-+0-9.eE]{1,40})[ \t]*\r?\n")
+_NUMBER = rb"[-+]?\d{0,20}\.?\d{1,20}(?:[eE][-+]?\d{1,2})?"
+_PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(" + _NUMBER + rb")[ \t]*\r?\n")
 
 
 def _read_pfm(path: Path, data: bytes) -> DepthFile:
     """Rows are stored from the bottom; the sign of the scale factor gives the byte order."""
     match = _PFM_HEADER.match(data)
-    if match is None:
-        raise damaged(path, "PFM", "has no valid header")
-    if match[1] == b"PF":
-        raise FileFormatError(f"{path} is a colour PFM; depth is one channel (Pf), save it so")
-    width, height = int(match[2]), int(match[3])
+    if match is None or float(match[3]) == 0:
+        raise damaged(path, "PFM", "has no valid header of one channel (Pf)")
+    width, height, factor = int(match[1]), int(match[2]), float(match[3])
     check_pixel_count(path, width, height)
-    try:
-        factor = float(match[4])
-    except ValueError as error:
-        raise damaged(path, "PFM", "has no valid scale factor") from error
-    if not math.isfinite(factor) or factor == 0:
-        raise damaged(path, "PFM", f"has the scale factor {factor:g}")
     body = data[match.end() :]
     if len(body) != 4 * width * height:
         fact = f"holds {len(body):,} bytes where {width}x{height} needs {4 * width * height:,}"
@@ -177,6 +153,4 @@ def _write_pfm(file: Path, metres: NDArray[np.float32], text: Mapping[str, str])
     file.write_bytes(header + metres[::-1].astype("<f4").tobytes())
 
 
-PFM = DepthFormat(
-    name="PFM", suffixes=(".pfm",), magic=(b"Pf", b"PF"), read=_read_pfm, write=_write_pfm
-)
+PFM = DepthFormat(name="PFM", suffixes=(".pfm",), magic=(b"Pf",), read=_read_pfm, write=_write_pfm)

@@ -150,15 +150,13 @@ def test_a_raw_drive_has_its_calibration_and_the_annotated_depth(
 ) -> None:
     tree(tmp_path, TREES["kitti-raw"][0])
     gt = tmp_path / "data_depth_annotated" / "val" / DRIVE / "proj_depth/groundtruth/image_02"
-    packet = tmp_path / "2011_09_26" / DRIVE / "oxts/data/0000000005.txt"
-    touch(gt / "0000000005.png", packet)
+    touch(gt / "0000000005.png")
     layout, frames, unmatched = list_frames(tmp_path / start)
     assert layout == "kitti-raw"
     assert [frame.name for frame in frames] == TREES["kitti-raw"][1]
     assert {frame.calib for frame in frames} == {tmp_path / "2011_09_26"}
     assert [frame.camera for frame in frames] == [2, 2, 3, 3]
     assert [frame.gt for frame in frames] == [gt / "0000000005.png", None, None, None]
-    assert [frame.oxts for frame in frames] == [packet, None, packet, None]
     assert [lost.path.name for lost in unmatched] == ["0000000007.png"]
 
 
