@@ -12,7 +12,8 @@ layers, and runs ten further iterations after each update. A cut inside the solv
 
 Written from the published description and the graph of nchodosh/Super-LiDAR, which names no
 licence; parameter names are the same. The authors published no weights. To use your own, save the
-variables by name, `numpy.savez("adnn.npz", kernel0=…, …, bias2=…)`. `-tiny` is this project's own.
+variables by name, `numpy.save("adnn.npy", {"kernel0": …, …, "bias2": …})`. `-tiny` is this
+project's own.
 """
 
 from __future__ import annotations

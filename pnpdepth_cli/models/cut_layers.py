@@ -9,6 +9,7 @@ network's error is smooth over surfaces, and later layers follow each point and 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,6 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.split.tensors import map_tensors
 from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.frame_map import FrameMap
@@ -122,25 +122,25 @@ def suggest_layers(
         Names of submodules, from coarse to fine; empty if none qualifies.
 
     Raises:
-        ModelError: The network raises, or no gradient comes back from its prediction to any layer.
+        ModelError: The network raises, or no gradient comes back from its prediction.
     """
     image = next((a for a in arguments if a.ndim == 4), None)
     if image is None:
         return ()
     sides = image.shape[1:3] if image.shape[-1] <= 4 else image.shape[2:4]
-    # Where the front has no gradients, the layers behind it may.
-    prediction, maps, _ = _observe(module, arguments, prediction_of)
+    prediction, maps = _observe(module, arguments, prediction_of)
     if not prediction.requires_grad:
-        prediction, maps, copies = _observe(module, arguments, prediction_of, reach_all=True)
-        if not _reaches_features(prediction, copies):
-            raise ModelError(
-                "no gradient comes back from the network's prediction to any of its layers; does"
-                " its forward run under torch.no_grad or inference_mode, detach, or go through"
-                " numpy? take that out"
-            )
+        raise ModelError(
+            "no gradient comes back from the network's prediction; does a part of its forward run"
+            " under torch.no_grad or inference_mode, detach, or go through numpy? take that out, or"
+            " state layers behind it in a definition"
+        )
     # Feature maps that the prediction depends on.
     useful = {n: m for n, m in maps.items() if m.shape[1] > 1 and _has_aspect_of(m, sides)}
-    gradients = _gradients(prediction, list(useful.values()))
+    if not useful:
+        return ()
+    with torch.enable_grad(), wrap_user_errors("the gradient of the network"):
+        gradients = torch.autograd.grad(prediction.sum(), [*useful.values()], allow_unused=True)
     areas = {
         name: _area(useful[name])
         for name, gradient in zip(useful, gradients, strict=True)
@@ -164,14 +164,6 @@ def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:
     return 1 / _SIMILAR_ASPECT < ratio < _SIMILAR_ASPECT
 
 
-def _gradients(prediction: Tensor, tensors: list[Tensor]) -> tuple[Tensor | None, ...]:
-    """Gradients of the prediction's sum; None for a tensor that it does not depend on."""
-    if not tensors or not prediction.requires_grad:
-        return (None,) * len(tensors)
-    with torch.enable_grad(), wrap_user_errors("the gradient of the network"):
-        return torch.autograd.grad(prediction.sum(), tensors, allow_unused=True, retain_graph=True)
-
-
 def _last_of_each_resolution(areas: Mapping[str, int]) -> list[str]:
     """The last map before each finer one, from the first of the coarsest maps on."""
     chosen: list[str] = []
@@ -186,39 +178,17 @@ def _last_of_each_resolution(areas: Mapping[str, int]) -> list[str]:
 
 
 def _observe(
-    module: nn.Module,
-    arguments: tuple[Tensor, ...],
-    prediction_of: Callable[[Any], Tensor],
-    *,
-    reach_all: bool = False,
-) -> tuple[Tensor, Maps, list[Tensor]]:
-    """One pass: the prediction, the maps of submodules that ran once, and copies of outputs.
-
-    With `reach_all`, outputs that gradients do not reach are replaced by copies that they do reach,
-    as a cut there would.
-    """
+    module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[Any], Tensor]
+) -> tuple[Tensor, Maps]:
+    """One pass: the prediction, and the maps that gradients reach of submodules that ran once."""
     maps: Maps = {}
-    ran: set[str] = set()
-    ran_twice: set[str] = set()
-    copies: list[Tensor] = []
+    ran: Counter[str] = Counter()
 
-    # Copies of outputs that gradients do not reach.
-    def with_gradient(path: tuple[str, ...], tensor: Tensor) -> Tensor:
-        if tensor.requires_grad or not tensor.is_floating_point():
-            return tensor
-        with torch.inference_mode(False), torch.enable_grad():
-            copies.append(tensor.clone().detach().requires_grad_(True))
-            return copies[-1].clone()  # in-place operations on the copy itself are forbidden
-
-    # Maps that gradients reach, of submodules that ran once.
-    def keep(name: str, output: Any) -> Any:
-        output = map_tensors(output, with_gradient) if reach_all else output
-        (ran_twice if name in ran else ran).add(name)
+    def keep(name: str, output: Any) -> None:
+        ran[name] += 1
         if isinstance(output, Tensor) and output.ndim == 4 and output.requires_grad:
             maps[name] = output
-        return output
 
-    # The pass itself.
     hooks = [
         part.register_forward_hook(lambda m, inputs, output, name=name: keep(name, output))
         for name, part in module.named_modules()
@@ -233,11 +203,4 @@ def _observe(
     finally:
         for hook in hooks:
             hook.remove()
-    return prediction, {name: maps[name] for name in maps if name not in ran_twice}, copies
-
-
-def _reaches_features(prediction: Tensor, copies: list[Tensor]) -> bool:
-    """True if a gradient comes back to a copy that is more than the depth map itself."""
-    depth = prediction.squeeze().shape
-    features = [t for t in copies if t.ndim > 2 and t.shape[1] > 1 and t.squeeze().shape != depth]
-    return any(gradient is not None for gradient in _gradients(prediction, features))
+    return prediction, {name: output for name, output in maps.items() if ran[name] == 1}

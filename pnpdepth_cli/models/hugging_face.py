@@ -2,7 +2,7 @@
 
 Needs `pip install pnpdepth[hf]`. The network is a class of transformers, with code from that
 package only; nothing is downloaded. The image is resized and normalised as preprocessor_config.json
-says, or as networks of the type usually are, by this program's own code.
+says, by this program's own code.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -26,8 +25,6 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
     UNTUNED_DEFAULTS,
     Fixed,
     ModelDefinition,
@@ -37,9 +34,6 @@ from pnpdepth_cli.models.definition import (
 from pnpdepth_cli.points import SparsePoints
 
 _MOST_JSON_BYTES = 1 << 24
-_WEIGHTS = ("model.safetensors", "model.safetensors.index.json")
-_PICKLED = ("pytorch_model.bin", "pytorch_model.bin.index.json")
-
 _MAX_SIDE = 1 << 16  # pixels
 _LARGEST_NUMBER = 1e6  # in a config.json; no network has more of any part
 _PLAIN_ATTENTION = ("eager", "sdpa")
@@ -103,46 +97,27 @@ def _pixels(side: float | None) -> int:
     return round(1 / side) if isinstance(side, float) else side
 
 
-def _resized(height: int, width: int, **more: Any) -> _Processing:
-    size: dict[str, int | None] = {"height": height, "width": width}
-    return _Processing(size=size, keep_aspect_ratio=True, do_normalize=True, **more)
-
-
-@dataclass(frozen=True)
-class _Family:
-    """What the networks of one model type predict.
-
-    of: what sides of images are multiples of. usual: how transformers prepares the image.
-    """
-
-    kind: OutputKind
-    scale: OutputScale
-    usual: _Processing
-    of: int = 1
-
-
 PROMPT_SIZE = (192, 256)
 """Rows and columns of the depth that Prompt Depth Anything was trained with, a phone's LiDAR."""
 
-_IMAGENET = {"image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
-_FAMILIES = {
-    "depth_anything": _Family("inverse", "affine", _resized(518, 518, **_IMAGENET), 14),
-    "prompt_depth_anything": _Family("depth", "metric", _resized(756, 756, **_IMAGENET), 14),
+_FAMILIES: dict[str, tuple[OutputKind, OutputScale, int]] = {
+    "depth_anything": ("inverse", "affine", 14),
+    "prompt_depth_anything": ("depth", "metric", 14),
     # Intel's DPT give inverse depth, Meta's on DINOv2 give depth; their configurations do not say.
-    "dpt": _Family("unknown", "affine", _Processing(size=384, do_normalize=True), 16),
-    "zoedepth": _Family("depth", "metric", _resized(384, 512), 32),
-    "glpn": _Family("depth", "metric", _Processing(size_divisor=32), 32),
+    "dpt": ("unknown", "affine", 16),
+    "zoedepth": ("depth", "metric", 32),
+    "glpn": ("depth", "metric", 32),
     # Inverse depth for a canonical camera: a factor away from metres.
-    "depth_pro": _Family("inverse", "scale", _Processing(size=1536, do_normalize=True)),
+    "depth_pro": ("inverse", "scale", 1),
 }
+"""What the networks of a model type predict, and what sides of images are multiples of."""
 
 
 def hf_definition(folder: Path) -> ModelDefinition:
     """Returns the definition of a depth network in a Hugging Face folder.
 
     Args:
-        folder: Folder with config.json and model.safetensors, and preprocessor_config.json if it
-            was saved.
+        folder: Folder with config.json, preprocessor_config.json and model.safetensors.
 
     Raises:
         ModelError: A file is missing or wrong, or the type of network is not known.
@@ -157,37 +132,37 @@ def hf_definition(folder: Path) -> ModelDefinition:
             f" {', '.join(_FAMILIES)}"
         )
     _check_settings(config, folder / "config.json")
-    # What its numbers are.
-    family, assumed = _FAMILIES[kind], ""
+    # What its numbers are, and how images are prepared.
+    output_kind, output_scale, of = _FAMILIES[kind]
     if config.get("depth_estimation_type") == "metric":
-        family = replace(family, kind="depth", scale="metric")
-    # How images are prepared, as stated or as usual for the type.
-    file, processing = folder / "preprocessor_config.json", family.usual
-    if file.is_file():
-        processing = _read(file, _Processing)
-    size, normalisation = processing.size_policy(family.of), processing.normalisation()
+        output_kind, output_scale = "depth", "metric"
+    file = folder / "preprocessor_config.json"
+    processing = _read(file, _Processing)
+    size = processing.size_policy(of)
     if size is None:
         raise ModelError(f"{file}: it says no size")
-    if not file.is_file():
-        assumed = f"{folder.name} has no {file.name}; assumed, as usual for {kind}: {size}"
-        assumed = f"{assumed}, {normalisation}"
+    weights = folder / "model.safetensors"
+    if not weights.is_file():
+        raise CheckpointError(
+            f"{folder} has no {weights.name}; have transformers load the network and write it by"
+            " save_pretrained"
+        )
     # The definition, whose network is built when it is needed.
-    weights, prompted = _weights(folder), kind == "prompt_depth_anything"
+    prompted = kind == "prompt_depth_anything"
     return ModelDefinition(
         name=folder.resolve().name,
         summary=f"Hugging Face {kind}",
         input_kind="rgb+sparse" if prompted else "rgb",
         size=size,
-        normalisation=normalisation,
-        output_kind=family.kind,
-        output_scale=family.scale,
+        normalisation=processing.normalisation(),
+        output_kind=output_kind,
+        output_scale=output_scale,
         build=lambda: _build(folder),
         complete=True,
         checkpoint=weights,
         arguments=_with_prompt if prompted else None,
         output=lambda output: output.predicted_depth,
         defaults=UNTUNED_DEFAULTS,
-        assumed=assumed,
     )
 
 
@@ -238,25 +213,6 @@ def _read(file: Path, kind: type[_Kind]) -> _Kind:
         raise ModelError(f"{file}: {describe(error)[:160]}") from None
 
 
-def _weights(folder: Path) -> Path:
-    single, index = (folder / name for name in _WEIGHTS)
-    if single.is_file():
-        return single
-    if index.is_file():
-        parts = _read(index, dict[str, Any]).get("weight_map")
-        for name in parts.values() if isinstance(parts, Mapping) else [parts]:
-            file = folder / str(name)
-            if file.parent != folder or file.suffix != single.suffix or not file.is_file():
-                raise CheckpointError(f"{index}: {file} is no safetensors file beside it")
-        return index
-    if any((folder / name).is_file() for name in _PICKLED):
-        raise CheckpointError(
-            f"{folder} has its weights as a pickle only; have transformers load it and write"
-            f" {_WEIGHTS[0]} by save_pretrained"
-        )
-    raise CheckpointError(f"{folder} has no {_WEIGHTS[0]}")
-
-
 def _build(folder: Path) -> nn.Module:
     # Read when huggingface_hub is imported; a folder may name a backbone that is looked for online.
     os.environ["HF_HUB_OFFLINE"] = "1"
@@ -300,7 +256,7 @@ def _build(folder: Path) -> nn.Module:
 @contextmanager
 def _fewer_parameters_than_bytes(folder: Path) -> Iterator[None]:
     """Inside, a network of more parameters than its weights have bytes raises ModelError."""
-    left = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
+    left = (folder / "model.safetensors").stat().st_size
 
     def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
         nonlocal left

@@ -7,8 +7,8 @@ entry point, also the object itself) with one of
     definition = ModelDefinition(...)
     definitions = {"my-net": ModelDefinition(...), "my-net-tiny": ModelDefinition(...)}
 
-A Python file is run, as importing it would run it. `net.py` holds a `definition`, or is one network
-whose class takes no arguments; `net.py:NAME` names another definition, class or function in it.
+A Python file is run, as importing it would run it. `net.py` holds a `definition`; `net.py:NAME`
+names another definition in it, or a class or function that makes a network without arguments.
 """
 
 from __future__ import annotations
@@ -17,11 +17,10 @@ import difflib
 import importlib.util
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.core.user_code import describe
@@ -129,11 +128,8 @@ def _from_file(spec: str) -> ModelDefinition | None:
 
 def _python_definition(file: Path, attribute: str | None) -> ModelDefinition:
     """The definition in a Python file, or one assumed for the network class in it."""
-    module = _run(file)
     named = attribute or "definition"
-    value = getattr(module, named, None)
-    if value is None and attribute is None:
-        named, value = _only_network_class(module) or (named, None)
+    value = getattr(_run(file), named, None)
     if value is None:
         raise ModelError(f"model file {file} defines no {named!r}; name it as {file}:ATTRIBUTE")
     if isinstance(value, ModelDefinition):
@@ -171,23 +167,6 @@ def _run(file: Path) -> ModuleType:
     except (Exception, SystemExit) as error:
         raise ModelError(f"model file {file} raises {describe(error, file)}") from error
     return module
-
-
-def _only_network_class(module: ModuleType) -> tuple[str, Callable[[], Any]] | None:
-    """The one network class that the file itself defines and no other class in it uses."""
-    from torch import nn
-
-    own = {
-        name: value
-        for name, value in vars(module).items()
-        if isinstance(value, type)
-        and issubclass(value, nn.Module)
-        and value.__module__ == module.__name__
-    }
-    codes = (getattr(network.__init__, "__code__", None) for network in own.values())
-    blocks = {name for code in codes if code is not None for name in code.co_names}
-    networks = [(name, value) for name, value in own.items() if name not in blocks]
-    return networks[0] if len(networks) == 1 else None
 
 
 @contextmanager

@@ -29,13 +29,12 @@ from pnpdepth_cli.models.steps import Step, Steps, Unsupported, Value
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
 from pnpdepth_cli.models.weights.torch_file import refuse_inflated
 
-_OPERATOR = re.compile(r"torch\.ops\.(aten|prims?|torchvision|quantized)\.(\w+)\.(\w+)")
-_TOUCHES_FILES = re.compile("file|save|load|read|write|video|decode")
+_OPERATOR = re.compile(r"torch\.ops\.(aten|prims?)\.(\w+)\.(\w+)")
+_TOUCHES_FILES = re.compile("file|save|load")
 _ARITHMETIC = re.compile(
     r"_operator\.(add|sub|mul|truediv|floordiv|mod|neg|pos|abs|eq|ne|lt|le|gt|ge|and_|or_|not_"
     r"|getitem)|math\.(ceil|floor|trunc|sqrt)|torch\.(_?sym_\w+)"
 )
-_WITHOUT_GRADIENT = "torch.ops.higher_order.wrap_with_set_grad_enabled"
 _DTYPES = {
     1: torch.uint8, 2: torch.int8, 3: torch.int16, 4: torch.int32, 5: torch.int64,
     6: torch.float16, 7: torch.float32, 8: torch.float64, 12: torch.bool, 13: torch.bfloat16,
@@ -108,12 +107,8 @@ class ExportedGraph(nn.Module):
 
     def _steps_of(self, graph: Mapping[str, Any]) -> Iterator[Step]:
         for node in graph["nodes"]:
-            target, outputs = node["target"], node["outputs"]
-            if target == _WITHOUT_GRADIENT:
-                enabled, body, *given = (argument["arg"] for argument in node["inputs"])
-                yield from self._inline(body["as_graph"]["graph"], given, outputs, **enabled)
-            elif outputs:  # the others only check what the exporter saw
-                yield self._step(target, node["inputs"], outputs)
+            if node["outputs"]:  # the others only check what the exporter saw
+                yield self._step(node["target"], node["inputs"], node["outputs"])
 
     def _step(self, target: str, inputs: list[Any], outputs: list[Any]) -> Step:
         run, inputs = _function(target), [dict(one) for one in inputs]
@@ -132,20 +127,6 @@ class ExportedGraph(nn.Module):
             outputs=str(named[0]) if alone else named,
             name=target,
         )
-
-    def _inline(
-        self, body: Mapping[str, Any], given: list[Any], outputs: list[Any], *, as_bool: bool
-    ) -> Iterator[Step]:
-        """A graph in the graph, whose result has no gradient unless `as_bool` says so."""
-        before = [one for value in body["inputs"] for one in _outputs_in(value)]
-        for name, value in zip(before, given, strict=True):
-            yield Step(run=_same, arguments=[_argument(value)], outputs=str(name))
-        yield from self._steps_of(body)
-        results = [one for value in body["outputs"] for one in _outputs_in(value)]
-        names = [one for output in outputs for one in _outputs_in(output)]
-        for name, result in zip(names, results, strict=True):
-            run = _same if as_bool else torch.detach
-            yield Step(run=run, arguments=[Value(str(result))], outputs=str(name))
 
 
 def exported_definition(file: Path, **stated: Any) -> ModelDefinition:
@@ -274,7 +255,3 @@ def _outputs_in(stated: Mapping[str, Any]) -> list[str | None]:
     if not isinstance(name, str):
         raise BrokenFileError(f"it has an output {str(kind)[:40]!r}")
     return [name]
-
-
-def _same(value: Any) -> Any:
-    return value

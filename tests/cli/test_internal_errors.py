@@ -64,7 +64,6 @@ READERS: list[tuple[str, str, Callable[[Path], object], Callable[[Path], object]
         "w.safetensors", "safetensors.torch.safe_open",
         lambda path: save_file({"w": torch.ones(2)}, path), read_checkpoint,
     ),
-    ("w.npz", "numpy.load", lambda path: np.savez(path, w=np.ones(2)), read_checkpoint),
     (
         "w.pt", "pickletools.genops",
         lambda path: torch.save({"w": torch.ones(2)}, path), read_checkpoint,

@@ -103,10 +103,9 @@ def _networks(rng: np.random.Generator) -> dict[str, str]:
     save_file(tensors, "net.safetensors")
     torch.save({"state_dict": state, "epoch": 3}, "net.pt")
     torch.save(state, "old.pth", _use_new_zipfile_serialization=False)
-    np.savez("net.npz", **tensors)
     np.save("net.npy", np.array(tensors, dtype=object), allow_pickle=True)
     Path("any_weights.py").write_text(ANY_WEIGHTS)
-    weights = ("net.safetensors", "net.pt", "old.pth", "net.npz", "net.npy", written(Path()).name)
+    weights = ("net.safetensors", "net.pt", "old.pth", "net.npy", written(Path()).name)
     commands = {name: f"models check any_weights.py --checkpoint {name}" for name in weights}
     write_network(Path("net.onnx"), shape=(1, 3, HEIGHT, WIDTH))
     with warnings.catch_warnings():

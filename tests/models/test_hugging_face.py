@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import socket
 from pathlib import Path
@@ -17,7 +16,6 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.frame_map import FrameMap
-from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
@@ -165,22 +163,6 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(original: Path, tmp_path: Path) -> Path:
     """A folder of a GLPN."""
     return Path(shutil.copytree(original, tmp_path / "net"))
-
-
-@pytest.mark.parametrize(
-    "name", ["../original.safetensors", "/dev/zero", 5, "pytorch_model.bin", "pipe.safetensors"]
-)
-def test_an_index_names_files_of_its_folder_only(name: object, folder: Path) -> None:
-    shutil.copy(folder / "model.safetensors", folder.parent / "original.safetensors")
-    (folder / "model.safetensors").rename(folder / "part.safetensors")
-    (folder / "pytorch_model.bin").write_bytes(b"x")
-    os.mkfifo(folder / "pipe.safetensors")
-    index = folder / "model.safetensors.index.json"
-    index.write_text(json.dumps({"weight_map": {"a": "part.safetensors"}}))
-    assert hf_definition(folder).checkpoint == index
-    index.write_text(json.dumps({"weight_map": {"a": "part.safetensors", "b": name}}))
-    with pytest.raises(CheckpointError):
-        hf_definition(folder)
 
 
 @pytest.mark.parametrize(

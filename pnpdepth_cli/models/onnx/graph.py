@@ -1,8 +1,7 @@
 """An ONNX graph as a torch module whose submodules are the graph's nodes, under their own names.
 
-What depends on no input is computed once, when
-the module is made. Arithmetic on shapes is no layer; every other node is a submodule, so that the
-network can be cut at it.
+What depends on no input is computed once, when the module is made. Arithmetic on shapes is no
+layer; every other node is a submodule, so that the network can be cut at it.
 """
 
 from __future__ import annotations
@@ -91,14 +90,13 @@ class OnnxNode(nn.Module):
 
 
 class OnnxGraph(nn.Module):
-    """An ONNX model as a module: called with the graph's inputs, it returns its outputs.
+    """An ONNX model as a module: called with the graph's inputs, it returns its output.
 
-    One output is a tensor, several are a dict by name. Everything is computed in float32; weights
-    in half precision are widened. The first pass with inputs of a size allocates no activation
-    beyond `largest_activation`.
+    Everything is computed in float32; weights in half precision are widened.
 
     Args:
-        model: The onnx.ModelProto, without functions of its own, its nodes in order.
+        model: The onnx.ModelProto with one output, without functions of its own, its nodes in
+            order.
         path: File of the model, for messages.
 
     Raises:
@@ -113,19 +111,20 @@ class OnnxGraph(nn.Module):
         constants = {t.name: _tensor(t, path) for t in graph.initializer}
         self.is_half = any(t.data_type == t.FLOAT16 for t in graph.initializer)
         self.input_names = tuple(i.name for i in graph.input if i.name not in constants)
-        self.output_names = tuple(o.name for o in graph.output)
+        (self.output_name,) = (output.name for output in graph.output)
         self._stored = sum(constant.numel() for constant in constants.values())
         nodes = zip(_names(graph.node), graph.node, strict=True)
         self._steps = Steps(
-            self._steps_of(nodes, opset, constants, path), self.output_names,
+            self._steps_of(nodes, opset, constants, path), [self.output_name],
             kind="ONNX node", stored=self._stored,
         )  # fmt: skip
-        self._constants = {n: constants[n] for n in self.output_names if n in constants}
+        if self.output_name in constants:
+            raise ModelError(f"ONNX file {path}: its output depends on no input")
 
     def _steps_of(
         self, nodes: Iterable[tuple[str, Any]], opset: int, constants: dict[str, Tensor], path: Path
     ) -> list[Step]:
-        shapes: set[str] = set()
+        shapes, given = set[str](), {*self.input_names}
         steps = []
         largest = max(_CONSTANT_ELEMENTS, _CONSTANT_GROWTH * self._stored)
         limit = SizeLimit(largest, in_all=_CONSTANTS * largest, work=_WORK)
@@ -138,6 +137,11 @@ class OnnxGraph(nn.Module):
             inputs: list[Tensor | str] = [constants.get(n, n) for n in proto.input]
             module = OnnxNode(node, [None if isinstance(n, str) and not n else n for n in inputs])
             handed_in = tuple(n for n in inputs if isinstance(n, str) and n)
+            if not given.issuperset(handed_in):
+                raise ModelError(
+                    f"ONNX file {path}: node {name!r} reads a value that nothing gives"
+                )
+            given.update(proto.output)
             if not handed_in:
                 constants.update(_fold(module, proto.output, limit, path))
                 continue
@@ -157,13 +161,12 @@ class OnnxGraph(nn.Module):
             )
         return steps
 
-    def forward(self, *inputs: Tensor) -> Any:
-        """Returns the output, or several outputs by name."""
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Returns the output."""
         values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
         self._device = inputs[0].device
         self._steps.run(values, tuple(one.shape for one in inputs))
-        outputs = {n: values[n] if n in values else self._constants[n] for n in self.output_names}
-        return outputs if len(outputs) > 1 else outputs[self.output_names[0]]
+        return values[self.output_name]
 
     def _run(self, module: OnnxNode, on_shapes: bool, *inputs: Tensor) -> Sequence[Tensor]:
         """The node's outputs. Arithmetic on shapes stays on the CPU."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import graphlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -170,47 +171,32 @@ def _choose_output(model: Any, wanted: str | None, file: Path) -> str:
 
 
 def _prune(model: Any, output: str, file: Path) -> bool:
-    """Leaves in the model one output and the nodes that it needs. True if others were there.
-
-    Each node comes after those it reads. The order is that of the file if possible; files converted
-    to half precision are not in order. ModelError if a node reads a value that nothing gives, or
-    nodes read each other in a circle.
-    """
-    # What gives each value.
-    graph = model.graph
-    nodes, outputs = list(graph.node), [o for o in graph.output if o.name == output]
-    known = {*(t.name for t in graph.initializer), *(i.name for i in graph.input)}
-    producer = {name: n for n, proto in enumerate(nodes) for name in proto.output if name}
-    # The nodes that the output needs, from the output backwards.
-    reads: dict[int, set[int]] = {}
-    pending = [producer[output]] if output in producer else []
-    while pending:
-        n = pending.pop()
-        if n in reads:
-            continue
-        inputs = {name for name in nodes[n].input if name and name not in known}
-        absent = sorted(inputs - producer.keys())
-        if absent:
-            raise ModelError(f"ONNX file {file}: a node reads {absent[0]!r}, which nothing gives")
-        reads[n] = {producer[name] for name in inputs}
-        pending += reads[n]
-    # Their order is the file's, unless a node would come before what it reads.
-    order = sorted(reads)
-    if any(before >= n for n, befores in reads.items() for before in befores):
-        try:
-            by_number = dict(sorted(reads.items()))
-            order = [*graphlib.TopologicalSorter(by_number).static_order()]
-        except graphlib.CycleError:
-            raise ModelError(f"ONNX file {file}: its nodes read each other in a circle") from None
-    # They replace the graph's.
-    is_part = len(order) < len(nodes) or len(outputs) < len(graph.output)
+    """Leaves in the model one output and the nodes that it needs. True if others were there."""
+    graph, needed, nodes = model.graph, {output}, []
+    for node in reversed(_in_order(graph.node, file)):
+        if not needed.isdisjoint(node.output):
+            nodes.append(node)
+            needed.update(filter(None, node.input))
+    is_part = len(nodes) < len(graph.node) or len(graph.output) > 1
     kept = type(graph)()
-    kept.node.extend(nodes[n] for n in order)
-    kept.output.extend(outputs)
+    kept.node.extend(reversed(nodes))
+    kept.output.extend(o for o in graph.output if o.name == output)
     graph.ClearField("node")
     graph.ClearField("output")
     graph.MergeFrom(kept)
     return is_part
+
+
+def _in_order(nodes: Sequence[Any], file: Path) -> list[Any]:
+    """The nodes, each after those it reads; files converted to half precision are not in order."""
+    producer = {name: n for n, node in enumerate(nodes) for name in node.output if name}
+    reads = {n: {producer[i] for i in nodes[n].input if i in producer} for n in range(len(nodes))}
+    if all(before < n for n, befores in reads.items() for before in befores):
+        return list(nodes)
+    try:
+        return [nodes[n] for n in graphlib.TopologicalSorter(reads).static_order()]
+    except graphlib.CycleError:
+        raise ModelError(f"ONNX file {file}: its nodes read each other in a circle") from None
 
 
 def _as_map(output: Tensor) -> Tensor:

@@ -35,7 +35,6 @@ _INDEX = ".index"  # of a TensorFlow checkpoint
 _READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     ".safetensors": ("safetensors file", load_file),
     ".npy": ("numpy file", read_numpy_file),
-    ".npz": ("numpy file", read_numpy_file),
     _INDEX: ("TensorFlow checkpoint", read_tensor_bundle),
 }
 """Kind and reader by suffix; any other file is one of torch."""
@@ -43,7 +42,6 @@ _READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
 WEIGHT_SUFFIXES = (*_READERS, ".pth", ".pt", ".bin", ".ckpt", ".tar")
 
 _COUNTER = "num_batches_tracked"
-_LFS_POINTER = b"version https://git-lfs"
 _SHOWN_NAMES = 4
 _MAX_WORD = 60  # characters of a word out of a file that are shown
 
@@ -52,7 +50,7 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
     """Returns the tensors of a checkpoint by name, on the CPU.
 
     Args:
-        path: A torch, safetensors or numpy file, the PREFIX.index of a TensorFlow checkpoint, or a
+        path: A torch, safetensors or .npy file, the PREFIX.index of a TensorFlow checkpoint, or a
             folder with several of these, such as encoder.pth and decoder.pth; then each name is
             preceded by the name of its file up to the first dot. In a torch file the tensors may
             lie in an entry such as "state_dict" beside an epoch or an optimiser; FILE:KEY names it.
@@ -92,12 +90,6 @@ def _check_file(path: Path) -> None:
         index = path.with_name(path.name + _INDEX)
         hint = f"; {index.name} does, name that" if index.is_file() else ""
         raise CheckpointError(f"checkpoint {path} does not exist{hint}")
-    with path.open("rb") as file:
-        if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
-            raise CheckpointError(
-                f"checkpoint {path} is a Git LFS pointer, not the file it points to; `git lfs pull`"
-                " fetches that"
-            )
     check_network_file(path, "checkpoint", CheckpointError)
 
 

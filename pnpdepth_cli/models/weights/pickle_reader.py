@@ -21,7 +21,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
 
-import torch
 from torch import Tensor
 
 from pnpdepth_cli.budget import check_claim
@@ -33,13 +32,12 @@ MAX_NAME = 1_000
 """Characters of a name in a pickle."""
 
 _MAX_EXPANDED = 1 << 28  # elements of a tensor with strides of 0; nothing is allocated for them
-_DTYPES = {str(value): value for value in vars(torch).values() if isinstance(value, torch.dtype)}
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 _LITERALS = frozenset(
     {
         *("BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINSTRING"),
-        *("SHORT_BINSTRING", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES"),
-        *("SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"),
+        *("SHORT_BINSTRING", "BINUNICODE", "SHORT_BINUNICODE", "BINBYTES", "SHORT_BINBYTES"),
+        *("BINBYTES8",),
     }
 )
 """Opcodes of protocols 2 to 5 that put their argument on the stack."""
@@ -129,8 +127,6 @@ class _Machine:
                 stack[-count:] = [tuple(stack[-count:])]
             case "EMPTY_LIST" | "EMPTY_SET":  # elements of a set would have to be hashed
                 stack.append([])
-            case "FROZENSET":
-                stack.append(self._to_mark())
             case "EMPTY_DICT":
                 stack.append({})
             case "APPEND":
@@ -146,9 +142,6 @@ class _Machine:
             case "STACK_GLOBAL":
                 stack.append(self._name(stack.pop(-2), stack.pop()))
             case "REDUCE" | "NEWOBJ":
-                stack.append(self._call(stack.pop(-2), stack.pop()))
-            case "NEWOBJ_EX":  # the last are arguments by name
-                stack[-1:] = []
                 stack.append(self._call(stack.pop(-2), stack.pop()))
             case "BUILD":
                 state = stack.pop()
@@ -217,9 +210,9 @@ class _Machine:
             case "collections.OrderedDict" | "collections.defaultdict" | "builtins.dict":
                 pairs = first if isinstance(first, list) else []
                 return self._mapping([value for key, one in pairs for value in (key, one)])
-            case "builtins.set" | "builtins.frozenset":
+            case "builtins.set":
                 return first if isinstance(first, list) else []
-            case "_codecs.encode" | "builtins.bytes" | "builtins.bytearray":
+            case "_codecs.encode" | "builtins.bytes":
                 return "" if first is None else first  # text of Latin-1
             case "torch.Size" | "torch.device":
                 return first or ()
@@ -227,11 +220,6 @@ class _Machine:
                 return self._call(first, ())
             case "torch._utils._rebuild_tensor" | "torch._utils._rebuild_tensor_v2":
                 return view_of(*arguments[:4])
-            case "torch._utils._rebuild_tensor_v3":  # of a dtype that storages do not name
-                storage, *view = arguments[:4]
-                return view_of(storage.view(_DTYPES[arguments[6].path]), *view)
-            case "torch._tensor._rebuild_from_type_v2":  # it has attributes of its own
-                return self._call(first, arguments[2])
             case (
                 "torch._utils._rebuild_parameter"
                 | "torch._utils._rebuild_parameter_with_state"

@@ -181,6 +181,5 @@ class _Storages:
 def _dtype(kind: Any) -> torch.dtype:
     name = kind.path.rpartition(".")[2] if isinstance(kind, Name) else ""
     if name not in _DTYPES:
-        quantised = "; save quantised tensors as floats" if name.startswith("Q") else ""
-        raise BrokenFileError(f"a storage of type {name[:40] or '?'}{quantised}")
+        raise BrokenFileError(f"a storage of type {name[:40] or '?'}")
     return _DTYPES[name]

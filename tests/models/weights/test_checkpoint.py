@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -67,10 +66,6 @@ def save_layers(state: Mapping[str, Tensor], path: Path) -> None:
     npy_of(path, pickled(layers))
 
 
-def save_numbered(state: Mapping[str, Tensor], path: Path) -> None:
-    np.savez(path, **{f"{n}:0": t.numpy() for n, t in state.items()})  # as TensorFlow names outputs
-
-
 def save_beside(key: str) -> Callable[[Any, Path], None]:
     optimiser = torch.optim.Adam(Net().parameters()).state_dict()
     rest = {"epoch": 3, "loss": 0.5, "optimizer": optimiser}
@@ -92,7 +87,6 @@ def save_uncounted(state: Mapping[str, Tensor], path: Path) -> None:
         *((torch.save, suffix) for suffix in (".pth", ".pt", ".pth.tar", ".ckpt", "")),
         (save_older, ".pth"),
         (save_layers, ".npy"),
-        (save_numbered, ".npz"),
         (save_uncounted, ".pth"),
         *((save_beside(key), ".pth") for key in ("state_dict", "model_state_dict", "model", "net")),
     ],
@@ -245,7 +239,6 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
         (save_older, ".pth"),
         (save_file, ".safetensors"),
         (save_layers, ".npy"),
-        (save_numbered, ".npz"),
     ],
 )
 def test_a_file_cut_anywhere_is_refused(
@@ -303,7 +296,7 @@ def large_file(path: Path, head: bytes = b"") -> Path:
 def test_files_that_memory_cannot_hold_are_refused_before_they_are_read(tmp_path: Path) -> None:
     header = json.dumps({"a": {"dtype": "F32", "shape": [25 << 30], "data_offsets": [0, LARGE]}})
     head = struct.pack("<Q", len(header)) + header.encode()
-    for suffix in (".safetensors", ".pt", ".npy", ".npz", ".index"):
+    for suffix in (".safetensors", ".pt", ".npy", ".index"):
         refused(large_file(tmp_path / f"y{suffix}", head))
     index = bundle(tmp_path, {"a": entry(1, (25 << 30,), 0, LARGE)}, b"")
     large_file(tmp_path / "x.data-00000-of-00001")
