@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.terminal import print_json, progress_bar
+from pnpdepth_cli.cli.terminal import print_json
 from pnpdepth_cli.commands.refinement.refine_request import HoldOut, NetworkChoice, OutputOptions
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import DivergedError
@@ -77,12 +77,7 @@ def refine(as_json: bool, **values: Any) -> None:
     from pnpdepth_cli.commands.refinement.refine_image import refine_image
 
     request = options.request_of(values)
-    with progress_bar("refine", "update") as show:
-
-        def show_update(done: int, of: int, loss: float) -> None:
-            show(done, of, f"loss {loss:.4g}")
-
-        record = refine_image(request, on_iteration=show_update)
+    record = refine_image(request)
     if as_json:
         print_json(record.to_json())
     else:

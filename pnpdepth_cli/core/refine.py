@@ -35,9 +35,6 @@ _LOSS_SCALE = 1024.0
 DepthOf = Callable[[Any], Tensor]
 """Turns the network's output for one frame into depth (1, 1, h, w) in metres, differentiably."""
 
-OnIteration = Callable[[int, float], None]
-"""Called with (updates made, loss)."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Refinement:
@@ -57,7 +54,6 @@ def refine(
     *,
     depth_of: DepthOf,
     z0: Tensor | None = None,
-    on_iteration: OnIteration = lambda done, loss: None,
 ) -> Refinement:
     """Returns the network's depth for one frame, refined to agree with the points.
 
@@ -68,7 +64,6 @@ def refine(
         settings: Update rule, loss, step size and number of updates.
         depth_of: Turns the network's output into depth (1, 1, h, w) in metres, differentiably.
         z0: f_front of the arguments, where the front has run. None: it has not.
-        on_iteration: Callback after each update; gets the loss before it.
 
     Raises:
         DivergedError: The loss or its gradient is not finite; `last_good` is the Refinement until
@@ -124,7 +119,6 @@ def refine(
                 direction = rule(gradient).reshape(gradient.shape)
             alpha = step * SCHEDULES[settings.schedule](updates / settings.iterations)
             z = z - alpha * direction
-        on_iteration(updates + 1, so_far.losses[-1])
     assert so_far is not None
     return so_far
 

@@ -16,7 +16,6 @@ import torch
 from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration, evidence
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.refine import OnIteration
 from pnpdepth_cli.errors import PnpDepthError, UsageError
 from pnpdepth_cli.frames.default import refine_default
 from pnpdepth_cli.frames.frame import Frame, Register
@@ -125,14 +124,8 @@ class Method:
         """The settings of the user's network."""
         return self.own.settings
 
-    def refine(
-        self, frame: Frame, *, on_iteration: OnIteration = lambda done, loss: None
-    ) -> Refined:
+    def refine(self, frame: Frame) -> Refined:
         """Returns one frame refined, the same whatever was refined before.
-
-        Args:
-            frame: The frame.
-            on_iteration: Callback after each update of z of a fixed method.
 
         Raises:
             PnpDepthError: The frame cannot be refined.
@@ -147,10 +140,7 @@ class Method:
         if self.is_default:
             refined = refine_default(self._open, frame, seed=seed)
         else:
-            refined = refine_fixed(
-                self._open[0], frame,
-                seed=seed, validated=self._validated, on_iteration=on_iteration,
-            )  # fmt: skip
+            refined = refine_fixed(self._open[0], frame, seed=seed, validated=self._validated)
         if not self._uncertainty:
             return refined
         source = frame.sources.get("sparse")  # only a COLMAP model names an image
@@ -173,12 +163,7 @@ class Method:
 
 
 def refine_fixed(
-    network: OpenNetwork,
-    frame: Frame,
-    *,
-    seed: int = 0,
-    validated: bool = False,
-    on_iteration: OnIteration = lambda done, loss: None,
+    network: OpenNetwork, frame: Frame, *, seed: int = 0, validated: bool = False
 ) -> Refined:
     """Returns the frame refined by its one network, also if it diverged after a good depth.
 
@@ -187,14 +172,13 @@ def refine_fixed(
         frame: The frame, its image moved to its points.
         seed: Random seed of the validation points.
         validated: Whether the result is validated, for which the frame is refined again.
-        on_iteration: Callback after each update of z.
 
     Raises:
         PnpDepthError: The frame cannot be refined.
     """
     network.next_image()
     network.cut()
-    own = network.refine(frame, on_iteration=on_iteration)
+    own = network.refine(frame)
     kind = network.member.settings.propagate
     depth = propagate(own.after, frame.points, frame.rgb, kind=kind)
     split = split_frame(frame, depth, seed) if validated else None

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.losses import checked_loss
-from pnpdepth_cli.core.refine import OnIteration, Refinement, refine
+from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.replay import Interception
 from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
@@ -125,19 +125,12 @@ class OpenNetwork:
             self._split = self._open.enter_context(member.network.cut_at(member.layer))
         return self._split
 
-    def refine(
-        self,
-        frame: Frame,
-        *,
-        updates: bool = True,
-        on_iteration: OnIteration = lambda done, loss: None,
-    ) -> Prediction:
+    def refine(self, frame: Frame, *, updates: bool = True) -> Prediction:
         """Returns what this network gives for the frame, its residual not propagated.
 
         Args:
             frame: The image, the same in all calls until `next_image`, and the points of this call.
             updates: Whether z is updated.
-            on_iteration: Callback after each update of z.
 
         Raises:
             PnpDepthError: The refinement fails.
@@ -163,7 +156,7 @@ class OpenNetwork:
                     with self._coarse() as at_full_size:
                         result = refine(
                             self.cut(), prepared.arguments, prepared.points, settings,
-                            depth_of=reader, z0=z0, on_iteration=on_iteration,
+                            depth_of=reader, z0=z0,
                         )  # fmt: skip
                     if at_full_size:
                         before, after = reader(at_full_size[0]), reader(at_full_size[-1])

@@ -44,16 +44,11 @@ from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALID
 Stages = dict[str, Scores]
 
 
-def refine_image(
-    request: RefineRequest,
-    *,
-    on_iteration: Callable[[int, int, float], None] = lambda done, of, loss: None,
-) -> FrameRecord:
+def refine_image(request: RefineRequest) -> FrameRecord:
     """Refines one frame, writes its depth and companions, and returns its record.
 
     Args:
         request: Files, network and settings of the refinement.
-        on_iteration: Callback with (done, of, loss) after each update of z.
 
     Raises:
         PnpDepthError: Any of its kinds; then nothing is written.
@@ -65,8 +60,7 @@ def refine_image(
     with watch("load network"):
         method = load_method(request, inputs)
     with watch("refine"), method:
-        of = method.settings.iterations
-        frame = method.refine(inputs, on_iteration=lambda done, loss: on_iteration(done, of, loss))
+        frame = method.refine(inputs)
     return write_refined(request, outputs, method, inputs, frame, watch)
 
 
