@@ -62,49 +62,31 @@ class Pixels:
         return (self.predicted / self.truth).maximum(self.truth / self.predicted)
 
 
-Term = Callable[[Pixels], "Tensor"]
-"""What is summed over the pixels: (N,) of N pixels."""
+OfPixels = Callable[[Pixels], "Tensor"]
+"""Of N pixels: a value of each, (N,), or a measure of all, a scalar."""
 
 
-@dataclass(frozen=True)
-class Formula:
-    """A measure as a function of sums over pixels.
-
-    So the sums of several images can be added, which gives all their pixels equal weight.
-    """
-
-    terms: tuple[Term, ...]
-    """What is summed; the first term counts the pixels."""
-    of_sums: Callable[..., Tensor]
-    """Function from the sum of each term, of any shape, to the measure."""
-
-
-def pixel_count(pixels: Pixels) -> Tensor:
-    """Returns 1 for each pixel."""
-    return pixels.truth.new_ones(pixels.truth.shape)
-
-
-def mean(term: Term, factor: float = 1.0) -> Formula:
+def mean(term: OfPixels, factor: float = 1.0) -> OfPixels:
     """Returns the formula factor · mean of the term."""
-    return Formula((pixel_count, term), lambda count, total: factor * (total / count))
+    return lambda pixels: factor * term(pixels).mean()
 
 
-def root_mean_square(term: Term, factor: float = 1.0) -> Formula:
+def root_mean_square(term: OfPixels, factor: float = 1.0) -> OfPixels:
     """Returns the formula factor · √ mean of the squared term."""
-    terms = (pixel_count, lambda pixels: term(pixels).square())
-    return Formula(terms, lambda count, total: factor * (total / count).sqrt())
+    return lambda pixels: factor * term(pixels).square().mean().sqrt()
 
 
-def deviation(term: Term, factor: float = 1.0) -> Formula:
+def deviation(term: OfPixels, factor: float = 1.0) -> OfPixels:
     """Returns the formula factor · standard deviation of the term."""
 
-    def of_sums(count: Tensor, squares: Tensor, total: Tensor) -> Tensor:
-        return factor * (squares / count - (total / count).square()).clamp_min(0).sqrt()
+    def of_pixels(pixels: Pixels) -> Tensor:
+        values = term(pixels)
+        return factor * (values.square().mean() - values.mean().square()).clamp_min(0).sqrt()
 
-    return Formula((pixel_count, lambda pixels: term(pixels).square(), term), of_sums)
+    return of_pixels
 
 
-def fraction_below(number: int) -> Formula:
+def fraction_below(number: int) -> OfPixels:
     """Returns the formula of δ: the fraction of pixels whose ratio is below a threshold."""
     return mean(lambda pixels: (pixels.ratio < pixels.thresholds[number - 1]).double())
 
@@ -128,11 +110,13 @@ class Measure:
     """Factor from `unit` to the unit in tables."""
     main: bool = False
     """True if short tables have it."""
-    formula: Formula | Callable[..., float] | None = field(default=None, compare=False, repr=False)
-    """Formula of sums over scored pixels, or function of images. None: the measure is from a file.
+    of_pixels: OfPixels | None = field(default=None, compare=False, repr=False)
+    """Formula of the scored pixels; NaN without any."""
+    formula: Callable[..., float] | None = field(default=None, compare=False, repr=False)
+    """Function of images, where there is no formula of pixels. None: the measure is from a file.
 
-    The function takes predicted and true depth (H, W) in metres, 0 where unknown or not scored. It
-    gives NaN where there is no value."""
+    It takes predicted and true depth (H, W) in metres, 0 where unknown or not scored. It gives NaN
+    where there is no value."""
 
     @property
     def table_unit(self) -> str:
@@ -160,13 +144,13 @@ class Measure:
         return f"{value * self.shown_factor:,.{self.decimals}f} {unit}".rstrip()
 
     def value(self, *inputs: Any) -> float:
-        """Returns the value by a formula that is not of sums."""
-        assert callable(self.formula)
+        """Returns the value by the function of images."""
+        assert self.formula is not None
         return self.formula(*inputs)
 
     def to_json(self) -> dict[str, Any]:
         """Returns all but the formula."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "formula"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Measure:
@@ -207,37 +191,37 @@ class FrameMeans:
 
 MEASURES = (
     Measure(
-        key="rmse", title="RMSE", unit="m", main=True, formula=root_mean_square(lambda p: p.error)
+        key="rmse", title="RMSE", unit="m", main=True, of_pixels=root_mean_square(lambda p: p.error)
     ),
-    Measure(key="mae", title="MAE", unit="m", main=True, formula=mean(lambda p: p.error.abs())),
-    Measure(key="mre", title="MRE", main=True, formula=mean(lambda p: p.error.abs() / p.truth)),
+    Measure(key="mae", title="MAE", unit="m", main=True, of_pixels=mean(lambda p: p.error.abs())),
+    Measure(key="mre", title="MRE", main=True, of_pixels=mean(lambda p: p.error.abs() / p.truth)),
     Measure(
-        key="sq_rel", title="SqRel", unit="m", formula=mean(lambda p: p.error.square() / p.truth)
+        key="sq_rel", title="SqRel", unit="m", of_pixels=mean(lambda p: p.error.square() / p.truth)
     ),
     Measure(
-        key="log10", title="log10", formula=mean(lambda p: p.log_error.abs(), 1 / math.log(10))
+        key="log10", title="log10", of_pixels=mean(lambda p: p.log_error.abs(), 1 / math.log(10))
     ),
-    Measure(key="rmse_log", title="RMSE log", formula=root_mean_square(lambda p: p.log_error)),
+    Measure(key="rmse_log", title="RMSE log", of_pixels=root_mean_square(lambda p: p.log_error)),
     Measure(
         key="irmse",
         title="iRMSE",
         unit="1/km",
         decimals=2,
-        formula=root_mean_square(lambda p: p.inverse_error, 1000),
+        of_pixels=root_mean_square(lambda p: p.inverse_error, 1000),
     ),
     Measure(
         key="imae",
         title="iMAE",
         unit="1/km",
         decimals=2,
-        formula=mean(lambda p: p.inverse_error.abs(), 1000),
+        of_pixels=mean(lambda p: p.inverse_error.abs(), 1000),
     ),
     Measure(
         key="silog",
         title="SILog",
         unit="100·log m",
         decimals=2,
-        formula=deviation(lambda p: p.log_error, 100),
+        of_pixels=deviation(lambda p: p.log_error, 100),
     ),
     *(
         Measure(
@@ -247,7 +231,7 @@ MEASURES = (
             percent=True,
             decimals=2,
             main=number == 1,
-            formula=fraction_below(number),
+            of_pixels=fraction_below(number),
         )
         for number in (1, 2, 3)
     ),
@@ -275,22 +259,23 @@ def by_depth(near_m: float, far_m: float) -> tuple[Measure, ...]:
             key=f"{measure.key}_{name}",
             title=f"{measure.title} {title}",
             main=False,
-            formula=_within(measure.formula, low_m, high_m),
+            of_pixels=_within(measure.of_pixels, low_m, high_m),
         )
         for name, title, low_m, high_m in parts
         for measure in MEASURES
-        if measure.main and isinstance(measure.formula, Formula)
+        if measure.main and measure.of_pixels
     )
 
 
-def _within(formula: Formula, low_m: float, high_m: float) -> Formula:
-    """The formula over the pixels whose true depth lies in [low_m, high_m)."""
+def _within(of_pixels: OfPixels, low_m: float, high_m: float) -> OfPixels:
+    """The formula of the pixels whose true depth lies in [low_m, high_m)."""
 
-    def within(term: Term, pixels: Pixels) -> Tensor:
+    def within(pixels: Pixels) -> Tensor:
         inside = (pixels.truth >= low_m) & (pixels.truth < high_m)
-        return term(pixels) * inside
+        part = Pixels(pixels.predicted[inside], pixels.truth[inside], pixels.thresholds)
+        return of_pixels(part)
 
-    return Formula(tuple(partial(within, term) for term in formula.terms), formula.of_sums)
+    return within
 
 
 _RATIOS = tuple(1.05 + 0.2 * step / 9 for step in range(10))

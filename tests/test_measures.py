@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy.integrate import trapezoid
 
-from pnpdepth_cli.core.metrics import error_sums, measures_of
+from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.measures import OF_SIGMA, TABLE, FrameMeans, by_depth
+from pnpdepth_cli.measures import DELTA_THRESHOLDS, OF_SIGMA, TABLE, FrameMeans, by_depth
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 MAIN = ("rmse", "mae", "mre", "delta1")
@@ -102,7 +102,8 @@ def test_errors_by_depth_are_those_of_the_pixels_of_each_part() -> None:
     for depth, truth in frames():
         measures = by_depth(3.0, 12.0)
         tensors = (torch.from_numpy(each.copy()) for each in (depth, truth))
-        found = measures_of(error_sums(*tensors, measures=measures), measures).tolist()
+        pixels = scored_pixels(*tensors, DELTA_THRESHOLDS)
+        found = list(measure_pixels(pixels, measures).values())
         p, g = (each[(depth > 0) & (truth > 0)].astype(np.float64) for each in (depth, truth))
         expected = []
         for part in (g < 3, (g >= 3) & (g < 12), g >= 12):

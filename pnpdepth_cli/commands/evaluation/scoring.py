@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
-from pnpdepth_cli.core.metrics import error_sums, measures_of
+from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
 from pnpdepth_cli.dataset.arrays import apply_masks, raw_depth, read_image
 from pnpdepth_cli.dataset.frame_camera import camera_of_file
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
@@ -28,7 +28,7 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_depth
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.sparse_files import read_sparse
-from pnpdepth_cli.measures import OF_SIGMA, Formula
+from pnpdepth_cli.measures import OF_SIGMA
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import rays_of_image
 from pnpdepth_cli.sensors.pixels import pixel_index
@@ -143,7 +143,7 @@ def _score(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> tuple[S
         "factor": factor,
         "shift": shift,
     }
-    # Measures of sums over pixels, then those of whole images.
+    # Measures of pixels, then those of whole images.
     of_sigma: Scores = {}
     if frame.sigma is not None:
         of_sigma = {m.key: m.value(depth, gt, frame.sigma) for m in OF_SIGMA}
@@ -152,11 +152,9 @@ def _score(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> tuple[S
     if not both.any():
         where = " where the ground truth is known" if (depth > 0).any() else ""
         return counts, f"{pair.result.depth} holds no valid depth{where}"
-    summed = [m for m in request.measures if isinstance(m.formula, Formula)]
     depths = torch.from_numpy(depth), torch.from_numpy(gt)
-    sums = error_sums(*depths, request.rules.thresholds, summed)
-    of_pixels = zip(summed, measures_of(sums, summed).tolist(), strict=True)
-    values: Scores = {measure.key: value for measure, value in of_pixels}
+    pixels = scored_pixels(*depths, request.rules.thresholds)
+    values: Scores = {**measure_pixels(pixels, request.measures)}
     values |= {m.key: m.value(depth, gt) for m in request.measures if m.key not in values}
     return values | of_sigma | counts, None
 
