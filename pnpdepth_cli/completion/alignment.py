@@ -94,9 +94,7 @@ def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -
 
     Args:
         x: (N,) the network's numbers at the points.
-        points: N points.
         spaces: Quantities that the network may predict, of `choices.SPACES`.
-        kind: One of `choices.ALIGNMENTS`.
 
     Raises:
         NoPointsError: There are too few points.
@@ -129,8 +127,6 @@ def align_prediction(
 
     Args:
         prediction: (H, W) depth, metric or not; not positive or not finite is unknown.
-        points: Sparse depth of the same image.
-        kind: One of `choices.ALIGNMENTS`.
         space: Quantity in which the line is fitted, one of `choices.SPACES`.
 
     Raises:

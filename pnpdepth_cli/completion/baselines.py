@@ -54,7 +54,6 @@ def align_locally(prediction: Tensor, points: SparsePoints) -> Tensor:
     Args:
         prediction: (H, W) depth, metric or not; not positive or not finite is unknown, and 0 in the
             result.
-        points: Sparse depth of the same image.
 
     Raises:
         NoPointsError: No point has a prediction.

@@ -107,7 +107,6 @@ def predict_at(field: ResidualField, xy: Tensor, features: Tensor) -> Tensor:
 
     Args:
         xy: (M, 2) pixel coordinates.
-        features: (M, 3 or 6), the features there.
     """
     if _is_exact(field) or len(field.points) <= NEIGHBOURS:
         return _solve(field, _all_points(field), features[None])[0]

@@ -36,9 +36,7 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
     taken outside the points' hull, and everywhere if all are on one line.
 
     Args:
-        points: Sparse depth.
         xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel.
-        space: Quantity that is linear.
     """
     points = distinct(points)
     pixels = pixels_of(points.size) if xy is None else xy.cpu().double()

@@ -42,7 +42,6 @@ def outliers(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Te
 
     Args:
         prediction: (H, W) metres.
-        points: Sparse depth of the same image.
         rgb: (3, H, W) in 0…1, or None.
 
     Raises:
@@ -63,7 +62,6 @@ def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
 
     Args:
         prediction: (H, W) metres, 0 = unknown, of a network that weighs its points.
-        points: The points that it was given.
     """
     at_points = points.sample(prediction)
     error = points.depth.log() - at_points.clamp_min(1e-6).log()

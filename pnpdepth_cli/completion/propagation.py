@@ -67,7 +67,6 @@ def propagate(
 
     Args:
         prediction: (H, W) metres.
-        points: Sparse depth of the same image.
         rgb: (3, H, W) in 0…1, or None.
         kind: A name in `choices.PROPAGATIONS`, or "none".
 
@@ -89,10 +88,8 @@ def propagate_at(
 
     Args:
         prediction: (H, W) metres.
-        points: Sparse depth of the same image.
         rgb: (3, H, W) in 0…1, or None.
         xy: (M, 2) pixel coordinates.
-        kind: A name in `choices.PROPAGATIONS`.
 
     Raises:
         NoPointsError: No point has a prediction.
@@ -129,7 +126,6 @@ def local_lines(
     """Returns shift and slope, (H, W) each, of the line around every pixel.
 
     Args:
-        points: N points.
         xy: (M, 2) pixel coordinates around which lines (M,) are wanted. None: every pixel.
         residual: (N,) y at the points.
         z: (N,) x at the points, in units of its standard deviation.

@@ -67,7 +67,6 @@ def residual_field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None)
 
     Args:
         prediction: (H, W) metres; not positive or not finite is unknown.
-        points: Sparse depth of the same image.
         rgb: (3, H, W) in 0…1, or None.
 
     Raises:

@@ -14,7 +14,7 @@ equations 2 and 3:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -78,6 +78,7 @@ def refine(
     rule: Update = UPDATES[settings.update]()
     scale = _LOSS_SCALE if split.in_half else 1.0  # of the loss, so that no gradient vanishes
     so_far: Refinement | None = None
+    losses: tuple[float, ...] = ()
     for updates in range(settings.iterations + 1):
         is_last = updates == settings.iterations
         # The depth f_rear(z_k) and its loss L at the points.
@@ -97,7 +98,9 @@ def refine(
             loss = loss_of(at_points, points.depth)
         if settings.iterations and not bool(loss.isfinite()):
             raise _diverged("loss", updates, step, so_far)
-        so_far = _append(so_far, depth.detach(), float(loss.detach()), step)
+        after, losses = depth.detach(), (*losses, float(loss.detach()))
+        before = after if so_far is None else so_far.before
+        so_far = Refinement(before=before, after=after, losses=losses, step=step)
         if is_last:
             break
         # Its gradient at z_k.
@@ -121,13 +124,6 @@ def refine(
             z = z - alpha * direction
     assert so_far is not None
     return so_far
-
-
-def _append(so_far: Refinement | None, depth: Tensor, loss: float, step: float) -> Refinement:
-    """The refinement with the depth of one more z."""
-    if so_far is None:
-        return Refinement(before=depth, after=depth, losses=(loss,), step=step)
-    return replace(so_far, after=depth, losses=(*so_far.losses, loss))
 
 
 def _diverged(quantity: str, updates: int, step: float, so_far: Refinement | None) -> DivergedError:

@@ -93,10 +93,8 @@ def learn(
     The network itself does not change.
 
     Args:
-        network: Network with a resolved definition.
         frames: Frames with their names, at least `LEAST_FRAMES`.
         seed: Random seed of the frames' order and of the hidden points.
-        on_step: Callback after every update.
 
     Raises:
         UsageError: The network takes no sparse depth.

@@ -170,7 +170,6 @@ def refine_fixed(
     Args:
         network: The network, open.
         frame: The frame, its image moved to its points.
-        seed: Random seed of the validation points.
         validated: Whether the result is validated, for which the frame is refined again.
 
     Raises:

@@ -130,7 +130,6 @@ class OpenNetwork:
 
         Args:
             frame: The image, the same in all calls until `next_image`, and the points of this call.
-            updates: Whether z is updated.
 
         Raises:
             PnpDepthError: The refinement fails.
@@ -243,7 +242,6 @@ def encoding_once(network: Network, encoded: dict[str, Any]) -> Iterator[None]:
     """Inside, the image encoder runs once, if the definition names one; its output is kept.
 
     Args:
-        network: The network.
         encoded: Kept outputs by the encoder's name; the caller clears them for another image.
     """
     name = network.definition.image_encoder

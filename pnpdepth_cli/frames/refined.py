@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,9 +115,9 @@ def make_refined(
     *,
     used: SparsePoints,
     notes: Sequence[str] = (),
-    stages: Mapping[str, Tensor] | None = None,
+    stages: Mapping[str, Tensor] = MappingProxyType({}),
     validation: Validation | None = None,
-    weights: Mapping[str, float] | None = None,
+    weights: Mapping[str, float] = MappingProxyType({}),
 ) -> Refined:
     """Returns the refined frame.
 
@@ -124,27 +125,22 @@ def make_refined(
         frame: The frame, its image moved to its points.
         own: Prediction of the user's network for it.
         depth: (H, W) metres, 0 = unknown: the refined depth.
-        used: The points that the depth was fitted to.
         notes: Lines of the method for a person.
         stages: (H, W) metres of stages of the method, by name.
-        validation: The stages at the validation points.
-        weights: Weights of the experts by name.
     """
     if frame.registration is not None:
         notes = (f"image: moved into the frame of the points by {frame.registration}", *notes)
-    stages = stages or {}
-    before, after, *others = (each.numpy() for each in (own.before, depth, *stages.values()))
     return Refined(
-        before=before,
-        after=after,
+        before=own.before.numpy(),
+        after=depth.numpy(),
         used=used,
         held_out=used.select(slice(0)) if frame.held_out is None else frame.held_out,
         refinement=own.refinement,
         diverged=own.diverged,
         alignment=own.alignment,
         notes=(*own.notes, *notes),
-        stages=dict(zip(stages, others, strict=True)),
+        stages={name: each.numpy() for name, each in stages.items()},
         validation=validation,
-        weights=weights or {},
+        weights=weights,
         registration=frame.registration,
     )

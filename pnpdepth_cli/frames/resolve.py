@@ -64,7 +64,6 @@ def resolve_definition(
     frames.
 
     Args:
-        frame: The first frame, registered.
         more_frames: Function of further frames; called only where the input range is open.
 
     Raises:
@@ -120,8 +119,6 @@ def resolve_settings(
     an image alone is scaled to points in another unit.
 
     Args:
-        definition: The network's definition.
-        settings: Settings that the user gives.
         metric: Whether the points are in metres.
 
     Raises:
@@ -142,12 +139,6 @@ def resolve_member(network: Network, frame: Frame, asked: Settings, *, is_defaul
 
     In the default method, a network whose output is metric is aligned too, where the points say
     that it should be. Of networks that take the points, only those with a prior are updated.
-
-    Args:
-        network: A network whose definition is resolved.
-        frame: The first frame, registered.
-        asked: Settings that the user gives.
-        is_default: Whether the default method refines it.
     """
     definition, layer = network.definition, asked.layer
     if layer is None and not asked.is_paper:

@@ -71,7 +71,6 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
     """Returns a refined frame with its standard deviation, calibrated by its check.
 
     Args:
-        frame: The refined frame.
         of_matches: Whether its points were matched in images, as those of COLMAP.
     """
     points = frame.used
@@ -185,7 +184,6 @@ def valid_depth(points: SparsePoints, depth: Tensor, sigma: Tensor) -> Tensor:
     lines, except at pixels about as near to a point as the pixels inside the hull are.
 
     Args:
-        points: Sparse depth of the image.
         depth: (H, W) metres.
         sigma: (H, W) metres.
     """

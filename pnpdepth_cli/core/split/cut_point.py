@@ -110,20 +110,6 @@ class CutPoint:
         hint = f"cut at a part of it: {', '.join(inside[:4])}" if inside else "choose another layer"
         return LayerError(f"layer {self.layer!r} never runs in this network's forward; {hint}")
 
-    def several_calls(self, calls: int) -> LayerError:
-        """Returns the error of a layer that is called several times, without a choice of one."""
-        choices = ", ".join(f"{self.layer}#{call}" for call in range(1, calls + 1))
-        return LayerError(
-            f"layer {self.layer!r} is called {calls} times; say which call: {choices}"
-        )
-
-    def aliased(self) -> LayerError:
-        """Returns the error of a z that shares memory with a tensor the network changes."""
-        return LayerError(
-            f"layer {self.layer!r}: its output lies in the memory of an earlier tensor, and"
-            " the network changes one in place and reads the other; cut one layer later"
-        )
-
 
 def _containers(inner: nn.Module, modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
     names = [f"{name}." for name, module in modules.items() if module is inner]

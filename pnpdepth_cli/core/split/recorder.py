@@ -11,13 +11,13 @@ from pnpdepth_cli.core.split.cut_point import CutPoint
 from pnpdepth_cli.core.split.replay import RecordedCall, Recording, Replay, shapes_of
 from pnpdepth_cli.core.split.tensors import SavedTensors, tensors_in
 from pnpdepth_cli.core.split.watch import Watch
+from pnpdepth_cli.errors import LayerError
 
 
 class Recorder:
     """Notes the calls of one pass that the replay's recording does not know yet.
 
     Args:
-        cut: Layer where the network is cut.
         watch: Sees the operations of the pass.
         replay: Handles the pass; gets the longer recording when the pass is over.
         uncacheable: Submodules that contain something which forbids to cache them as a whole;
@@ -87,11 +87,15 @@ class Recorder:
         Raises:
             LayerError: The cut is ambiguous, or its output cannot be replaced.
         """
-        calls = self._replay.calls[self._cut.module]
+        layer, calls = self._cut.layer, self._replay.calls[self._cut.module]
         if self._cut.name.call is None and calls > 1:
-            raise self._cut.several_calls(calls)
-        if self.watch.torn:
-            raise self._cut.aliased()
+            choices = ", ".join(f"{layer}#{call}" for call in range(1, calls + 1))
+            raise LayerError(f"layer {layer!r} is called {calls} times; say which call: {choices}")
+        if self.watch.torn:  # z shares memory with a tensor that the network changes
+            raise LayerError(
+                f"layer {layer!r}: its output lies in the memory of an earlier tensor, and the"
+                " network changes one in place and reads the other; cut one layer later"
+            )
         # Another z may take another path behind the cut, unless the definition says otherwise. So
         # no call there is recorded, and saved outputs stay whole, as it may read or change them.
         if self.watch.data_dependent and not promised_static:

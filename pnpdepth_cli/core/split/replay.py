@@ -120,7 +120,6 @@ class Replay:
     In the learning passes, calls that the recording does not know go to the `recorder`.
 
     Args:
-        cut: Layer where the network is cut.
         arguments: Arguments of the network for the first frame.
     """
 
