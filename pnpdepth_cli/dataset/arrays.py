@@ -71,7 +71,7 @@ def read_levels(path: Path) -> NDArray[np.floating | np.integer]:
     if path.suffix.lower() in IMAGE_SUFFIXES:
         image = read_rgb(path)
         return np.asarray(np.rint(image.values.max(axis=2) * image.white))
-    values = load_stored(path).values
+    values = load_stored(path, is_mask=True).values
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[:, :, 0]
     if values.ndim != 2:

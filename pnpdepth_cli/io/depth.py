@@ -67,8 +67,8 @@ def read_depth(path: Path, *, scale: float | None = None) -> DepthFile:
     return depth_from_stored(path, load_stored(path), scale)
 
 
-def load_stored(path: Path) -> DepthFile:
-    """Returns the one array of numbers in the file that can be depth, of whatever shape.
+def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
+    """Returns the one array in the file, of whatever shape; of truth values only if it is a mask.
 
     Raises:
         InputError: The file is missing, damaged, beyond the budget, or not a depth file.
@@ -76,7 +76,10 @@ def load_stored(path: Path) -> DepthFile:
     data = read_bytes(path)
     depth_format = format_of_content(data)
     if depth_format is not None:
-        return depth_format.read(path, data)
+        stored = depth_format.read(path, data)
+        if stored.values.dtype.kind == "b" and not is_mask:
+            raise FileFormatError(f"{path} holds bool values; depth is float or integer")
+        return stored
     kind = kind_of(data)
     if kind is not None:
         raise eight_bits(path, kind)

@@ -278,6 +278,15 @@ def test_only_sparse_depth_of_enough_confidence_is_used(
         indoor(tmp_path / "sparse.npy", None, of)
 
 
+def test_an_array_of_truth_values_is_a_mask_and_no_depth(tmp_path: Path) -> None:
+    np.save(tmp_path / "mask.npy", np.arange(640) < np.full((480, 1), 320))
+    frame = indoor(INDOOR / "sparse.png", tmp_path / "mask.npy")
+    expected = np.count_nonzero(codes_of(INDOOR / "sparse.png")[:, :320])
+    assert len(frame.points) == expected
+    with pytest.raises(FileFormatError, match=r"mask\.npy"):
+        indoor(tmp_path / "mask.npy", None)
+
+
 def test_a_mask_of_ground_truth_that_is_not_there_is_said_not_to_be_used(tmp_path: Path) -> None:
     Image.fromarray(np.ones((480, 640), np.uint8)).save(tmp_path / "mask.png")
     frame = indoor(INDOOR / "sparse.png", None, masks=(tmp_path / "mask.png",))

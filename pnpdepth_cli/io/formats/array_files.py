@@ -60,8 +60,8 @@ def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]
         raise damaged(path, kind, f"cannot be read ({type(error).__name__}: {error})") from error
     if dtype.hasobject:
         raise FileFormatError(f"{path} holds pickled objects; save numbers with allow_pickle=False")
-    if dtype.kind not in "fiu":
-        raise FileFormatError(f"{path} holds {dtype} values; depth is float or integer, save it so")
+    if dtype.kind not in "fiub":
+        raise FileFormatError(f"{path} holds {dtype} values; save numbers")
     # The numbers that it claims.
     count, start = math.prod(shape), stream.tell()
     check_value_count(path, count, value_bytes=dtype.itemsize)
