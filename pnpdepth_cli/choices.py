@@ -242,6 +242,5 @@ LENSES = ("radial-tangential", "fisheye")
 PROTOCOLS = tuple(protocols.PROTOCOLS)
 """How frames are cut, given points and scored: `pnpdepth_cli.protocols`."""
 
-RESIZES = ("nearest", "bilinear")  # of a prediction to the size of the ground truth
-SCALINGS = ("none", "median", "affine", "affine-disparity", "log")  # of each image to its truth
+SCALINGS = ("none", "median", "affine", "affine-disparity")  # of each image to its truth
 PREDICTION_KINDS = ("depth", "disparity")

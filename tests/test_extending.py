@@ -69,7 +69,7 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     by_file += ["--propagate", "median", "-o", "by_file.raw", "--json"]
     again = json.loads(run(["refine", *files, *network, *by_file], package))
     assert again["loss"] == record["loss"]
-    measures = ["--measures", "median_error", "--json"]
+    measures = ["--columns", "mae,median_error", "--json"]
     scores = json.loads(run(["eval", "out/rgb_depth.raw", "indoor/gt.png", *measures], package))
     assert {"rmse", "median_error"} <= {each["key"] for each in scores["measures"]}
     assert scores["mean"]["median_error"] < scores["mean"]["mae"]

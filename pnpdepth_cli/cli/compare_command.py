@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +11,6 @@ from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import print_json
 from pnpdepth_cli.measures import parse_keys
 
-_LABEL_LETTERS = 36
-
-
-columns = click.option(
-    "--columns",
-    type=parse_keys,
-    metavar="KEY,…",
-    help="Measures of the tables, in this order, such as rmse,mae,delta1.",
-)
-
 
 @click.command(short_help="Compare runs that eval or batch scored.")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN RUN…")
@@ -29,7 +18,12 @@ columns = click.option(
     csv="Write the table as CSV.",
     latex="Write a tabular of runs × measures: the best in bold, * where p < 0.05.",
 )
-@columns
+@click.option(
+    "--columns",
+    type=parse_keys,
+    metavar="KEY,…",
+    help="Measures of the tables, in this order, such as rmse,mae,delta1.",
+)
 @click.option(
     "--plot",
     type=options.FILE,
@@ -67,14 +61,8 @@ def compare(
         plot_comparison(comparison, plot, overwrite=files.overwrite)
     print_notes(comparison.notes)
     table = command.comparison_table(comparison)
-    to_stdout = files.write(csv=table, latex=command.methods_table(comparison))
+    to_stdout = files.write(table, command.methods_table(comparison))
     if files.as_json:
         print_json(comparison.to_json())
     elif not to_stdout:
-        # a long label would make the table wider than a terminal
-        rows = [[title, _short(label), *cells] for title, label, *cells in table.rows]
-        print_table(replace(table, rows=rows))
-
-
-def _short(label: str) -> str:
-    return label if len(label) <= _LABEL_LETTERS else f"…{label[1 - _LABEL_LETTERS :]}"
+        print_table(table)

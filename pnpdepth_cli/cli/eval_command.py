@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from pnpdepth_cli.cli import grouped_help, options
-from pnpdepth_cli.cli.compare_command import columns
 from pnpdepth_cli.cli.terminal import print_json, progress_bar
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.errors import FramesFailedError
 
-_OUTPUT = ("--csv", "--latex", "--columns", "--overwrite", "--json")
+_OUTPUT = ("--csv", "--columns", "--overwrite", "--json")
 
 
 @click.command(
@@ -27,15 +25,14 @@ _OUTPUT = ("--csv", "--latex", "--columns", "--overwrite", "--json")
     ),
     groups={
         "Protocol": (EvalRequest,),
-        "Input": ("--pred-scale", "--gt-scale", "--gt-range"),
+        "Input": ("--pred-scale", "--gt-scale"),
         "Output": _OUTPUT,
     },
 )
 @click.argument("prediction", type=options.FILE, metavar="PRED")
 @click.argument("ground_truth", type=options.FILE, metavar="GT")
 @options.options_of_groups(EvalRequest)
-@options.table_files(csv="Write a row per frame.", latex="Write a tabular of the means.")
-@columns
+@options.table_files(csv="Write a row per frame.")
 def evaluate(prediction: Path, ground_truth: Path, **values: Any) -> None:
     """Score the depth in PRED against the ground truth in GT: two files, or two folders.
 
@@ -63,27 +60,23 @@ def evaluate(prediction: Path, ground_truth: Path, **values: Any) -> None:
     """
     from pnpdepth_cli.cli.printing import TableFiles, print_notes, print_table
     from pnpdepth_cli.commands.evaluation import evaluate as command
-    from pnpdepth_cli.measures import OF_SIGMA, choose_measures
 
     # All that can be wrong is found before anything is scored.
-    files = TableFiles(**{each.name: values.pop(each.name) for each in fields(TableFiles)})
+    names = ("csv", "overwrite", "as_json")
+    files = TableFiles(**{name: values.pop(name) for name in names})
     files.check((prediction, ground_truth))
-    keys = values.pop("columns")
     request = EvalRequest(prediction=prediction, ground_truth=ground_truth, **values)
-    choose_measures((*request.measures, *OF_SIGMA), keys)
     # The scores, as tables and as JSON.
     with progress_bar("eval", "frame") as show:
         evaluation = command.evaluate(request, on_frame=show)
     print_notes([f"protocol {request.describe()}", *evaluation.notes])
-    frames, means = command.frames_table(evaluation, keys), command.means_table(evaluation, keys)
-    described = replace(means, title=f"{means.title}; {evaluation.describe()}")
-    to_stdout = files.write(csv=frames, latex=described)
+    to_stdout = files.write(command.frames_table(evaluation))
     if files.as_json:
         print_json(evaluation.to_json())
     elif not to_stdout:
-        print_table(means)
-        if len(evaluation.frames) > 1:
-            print_table(command.worst_frames(evaluation, keys))
+        print_table(command.means_table(evaluation))
+        if len(evaluation.scored) > 1:
+            print_table(command.worst_frames(evaluation))
     if reasons := evaluation.describe_unscored():
         out, of = len(evaluation.frames) - len(evaluation.scored), len(evaluation.frames)
         raise FramesFailedError(

@@ -123,18 +123,20 @@ sparse_output = click.option(
 )
 
 
-def table_files(*, csv: str, latex: str) -> Callable[[Any], Any]:
+def table_files(*, csv: str, latex: str | None = None) -> Callable[[Any], Any]:
     """Returns a decorator that adds the options of `tables.TableFiles`.
 
     Args:
         csv: Help text of `--csv`.
-        latex: Help text of `--latex`.
+        latex: Help text of `--latex`. None: the command has no such option.
     """
 
     def decorate(command: Any) -> Any:
-        with_latex = click.option("--latex", type=FILE, metavar="FILE|-", help=latex)
-        with_csv = click.option("--csv", type=FILE, metavar="FILE|-", help=csv)
-        return with_csv(with_latex(overwrite(as_json(command))))
+        command = overwrite(as_json(command))
+        for flag, help in (("--latex", latex), ("--csv", csv)):
+            if help is not None:
+                command = click.option(flag, type=FILE, metavar="FILE|-", help=help)(command)
+        return command
 
     return decorate
 

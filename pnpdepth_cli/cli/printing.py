@@ -38,7 +38,7 @@ class TableFiles:
     """Where the tables of a command are written; `-` is stdout."""
 
     csv: Path | None
-    latex: Path | None
+    latex: Path | None = None
     overwrite: bool
     as_json: bool
 
@@ -63,16 +63,17 @@ class TableFiles:
             if not path.parent.is_dir():
                 raise OutputError(f"{path}: its folder does not exist; create it first")
 
-    def write(self, *, csv: Table, latex: Table) -> bool:
+    def write(self, csv: Table, latex: Table | None = None) -> bool:
         """Writes the files that were named. Returns whether a text went to stdout."""
-        to_stdout = False
-        for path, text in ((self.csv, csv.csv), (self.latex, latex.latex)):
+        texts = {} if self.csv is None else {self.csv: csv.csv()}
+        if self.latex is not None and latex is not None:
+            texts[self.latex] = latex.latex()
+        for path, text in texts.items():
             if str(path) == "-":
-                to_stdout = True
-                click.echo(text().encode("utf-8", "backslashreplace"), nl=False)
-            elif path is not None:
-                write_text(path, text())
-        return to_stdout
+                click.echo(text.encode("utf-8", "backslashreplace"), nl=False)
+            else:
+                write_text(path, text)
+        return Path("-") in texts
 
 
 class _Console(Console):

@@ -2,7 +2,8 @@
 
 Errors of neighbouring frames of a video are alike, so whole clusters of frames are left out or
 swapped. The bootstraps of scipy.stats cover too little with few clusters of skewed errors; the
-coverage of the intervals here is in docs/notes/statistics.md.
+coverage of the intervals here is in docs/notes/statistics.md. A frame that lacks a measure, which
+is then NaN, is left out.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ MAX_BLOCKS = 10
 """Most blocks of a single sequence. Few long blocks stay independent also where the correlation is
 not that of a first-order autoregression, at a small loss of power (Ibragimov and Müller 2010)."""
 
+PERMUTATIONS = 10_000
+"""Most swaps of two runs that are tried."""
 _CELLS = 1 << 21
 """Numbers held at once, so that memory stays bounded for any number of clusters."""
 
@@ -47,6 +50,10 @@ class Clusters:
     def count(self) -> int:
         """How many clusters there are."""
         return int(self.ids.max()) + 1
+
+    def to_json(self) -> dict[str, object]:
+        """Returns what JSON files have of it."""
+        return {"count": self.count, "unit": self.unit}
 
     def describe(self) -> str:
         """Returns text such as `12 groups of frames`."""
@@ -110,117 +117,97 @@ def block_length(series: Floats) -> int:
     return min(frames, math.ceil(2 * correlation / (1 - correlation**2) / BLOCK_BIAS))
 
 
-def _cluster_sums(values: Floats, clusters: Clusters) -> Floats:
-    """(G, 2, M) the sum of (N, M) values in each cluster, and how many frames have one."""
-    known = np.isfinite(values)
-    sums = np.zeros((clusters.count, 2, values.shape[1]))
-    np.add.at(sums, clusters.ids, np.stack([np.where(known, values, 0.0), known], axis=1))
-    return sums
+def _sums(values: Sequence[Floats], clusters: Clusters) -> tuple[Floats, Floats]:
+    """(R, G) sums of R runs (N,) in each cluster that has any, and (G,) how many frames they have.
+
+    Frames count that all runs have.
+    """
+    known = np.isfinite(values).all(axis=0)
+    ids = np.unique(clusters.ids[known], return_inverse=True)[1]
+    counts = np.bincount(ids).astype(np.float64)
+    return np.array([np.bincount(ids, run[known], len(counts)) for run in values]), counts
 
 
-def _mean(sums: Floats) -> Floats:
-    """(…, M) the means of sums and counts (…, 2, M); NaN where no frame has a value."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(sums[..., 0, :] / sums[..., 1, :])
-
-
-def gain(before: Floats, after: Floats, better: Floats) -> Floats:
-    """Returns (…, M) the change in per cent of `before`; NaN where that is no number.
+def gain(before: Floats | float, after: Floats | float, sign: int) -> Floats:
+    """Returns the change in per cent of `before`; NaN where that is no number.
 
     Args:
-        before: (…, M)
-        after: (…, M)
-        better: (M,) `Measure.sign`.
+        before: (…) means.
+        after: (…) means.
+        sign: `Measure.sign`.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        change = np.where(before == after, 0.0, 100 * better * (after - before) / np.abs(before))
-    return np.where(np.isfinite(change) & (better != 0), change, math.nan)
+        relative = np.divide(np.subtract(after, before), np.abs(before))
+    change = np.where(np.equal(before, after), 0.0, 100 * sign * relative)
+    return np.where(np.isfinite(change) & (sign != 0), change, math.nan)
 
 
 def interval(
-    statistic: Callable[..., Floats], runs: Sequence[Floats], clusters: Clusters
-) -> tuple[Floats, Floats]:
-    """Returns (M,), (M,): the ends of the 95 % interval of statistic(*means of the runs).
+    statistic: Callable[..., Floats], values: Sequence[Floats], clusters: Clusters
+) -> tuple[float, float]:
+    """Returns the ends of the 95 % interval of statistic(*means of the runs).
 
     The jackknife leaves out one cluster after the other; its pseudo-values are a sample whose mean
     is the statistic. Each end is that of Student's t, or of t corrected for the skewness of the
-    sample (Hall 1992), whichever is farther out. NaN for a measure that fewer than MIN_CLUSTERS
-    clusters have.
+    sample (Hall 1992), whichever is farther out. NaN for fewer than MIN_CLUSTERS clusters.
 
     Args:
-        statistic: Function from means (…, M) of each run to (…, M).
-        runs: (N, M) each, of the same frames and measures; NaN where a frame lacks a measure.
+        statistic: Function of the mean of each run, or of as many means (G,), which it keeps apart.
+        values: (N,) of each run, of the same frames.
         clusters: Clusters of the frames.
     """
-    from scipy.special import stdtrit
+    from scipy import stats
 
-    sums = [_cluster_sums(values, clusters) for values in runs]
-    value = statistic(*(_mean(each.sum(axis=0)) for each in sums))
-    without = statistic(*(_mean(each.sum(axis=0) - each) for each in sums))
-    # a cluster without the measure is no observation of it
-    has = np.all([each[:, 1] > 0 for each in sums], axis=0)
-    count = has.sum(axis=0).astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # the pseudo-values' deviations from their mean, and standard error and skewness of it
-        pseudo = np.where(has, count * value - (count - 1) * without, 0.0)
-        deviation = np.where(has, pseudo - pseudo.sum(axis=0) / count, 0.0)
-        variance, third = ((deviation**power).sum(axis=0) / count for power in (2, 3))
-        error = np.sqrt(variance / (count - 1))
-        skew = third / variance**1.5 * np.sqrt(count - 1) / (count - 2)
-        error = np.where(count >= MIN_CLUSTERS, error, math.nan)
-        skew = np.where(error > 1e-8 * np.maximum(np.abs(value), 1.0), skew, 0.0)
-    reach = stdtrit(np.maximum(count - 1, 1), (1 + LEVEL) / 2)  # quantile of Student's t
-    below, above = (
-        np.clip(end, reach, _WIDEST * reach)
-        for end in (_correct_for_skewness(reach, skew), -_correct_for_skewness(-reach, skew))
+    sums, counts = _sums(values, clusters)
+    size, whole, frames = len(counts), sums.sum(axis=1), counts.sum()
+    if size < MIN_CLUSTERS:
+        return math.nan, math.nan
+    value = float(statistic(*(whole / frames)))
+    without = statistic(*((whole[:, None] - sums) / (frames - counts)))
+    pseudo = size * value - (size - 1) * without
+    # standard error of the mean, and its skewness, unless the pseudo-values are equal
+    error, skew = float(stats.sem(pseudo)), 0.0
+    if error > 1e-8 * max(abs(value), 1.0):
+        skew = float(stats.skew(pseudo, bias=False)) / math.sqrt(size)
+    reach = float(stats.t.ppf((1 + LEVEL) / 2, size - 1))
+    below, above = np.clip(
+        [_correct_for_skewness(reach, skew), -_correct_for_skewness(-reach, skew)],
+        reach,
+        _WIDEST * reach,
     )
     return value - below * error, value + above * error
 
 
-def _correct_for_skewness(t: Floats, skew: Floats) -> Floats:
-    """The values that t has in samples of this skewness over √n (Hall 1992, equation 5)."""
-    slight = np.abs(skew) < 1e-6
-    skew = np.where(slight, 1.0, skew)
-    return np.where(slight, t, 3 / skew * (np.cbrt(1 + skew * (t - skew / 6)) - 1))
+def _correct_for_skewness(t: float, skew: float) -> float:
+    """The value that t has in samples of this skewness over √n (Hall 1992, equation 5)."""
+    if abs(skew) < 1e-6:
+        return t
+    return float(3 / skew * (np.cbrt(1 + skew * (t - skew / 6)) - 1))
 
 
-def swap_p_values(
-    first: Floats, other: Floats, clusters: Clusters, permutations: int, seed: int
-) -> tuple[Floats, bool]:
-    """Returns (M,) two-sided p-values of paired runs, and whether they are exact.
+def swap_p_value(first: Floats, other: Floats, clusters: Clusters) -> float:
+    """Returns the two-sided p-value of two paired runs (N,); NaN for less than two clusters.
 
-    The p-value is the fraction of swaps of the two runs, cluster by cluster, after which the means
-    differ at least as much as observed (Good 2005, chapter 3). All 2^G swaps are tried if they are
-    at most `permutations`; else so many random ones, with the observed one counted in.
-    scipy.stats.permutation_test takes 15 times as long for 2,000 clusters.
-
-    Args:
-        first: (N, M), NaN where a frame lacks a measure.
-        other: (N, M) of the same frames, NaN in the same places.
-        clusters: Clusters of the frames.
-        permutations: The most swaps that are tried.
-        seed: Random seed of the swaps.
+    It is the fraction of swaps of the two runs, cluster by cluster, after which the means differ at
+    least as much as observed (Good 2005, chapter 3). All 2^G swaps are tried if they are at most
+    PERMUTATIONS; else so many random ones, with the observed one counted in.
     """
+    from scipy import stats
+
     # a swap changes the sign of what its cluster adds to the difference of the means
-    sums, known = _cluster_sums(other - first, clusters).transpose(1, 0, 2)
-    count = len(sums)
-    exact = count <= math.log2(permutations)
-    tried = 2**count if exact else permutations
-    # rounding must not make an equal difference look smaller than the observed one
-    least = np.abs(sums.sum(axis=0)) * (1 - 1e-9)
-    generator = np.random.default_rng(seed)
-    as_much = np.zeros(len(least))
-    at_once = max(1, _CELLS // count)
-    for start in range(0, tried, at_once):
-        numbers = np.arange(start, min(tried, start + at_once))
-        if exact:  # the bits of a number say which clusters are swapped
-            swapped = numbers[:, None] >> np.arange(count) & 1
-        else:
-            swapped = generator.integers(0, 2, (len(numbers), count))
-        as_much += (np.abs((1.0 - 2 * swapped) @ sums) >= least).sum(axis=0)
-    p_values = as_much / tried if exact else (as_much + 1) / (tried + 1)
-    has_values = (known.sum(axis=0) > 0) & (count > 1)
-    return np.where(has_values, p_values, math.nan), exact
+    (changes,), counts = _sums([other - first], clusters)
+    if len(counts) < 2:
+        return math.nan
+    found = stats.permutation_test(
+        [changes],
+        np.sum,
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=PERMUTATIONS,
+        batch=max(1, _CELLS // len(counts)),
+        random_state=np.random.default_rng(0),
+    )
+    return float(found.pvalue)
 
 
 def holm(p_values: Floats) -> Floats:

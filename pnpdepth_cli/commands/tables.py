@@ -21,7 +21,7 @@ _LATEX = str.maketrans(
         "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
         "δ": r"$\delta$", "±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "−": "$-$",
         "·": r"$\cdot$", "×": r"$\times$", "°": r"$^\circ$", "<": "$<$", "–": "--",
-        "…": r"\ldots{}", "\n": " ",
+        "…": r"\ldots{}", "σ": r"$\sigma$", "\n": " ",
     }
 )  # fmt: skip
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")

@@ -42,7 +42,7 @@ COMMANDS = {
         ("eval", "--protocol kiti", 2, "kitti"),
         ("eval", "--delta 1,2", 2, "--delta"),
         ("eval", "--columns rmse,none", 2, "--columns none is not one of rmse, mae"),
-        ("eval", "--csv x --latex ./x", 2, "--csv and --latex are the same file"),
+        ("compare a.json b.json", "--csv x --latex ./x", 2, "--csv and --latex are the same file"),
         ("eval", "--json --csv -", 2, "can go to stdout"),
         ("eval", "--protocol nyu-eigen", 3, "640×480"),
         ("compare a.json b.json", "", 3, "a.json"),

@@ -105,6 +105,6 @@ def test_options_of_one_name_say_the_same_thing_in_every_command() -> None:
             texts.setdefault(long_name(option), set()).add(option.help)
     own = {
         *("--output", "--image", "--calib", "--poses", "--html", "--csv", "--latex", "--protocol"),
-        *("--model", "--max-depth"),
+        *("--model", "--max-depth", "--columns"),
     }
     assert {name for name, helps in texts.items() if len(helps) > 1} <= own

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -19,7 +20,7 @@ from pnpdepth_cli.commands.statistics import (
     find_clusters,
     gain,
     holm,
-    swap_p_values,
+    swap_p_value,
 )
 from pnpdepth_cli.dataset.frame_files import groups_by_name
 
@@ -28,10 +29,10 @@ def clusters_of(ids: list[int] | np.ndarray) -> Clusters:
     return Clusters(ids=np.asarray(ids), unit="frames")
 
 
-def interval(values: np.ndarray, ids: object = None) -> np.ndarray:
-    """(2, M) the ends of the interval of the means."""
+def interval(values: np.ndarray, ids: object = None) -> list[float]:
+    """The ends of the interval of the mean."""
     clusters = clusters_of(np.arange(len(values)) if ids is None else ids)
-    return np.stack(statistics.interval(lambda mean: mean, [values], clusters))
+    return [*statistics.interval(lambda mean: mean, [values], clusters)]
 
 
 def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewness() -> None:
@@ -39,7 +40,7 @@ def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewne
     student = stats.t.interval(0.95, 8, loc=values.mean(), scale=stats.sem(values))
     skew = stats.skew(values, bias=False) / 3
     # Hall's transformation of t, which is a cubic, at the end of the interval
-    low, high = np.ravel(interval(values[:, None]))
+    low, high = interval(values)
     assert low == pytest.approx(student[0])  # the errors are skewed
     t = (values.mean() - high) / stats.sem(values)
     cubic = t + skew * t**2 / 3 + skew**2 * t**3 / 27 + skew / 6
@@ -48,10 +49,10 @@ def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewne
 
 
 def test_clusters_of_equal_frames_are_as_sure_as_one_frame_each() -> None:
-    values = np.random.default_rng(2).lognormal(0, 0.5, (9, 1))
-    bounds = interval(np.repeat(values, 20, axis=0), ids=np.repeat(np.arange(9), 20))
+    values = np.random.default_rng(2).lognormal(0, 0.5, 9)
+    bounds = interval(np.repeat(values, 20), ids=np.repeat(np.arange(9), 20))
     assert bounds == pytest.approx(interval(values))
-    assert interval(np.full((6, 1), 2.5)).tolist() == [[2.5], [2.5]]
+    assert interval(np.full(6, 2.5)) == [2.5, 2.5]
 
 
 @pytest.mark.parametrize("frames", [5, 8, 20])
@@ -59,37 +60,31 @@ def test_clusters_of_equal_frames_are_as_sure_as_one_frame_each() -> None:
 def test_intervals_hold_the_true_mean_in_93_to_97_per_cent(frames: int, spread: float) -> None:
     rng, trials = np.random.default_rng(0), 1500
     draws = rng.lognormal(-(spread**2) / 2, spread, (frames, trials))  # of mean 1
-    low, high = interval(draws)
+    low, high = np.array([interval(draw) for draw in draws.T]).T
     covered = float(np.mean((low <= 1) & (high >= 1)))
     error = np.sqrt(0.95 * 0.05 / trials)
     assert 0.93 - 2 * error < covered < 0.97 + 2 * error
 
 
-def test_the_gain_is_in_per_cent_of_the_first_and_its_interval_narrows_with_equal_gains() -> None:
-    before = np.random.default_rng(0).lognormal(0, 1, (9, 2))
-    noise = np.random.default_rng(1).uniform(0.3, 0.7, before.shape)
-    first, half, noisy = (before * by for by in (1, 0.5, noise))
-    better, clusters = np.array([-1.0, 1.0]), clusters_of(np.arange(9))
-
-    def gains(other: np.ndarray) -> np.ndarray:
-        """(3, 2) the gain and the ends of its interval."""
-        between = statistics.interval(lambda a, b: gain(a, b, better), [first, other], clusters)
-        return np.stack([gain(first.mean(axis=0), other.mean(axis=0), better), *between])
-
-    assert gains(half) == pytest.approx(np.array([[50, -50]] * 3), abs=1e-6)
-    value, low, high = gains(noisy)
-    assert (low < value - 1).all()
-    assert (value + 1 < high).all()
-    assert np.isnan(gain(np.zeros(2), np.array([1.0, np.nan]), better)).all()
-    assert np.isnan(gain(np.ones(1), np.array([2.0]), np.zeros(1))).all()  # neither is better
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_gain_is_in_per_cent_of_the_first_and_its_interval_narrows_with_equal_gains(
+    sign: int,
+) -> None:
+    before = np.random.default_rng(0).lognormal(0, 1, 9)
+    noise = np.random.default_rng(1).uniform(0.3, 0.7, 9)
+    change, clusters = partial(gain, sign=sign), clusters_of(np.arange(9))
+    half = statistics.interval(change, [before, before / 2], clusters)
+    assert half == pytest.approx((-50 * sign, -50 * sign), abs=1e-6)
+    low, high = statistics.interval(change, [before, before * noise], clusters)
+    value = float(change(before.mean(), (before * noise).mean()))
+    assert low + 1 < value < high - 1
+    assert np.isnan(gain(np.zeros(2), np.array([1.0, np.nan]), sign)).all()
+    assert np.isnan(gain(1.0, 2.0, 0))  # neither is better
 
 
-def p_value_of(changes: np.ndarray, resamples: int) -> tuple[float, bool]:
+def p_value_of(changes: np.ndarray) -> float:
     """Of runs whose frames differ by these."""
-    runs = (rows[:, None] for rows in (np.zeros_like(changes), changes))
-    clusters = clusters_of(np.arange(len(changes)))
-    (p_value,), exact = swap_p_values(*runs, clusters, resamples, seed=0)
-    return p_value, exact
+    return swap_p_value(np.zeros_like(changes), changes, clusters_of(np.arange(len(changes))))
 
 
 @given(st.lists(st.integers(-5, 5), min_size=2, max_size=7))
@@ -99,30 +94,25 @@ def test_the_exact_p_value_is_the_fraction_of_all_swaps_that_differ_as_much(
     values = np.array(changes, float)
     swaps = [abs(np.dot(signs, values)) for signs in product((1, -1), repeat=len(values))]
     expected = np.mean([swap >= abs(values.sum()) - 1e-9 for swap in swaps])
-    assert p_value_of(values, 1000) == (expected, True)
+    assert p_value_of(values) == expected
 
 
 def test_the_sampled_p_value_is_near_the_exact_one_and_never_zero() -> None:
-    values = np.random.default_rng(0).normal(0.4, 1, 12)
-    (exact_p, exact), (sampled_p, sampled) = (p_value_of(values, n) for n in (4096, 4095))
-    assert (exact, sampled) == (True, False)
-    assert sampled_p == pytest.approx(exact_p, abs=0.03)
-    assert p_value_of(np.ones(100), 999) == (1 / 1000, False)
+    values = np.random.default_rng(0).normal(0.4, 1, 14)
+    swaps = np.array([*product((1, -1), repeat=14)]) @ values
+    assert p_value_of(values) == pytest.approx(np.mean(abs(swaps) >= values.sum()), abs=0.01)
+    assert p_value_of(np.ones(100)) == 2 / 10_001
 
 
 def test_a_measure_that_some_frames_lack_has_the_interval_of_the_others() -> None:
-    rows = np.random.default_rng(0).lognormal(0, 0.5, (12, 3))
-    rows[:4, 1] = np.nan
-    rows[:8, 2] = np.nan  # four frames are too few
-    found = interval(rows)
-    assert found[:, 0] == pytest.approx(np.ravel(interval(rows[:, :1])))
-    assert found[:, 1] == pytest.approx(np.ravel(interval(rows[4:, 1:2])))
-    assert np.isnan(found[:, 2]).all()
-    p_values, exact = swap_p_values(rows, 1.5 * rows, clusters_of(np.arange(12)), 4096, 0)
-    assert exact
-    assert p_values == pytest.approx([2 / 2**12, 2 / 2**8, 2 / 2**4])
-    nothing = np.full((5, 1), np.nan)
-    assert np.isnan(swap_p_values(nothing, nothing, clusters_of(np.arange(5)), 50, 0)[0]).all()
+    values = np.random.default_rng(0).lognormal(0, 0.5, 12)
+    values[:4] = np.nan
+    assert interval(values) == pytest.approx(interval(values[4:]))
+    assert swap_p_value(values, 1.5 * values, clusters_of(np.arange(12))) == 2 / 2**8
+    values[:8] = np.nan  # four frames are too few
+    assert np.isnan(interval(values)).all()
+    nothing = np.full(5, np.nan)
+    assert np.isnan(swap_p_value(nothing, nothing, clusters_of(np.arange(5))))
 
 
 def test_holm_multiplies_the_smallest_most_and_keeps_the_order() -> None:

@@ -128,13 +128,16 @@ def styled(table: Table) -> list[list[tuple[str, str]]]:
 
 
 def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -> None:
-    def gain(percent: float | None, p: float | None) -> Gain:
-        return Gain(percent, None, 1.0, difference=None, p_value=None, p_adjusted=p)
+    def gain(percent: float, p: float) -> Gain:
+        return Gain(
+            percent=percent, low_percent=nan, high_percent=1.0, difference=nan, p_value=nan,
+            p_adjusted=p,
+        )  # fmt: skip
 
     gains: list[dict[str, Gain]] = [
         {},
         {"rmse": gain(50.0, 0.0009), "delta1": gain(-50.0, 0.01)},
-        {"rmse": gain(-50.0, 0.049), "delta1": gain(None, None)},
+        {"rmse": gain(-50.0, 0.049), "delta1": gain(nan, nan)},
     ]
     means = [(2.0, 0.5), (1.0, 0.25), (3.0, None)]
     runs = [

@@ -10,7 +10,14 @@ from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.measures import MEASURES, Measure, by_depth, parse_keys
+from pnpdepth_cli.measures import (
+    MEASURES,
+    OF_SIGMA,
+    Measure,
+    by_depth,
+    choose_measures,
+    parse_keys,
+)
 from pnpdepth_cli.protocols import KITTI_DEVKIT, Protocol, find_protocol
 from pnpdepth_cli.settings import option
 
@@ -56,13 +63,6 @@ class EvalRequest:
         choices=choices.PREDICTION_KINDS,
         show_default=True,
     )
-    more_measures: tuple[str, ...] | None = option(
-        None,
-        f"More measures, for dense ground truth: {', '.join(choices.MEASURES)}.",
-        flag="--measures",
-        metavar="KEY,…",
-        parse=parse_keys,
-    )
     depth_limits: tuple[float, float] | None = option(
         None,
         "Also errors of pixels nearer than NEAR metres, farther than FAR, and between, by their"
@@ -70,15 +70,17 @@ class EvalRequest:
         flag="--by-depth",
         metavar="NEAR FAR",
     )
-    resize: str | None = option(
-        None, "Resize predictions to the size of the ground truth.", choices=choices.RESIZES
-    )
+    resize: bool = option(False, "Resize predictions to the size of the ground truth, bilinearly.")
     exclude_sparse: bool = option(False, "Leave out pixels with a sparse point.")
 
     pred_scale: float | None = option(None, "Integer predictions hold metres × S.", metavar="S")
     gt_scale: float | None = option(None, "Integer ground truth holds metres × S.", metavar="S")
-    gt_range: bool = option(
-        False, "Ground truth is the distance from the camera, not depth z; needs the camera."
+    columns: tuple[str, ...] | None = option(
+        None,
+        "Measures of the tables, in this order, such as rmse,mae,delta1. Only here, for dense"
+        f" ground truth: {', '.join(choices.MEASURES)}.",
+        metavar="KEY,…",
+        parse=parse_keys,
     )
 
     def __post_init__(self) -> None:
@@ -93,12 +95,11 @@ class EvalRequest:
         near, far = self.depth_limits or (1.0, 2.0)
         if not (0 < near < far and math.isfinite(far)):
             raise UsageError(f"--by-depth must be two rising depths in metres: {near:g} {far:g}")
-        if self.is_devkit and (self.delta or self.more_measures or self.depth_limits):
+        if self.is_devkit and (self.delta or self.depth_limits):
             raise UsageError(
-                f"--delta, --measures and --by-depth do not apply to {KITTI_DEVKIT}, which has its"
-                " own measures"
+                f"--delta and --by-depth do not apply to {KITTI_DEVKIT}, which has its own measures"
             )
-        _ = self.measures
+        _ = self.shown
 
     @cached_property
     def rules(self) -> Protocol:
@@ -125,34 +126,24 @@ class EvalRequest:
             return DEVKIT_MEASURES
         base = _IN_MILLIMETRES if self.protocol == "kitti" else MEASURES
         of_parts = () if self.depth_limits is None else by_depth(*self.depth_limits)
-        return (*base, *of_parts, *(choices.MEASURES[key] for key in self.more_measures or ()))
+        named = (key for key in self.columns or () if key in choices.MEASURES)
+        return (*base, *of_parts, *(choices.MEASURES[key] for key in named))
+
+    @property
+    def shown(self) -> tuple[Measure, ...]:
+        """The measures of tables: those of `columns`, else all.
+
+        Raises:
+            UsageError: For an unknown one.
+        """
+        return choose_measures((*self.measures, *OF_SIGMA), self.columns)
 
     def describe(self) -> str:
-        """Returns one line, such as `eigen: ground truth in 0.001–80 m, crop eigen, …`."""
-        rules = self.rules
-        bounds = f" above {rules.min_depth:g} m" if rules.min_depth else ""
-        if rules.max_depth is not None:
-            bounds = f" in {rules.min_depth:g}–{rules.max_depth:g} m"
-        changed = "" if rules == find_protocol(self.protocol) else " (changed)"
-        limits = ", ".join(f"{limit:.6g}" for limit in rules.thresholds)
-        parts = {
-            f"{rules.name}{changed}: all known ground truth{bounds}": True,
-            "no crop" if rules.crop == "none" else f"crop {rules.crop}": True,
-            "predictions clipped to the same range": rules.clip,
-            "without the pixels of sparse points": rules.exclude_sparse,
-            f"predictions resized ({self.resize})": self.resize,
-            "predictions are disparity": self.prediction_kind == "disparity",
-            f"each image scaled by {self.scale_by}": self.scale_by != "none",
-            "empty predictions scored as the lower bound": rules.missing == "min",
-            "missing predictions filled in, errors as its program prints them": self.is_devkit,
-            f"δ below {limits}": not self.is_devkit,
-            "mean over the images": True,
-        }
-        return ", ".join(text for text, applies in parts.items() if applies)
-
-    def scoring(self) -> dict[str, Any]:
-        """Returns what decides the figures; equal for two evaluations that can be compared."""
-        return scoring_of(self.rules, self.scale_by)
+        """Returns one line, such as `eigen: min_depth 0.001, max_depth 80, crop eigen, …`."""
+        changed = "" if self.rules == find_protocol(self.protocol) else " (changed)"
+        rules = scoring_of(self.rules, self.scale_by).items()
+        texts = (f"{name} {value}" for name, value in rules if value not in (None, False, "none"))
+        return f"{self.protocol}{changed}: {', '.join(texts)}; mean over the images"
 
 
 def scoring_of(rules: Protocol, scale_by: str = "none") -> dict[str, Any]:

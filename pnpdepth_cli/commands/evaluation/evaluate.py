@@ -10,9 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRequest
+from pnpdepth_cli.commands.evaluation.eval_request import (
+    WITHOUT_SPARSE,
+    EvalRequest,
+    scoring_of,
+)
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
-from pnpdepth_cli.commands.evaluation.pairing import FramePair, pair_frames, some_names
+from pnpdepth_cli.commands.evaluation.pairing import pair_frames, some_names
 from pnpdepth_cli.commands.evaluation.scoring import FILES, is_missing, score_pair, scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.commands.statistics import LEVEL, MIN_CLUSTERS, Clusters, find_clusters, interval
@@ -24,14 +28,7 @@ from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.text_files import plain
-from pnpdepth_cli.measures import (
-    COVERAGE,
-    OF_SIGMA,
-    FrameMeans,
-    Measure,
-    by_depth,
-    choose_measures,
-)
+from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, FrameMeans, Measure
 from pnpdepth_cli.points import METRES
 
 _LISTED = 3
@@ -46,10 +43,8 @@ class Evaluation:
     """Scored frames and their means."""
 
     request: EvalRequest
-    pairs: list[FramePair]
-    """The files of each frame of the ground truth, in its order."""
     frames: list[FrameRecord]
-    """The scores of each."""
+    """The scores of each frame of the ground truth, in its order."""
     measures: tuple[Measure, ...]
     """Measures of the request, and of the standard deviation where a frame has one."""
     mean: dict[str, float | None]
@@ -75,27 +70,10 @@ class Evaluation:
         known = sum(_numbers(self.scored, "known"))
         return sum(_numbers(self.scored, "predicted")) / known if known else math.nan
 
-    def chosen(self, keys: Sequence[str] | None) -> tuple[Measure, ...]:
-        """Returns the measures with these keys, and those of their pixels by depth; all for None.
-
-        Raises:
-            UsageError: If one is unknown.
-        """
-        if keys is not None and self.request.depth_limits is not None:
-            parts = (measure.key for measure in by_depth(*self.request.depth_limits))
-            own = (key for key in parts if key.rpartition("_")[0] in keys)
-            keys = [*dict.fromkeys((*keys, *own))]
-        return choose_measures(self.measures, keys)
-
-    def describe(self) -> str:
-        """Returns the protocol and every scale of files that was assumed, on one line."""
-        readings = (
-            f"{side}: {reading}"
-            for side in _OPTIONS
-            for reading, _ in _readings(self.frames, side)
-            if reading.assumed
-        )
-        return "; ".join([self.request.describe(), *readings])
+    @property
+    def shown(self) -> tuple[Measure, ...]:
+        """The measures of tables."""
+        return self.measures if self.request.columns is None else self.request.shown
 
     def describe_unscored(self) -> str:
         """Returns why frames are in no mean; empty if all are."""
@@ -115,8 +93,7 @@ class Evaluation:
             "truth": request.ground_truth,
             "scales": {"prediction": request.pred_scale, "truth": request.gt_scale},
             "protocol": request.protocol,
-            "described": request.describe(),
-            "scoring": request.scoring(),
+            "scoring": scoring_of(request.rules, request.scale_by),
             "measures": [measure.to_json() for measure in self.measures],
             "counts": {
                 "frames": len(self.frames),
@@ -128,7 +105,7 @@ class Evaluation:
             "mean": self.mean,
             "interval": self.interval,
             "level": LEVEL,
-            "clusters": {"count": self.clusters.count, "unit": self.clusters.unit},
+            "clusters": self.clusters.to_json(),
             "frames": [frame.to_json() for frame in self.frames],
             "notes": self.notes,
         }))  # fmt: skip
@@ -161,38 +138,35 @@ def evaluate(
     of_sigma = [m for m in OF_SIGMA if any(m.key in each for each in scores)]
     measures = (*request.measures, *of_sigma)
     keys = [measure.key for measure in measures]
-    values = np.array([[each.get(key, math.nan) for key in keys] for each in scores], np.float64)
+    values = np.array([[each.get(key) for key in keys] for each in scores], np.float64)
     mean = FrameMeans({key: each.get(key) for key in keys} for each in scores).means()
     clusters = find_clusters([row.group or "" for row in scored], values)
     if request.is_devkit:
         exact = devkit_mean(values[:, : len(request.measures)]).tolist()
         mean |= dict(zip(keys, exact, strict=False))
     ends = {}
-    if clusters.count >= MIN_CLUSTERS:
-        sides = interval(lambda means: means, [values], clusters)
-        for measure, low, high in zip(measures, *(side.tolist() for side in sides), strict=True):
+    for measure, column in zip(measures, values.T, strict=True):
+        if clusters.count >= MIN_CLUSTERS:
+            low, high = interval(lambda mean: mean, [column], clusters)
             # within what the measure can be
             ends[measure.key] = max(low, 0.0), min(high, 1.0 if measure.percent else math.inf)
     notes += clusters.notes()
-    if len(scored) > 1 and clusters.count < MIN_CLUSTERS:
+    if len(scored) > 1 and not ends:
         notes.append(
             f"no interval: {clusters.describe()} are too few to tell how sure the means are;"
             f" {MIN_CLUSTERS} are needed"
         )
+    notes += _notes_on_files(rows)
+    notes += _notes_on_pixels(scored, request)
+    notes += _notes_on_scales(scored, request)
     return Evaluation(
         request=request,
-        pairs=pairs,
         frames=rows,
         measures=measures,
         mean=mean,
         interval=ends or None,
         clusters=clusters,
-        notes=[
-            *notes,
-            *_notes_on_files(rows),
-            *_notes_on_pixels(scored, request),
-            *_notes_on_scales(scored, request),
-        ],
+        notes=notes,
     )
 
 
@@ -219,21 +193,20 @@ def _notes_on_files(rows: Sequence[FrameRecord]) -> Iterator[str]:
         ]
         if texts:
             yield f"{side}: {some_names(texts)}"
-    # Frames that are in no mean.
+    # Frames that are in no mean, and what was made of ground truth that is none.
     if missing := [row.name for row in rows if is_missing(row)]:
         count = count_of(len(missing), "frame")
         yield f"warning: {count} without prediction: {some_names(missing)}"
-    faulty = [row for row in rows if row.status == "failed" and not is_missing(row)]
-    for row in faulty[:_LISTED]:
-        yield f"warning: frame {one_line(row.name)} was not scored: {row.message}"
-    if (more := len(faulty) - _LISTED) > 0:
-        yield f"warning: {count_of(more, 'more frame')} not scored"
-    # What was made of ground truth that is none.
-    noted = [row for row in rows if row.notes]
-    for row in noted[:_LISTED]:
-        yield from (f"frame {one_line(row.name)}: {note}" for note in row.notes)
-    if (more := len(noted) - _LISTED) > 0:
-        yield f"{count_of(more, 'more frame')} with such ground truth"
+    faulty = [
+        f"warning: frame {one_line(row.name)} was not scored: {row.message}"
+        for row in rows
+        if row.status == "failed" and not is_missing(row)
+    ]
+    noted = [f"frame {one_line(row.name)}: {note}" for row in rows for note in row.notes]
+    for lines in (faulty, noted):
+        yield from lines[:_LISTED]
+        if (more := len(lines) - _LISTED) > 0:
+            yield f"{count_of(more, 'more note')} of that kind; --csv or --json has all"
 
 
 def _notes_on_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
@@ -248,13 +221,6 @@ def _notes_on_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
         yield (
             f"warning: {count_of(round(empty), 'pixel')} ({empty / known:.2%}) of the ground truth"
             f" without prediction; what is missing {treatment}"
-        )
-    holes = [row.name for row in scored if math.isnan(scores_of(row).get("log_mae") or 0.0)]
-    if holes:
-        yield (
-            f"warning: {count_of(len(holes), 'prediction')} with empty rows between filled ones,"
-            f" which the development kit sets to −1 m and scores (its logarithmic errors are then"
-            f" NaN): {some_names(holes)}"
         )
     given = round(sum(_numbers(scored, "given")))
     if given and not request.rules.exclude_sparse:
@@ -292,7 +258,7 @@ def _notes_on_scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
         yield warning
 
 
-def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
+def means_table(evaluation: Evaluation) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
     intervals, all_frames = evaluation.interval, count_of(len(evaluation.frames), "frame")
     title, pixels = f"Means over {all_frames}", count_of(evaluation.pixels, "pixel")
@@ -305,47 +271,40 @@ def means_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
         title += f"; 95 % interval over {evaluation.clusters.describe()}"
     rows = []
     mean = evaluation.mean | {COVERAGE.key: evaluation.coverage}
-    for measure in (*evaluation.chosen(keys), COVERAGE):
+    for measure in (*evaluation.shown, COVERAGE):
         ends = [] if intervals is None else [intervals.get(measure.key, ())]
         texts = (" … ".join(map(measure.text, each)) for each in ends)
-        rows.append([measure.heading, measure.text(mean[measure.key]), *texts])
+        rows.append([measure.heading, measure.text(mean.get(measure.key)), *texts])
     title += WITHOUT_SPARSE * evaluation.request.rules.exclude_sparse
     return Table(title=title, columns=columns, rows=rows)
 
 
-def frames_table(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
-    """Returns a row for each frame: its files, its counts, and the chosen measures as stored."""
-    measures = evaluation.chosen(keys)
+def frames_table(evaluation: Evaluation) -> Table:
+    """Returns a row for each frame: its files, its counts, and the measures as stored."""
     rows = []
     for frame in evaluation.frames:
         files, scores = (frame.inputs.get(name) for name in FILES), plain(scores_of(frame))
         row = [frame.name, frame.group, *(file and file.path for file in files)]
-        row += map(scores.get, (*_COUNTS, *(measure.key for measure in measures)))
+        row += map(scores.get, (*_COUNTS, *(measure.key for measure in evaluation.shown)))
         rows.append([*row, frame.message])
     counts = [COVERAGE if name == COVERAGE.key else name for name in _COUNTS]
-    return Table(columns=["name", "group", *FILES, *counts, *measures, "error"], rows=rows)
+    columns = ["name", "group", *FILES, *counts, *evaluation.shown, "error"]
+    return Table(columns=columns, rows=rows)
 
 
-def worst_frames(evaluation: Evaluation, keys: Sequence[str] | None) -> Table:
-    """Returns a row for each frame or the worst of many: the chosen measures, else the first."""
-    title, frames = "Frames", evaluation.frames
+def worst_frames(evaluation: Evaluation) -> Table:
+    """Returns a row for each scored frame, of many the worst: the chosen measures, or the first."""
+    title, frames = "Frames", evaluation.scored
     if len(frames) > _FRAMES_SHOWN:
-        frames = worst(evaluation)[:_FRAMES_SHOWN]
         title = f"The {_FRAMES_SHOWN} worst by RMSE; --csv has all"
-    measures = choose_measures(evaluation.measures, keys)
-    shown = [*(measures if keys else measures[:_FRAME_COLUMNS]), COVERAGE]
+        frames = sorted(frames, key=lambda frame: -(scores_of(frame)["rmse"] or 0.0))
+    is_chosen = evaluation.request.columns is not None
+    shown = [*evaluation.shown[: None if is_chosen else _FRAME_COLUMNS], COVERAGE]
     return Table(
         title=title + WITHOUT_SPARSE * evaluation.request.rules.exclude_sparse,
         columns=["name", *shown],
-        rows=[[frame.name, *(scores_of(frame).get(m.key) for m in shown)] for frame in frames],
+        rows=[
+            [frame.name, *(scores_of(frame).get(m.key) for m in shown)]
+            for frame in frames[:_FRAMES_SHOWN]
+        ],
     )
-
-
-def worst(evaluation: Evaluation) -> list[FrameRecord]:
-    """Returns the scored frames by RMSE, worst first, those with NaN at the very end."""
-
-    def rank(frame: FrameRecord) -> float:
-        rmse = scores_of(frame)["rmse"]
-        return math.inf if rmse is None or math.isnan(rmse) else -rmse
-
-    return sorted(evaluation.scored, key=rank)

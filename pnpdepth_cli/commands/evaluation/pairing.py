@@ -65,18 +65,23 @@ def pair_frames(
             f"give two files, two folders, or a folder and a data set: {prediction}, {ground_truth}"
         )
     # The predictions by name, and the frames with ground truth.
-    name, notes, more = frame_name(prediction.stem), list[str](), list[str]()
-    predictions = {name: prediction}
+    notes: list[str] = []
+    predictions = {frame_name(prediction.stem): prediction}
+    truths = dict.fromkeys(predictions, ground_truth)
     if prediction.is_dir():
-        predictions, notes = depth_files(prediction)
+        predictions = depth_files(prediction)
     if layout is not None:
-        frames, more = _with_truth(ground_truth, layout, frames, part)
-    elif ground_truth.is_dir():
-        files, more = depth_files(ground_truth)
-        frames = [FrameFiles(name=name, gt=path) for name, path in files.items()]
+        frames = [replace(f, part=part or f.part) for f in frames if f.gt is not None]
+        if not frames:
+            raise InputError(
+                f"{ground_truth} looks like {layout!r}, and no frame in it has ground truth"
+            )
+        cuts = ", ".join(sorted({str(frame.part) for frame in frames if frame.part != WHOLE}))
+        note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
+        notes.append(note + (f", of which {cuts} is used" if cuts else ""))
     else:
-        frames = [FrameFiles(name=name, gt=ground_truth)]
-    notes += more
+        truths = depth_files(ground_truth) if ground_truth.is_dir() else truths
+        frames = [FrameFiles(name=name, gt=path) for name, path in truths.items()]
     # At least one name must be common to both.
     names = {frame.name: None for frame in frames}
     extra = [name for name in sorted(predictions) if name not in names]
@@ -90,14 +95,10 @@ def pair_frames(
             f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
             f" and are not scored: {some_names(extra)}"
         )
-    # Each frame with its prediction.
-    groups = groups_by_name([*names])
+    grouped = zip(frames, groups_by_name([*names]), strict=True)
     return [
-        _pair(
-            replace(frame, group=group if frame.group is None else frame.group),
-            predictions.get(frame.name),
-        )
-        for frame, group in zip(frames, groups, strict=True)
+        _pair(replace(frame, group=frame.group or group), predictions.get(frame.name))
+        for frame, group in grouped
     ], notes
 
 
@@ -112,22 +113,6 @@ def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFil
         with contextlib.suppress(InputError, OSError):
             return list_frames(folder, layout)[:2]
     return None, []
-
-
-def _with_truth(
-    folder: Path, layout: str, frames: list[FrameFiles], part: FramePart | None
-) -> tuple[list[FrameFiles], list[str]]:
-    """The frames of a data set that have ground truth, and a note."""
-    frames = [
-        frame if part is None else replace(frame, part=part)
-        for frame in frames
-        if frame.gt is not None
-    ]
-    if not frames:
-        raise InputError(f"{folder} looks like {layout!r}, and no frame in it has ground truth")
-    cuts = ", ".join(sorted({str(frame.part) for frame in frames if frame.part != WHOLE}))
-    note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
-    return frames, [note + (f", of which {cuts} is used" if cuts else "")]
 
 
 def _pair(files: FrameFiles, prediction: Path | None) -> FramePair:
@@ -152,18 +137,17 @@ def frame_name(stem: str) -> str:
     return _MARK.sub("", _KITTI_KIND.sub("_sync_", stem))
 
 
-def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
-    """Returns the depth files below a folder by frame name, sorted, and notes on them.
+def depth_files(folder: Path) -> dict[str, Path]:
+    """Returns the depth files below a folder by frame name, sorted.
 
     A frame in a subfolder has it in its name. Where files `x_depth` are, all others are no depth.
 
     Raises:
-        InputError: If there is none, or two are one frame.
+        InputError: If there is none, or two are one frame, or a folder cannot be read.
     """
     found, problems = find_files(folder, DEPTH_SUFFIXES)
-    for problem in problems:
-        if problem.path.is_file():
-            raise InputError(str(problem))
+    if problems:
+        raise InputError(str(problems[0]))
     marked = {stem: path for stem, path in found.items() if _MARK.search(stem)}
     by_frame: dict[str, Path] = {}
     for stem, path in (marked or found).items():
@@ -173,7 +157,7 @@ def depth_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     if not by_frame:
         suffixes = " ".join(DEPTH_SUFFIXES)
         raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
-    return dict(sorted(by_frame.items())), [f"warning: {problem}" for problem in problems]
+    return dict(sorted(by_frame.items()))
 
 
 def some_names(names: Iterable[str]) -> str:

@@ -58,7 +58,7 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
                 means = [[run.before[measure.key], run.mean[measure.key]] for run in runs]
                 # None becomes NaN
                 before, after = np.array(means, np.float64).T * measure.shown_factor
-                improved = gain(before, after, np.array(measure.sign, np.float64))
+                improved = gain(before, after, measure.sign)
                 above.plot(x, before, f"C{number}--", linewidth=0.8)
                 above.plot(x, after, f"C{number}o-", label=label or "after refinement")
                 below.plot(x, improved, f"C{number}o-")

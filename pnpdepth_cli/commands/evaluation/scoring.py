@@ -5,9 +5,7 @@ Predictions of relative networks are scaled to the ground truth of each image (`
 
 from __future__ import annotations
 
-import math
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,17 +18,16 @@ from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
 from pnpdepth_cli.dataset.arrays import apply_masks, raw_depth, read_image
-from pnpdepth_cli.dataset.frame_camera import camera_of_file
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
 from pnpdepth_cli.file_record import FileRecord
-from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_depth
+from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.measures import OF_SIGMA
 from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors.lens import rays_of_image
+from pnpdepth_cli.protocols import Protocol
 from pnpdepth_cli.sensors.pixels import pixel_index
 from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
 from pnpdepth_cli.stages import AFTER, GT
@@ -55,27 +52,6 @@ _CROPS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class LoadedFrame:
-    """The depths as they are scored: scaled, clipped, and filled in as the protocol says."""
-
-    depth: Depth
-    """(H, W) metres, 0 where unknown."""
-    gt: Depth
-    """(H, W) metres, 0 where unknown or not scored."""
-    readings: dict[str, Reading]
-    """How the files "prediction" and "gt" were read."""
-    given: Mask | None = None
-    """(H, W) true where the network was given a sparse point; None if that is not known."""
-    predicted: Mask
-    """(H, W) true where the file has a prediction."""
-    fit: Fit | None = None
-    sigma: Depth | None = None
-    """Standard deviation of the prediction in metres, 0 where unknown, if a file has it."""
-    notes: list[str]
-    """What a person should know of the ground truth."""
-
-
 def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
     """Returns the scores of a frame's files, or why it has none.
 
@@ -89,29 +65,47 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
     named = zip(FILES, paths, strict=True)
     inputs = {name: FileRecord(path=str(path)) for name, path in named if path is not None}
     record = FrameRecord(
-        name=files.name,
-        group=files.group,
-        unit=pair.record.unit,
-        inputs=inputs,
+        name=files.name, group=files.group, unit=pair.record.unit, inputs=inputs, status="failed"
     )
     if result is None:
-        return replace(record, status="failed", message="there is no prediction")
+        return replace(record, message="there is no prediction")
     try:
-        frame = load_frame(pair, request)
+        # The ground truth that is scored, and the prediction as the protocol changes it.
+        gt, of_gt, notes = _read_truth(pair, request)
+        given = _given_points(pair, gt, required=request.rules.exclude_sparse)
+        truth = np.where(_where_scored(gt, given, request.rules), gt, np.float32(0))
+        if not truth.any():
+            raise InputError(
+                f"{files.gt} has no known depth where protocol {request.protocol} scores"
+            )
+        values, of_prediction = _read_prediction(pair, truth.shape, request)
+        depth, fit = scale_prediction(values, truth, request.prediction_kind, request.scale_by)
+        depth = _within_bounds(depth, request.rules)
+        both, known = (truth > 0) & (depth > 0), int((truth > 0).sum())
+        if not both.any() and not request.is_devkit:
+            raise InputError(f"{result.depth} holds no valid depth where the truth is known")
+        # The measures, and the numbers of pixels.
+        scores = _measure(depth, truth, request)
+        if result.sigma is not None and fit is None and request.prediction_kind == "depth":
+            sigma = result.of_size(result.sigma, depth)
+            scores |= {m.key: m.value(depth, truth, sigma) for m in OF_SIGMA}
     except PnpDepthError as error:
-        return replace(record, status="failed", message=str(error))
-    for name, each in frame.readings.items():
+        return replace(record, message=str(error))
+    predicted = int(((values > 0) & (truth > 0)).sum())
+    scores |= {
+        "pixels": int(both.sum()),
+        "known": known,
+        "predicted": predicted,
+        "coverage": predicted / known,
+        "given": None if given is None else int((given & both).sum()),
+        "median_ratio": float(np.median(depth[both] / truth[both])) if both.any() else None,
+    }
+    scores["factor"], scores["shift"] = fit or (None, None)
+    for name, each in (("prediction", of_prediction), ("gt", of_gt)):
         inputs[name] = replace(
             inputs[name], read_as=each.source, scale=each.scale, assumed=each.assumed
         )
-    scores, fault = _score(frame, pair, request)
-    return replace(
-        record,
-        notes=frame.notes,
-        status="failed" if fault else "done",
-        message=fault,
-        errors={GT: {AFTER: scores}} if scores else {},
-    )
+    return replace(record, status="done", notes=notes, errors={GT: {AFTER: scores}})
 
 
 def is_missing(record: FrameRecord) -> bool:
@@ -124,50 +118,19 @@ def scores_of(record: FrameRecord) -> Scores:
     return record.errors.get(GT, {}).get(AFTER, {})
 
 
-def _score(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> tuple[Scores, str | None]:
-    """The scores of a frame, and why they are counts alone or nothing."""
-    assert pair.result is not None
-    depth, gt = frame.depth, frame.gt
-    known, both = gt > 0, (gt > 0) & (depth > 0)
-    if not known.any():
-        return {}, f"{pair.files.gt} has no known depth where protocol {request.protocol} scores"
-    # Counts of pixels.
-    predicted, (factor, shift) = int((frame.predicted & known).sum()), frame.fit or (None, None)
-    counts: Scores = {
-        "pixels": int(both.sum()),
-        "known": int(known.sum()),
-        "predicted": predicted,
-        "coverage": predicted / int(known.sum()),
-        "given": None if frame.given is None else int((frame.given & both).sum()),
-        "median_ratio": float(np.median(depth[both] / gt[both])) if both.any() else None,
-        "factor": factor,
-        "shift": shift,
-    }
-    # Measures of pixels, then those of whole images.
-    of_sigma: Scores = {}
-    if frame.sigma is not None:
-        of_sigma = {m.key: m.value(depth, gt, frame.sigma) for m in OF_SIGMA}
+def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
+    """The measures of depth (H, W) against the scored ground truth."""
     if request.is_devkit:
-        return devkit_errors(depth, gt) | of_sigma | counts, None
-    if not both.any():
-        where = " where the ground truth is known" if (depth > 0).any() else ""
-        return counts, f"{pair.result.depth} holds no valid depth{where}"
-    depths = torch.from_numpy(depth), torch.from_numpy(gt)
+        return {**devkit_errors(depth, truth)}
+    depths = torch.from_numpy(depth), torch.from_numpy(truth)
     pixels = scored_pixels(*depths, request.rules.thresholds)
     values: Scores = {**measure_pixels(pixels, request.measures)}
-    values |= {m.key: m.value(depth, gt) for m in request.measures if m.key not in values}
-    return values | of_sigma | counts, None
+    return values | {m.key: m.value(depth, truth) for m in request.measures if m.key not in values}
 
 
-def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
-    """Returns the frame's depths as the protocol scores them.
-
-    Raises:
-        InputError: For a file that cannot be read.
-        SizeError: Where sizes differ.
-    """
-    frame, rules = pair.files, request.rules
-    # The ground truth, in the part of the frame that the protocol keeps.
+def _read_truth(pair: FramePair, request: EvalRequest) -> tuple[Depth, Reading, list[str]]:
+    """The ground truth in the part of the frame that is kept, how it was read, and notes."""
+    frame = pair.files
     scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
     assert frame.gt is not None
     if (raw := raw_depth(frame.gt, frame.image)) is not None:
@@ -176,59 +139,43 @@ def load_frame(pair: FramePair, request: EvalRequest) -> LoadedFrame:
         values, reading = _read(frame.gt, scale, request)
     values = apply_masks(values, frame.masks)
     values, notes = plausible_map(values, reading, "gt", "--gt-scale", scale)
-    gt = np.ascontiguousarray(frame.part.apply(values))
-    if request.gt_range:
-        gt = _depth_of_distances(gt, pair, (values.shape[0], values.shape[1]))
-        reading = reading._replace(source=f"{reading.source}, distances")
-    # The pixels that are scored.
-    given = _given_points(pair, gt, required=rules.exclude_sparse)
+    return np.ascontiguousarray(frame.part.apply(values)), reading, notes
+
+
+def _where_scored(gt: Depth, given: Mask | None, rules: Protocol) -> Mask:
+    """(H, W) true where the protocol scores: its crop, its bounds, and no input points."""
     scored = np.zeros(gt.shape, bool)
     scored[crop_window(rules.crop, gt.shape)] = True
-    highest = math.inf if rules.max_depth is None else rules.max_depth
+    highest = np.inf if rules.max_depth is None else rules.max_depth
     scored &= (gt > rules.min_depth) & (gt < highest)
     if given is not None and rules.exclude_sparse:
         scored &= ~given
-    # The prediction is fitted to those.
-    loaded = LoadedFrame(
-        depth=np.zeros_like(gt),
-        gt=np.where(scored, gt, np.float32(0)),
-        readings={"gt": reading},
-        given=given,
-        predicted=np.zeros(gt.shape, bool),
-        notes=notes,
-    )
-    return _with_prediction(loaded, pair, request)
+    return scored
 
 
-def _with_prediction(frame: LoadedFrame, pair: FramePair, request: EvalRequest) -> LoadedFrame:
-    """The frame with its prediction at the ground truth's size, scaled, clipped and filled in."""
+def _read_prediction(pair: FramePair, size: Size, request: EvalRequest) -> tuple[Depth, Reading]:
+    """The prediction at the ground truth's size, and how it was read."""
     assert pair.result is not None
-    rules, size, result = request.rules, frame.gt.shape, pair.result
-    values, reading = _read(result.depth, request.pred_scale, request)
+    values, reading = _read(pair.result.depth, request.pred_scale, request)
+    if values.shape != size and not request.resize:
+        advice = "; --resize scales predictions if both show the same view"
+        raise _different(pair, f"prediction {pair.result.depth}", values.shape, size, advice)
     if values.shape != size:
-        if request.resize is None:
-            advice = "--resize nearest or bilinear scales predictions if both show the same view"
-            raise _different(pair, f"prediction {result.depth}", values.shape, size, f"; {advice}")
-        values = _resize(values, size, request.resize)
-    depth, fit = scale_prediction(values, frame.gt, request.prediction_kind, request.scale_by)
+        known = (values > 0).astype(np.float32)
+        total, weight = (cv2.resize(part, (size[1], size[0])) for part in (values, known))
+        # a resized pixel is known where most of its interpolation weight is on known pixels
+        values = np.where(weight > 0.5, total / np.maximum(weight, 0.5), np.float32(0))
+    return values, reading
+
+
+def _within_bounds(depth: Depth, rules: Protocol) -> Depth:
+    """The depth (H, W) clipped and filled in as the protocol says."""
     if rules.clip:
         clipped = np.clip(depth, rules.min_depth, rules.max_depth)
         depth = np.where(depth > 0, clipped, 0).astype(np.float32)
     if rules.missing == "min":
         depth = np.where(depth > 0, depth, np.float32(rules.min_depth))
-    # A standard deviation is of unscaled depth.
-    sigma = None
-    if result.sigma is not None and fit is None and request.prediction_kind == "depth":
-        with suppress(InputError):
-            sigma = read_depth(result.sigma).values
-    return replace(
-        frame,
-        depth=depth,
-        readings={"prediction": reading, **frame.readings},
-        predicted=values > 0,
-        fit=fit,
-        sigma=sigma if sigma is not None and sigma.shape == size else None,
-    )
+    return depth
 
 
 def _read(path: Path, scale: float | None, request: EvalRequest) -> tuple[Depth, Reading]:
@@ -243,23 +190,6 @@ def _read(path: Path, scale: float | None, request: EvalRequest) -> tuple[Depth,
     return values, image.reading._replace(assumed=assumed)
 
 
-def _depth_of_distances(gt: Depth, pair: FramePair, whole: tuple[int, int]) -> Depth:
-    """Depth z of distances from the camera of the data set, else of the prediction's record."""
-    files, size, camera = pair.files, (gt.shape[0], gt.shape[1]), None
-    if files.calib is not None:
-        found, _ = camera_of_file(files.calib, files.camera, whole, files.image_file)
-        camera = files.part.camera_in_crop(found, whole)
-    elif pair.result is not None and pair.record.size == size[::-1]:
-        camera, _ = pair.result.camera_and_pose
-    if camera is None:
-        raise InputError(
-            f"--gt-range needs the camera of frame {files.name}, which neither the data set nor the"
-            " record beside the prediction has; add the column calib to a list"
-        )
-    rays = rays_of_image(camera, size)
-    return known_metres(gt / np.sqrt(1 + (rays**2).sum(axis=2)))
-
-
 def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
     """(H, W) true at the network's sparse points; None where they are not known or unusable.
 
@@ -271,7 +201,9 @@ def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
     try:
         if drawn is not None and pair.record.size == size[::-1]:
             pattern = SamplePattern(kind=drawn.kind, count=drawn.count, fraction=drawn.fraction)
-            image = image_of(pair, size) if drawn.kind == "features" else None
+            image = None
+            if drawn.kind == "features" and frame.image is not None:
+                image = frame.part.apply(read_image(frame.image))
             xy = sample_points(gt, pattern, drawn.seed, image=image).xy
         elif frame.sparse is not None:
             points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
@@ -294,18 +226,6 @@ def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
     return given
 
 
-def image_of(pair: FramePair, size: Size) -> Depth | None:
-    """Returns (H, W, 3) in 0…1, the frame's image; None unless one is known and of that size.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
-    if pair.files.image is None:
-        return None
-    rgb = pair.files.part.apply(read_image(pair.files.image))
-    return rgb if rgb.shape[:2] == size else None
-
-
 def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     """Returns the rows and columns of a frame of `size` (H, W) pixels that lie in a crop.
 
@@ -321,16 +241,6 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     top, bottom, left, right = _CROPS[crop]
     rows, columns = (top * height, bottom * height), (left * width, right * width)
     return slice(*map(int, rows)), slice(*map(int, columns))
-
-
-def _resize(depth: Depth, size: Size, method: str) -> Depth:
-    target = size[1], size[0]
-    if method == "nearest":
-        return cv2.resize(depth, target, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
-    known = (depth > 0).astype(np.float32)
-    total, weight = (cv2.resize(part, target) for part in (depth, known))  # bilinear
-    # a resized pixel is known where most of its interpolation weight is on known pixels
-    return np.where(weight > 0.5, total / np.maximum(weight, 0.5), 0).astype(np.float32)
 
 
 def _different(pair: FramePair, what: str, shape: Size, size: Size, advice: str = "") -> SizeError:
@@ -349,8 +259,7 @@ def scale_prediction(
 
     - median: ratio of the medians (Zhou et al. 2017, monodepth2),
     - affine: least squares in depth (Ke et al. 2024, Marigold),
-    - affine-disparity: least squares in 1/m (Ranftl et al. 2020, MiDaS),
-    - log: mean of the logarithm (Eigen et al. 2014).
+    - affine-disparity: least squares in 1/m (Ranftl et al. 2020, MiDaS).
 
     A fitted value that is not above 0 becomes unknown (0).
 
@@ -376,14 +285,10 @@ def scale_prediction(
     factor, shift = 1.0, 0.0
     if scale_by == "median":
         factor = float(np.median(g) / np.median(p))
-    elif scale_by == "log":
-        factor = float(np.exp((np.log(g) - np.log(p)).mean()))
     else:
-        target, variance = 1 / g if in_disparity else g, float(p.var())
-        if not variance:
+        if p.min() == p.max():
             raise InputError("the prediction is constant, so that no scale and shift can be fitted")
-        factor = float(((p - p.mean()) * (target - target.mean())).mean()) / variance
-        shift = float(target.mean() - factor * p.mean())
+        factor, shift = np.polyfit(p, 1 / g if in_disparity else g, 1).tolist()
     fitted = depth * np.float64(factor) + shift
     result = np.where((depth > 0) & (fitted > 0), fitted, 0).astype(np.float32)
     return _inverse(result) if in_disparity else result, (factor, shift)
