@@ -15,12 +15,9 @@ from rich.table import Table as RichTable
 
 from pnpdepth_cli.cli.terminal import printable, say
 from pnpdepth_cli.commands.error_tables import (
-    baselines_table,
-    error_table,
-    has_baselines,
     mean_weights_text,
-    means_table,
-    refinement_table,
+    means_tables,
+    refinement_tables,
 )
 from pnpdepth_cli.commands.tables import Cell, Table, count_of, write_text
 from pnpdepth_cli.dataset.frame_record import FrameRecord
@@ -116,24 +113,19 @@ def print_refinement(record: FrameRecord) -> None:
     """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
     assert record.method is not None
     # Notes and tables of errors.
-    is_default, errors = record.method.kind == "default", record.errors
     print_notes(record.notes)
-    print_table(refinement_table(record), err=True)
-    if is_default and HELD_OUT in errors:
-        title = "held-out points, which nothing used"
-        print_table(error_table(title, errors, record.unit, bases=[HELD_OUT]), err=True)
+    for table in refinement_tables(record):
+        print_table(table, err=True)
     if record.worse_than_linear:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
-    if has_baselines(errors):
-        print_table(baselines_table(errors, record.unit), err=True)
     if record.improved_fraction is not None:
-        where = "held-out points" if HELD_OUT in errors else "points used"
-        where = "scored pixels" if GT in errors else where
+        where = "held-out points" if HELD_OUT in record.errors else "points used"
+        where = "scored pixels" if GT in record.errors else where
         say(f"improved: {record.improved_fraction:.1%} of the {where}")
     # Updates, times and files.
     parts = [", ".join(f"{stage} {spent:.2f} s" for stage, spent in record.seconds.items())]
     parts.append(f"peak {record.peak_memory_mb['process']:,.0f} MB")
-    if not is_default:
+    if record.method.kind != "default":
         settings = record.settings
         how = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
         parts.insert(0, f"{settings['iterations']} updates ({how})")
@@ -143,12 +135,10 @@ def print_refinement(record: FrameRecord) -> None:
 
 def print_batch(summary: BatchSummary) -> None:
     """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files."""
-    counts, errors = summary.counts, summary.errors
-    if errors:
-        print_table(means_table(errors, summary.unit, summary.columns), err=True)
+    counts = summary.counts
+    for table in means_tables(summary.errors, summary.unit, summary.columns):
+        print_table(table, err=True)
     print_notes(summary.notes)
-    if has_baselines(errors):
-        print_table(baselines_table(errors, summary.unit), err=True)
     # Counts of frames.
     parts = [f"{counts['done']:,} of {count_of(counts['frames'], 'frame')} done"]
     for kind in ("diverged", "failed", "pending", "with_warnings"):

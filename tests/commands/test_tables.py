@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.error_tables import (
-    baselines_table,
     change,
+    means_tables,
     names_of_depths,
-    refinement_table,
+    refinement_tables,
 )
 from pnpdepth_cli.commands.evaluation.compare import (
     ComparedRun,
@@ -29,21 +29,20 @@ from pnpdepth_cli.measures import MEASURES
 
 
 @pytest.mark.parametrize(
-    ("key", "before", "after", "text", "style"),
+    ("before", "after", "text", "style"),
     [
-        ("mae", None, 1.0, "–", "dim"),
-        ("mae", 1.0, nan, "–", "dim"),
-        ("mae", 0.0, 1.0, "–", "dim"),
-        ("mae", 2, 2, "+0.0%", "dim"),
-        ("mae", 1.0, 0.5, "-50.0%", "good"),
-        ("delta1", 0.0, 0.25, "+25.00 pt", "good"),
-        ("delta1", 0.75, 0.5, "-25.00 pt", "bad"),
+        (None, 1.0, "–", "dim"),
+        (1.0, nan, "–", "dim"),
+        (0.0, 1.0, "–", "dim"),
+        (2, 2, "+0.0%", "dim"),
+        (1.0, 0.5, "-50.0%", "good"),
+        (1.0, 1.5, "+50.0%", "bad"),
     ],
 )
-def test_a_change_is_relative_or_in_points_and_coloured_by_whether_it_is_better(
-    key: str, before: float | None, after: float | None, text: str, style: str
+def test_a_change_is_relative_and_coloured_by_whether_it_is_better(
+    before: float | None, after: float | None, text: str, style: str
 ) -> None:
-    cell = change(key, before, after)
+    cell = change(before, after)
     assert (cell, cell.style) == (text, style)
 
 
@@ -68,7 +67,8 @@ def at_points(count: int, **maes: float | None) -> dict[str, Scores]:
 def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> None:
     at = at_points(12, before=4.0, propagated=1.0, after=1.0, linear=2.0)
     record = record_of("net", weights={"net": 1.0}, errors={"validation": at})
-    assert styled(refinement_table(record)) == [
+    (table,) = refinement_tables(record)
+    assert styled(table) == [
         [("net, aligned with the points", ""), ("4.0000 m", ""), ("+100.0%", "bad")],
         [("net, residual propagated", "bold"), ("1.0000 m", "bold"), ("-50.0%", "good")],
         [("linear interpolation of all points", ""), ("2.0000 m", ""), ("", "")],
@@ -76,51 +76,50 @@ def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> Non
     at |= at_points(12, alone=0.7, after=0.5)
     weights = {"net": 0.15, "other with net": 0.0, "other": 0.85}
     record = record_of("net", "other", weights=weights, errors={"validation": at})
-    *_, alone, result, _ = (row[0] for row in refinement_table(record).rows)
+    *_, alone, result, _ = (row[0] for row in refinement_tables(record)[0].rows)
     assert (alone, result) == ("other alone", "fused (net 15%, other 85%)")
 
 
-def test_errors_stand_by_what_they_are_measured_on_and_validation_points_count_only_alone() -> None:
+def test_errors_are_shown_where_they_are_measured_and_at_other_points_only_without() -> None:
     after: Scores = {"rmse": 1.0, "delta1": 0.75, "pixels": 1200, "coverage": 0.5}
-    linear: Scores = {"rmse": 4.0, "delta1": 0.75}
     errors = {
-        "ground_truth": {"before": {"rmse": 2.0, "delta1": 0.5}, "after": after, "linear": linear},
+        "ground_truth": {"before": {"rmse": 2.0, "delta1": 0.5}, "after": after},
         "held_out": at_points(1000, before=0.5, after=1.0),
         "validation": at_points(12, before=4.0, after=1.0, linear=2.0),
         "used": at_points(2000, before=0.5, after=0.25),
     }
-    record = record_of(settings={"layer": "middle"}, errors=errors)
-    table = refinement_table(record)
-    scored = "scored on 1,200 pixels of ground truth (50.0% of those known)"
-    assert table.title == f"net cut at middle; {scored}"
-    at_used = ["error at 2,000 points used, MAE", "0.5000 m", "0.2500 m", "", "", ""]
-    assert table.rows == [
-        ["RMSE", "2.0000 m", "1.0000 m", "-50.0%", "4.0000 m", "-75.0%"],
-        ["δ1", "50.00%", "75.00%", "+25.00 pt", "75.00%", "+0.00 pt"],
-        ["error at 1,000 held-out points, MAE", "0.5000 m", "1.0000 m", "+100.0%", "–", "–"],
-        at_used,
+    settings = {"layer": "middle", "align": "none", "iterations": 5, "propagate": "none"}
+    record = record_of(settings=settings, errors=errors)
+    truth, held_out = refinement_tables(record)
+    pixels = "errors against ground truth, 1,200 pixels (50.0% of those known)"
+    assert truth.title == f"net cut at middle: {pixels}"
+    assert truth.rows == [
+        ["net", "2.0000 m", "50.00%", "–"],
+        ["net, 5 updates of z", "1.0000 m", "75.00%", "–"],
     ]
-    without = {basis: errors[basis] for basis in ("validation", "used")}
-    table = refinement_table(replace(record, errors=without))
-    assert table.title == "net cut at middle"
-    validated = ["error at 12 validation points, MAE", "4.0000 m", "1.0000 m", "-75.0%"]
-    assert table.rows == [[*validated, "2.0000 m", "-50.0%"], at_used]
+    assert held_out.title.endswith("errors at held-out points, 1,000 points")
+    for basis, count in (("validation", 12), ("used", 2000)):
+        (table,) = refinement_tables(replace(record, errors={basis: errors[basis]}))
+        assert table.title.endswith(f"{count:,} points")
 
 
-def test_baselines_are_sorted_and_have_ground_truth_where_one_of_them_has() -> None:
-    errors: dict[str, dict[str, Scores]] = {
-        "ground_truth": {"nearest": {"mae": 3.0, "rmse": 4.0}},
-        "validation": at_points(12, nearest=2.0, after=1.0, linear=None),
+def test_a_batch_has_its_means_and_every_baseline() -> None:
+    stages: dict[str, Scores] = {
+        "before": {"mae": 2.0, "rmse": 3.0, "frames": 3},
+        "after": {"mae": 1.0, "rmse": None, "frames": 3},
+        "linear": {"mae": None, "frames": 3},
+        "nearest": {"mae": 3.0, "rmse": 4.0, "frames": 3},
     }
-    table = baselines_table(errors, "m")
-    columns = ["MAE, validation points", "MAE, ground truth", "RMSE, ground truth"]
-    assert table.columns == ["", *columns]
-    assert styled(table) == [
-        [("result", "bold"), ("1.0000 m", "bold"), ("–", "bold"), ("–", "bold")],
-        [("nearest", ""), ("2.0000 m", ""), ("3.0000 m", ""), ("4.0000 m", "")],
+    (table,) = means_tables({"ground_truth": stages, "used": stages}, "m", ("mae", "rmse"))
+    assert table.title == "means: errors against ground truth, 3 frames"
+    assert table.columns == ["", "MAE", "RMSE", "MAE vs linear"]
+    assert [row[:3] for row in table.rows] == [
+        ["before", "2.0000 m", "3.0000 m"],
+        ["after", "1.0000 m", "–"],
+        ["linear interpolation of all points", "–", "–"],
+        ["nearest", "3.0000 m", "4.0000 m"],
     ]
-    unknown = {"validation": at_points(12, nearest=None, linear=None)}
-    assert sorted(baselines_table(unknown, "m").rows) == [["linear", "–"], ["nearest", "–"]]
+    assert means_tables({}, "m") == []
 
 
 def styled(table: Table) -> list[list[tuple[str, str]]]:

@@ -16,11 +16,9 @@ from typing import Any
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import BatchSummary
 from pnpdepth_cli.commands.error_tables import (
-    baselines_table,
     bases_of,
-    has_baselines,
     mean_weights_text,
-    means_table,
+    means_tables,
     weights_text,
 )
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
@@ -217,16 +215,12 @@ def _head(
         notes.append("Without ground truth or --holdout, no error is measured.")
     # The columns and tables.
     columns = _columns(basis, unit)
-    errors = summary.errors
-    tables = [means_table(errors, unit, summary.columns)] if first is not None else []
-    if has_baselines(errors):
-        tables.append(baselines_table(errors, unit))
     return Head(
         kind="Batch refinement",
         title=summary.output,
         facts=_facts(summary, first),
         notes=notes,
-        tables=tables,
+        tables=means_tables(summary.errors, unit, summary.columns),
         without_title=f"Not refined: {len(failed):,}",
         without=failed,
         columns=columns,

@@ -120,7 +120,7 @@ def test_without_ground_truth_changes_are_those_at_held_out_points_and_settings_
     assert frame["values"]["rmse_change"] is not None
     assert any("at held-out points" in note for note in frame["notes"])
     (table,) = page_data(report)["tables"]
-    assert table["title"] == "means over frames: 4 at held-out points, 4 at points used"
+    assert table["title"] == "means: errors at held-out points, 4 frames"
 
 
 def test_weights_of_all_experts_are_shown_for_each_frame_and_in_the_mean(
@@ -145,7 +145,8 @@ def test_with_neither_ground_truth_nor_held_out_points_there_is_no_change(
     data = page_data(report)
     assert not [column for column in data["columns"] if "change" in column["title"]]
     assert data["columns"][data["sort_by"]]["key"] == "rmse_after"
-    assert {row[3] for row in data["tables"][0]["rows"]} == {""}  # no change
+    assert "proves nothing" in data["tables"][0]["title"]
+    assert {row[3] for row in data["tables"][0]["rows"]} == {"–"}  # no change
     assert "no error is measured" in data["notes"][0]
     assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
 
