@@ -29,11 +29,11 @@ def cloud(**values: Any) -> None:
     The cloud is in the camera's coordinates (x right, y down, z forward), with poses in the
     world's. Pixels that NAME_valid.png beside NAME_depth excludes are left out.
     """
+    from pnpdepth_cli.cli.printing import print_notes
     from pnpdepth_cli.commands.cloud import write_depth_cloud
 
     with progress_bar("cloud", "frame") as show:
-        record = write_depth_cloud(CloudRequest(**values), show)
-    for note in record["notes"]:
-        click.echo(note, err=True)
-    colours = "coloured" if record["coloured"] else "without colours (no image is known)"
-    click.echo(f"wrote {record['points']:,} points, {colours}: {record['output']}")
+        summary = write_depth_cloud(CloudRequest(**values), show)
+    print_notes(summary.notes)
+    colours = "coloured" if summary.coloured else "without colours (no image is known)"
+    click.echo(f"wrote {summary.points:,} points, {colours}: {values['output']}")

@@ -34,12 +34,12 @@ def export(**values: Any) -> None:
     Camera and pose come from the records, so RESULTS are best those of a COLMAP project
     (`pnpdepth batch --layout colmap`). OUTPUT may be the project itself.
     """
+    from pnpdepth_cli.cli.printing import print_notes
     from pnpdepth_cli.commands.exports import export_results
     from pnpdepth_cli.commands.tables import count_of
 
     with progress_bar("export", "frame") as show:
-        record = export_results(**values, show=show)
-    for note in record["notes"]:
-        click.echo(note, err=True)
-    frames = count_of(record["frames"], "frame")
-    click.echo(f"wrote {frames} in {record['unit']}: {values['output']}")
+        summary = export_results(**values, show=show)
+    print_notes(summary.notes)
+    frames = count_of(summary.frames, "frame")
+    click.echo(f"wrote {frames} in {summary.unit}: {values['output']}")

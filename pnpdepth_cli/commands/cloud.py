@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
@@ -27,7 +25,6 @@ from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.poses import poses_of_frames
 from pnpdepth_cli.io.scans import write_cloud
-from pnpdepth_cli.io.text_files import plain, write_json
 from pnpdepth_cli.sensors.point_cloud import (
     PointCloud,
     View,
@@ -41,10 +38,19 @@ _IN_MEMORY = 12
 """Depth maps of neighbouring views that are kept, with their points."""
 
 
+class CloudSummary(NamedTuple):
+    """What was written."""
+
+    points: int
+    coloured: bool
+    notes: list[str]
+    """Lines for a person."""
+
+
 def write_depth_cloud(
     request: CloudRequest, show: Callable[[int, int], None] = lambda done, of: None
-) -> dict[str, Any]:
-    """Writes the cloud and its record beside it, and returns the record.
+) -> CloudSummary:
+    """Writes the cloud, and returns what is in it.
 
     Args:
         request: Depth files, camera, poses and limits of the cloud.
@@ -54,10 +60,8 @@ def write_depth_cloud(
         PnpDepthError: An input or output is at fault; then nothing is written.
     """
     # The frames, with poses where views must agree.
-    beside = record_path(request.output)
-    for path in (request.output, beside):
-        if path.exists() and not request.overwrite:
-            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
+    if request.output.exists() and not request.overwrite:
+        raise OutputError(f"{request.output} exists; --overwrite replaces it, -o names another")
     frames = result_frames(request.depth)
     notes: list[str] = []
     poses = _poses(request, frames, notes)
@@ -71,32 +75,7 @@ def write_depth_cloud(
     parts = _parts(request, frames, poses, coloured, notes, show)
     make_folder(request.output.parent)
     points = write_cloud(request.output, _merge(request, parts, coloured))
-    # The record beside it.
-    inputs = ("depth", "output", "image", "overwrite", "calib", "poses")
-    settings = {name: value for name, value in asdict(request).items() if name not in inputs}
-    record = {
-        "command": "cloud",
-        "version": __version__,
-        "output": str(request.output),
-        "points": points,
-        "coloured": coloured,
-        "unit": frames[0].unit,
-        "inputs": {
-            "depth": [str(frame.depth) for frame in frames],
-            "calib": None if request.calib is None else str(request.calib),
-            "poses": None if request.poses is None else str(request.poses),
-        },
-        "settings": plain(settings),
-        "notes": notes,
-        "frame": "camera" if poses[0] is None else "world",
-    }
-    write_json(beside, record)
-    return record
-
-
-def record_path(output: Path) -> Path:
-    """Returns the path of the record of a cloud; NAME.json may be that of a refinement."""
-    return output.with_name(f"{output.name}.json")
+    return CloudSummary(points, coloured, notes)
 
 
 def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -> list[Pose | None]:

@@ -51,7 +51,6 @@ class DepthScale:
 
     low_m: float
     high_m: float
-    warm_is_far: bool = False  # whether the warm end is the far one, as for a standard deviation
 
     @property
     def logarithmic(self) -> bool:
@@ -68,8 +67,7 @@ class DepthScale:
     def paint(self, depth: NDArray[np.floating]) -> Pixels:
         """Returns (..., 3) colours of depths of any shape; `UNKNOWN` where there is none."""
         known = np.isfinite(depth) & (depth > 0)
-        position = self.position(np.where(known, depth, self.low_m))
-        pixels = _turbo(position if self.warm_is_far else 1 - position)
+        pixels = _turbo(1 - self.position(np.where(known, depth, self.low_m)))
         pixels[~known] = UNKNOWN
         return pixels
 

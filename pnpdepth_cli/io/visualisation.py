@@ -92,13 +92,6 @@ def overlay(
     save_depth_figure(path, [panel], scale)
 
 
-def sigma_preview(sigma: Depth, path: Path, unit: str = "m") -> None:
-    """Writes a PNG of a standard deviation (H, W) in `unit`."""
-    scale = replace(depth_scale(sigma), warm_is_far=True)
-    pixels = resized(scale.paint(sigma), magnification(sigma.shape))
-    save_depth_figure(path, [Panel(title="Standard deviation", pixels=pixels)], scale, unit)
-
-
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     """Writes an 8-bit PNG, 255 where the mask (H, W) is true and 0 elsewhere."""
     from PIL import Image

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.cloud import write_depth_cloud
+from pnpdepth_cli.commands.cloud import CloudSummary, write_depth_cloud
 from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
@@ -36,7 +35,7 @@ def frame(
     return path
 
 
-def written(path: Path, output: Path, **values: Any) -> dict[str, Any]:
+def written(path: Path, output: Path, **values: Any) -> CloudSummary:
     calib = output.parent / "k.txt"
     calib.write_text(f"30 0 {WIDTH / 2} 0 30 {HEIGHT / 2} 0 0 1\n")
     return write_depth_cloud(
@@ -50,11 +49,10 @@ def points_of(path: Path) -> np.ndarray:
 
 def test_the_colours_come_from_the_image_that_the_record_names(tmp_path: Path) -> None:
     record = written(frame(tmp_path, "a"), tmp_path / "a.ply")
-    assert record["coloured"]
-    assert record["points"] == HEIGHT * WIDTH
+    assert record.coloured
+    assert record.points == HEIGHT * WIDTH
     row = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1][:27]
     assert list(row[24:27]) == [30, 20, 10]  # OpenCV wrote blue, green, red
-    assert json.loads((tmp_path / "a.ply.json").read_text()) == record
 
 
 def test_a_calibration_file_gives_the_camera(tmp_path: Path) -> None:
@@ -79,8 +77,7 @@ def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
     pose = [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]
     path = with_camera(frame(tmp_path, "a"), pose)
     record = written(path, tmp_path / "a.ply", calib=None)
-    assert (record["frame"], record["unit"]) == ("world", "model units")
-    assert record["notes"] == ["camera: made up (from the record)"]
+    assert record.notes == ["camera: made up (from the record)"]
     assert points_of(tmp_path / "a.ply")[-1] == pytest.approx(
         [5 + 2 * (WIDTH - 1) / 20, 2 * (HEIGHT - 1) / 20, 2]
     )
@@ -110,11 +107,11 @@ def test_pixels_beyond_the_limit_and_of_a_far_plane_are_left_out(tmp_path: Path)
     depth[:5] = 1e10
     write_depth(tmp_path / "d.exr", depth)
     record = written(tmp_path / "d.exr", tmp_path / "d.ply")
-    assert record["points"] == (HEIGHT - 5) * WIDTH
-    assert any("far plane" in note for note in record["notes"])
+    assert record.points == (HEIGHT - 5) * WIDTH
+    assert any("far plane" in note for note in record.notes)
     nearer = written(tmp_path / "d.exr", tmp_path / "e.ply", max_depth=5)
-    assert nearer["points"] == int((depth <= 5).sum())
-    assert not nearer["coloured"]
+    assert nearer.points == int((depth <= 5).sum())
+    assert not nearer.coloured
 
 
 def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:
@@ -126,24 +123,23 @@ def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> N
     sigma = np.full((HEIGHT, WIDTH), 0.05, np.float32)
     sigma[:, :8] = 0.5
     write_depth(tmp_path / f"a_sigma{path.suffix}", sigma)
-    assert written(path, tmp_path / "a.ply")["points"] == (HEIGHT - 4) * WIDTH
+    assert written(path, tmp_path / "a.ply").points == (HEIGHT - 4) * WIDTH
     record = written(path, tmp_path / "b.ply", max_sigma=0.1)
-    assert record["points"] == (HEIGHT - 4) * (WIDTH - 8)
+    assert record.points == (HEIGHT - 4) * (WIDTH - 8)
 
 
 def test_frames_are_one_cloud_in_the_world_frame_in_which_voxels_merge_them(tmp_path: Path) -> None:
     for name in "ab":
         frame(tmp_path / "out", name)
     (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 100 0 1 0 0 0 0 1 0\n")
-    record = written(tmp_path / "out", tmp_path / "w.ply", poses=tmp_path / "poses.txt")
+    written(tmp_path / "out", tmp_path / "w.ply", poses=tmp_path / "poses.txt")
     points = points_of(tmp_path / "w.ply")
-    assert record["frame"] == "world"
     assert len(points) == 2 * HEIGHT * WIDTH
     first, second = np.split(points, 2)
     assert second == pytest.approx(first + np.array([100, 0, 0]), abs=1e-4)
 
-    whole = written(tmp_path / "out", tmp_path / "a.ply")["points"]
-    merged = written(tmp_path / "out", tmp_path / "b.ply", voxel=0.5)["points"]
+    whole = written(tmp_path / "out", tmp_path / "a.ply").points
+    merged = written(tmp_path / "out", tmp_path / "b.ply", voxel=0.5).points
     points = points_of(tmp_path / "a.ply")
     assert whole == 2 * HEIGHT * WIDTH
     assert merged == len(np.unique(np.floor(points / 0.5), axis=0))
@@ -156,7 +152,7 @@ def test_pixels_that_too_few_views_agree_on_are_left_out(tmp_path: Path) -> None
         frame(tmp_path / "out", name, depth)
     values = {"poses": tmp_path / "poses.txt", "overwrite": True}
     found = {
-        views: written(tmp_path / "out", tmp_path / "o.ply", min_views=views, **values)["points"]
+        views: written(tmp_path / "out", tmp_path / "o.ply", min_views=views, **values).points
         for views in (1, 2)
     }
     assert found == {1: 3 * HEIGHT * WIDTH, 2: 2 * HEIGHT * WIDTH}
@@ -192,4 +188,4 @@ def test_a_cloud_is_a_ply_file_and_one_that_exists_is_kept_without_overwrite(
         with pytest.raises(OutputError):
             written(path, tmp_path / name)
     assert (tmp_path / "o.ply").read_text() == "mine"
-    assert written(path, tmp_path / "o.ply", overwrite=True)["points"]
+    assert written(path, tmp_path / "o.ply", overwrite=True).points

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.exports import export_results
+from pnpdepth_cli.commands.exports import ExportSummary, export_results
 from pnpdepth_cli.dataset.colmap_points import read_colmap_points
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
@@ -54,7 +54,7 @@ def results(root: Path, depth: np.ndarray = DEPTH, unit_scale: float | None = No
     return folder
 
 
-def export(folder: Path, to: str, output: Path, **values: Any) -> dict[str, Any]:
+def export(folder: Path, to: str, output: Path, **values: Any) -> ExportSummary:
     return export_results(folder, output, to=to, **values)
 
 
@@ -118,7 +118,7 @@ def test_no_pixel_is_infinitely_far_in_3dgs(root: Path) -> None:
     for name in NAMES:
         cv2.imwrite(str(folder / f"{name}_valid.png"), valid)
     record = export(folder, "gaussian-splatting", root)
-    assert f"warning: {3 * 3 * WIDTH:,} pixels are unknown or not valid" in "".join(record["notes"])
+    assert f"warning: {3 * 3 * WIDTH:,} pixels are unknown or not valid" in "".join(record.notes)
     scale = json.loads((root / "sparse/0/depth_params.json").read_text())["a"]["scale"]
     png = cv2.imread(str(root / "inverse_depths/a.png"), cv2.IMREAD_UNCHANGED)
     expected = np.concatenate([DEPTH[[2, 2]], DEPTH[2:]])
@@ -132,7 +132,7 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     scene, far = root / "scene", DEPTH.copy()
     far[0] = 20
     record = export(results(root, far, unit_scale), "nerfstudio", scene)
-    assert record["unit"] == ("m" if unit_scale else "model units")
+    assert record.unit == ("m" if unit_scale else "model units")
     content = json.loads((scene / "transforms.json").read_text())
     assert content["camera_model"] == "OPENCV"
     assert len(content["frames"]) == 3
@@ -162,7 +162,7 @@ def test_3dgs_finds_a_model_of_the_refined_images_and_points_of_their_depth(
 ) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     record = export(results(root, unit_scale=unit_scale), "gaussian-splatting", root / "scene")
-    assert record["unit"] == "model units"
+    assert record.unit == "model units"
     own, new = (pycolmap.Reconstruction(root / path) for path in ("sparse", "scene/sparse/0"))
     assert new.num_points3D() > 500
     depths = [point.xyz[2] for point in new.points3D.values()]
@@ -173,10 +173,10 @@ def test_3dgs_finds_a_model_of_the_refined_images_and_points_of_their_depth(
         assert image.camera.params == pytest.approx([50, 52, 32.5, 23])
         assert (root / "scene/images" / image.name).is_file()
     again = export(root / "out", "gaussian-splatting", root / "scene", overwrite=True)
-    assert again["files"] == record["files"]
+    assert again.files == record.files
     shutil.copytree(root / "sparse", root / "sparse/0")  # COLMAP's own stays
     record = export(root / "out", "gaussian-splatting", root)
-    assert not any(name.endswith("cameras.txt") for name in record["files"])
+    assert not any(path.name == "cameras.txt" for path in record.files)
 
 
 def test_depth_beyond_16_bits_is_unknown_for_nerfstudio_and_said_so(root: Path) -> None:
@@ -187,7 +187,7 @@ def test_depth_beyond_16_bits_is_unknown_for_nerfstudio_and_said_so(root: Path) 
     assert (codes[0] == 65534).all()
     assert not codes[1].any()
     assert codes[2:].all()
-    assert f" {3 * WIDTH} pixels beyond 65.53 m" in record["notes"][0]
+    assert f" {3 * WIDTH} pixels beyond 65.53 m" in record.notes[0]
 
 
 def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
     export(folder, "nerfstudio", tmp_path / "images/link", overwrite=True)
     assert json.loads((tmp_path / "transforms.json").read_text())["frames"] == frames
     for to in ("colmap", "gaussian-splatting"):
-        notes = "".join(export(folder, to, tmp_path / to)["notes"])
+        notes = "".join(export(folder, to, tmp_path / to).notes)
         assert " 3 of 3 images have lens distortion" in notes
         assert ("sparse/0 has no model" in notes) == (to == "gaussian-splatting")
 

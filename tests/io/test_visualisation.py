@@ -10,11 +10,10 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.io.figure import MARGIN, UNKNOWN, depth_scale, resized
+from pnpdepth_cli.io.figure import UNKNOWN, depth_scale, resized
 from pnpdepth_cli.io.visualisation import (
     improvement,
     preview,
-    sigma_preview,
 )
 
 BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
@@ -117,16 +116,6 @@ def test_better_worse_equal_and_unknown_have_their_own_colours(tmp_path: Path) -
     # the change itself has other colours: teal is farther
     change = previewed(tmp_path, np.full((8, 12), 4, np.float32), np.full((8, 12), 5, np.float32))
     assert change["Change"][0, 0].tolist() == [1, 102, 94]
-
-
-def test_a_large_standard_deviation_is_warm(tmp_path: Path) -> None:
-    path = tmp_path / "s.png"
-    sigma_preview(np.linspace(0.1, 1, 4800, dtype=np.float32).reshape(60, 80), path)
-    page = pixels_of(path).astype(int)
-    height = page.shape[0] - 2 * MARGIN
-    small, large = page[MARGIN + height // 10, 2 * MARGIN], page[-2 * MARGIN, 2 * MARGIN]
-    assert small[0] < small[2]
-    assert large[0] > large[2]
 
 
 @pytest.mark.parametrize(("held_out", "grey"), [(True, False), (False, True)])

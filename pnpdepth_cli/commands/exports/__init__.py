@@ -11,12 +11,11 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli import __version__
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
@@ -26,7 +25,6 @@ from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
 from pnpdepth_cli.io.rgb import sizes_of
-from pnpdepth_cli.io.text_files import write_json
 from pnpdepth_cli.points import MODEL_UNITS
 from pnpdepth_cli.sensors.point_cloud import PointCloud, cloud_from_depth
 
@@ -123,6 +121,16 @@ def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
     ]
 
 
+class ExportSummary(NamedTuple):
+    """What was written."""
+
+    files: list[Path]
+    frames: int
+    unit: str
+    notes: list[str]
+    """Lines for a person."""
+
+
 def export_results(
     results: Path,
     output: Path,
@@ -130,8 +138,8 @@ def export_results(
     to: str,
     overwrite: bool = False,
     show: Callable[[int, int], None] = lambda done, of: None,
-) -> dict[str, Any]:
-    """Writes the files and `export_NAME.json`, and returns what that holds.
+) -> ExportSummary:
+    """Writes the files, and returns what they hold.
 
     Args:
         results: A folder that `refine` or `batch` wrote, or a depth file in it.
@@ -152,31 +160,22 @@ def export_results(
     if len(units) > 1:
         raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
     # Files of different names, none of which is there.
-    written = [*export.files(output, frames), output / f"export_{to}.json"]
+    written = export.files(output, frames)
     if len(set(written)) < len(written):
         raise InputError(f"{results}: two frames have one image name; refine them again")
     for path in written:
         if path.exists() and not overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, -o names another folder")
-    # The record begins, and all files are written or none.
-    of_model = export.in_model_units and frames[0].unit_scale != 1
+    # All files, or none.
     for folder in {path.parent for path in written}:
         make_folder(folder)
-    record: dict[str, Any] = {
-        "command": "export",
-        "version": __version__,
-        "to": to,
-        "results": str(results),
-        "frames": len(frames),
-        "unit": MODEL_UNITS if of_model else frames[0].result.unit,
-    }
     numbers = itertools.count(1)
     show(0, len(frames))
     with all_or_none(written):
-        record["notes"] = export.write(output, frames, lambda: show(next(numbers), len(frames)))
-        record["files"] = [path.as_posix() for path in written[:-1]]
-        write_json(written[-1], record)
-    return record
+        notes = export.write(output, frames, lambda: show(next(numbers), len(frames)))
+    of_model = export.in_model_units and frames[0].unit_scale != 1
+    unit = MODEL_UNITS if of_model else frames[0].result.unit
+    return ExportSummary(written, len(frames), unit, notes)
 
 
 def _frame(result: ResultFrame, export: Export) -> ExportFrame:

@@ -6,27 +6,19 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
-from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, SCAN_ONLY_SUFFIXES
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import cannot_write
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 
-_FILE_SUFFIXES = {
-    *(*IMAGE_SUFFIXES, *DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES),
-    *(".hdr", ".bmp", ".mat", ".h5", ".csv", ".json"),
-}
-"""Suffixes that are taken for those of a file, though a folder's name may have a dot in it."""
-
-
 Outputs = Mapping[str, Path]
 """The files of a result by kind: depth, sigma, preview, …, and last its record."""
-IMAGES = frozenset({"preview", "improvement", "sigma_preview"})
+IMAGES = frozenset({"preview", "improvement"})
 """Kinds for a person, which may be deleted."""
 
 
 def outputs_in(folder: Path, name: str, request: RefineRequest) -> dict[str, Path]:
     """Returns the files of a result in a folder; slashes in the name are subfolders."""
-    without = set() if request.hold_out.uncertainty else {"sigma", "sigma_preview", "valid"}
+    without = set() if request.hold_out.uncertainty else {"sigma", "valid"}
     without |= set() if request.outputs.view_3d else {"view"}
     endings = _endings(f".{request.outputs.format}")
     return {kind: folder / f"{name}{end}" for kind, end in endings.items() if kind not in without}
@@ -37,7 +29,6 @@ def _endings(suffix: str) -> dict[str, str]:
     return {
         "depth": f"_depth{suffix}",
         "sigma": f"_sigma{suffix}",
-        "sigma_preview": "_sigma_preview.png",
         "valid": "_valid.png",  # mask of the pixels whose depth is valid
         "preview": "_preview.png",
         "improvement": "_improvement.png",
@@ -76,8 +67,6 @@ def plan_outputs(request: RefineRequest) -> dict[str, Path]:
     inputs = [path for path in sources if isinstance(path, Path)]
     output = options.output or Path(f"{inputs[0].stem}_refined")
     suffix, formats = output.suffix.lower(), " ".join(DEPTH_SUFFIXES)
-    if f".{options.format}" not in DEPTH_SUFFIXES:
-        raise UsageError(f"format {options.format!r} is not one of {formats}")
     # A depth file alone, or all files in a folder.
     if suffix in DEPTH_SUFFIXES:
         if request.hold_out.uncertainty:
@@ -85,7 +74,7 @@ def plan_outputs(request: RefineRequest) -> dict[str, Path]:
                 f"--uncertainty writes a second file; name a folder, not {output}, with -o"
             )
         outputs = {"depth": output}
-    elif suffix in _FILE_SUFFIXES and not output.is_dir():
+    elif suffix[1:].isalpha() and not output.is_dir():
         raise OutputError(f"{output}: depth is written as {formats}, or into a folder")
     elif output.is_file():
         raise OutputError(f"{output} is a file; name a folder, or a depth file ({formats})")

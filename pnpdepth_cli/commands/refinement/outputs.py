@@ -24,12 +24,7 @@ from pnpdepth_cli.io.depth import metres, write_depth
 from pnpdepth_cli.io.figure import depth_scale
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
 from pnpdepth_cli.io.text_files import write_json
-from pnpdepth_cli.io.visualisation import (
-    improvement,
-    preview,
-    sigma_preview,
-    write_mask,
-)
+from pnpdepth_cli.io.visualisation import improvement, preview, write_mask
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels
@@ -39,8 +34,6 @@ Image = NDArray[np.float32]
 INTEGER_SCALE = 256.0
 """KITTI's codes per metre, for points that have none of their own and fit."""
 
-_COARSER = (100.0, 10.0, 1.0, 0.1)  # codes per metre where 256 cannot hold the points
-_FINER = (1000.0, 10_000.0, 100_000.0)  # where 256 would round them
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
 
@@ -57,20 +50,17 @@ _RAY_NODES = 64
 def output_scale(inputs: Frame) -> float:
     """Returns the codes per metre of an integer depth file for this frame.
 
-    They are those of the sparse depth file. Without them they are 256, unless the points do not
-    fit. They are known before refinement.
+    They are those of the sparse depth file. Without them they are 256, or the largest power of ten
+    that fits where the points do not fit 256 or are rounded by it.
     """
     if inputs.depth_scale is not None:
         return inputs.depth_scale
     nearest, farthest = float(inputs.own.depth.min()), float(inputs.own.depth.max())
-    scale = INTEGER_SCALE
-    for coarser in _COARSER:
-        if _BEYOND_POINTS * farthest * scale > LARGEST_CODE:
-            scale = coarser
-    for finer in _FINER:
-        if nearest * scale < _LEAST_CODES and _BEYOND_POINTS * farthest * finer <= LARGEST_CODE:
-            scale = finer
-    return scale
+    finest = LARGEST_CODE / (_BEYOND_POINTS * farthest)
+    if nearest * INTEGER_SCALE >= _LEAST_CODES and finest >= INTEGER_SCALE:
+        return INTEGER_SCALE
+    power = _power_of_ten(finest)
+    return power if finest < INTEGER_SCALE else max(power, INTEGER_SCALE)
 
 
 def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Refined:
@@ -101,18 +91,21 @@ def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:
     scale = output_scale(inputs)
     nearest, farthest = np.float32(1 / scale), np.float32(LARGEST_CODE / scale)
     known = np.isfinite(frame.after) & (frame.after > 0)
-    beyond, below = known & (frame.after > farthest), known & (frame.after < 0.5 / scale)
-    notes = [
-        f"warning: {int(mask.sum()):,} of {mask.size:,} pixels clipped to {metres(float(limit))} m,"
-        f" the {extreme} depth of a 16-bit PNG with {scale:g} codes per metre; --format exr holds"
-        " every depth"
-        for mask, limit, extreme in ((beyond, farthest, "largest"), (below, nearest, "smallest"))
-        if mask.any()
-    ]
-    if not notes:
+    clipped = known & ((frame.after > farthest) | (frame.after < 0.5 / scale))
+    if not clipped.any():
         return frame
-    after = np.where(beyond, farthest, np.where(below, nearest, frame.after))
-    return replace(frame, after=after, notes=(*frame.notes, *notes))
+    limits = f"{metres(float(nearest))}–{metres(float(farthest))} m"
+    note = (
+        f"warning: {int(clipped.sum()):,} of {clipped.size:,} pixels clipped to {limits}, what a"
+        f" 16-bit PNG with {scale:g} codes per metre holds; --format exr holds every depth"
+    )
+    after = np.where(clipped, np.clip(frame.after, nearest, farthest), frame.after)
+    return replace(frame, after=after, notes=(*frame.notes, note))
+
+
+def _power_of_ten(largest: float) -> float:
+    """The largest power of ten up to this number."""
+    return 10.0 ** math.floor(math.log10(largest))
 
 
 def write_outputs(
@@ -135,7 +128,6 @@ def write_outputs(
     write_depth(outputs["depth"], frame.after, scale=output_scale(inputs))
     if "sigma" in outputs and frame.sigma is not None and frame.valid is not None:
         _write_sigma(outputs["sigma"], frame.sigma)
-        sigma_preview(frame.sigma, outputs["sigma_preview"], inputs.unit)
         write_mask(outputs["valid"], frame.valid)
     # Images for a person.
     improved, figures = None, {}
@@ -155,8 +147,7 @@ def write_outputs(
 
 def _write_sigma(path: Path, sigma: Image) -> None:
     """Writes σ; a PNG has the largest power of ten of codes per metre that holds the largest σ."""
-    largest = max(float(sigma.max()), 1e-9)
-    scale = 10.0 ** math.floor(math.log10(LARGEST_CODE / largest))
+    scale = _power_of_ten(LARGEST_CODE / max(float(sigma.max()), 1e-9))
     depth_format = format_of_suffix(path.suffix)
     if depth_format is not None and depth_format.integer:
         sigma = np.where(sigma > 0, np.maximum(sigma, np.float32(1 / scale)), np.float32(0))

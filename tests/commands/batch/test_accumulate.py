@@ -224,8 +224,8 @@ def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path)
 
     def cloud(name: str) -> tuple[float, list[str]]:
         """The depth of the farthest point along z, and the notes."""
-        record = write_depth_cloud(CloudRequest(depth=root / "out", output=tmp_path / name))
-        return float(read_scan(tmp_path / name).points[:, 2].max()), record["notes"]
+        summary = write_depth_cloud(CloudRequest(depth=root / "out", output=tmp_path / name))
+        return float(read_scan(tmp_path / name).points[:, 2].max()), summary.notes
 
     # Poses of the folder; then of a file, with which all frames are done again.
     batch(root, refine={"iterations": 0})

@@ -270,7 +270,6 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Pa
         ("fine\u0301", "needs a file of frame 'fin\u00e9'"),
         ("ok_depth.png/x", "needs a file of frame 'ok'"),
         ("ok.json/deep/x", "needs a file of frame 'ok'"),
-        ("ok_sigma", "needs a file of frame 'ok'"),
     ],
 )
 def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(

@@ -57,7 +57,7 @@ def test_a_stem_names_its_frame(stem: str, name: str) -> None:
 
 MATCHED = [
     (  # the files of a refinement, and ground truth without images
-        [f"b_{part}.png" for part in ("depth", "preview", "sigma_preview", "improvement")]
+        [f"b_{part}.png" for part in ("depth", "preview", "sigma", "improvement")]
         + ["ä ö_depth.exr", "b.png"],
         ["b.png", "ä ö.npy"],
         {"b": "b_depth.png", "ä ö": "ä ö_depth.exr"},

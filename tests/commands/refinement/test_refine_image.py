@@ -203,7 +203,6 @@ BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"image": None}, PnpDepthError, "takes an rgb image"),
     ({"device": "cuda:7"}, PnpDepthError, "device cpu"),
     ({"device": "tpu"}, PnpDepthError, "device cpu"),
-    ({"format": "jpg"}, UsageError, "not one of"),
     ({"depth_scale": -1.0}, UsageError, "scale"),
     ({"gt": "small.npy"}, SizeError, "ground truth .* is 62×10 but the image is 62×46"),
     ({"gt": "empty.npy"}, InputError, "no pixel with known depth"),
