@@ -185,6 +185,13 @@ def test_rows_that_are_no_points_of_the_image_are_counted() -> None:
     assert frame_of_arrays(rgb, good).notes == ()
 
 
+def test_frames_that_are_no_pairs_are_input_errors(network: pnp.Network, frame: Frame) -> None:
+    with pnp.Refiner(network) as refiner, pytest.raises(pnp.InputError):
+        refiner.share_registration([frame[0]])  # type: ignore[list-item]
+    with pytest.raises(pnp.InputError):
+        pnp.Refiner(network, adapt=[(*frame, "m")])  # type: ignore[list-item]
+
+
 def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -> None:
     class Bright(nn.Module):
         def __init__(self) -> None:

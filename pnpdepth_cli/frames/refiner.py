@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, Literal
@@ -82,7 +82,7 @@ class Refiner:
         self._asked = settings or Settings()
         self._uncertainty = uncertainty
         self._register = registration_to_make(registration, self._asked)
-        self._adapt = [frame_of_arrays(*pair, self._register) for pair in adapt]
+        self._adapt = [_frame_of_pair(pair, self._register) for pair in adapt]
         self._method: Method | None = None
         self._stack = ExitStack()
         self._lock = threading.Lock()
@@ -131,6 +131,22 @@ class Refiner:
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
         return refined
+
+    def share_registration(self, frames: Iterable[Pair]) -> None:
+        """Decides by some frames together how the images of a sequence are moved to the points.
+
+        Images of the size of the first one are then all moved alike; else each decides alone.
+
+        Args:
+            frames: Frames (image, sparse) of the sequence, such as 16 spread over it.
+
+        Raises:
+            InputError: A frame is no such pair, or cannot be used.
+        """
+        read = [_frame_of_pair(pair, self._register) for pair in frames]
+        if read:
+            with self._lock:
+                self._method_for(read[0]).share_registration(read)
 
     def _method_for(self, first: Frame) -> Method:
         """The method, which this frame decides if it is the first."""
@@ -222,6 +238,12 @@ def frame_of_arrays(
     )
 
 
+def _frame_of_pair(pair: Pair, register: Register) -> Frame:
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise InputError(f"frames are pairs (image, sparse), not {type(pair).__name__}")
+    return frame_of_arrays(*pair, register)
+
+
 def _rgb(image: ArrayLike) -> NDArray[np.float32]:
     """The image as (H, W, 3) in 0…1."""
     values = _numbers(image, "an image")
@@ -230,7 +252,8 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
     if values.ndim != 3 or values.shape[2] != 3 or not values.size:
         raise InputError(f"an image has shape (H, W, 3) or (H, W), not {np.shape(image)}")
     if values.dtype in FULL_SCALE:
-        return (values / FULL_SCALE[values.dtype]).astype(np.float32)
+        white = 255.0 if values.max() <= 255 else FULL_SCALE[values.dtype]  # as files are read
+        return (values / white).astype(np.float32)
     if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
         raise InputError(
             f"an image is uint8, uint16, or float in 0..1; this one is {values.dtype} in"

@@ -124,3 +124,14 @@ def test_arrays_in_memory_are_registered_too() -> None:
     with Refiner(network, fixed) as auto, Refiner(network, fixed, registration="off") as off:
         assert any("moved into the frame" in note for note in auto.refine(rgb, points).notes)
         assert not any("moved into" in note for note in off.refine(rgb, points).notes)
+
+
+def test_arrays_of_a_sequence_share_a_registration_that_one_alone_does_not_show() -> None:
+    frames = [frame(seed, UNREGISTERED, 80) for seed in range(8)]
+    network, fixed = load_network("compact"), Settings(propagate="none")
+    with Refiner(network, fixed) as alone, Refiner(network, fixed) as together:
+        together.share_registration(frames)
+        moved = [refiner.refine(*frames[0]).registration for refiner in (alone, together)]
+    assert moved[0] is None
+    assert moved[1] is not None
+    assert moved[1].zoom == pytest.approx(UNREGISTERED.zoom, abs=0.02)
