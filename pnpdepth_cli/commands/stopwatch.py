@@ -28,11 +28,8 @@ class Stopwatch:
         try:
             yield
         finally:
-            self.add(stage, time.perf_counter() - start)
-
-    def add(self, stage: str, seconds: float) -> None:
-        """Adds seconds to a stage."""
-        self.seconds[stage] = round(self.seconds.get(stage, 0.0) + seconds, 4)
+            spent = time.perf_counter() - start
+            self.seconds[stage] = round(self.seconds.get(stage, 0.0) + spent, 4)
 
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
-import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 import numpy as np
 
@@ -23,9 +24,7 @@ from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.text_files import read_json, write_json
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.frames.adapt import Learnt
     from pnpdepth_cli.frames.frame import Frame
-    from pnpdepth_cli.models.network import Network
 
 MOST_FRAMES = 64
 """Frames of a sequence that are learnt from, spread over it."""
@@ -54,9 +53,7 @@ def with_adapted_weights(
         UsageError: The network takes no points.
     """
     request = records.request
-    name = re.sub(r"[^\w.-]+", "_", sequence) or "frames"
-    if name != sequence:
-        name += f"-{hashlib.sha256(sequence.encode()).hexdigest()[:8]}"
+    name = quote(sequence, safe="") or "frames"
     spread = np.linspace(0, len(frames) - 1, min(len(frames), MOST_FRAMES)).round().astype(int)
     lessons = [request_of(request, frames[index]) for index in spread]
     named = f"{sequence}: " if sequence else ""
@@ -82,36 +79,38 @@ def with_adapted_weights(
 
 def _learn(
     lessons: Sequence[RefineRequest],
-    weights: Path,
+    path: Path,
     say: Callable[[str], None],
     stopped: Callable[[], bool],
 ) -> str | None:
     """Writes adapted weights if they are better beyond chance; returns why they are not."""
-    from pnpdepth_cli.commands.refinement.refine_image import read_requested  # these import torch
-    from pnpdepth_cli.frames.adapt import learn, too_little
+    from safetensors.torch import save_file  # these import torch
+
+    from pnpdepth_cli.commands.refinement.refine_image import read_requested
+    from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
     from pnpdepth_cli.frames.resolve import resolve_definition
     from pnpdepth_cli.models.network import load_network
 
-    # The frames of the sequence, until the run is stopped.
     def check() -> None:
         if stopped():
             raise KeyboardInterrupt
 
-    def frames() -> Iterator[tuple[str, Frame]]:
+    def read() -> Iterator[tuple[str, Frame]]:
         for each in lessons:
             check()
             yield each.files.name, read_requested(each)
 
-    # Too little to learn from.
-    first = read_requested(lessons[0])
+    # The network learns from the frames, if they are enough.
+    frames = read()
+    name, first = next(frames)
     if why := too_little(len(lessons), first):
         return why
-    # The network learns, and is written if it is better.
     choice = lessons[0].network
     network = load_network(choice.model, choice.checkpoint, choice.device)
     network = resolve_definition(network, first.registered())
+    frames, seed = itertools.chain([(name, first)], frames), lessons[0].method.seed
     try:
-        learnt = learn(network, frames(), seed=lessons[0].method.seed, on_step=check)
+        learnt = learn(network, frames, seed=seed, on_step=check)
     except UsageError as error:
         raise UsageError(
             "--adapt needs a network that takes points, such as compact, as the first --model"
@@ -119,25 +118,17 @@ def _learn(
     if not learnt.is_better:
         return str(learnt)
     say(f"adapt: {learnt}")
-    _write(weights, network, learnt)
-    return None
-
-
-def _write(path: Path, network: Network, learnt: Learnt) -> None:
-    """Writes all tensors of the network, those that learnt among them."""
-    from safetensors.torch import save_file
-
-    from pnpdepth_cli.frames.adapt import weights_in_place
-
+    # All its tensors are written, those that learnt among them.
     with weights_in_place(network, learnt.weights):
         state = network.module.state_dict()
         copies = {name: value.detach().cpu().clone().contiguous() for name, value in state.items()}
     make_folder(path.parent)
     with atomic_path(path) as file:
         save_file(copies, file)
+    return None
 
 
-def _digest(settings: dict[str, Any], lessons: Sequence[RefineRequest]) -> str:
+def _digest(settings: Mapping[str, object], lessons: Sequence[RefineRequest]) -> str:
     """The SHA-256 of the settings and files that the weights are learnt from."""
     files = [{part: fingerprint(p).sha256 for part, p in input_files(each)} for each in lessons]
     text = json.dumps([settings, files], sort_keys=True)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatch, fnmatchcase
-from pathlib import Path
+from fnmatch import fnmatchcase
+from pathlib import Path, PurePosixPath
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.sequence import (
@@ -29,7 +28,6 @@ from pnpdepth_cli.dataset.frame_files import (
 )
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.io.atomic import LOCKS
 from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.file_bytes import one_line
@@ -37,7 +35,6 @@ from pnpdepth_cli.io.poses import POSES_FILE
 from pnpdepth_cli.protocols import find_protocol
 
 CSV, JSON = "summary.csv", "summary.json"
-_IN_OUTPUT = "lies in the output folder, which is not searched for frames; move it"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,17 +80,18 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         UsageError: If none has sparse depth.
         OutputError: If the output is a file, or holds the frames.
     """
-    # The output must be a folder beside the frames.
+    # The frames of the layout; the output must be a folder beside them.
     source, output = request.source, request.output
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
-    if source.is_dir() and _is_inside(source, output):
-        raise _holds_the_frames(output)
-    # The frames of the layout, without results that lie in the output.
-    layout, listed, lost = list_frames(source, request.layout)
-    found, unmatched = _outside(output, listed)
+    layout, found, lost = list_frames(source, request.layout)
+    folders = {source, *(path.parent for frame in found for path in source_files(frame))}
+    if any(folder.is_dir() and _is_inside(folder, output) for folder in folders):
+        raise OutputError(
+            f"{output} holds the frames themselves; name a folder of its own, such as"
+            f" {output / 'out'}"
+        )
     frames, refused = _with_own_files(found, request.refine)
-    unmatched += [each for each in lost if not _is_inside(each.path, output)]
     # There must be some, with sparse depth.
     if not found:
         first = f" ({lost[0]})" if lost else ""
@@ -120,7 +118,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         frames=frames,
         chosen=chosen[:: request.every][: request.limit][number - 1 :: of],
         refused=refused,
-        unmatched=tuple(unmatched),
+        unmatched=tuple(each for each in lost if not _is_inside(each.path, output)),
         poses=poses,
     )
 
@@ -208,18 +206,6 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
         yield "calib", calib
 
 
-def _outside(
-    output: Path, frames: Sequence[FrameFiles]
-) -> tuple[list[FrameFiles], list[Unmatched]]:
-    """The frames without a file in the output folder, and the files of the others there."""
-    is_inside = functools.cache(lambda parent: _is_inside(parent, output))
-    inside = [next((p for p in source_files(f) if is_inside(p.parent)), None) for f in frames]
-    kept = [frame for frame, path in zip(frames, inside, strict=True) if path is None]
-    if frames and not kept:
-        raise _holds_the_frames(output)
-    return kept, [Unmatched(path=path, why=_IN_OUTPUT) for path in inside if path is not None]
-
-
 def _with_own_files(
     frames: Sequence[FrameFiles], refine: RefineRequest
 ) -> tuple[list[FrameFiles], list[tuple[FrameFiles, str]]]:
@@ -228,33 +214,31 @@ def _with_own_files(
     Names that differ in Unicode normalisation only are one file on macOS.
     """
     endings = [path.name for path in outputs_in(Path(), "", refine).values()]
-    owners, folders = dict[str, str](), dict[str, str]()  # names of frames by file, by folder
+    names = [unicodedata.normalize("NFC", frame.name) for frame in frames]
+    folders = {folder for name in names for folder in _folders_of(name)}
+    owners = dict[str, str]()  # names of frames by their files
     kept, refused = list[FrameFiles](), list[tuple[FrameFiles, str]]()
-    for frame in frames:
-        name = unicodedata.normalize("NFC", frame.name)
-        files, parts = [name + ending for ending in endings], name.split("/")
-        above = ["/".join(parts[:depth]) for depth in range(1, len(parts))]
-        other = next(filter(None, map(owners.get, (*files, *above))), None)
-        other = other or next(filter(None, map(folders.get, files)), None)
+    for frame, name in zip(frames, names, strict=True):
+        files = [name + ending for ending in endings]
+        owner = next((owners[file] for file in files if file in owners), None)
         why = name_problem(name)
-        if not {*files, *above}.isdisjoint((CSV, JSON)) or (above and fnmatch(above[0], LOCKS)):
+        if name.startswith(".batch") or not {CSV, JSON}.isdisjoint([*files, *_folders_of(name)]):
             why = why or "needs a file of the batch's own"
-        elif other is not None:
-            why = why or f"needs a file of frame {one_line(other)!r}"
+        elif not folders.isdisjoint(files):
+            why = why or "needs a file where other frames have a folder"
+        elif owner is not None:
+            why = why or f"needs a file of frame {one_line(owner)!r}"
         if why is not None:
             refused.append((frame, f"the name {one_line(frame.name)!r} {why}; rename it"))
             continue
         kept.append(frame)
         owners |= dict.fromkeys(files, frame.name)
-        folders |= dict.fromkeys(above, frame.name)
     return kept, refused
+
+
+def _folders_of(name: str) -> list[str]:
+    return [folder.as_posix() for folder in PurePosixPath(name).parents]
 
 
 def _is_inside(path: Path, folder: Path) -> bool:
     return path.resolve().is_relative_to(folder.resolve())
-
-
-def _holds_the_frames(output: Path) -> OutputError:
-    return OutputError(
-        f"{output} holds the frames themselves; name a folder of its own, such as {output / 'out'}"
-    )

@@ -128,7 +128,7 @@ class Records:
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _settings_of(request: RefineRequest, *groups: str) -> dict[str, Any]:
+def _settings_of(request: RefineRequest, *groups: str) -> dict[str, object]:
     """The settings of these groups, or all, that decide a frame's result, in JSON's own types.
 
     The files of the frame, its calibration among them, are compared by their content elsewhere.
@@ -145,7 +145,7 @@ def _settings_of(request: RefineRequest, *groups: str) -> dict[str, Any]:
     return settings
 
 
-def _code_of(request: RefineRequest) -> dict[str, Any]:
+def _code_of(request: RefineRequest) -> dict[str, object]:
     """The program's version, and the digests of the network's files and of the user's code.
 
     A file's name with its :ATTRIBUTE, :OUTPUT or :KEY counts; its folder does not.
@@ -165,7 +165,7 @@ def _code_of(request: RefineRequest) -> dict[str, Any]:
     return identity
 
 
-def _identity(spec: str) -> dict[str, Any]:
+def _identity(spec: str) -> dict[str, object]:
     path, part = file_and_part(Path(spec))
     files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
     return {

@@ -61,7 +61,7 @@ def run_batch(
     request = replace(request, refine=refine)
     found, own = find_frames(request), Records(request)
     if request.html is not None:
-        from pnpdepth_cli.commands.report.batch_report import check_batch_report
+        from pnpdepth_cli.commands.batch.batch_report import check_batch_report
 
         files = (path for frame in found.frames for path in source_files(frame))
         check_batch_report(request, request.html, files)

@@ -17,11 +17,11 @@ from safetensors.torch import load_file
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.cli.printing import print_batch
+from pnpdepth_cli.commands.batch.batch_report import write_batch_report
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.batch.run_batch import run_batch
 from pnpdepth_cli.commands.batch.summary import BatchSummary, summarise
-from pnpdepth_cli.commands.report.batch_report import write_batch_report
 from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
@@ -55,7 +55,7 @@ def summary(root: Path) -> dict[str, Any]:
 
 def summary_of(root: Path, records: Iterable[FrameRecord]) -> BatchSummary:
     request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
-    return summarise(request, find_frames(request), {}, records)
+    return summarise(request, find_frames(request), {}, [*records])
 
 
 def test_a_scale_of_ground_truth_that_nothing_decides_is_a_warning_until_it_is_stated(
@@ -268,8 +268,6 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Pa
         ("summary.csv/x", "needs a file of the batch's own"),
         (".batch.lock/x", "needs a file of the batch's own"),
         ("fine\u0301", "needs a file of frame 'fin\u00e9'"),
-        ("ok_depth.png/x", "needs a file of frame 'ok'"),
-        ("ok.json/deep/x", "needs a file of frame 'ok'"),
     ],
 )
 def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
@@ -292,10 +290,15 @@ def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
     assert why in {row["name"]: row.get("message") for row in summary(root)["frames"]}[name]
 
 
-def test_a_folder_cannot_lie_where_the_results_of_a_later_frame_go(root: Path) -> None:
-    rows = [f"rgb/a.png,sparse/a.png,{name}" for name in ("ok_depth.png/x", "ok")]
+@pytest.mark.parametrize("names", [("ok_depth.png/x", "ok"), ("ok", "ok.json/deep/x")])
+def test_a_folder_cannot_lie_where_the_results_of_a_frame_go(
+    root: Path, names: tuple[str, ...]
+) -> None:
+    rows = [f"rgb/a.png,sparse/a.png,{name}" for name in names]
     (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]))
-    assert batch(root, source=root / "list.csv").counts["failed"] == 1
+    listener = RecordingListener()
+    assert batch(root, listener, source=root / "list.csv").counts["failed"] == 1
+    assert listener.names == [name for name in names if name != "ok"]
 
 
 def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: Path) -> None:
@@ -476,7 +479,7 @@ def test_a_plain_prediction_without_scores_ends_no_batch(
     print_batch(means)
     assert "–" in capsys.readouterr().err
     request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
-    write_batch_report(request, tmp_path / "report", means, lambda: records)
+    write_batch_report(request, tmp_path / "report", means, records)
     assert frames_of(tmp_path / "report")["a"]["values"]["rmse_before"] is None
 
 

@@ -8,10 +8,9 @@ where their panels are. So a report also has the frames of earlier runs.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.summary import BatchSummary
@@ -36,13 +35,15 @@ from pnpdepth_cli.io.report import (
 from pnpdepth_cli.measures import MEASURES, Measure
 from pnpdepth_cli.stages import AFTER, BASES, BEFORE, GT, USED, VALIDATION
 
-_PANELS = {
-    "Depth before": "first",
-    "Depth after": "second",
-    "Change of error": "map",
-    "Image": "image",
-    "Sparse depth": "sparse",
+_LABELS = {
+    "first": "Depth before",
+    "second": "Depth after",
+    "map": "Change of error",
+    "image": "Image",
+    "sparse": "Sparse depth",
+    "gt": "Ground truth",
 }
+"""Titles of the panels of a figure, by the view of the page."""
 _CHANGE = "_change"
 _IMPROVED = Measure(
     key="improved", title="Improved", better="higher", percent=True, decimals=1, main=True
@@ -51,14 +52,6 @@ _SETTINGS = (
     *("model", "layer", "iterations", "lr", "loss", "update", "align", "propagate", "holdout"),
     "seed",
 )
-_LABELS = {
-    "first": "Before",
-    "second": "After",
-    "map": "Change of error",
-    "image": "Image",
-    "sparse": "Sparse depth",
-    "gt": "Ground truth",
-}
 
 
 def check_batch_report(request: BatchRequest, folder: Path, files: Iterable[Path]) -> None:
@@ -75,17 +68,17 @@ def check_batch_report(request: BatchRequest, folder: Path, files: Iterable[Path
             f"{folder} holds the results; name a folder of its own for the report, such as"
             f" {request.output / 'report'}"
         )
-    inputs = [request.source, *(files if folder.exists() else ())]
-    others = [path for path in inputs if not _holds_results(path, output, inside)]
+    lists = [request.source] if request.source.is_file() else []
+    inputs = [*lists, *files] if folder.exists() else []
     overwrite = request.refine.outputs.overwrite
-    check_report_folder(folder, others, made_of=_source(request, folder), overwrite=overwrite)
+    check_report_folder(folder, inputs, made_of=_source(request, folder), overwrite=overwrite)
 
 
 def write_batch_report(
     request: BatchRequest,
     folder: Path,
     summary: BatchSummary,
-    records: Callable[[], Iterable[FrameRecord]],
+    records: Sequence[FrameRecord],
 ) -> None:
     """Writes the page, and links the images of all frames.
 
@@ -93,32 +86,27 @@ def write_batch_report(
         request: Request of the batch.
         folder: Folder of the report.
         summary: The batch's summary.
-        records: Function that gives the records of the frames, each time anew.
+        records: The records of the frames.
     """
-    failed, first = [], None
-    for record in records():
-        if not record.outputs:
-            failed.append((record.name, record.message or ""))
-        elif first is None:
-            first = record
+    results = [record for record in records if record.outputs]
+    failed = [(record.name, record.message or "") for record in records if not record.outputs]
     basis = next(iter(bases_of(summary.errors)), USED)
-    head = _head(summary, basis, first, failed)
+    head = _head(summary, basis, results, failed)
 
-    def entries(images: Path) -> Iterator[dict[str, Any]]:
-        for record in records():
-            if record.outputs:
-                yield _entry(record, basis, head.columns) | _views(record, request, images)
+    def entries(images: Path) -> Iterator[dict[str, object]]:
+        for record in results:
+            yield _entry(record, basis, head.columns) | _views(record, request, images)
 
     write_report(folder, _source(request, folder), head, entries, viewer=request.html_3d)
 
 
-def _source(request: BatchRequest, folder: Path) -> dict[str, Any]:
+def _source(request: BatchRequest, folder: Path) -> dict[str, object]:
     """What the report is made of."""
     output = os.path.relpath(request.output.resolve(), folder.resolve())
     return {"command": "batch", "output": output}
 
 
-def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[str, Any]:
+def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[str, object]:
     """A frame's values on the basis of all frames; where it has none, what it has instead."""
     own = basis if basis in record.errors else next(iter(bases_of(record.errors)), "")
     values = _values(record, record.errors[basis]) if own == basis else {}
@@ -131,23 +119,23 @@ def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[
     }
 
 
-def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str, Any]:
+def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str, object]:
     """Links the images of the record's frame; returns the page's entry of them.
 
     There are none of a result whose images were deleted.
     """
     files = {kind: request.output / path for kind, path in record.outputs.items()}
-    key, views, figures = image_key(record.name), dict[str, Any](), record.figures
+    key, views, figures = image_key(record.name), dict[str, object](), record.figures
     shown = ("preview", "improvement")
     if not all(kind in figures and kind in files and files[kind].exists() for kind in shown):
         return {"key": None}
     for kind, figure in figures.items():
         name = f"{key}_{kind}.png"
         link_image(files[kind], images / name)
-        for title, box in figure.panels.items():
-            if title in _PANELS:
-                src = f"{IMAGES}/{name}"
-                views[_PANELS[title]] = {"src": src, "box": box, "size": figure.size}
+        for view, title in _LABELS.items():
+            if title in figure.panels:
+                box, src = figure.panels[title], f"{IMAGES}/{name}"
+                views[view] = {"src": src, "box": box, "size": figure.size}
     view_mb = None
     if request.html_3d and "view" in files:
         view_mb = save_view_3d(files["view"], images / f"{key}_view.js")
@@ -159,11 +147,6 @@ def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str
         "scale_m": figures["preview"].scale_m,
         "map": {"ends": gains.ends, "unknown": gains.unknown, "footer": gains.footer},
     }
-
-
-def _holds_results(path: Path, output: Path, folder: Path) -> bool:
-    """True for a folder that holds the results, if the report is among them too."""
-    return folder.is_relative_to(output) and output.is_relative_to(path.resolve())
 
 
 def _columns(basis: str, unit: str) -> list[Measure]:
@@ -206,19 +189,22 @@ def _notes(record: FrameRecord, basis: str) -> list[str]:
 
 
 def _head(
-    summary: BatchSummary, basis: str, first: FrameRecord | None, failed: list[tuple[str, str]]
+    summary: BatchSummary,
+    basis: str,
+    results: Sequence[FrameRecord],
+    failed: list[tuple[str, str]],
 ) -> Head:
     unit, unmatched, notes = summary.unit, len(summary.unmatched), [*summary.notes]
     if unmatched:
         notes.append(f"warning: {unmatched:,} files are in no frame; summary.json has them")
-    if first is not None and basis == USED:
+    if results and basis == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
     # The columns and tables.
     columns = _columns(basis, unit)
     return Head(
         kind="Batch refinement",
         title=summary.output,
-        facts=_facts(summary, first),
+        facts=_facts(summary, results),
         notes=notes,
         tables=means_tables(summary.errors, unit, summary.columns),
         without_title=f"Not refined: {len(failed):,}",
@@ -233,13 +219,13 @@ def _head(
     )
 
 
-def _facts(summary: BatchSummary, first: FrameRecord | None) -> list[tuple[str, str]]:
+def _facts(summary: BatchSummary, results: Sequence[FrameRecord]) -> list[tuple[str, str]]:
     """What was refined, and how: the settings that decide the results, by their options."""
     counts, method = summary.counts, "the default method"
     settings = dict(summary.settings)
     if summary.fixed_by:
         method = "the method of these settings"
-        settings |= {} if first is None else first.settings
+        settings |= results[0].settings if results else {}
     frames = [
         f"{counts[kind]:,} {kind.replace('_', ' ')}"
         for kind in ("done", "diverged", "failed", "pending", "with_warnings")

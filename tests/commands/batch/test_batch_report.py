@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.commands.batch import batch_report as report_batch
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.report import batch_report as report_batch
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.depth import read_depth
@@ -168,7 +168,7 @@ def test_a_frame_without_depth_at_any_point_has_no_figures(root: Path, report: P
     records = [FrameRecord.read(root / f"out/{name}.json") for name in NAMES]
     records[1] = replace(records[1], errors={})
     request = BatchRequest(source=root, output=root / "out", html=report, refine=refinement(root))
-    report_batch.write_batch_report(request, report, summary, lambda: records)
+    report_batch.write_batch_report(request, report, summary, records)
     assert {*frames_of(report)["b"]["values"].values()} == {None}
     assert None not in frames_of(report)["a"]["values"].values()
 
@@ -187,7 +187,7 @@ def refused(root: Path, output: Path, **changes: Any) -> str:
 
 
 def test_outputs_inside_the_inputs_or_around_them_are_refused(root: Path, tmp_path: Path) -> None:
-    assert "which is read" in refused(root, root / "rgb" / "report", overwrite=True)
+    assert "which is read" in refused(root, root / "rgb", overwrite=True)
     for output in (root, root / "out", tmp_path):
         assert "holds the results" in refused(root, output, overwrite=True)
     assert not (root / "out").exists()
