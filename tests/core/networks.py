@@ -14,6 +14,19 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 
+class Net(nn.Module):
+    """Named parts, and a function that is called with the network and its inputs."""
+
+    def __init__(self, run: Callable[..., Any], **parts: nn.Module) -> None:
+        super().__init__()
+        self.run = run
+        for name, part in parts.items():
+            self.add_module(name, part)
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        return self.run(self, *args, **kwargs)
+
+
 def conv(channels: int, out: int, kernel: int = 3, stride: int = 1) -> nn.Conv2d:
     return nn.Conv2d(channels, out, kernel, stride, padding=kernel // 2)
 
@@ -21,31 +34,28 @@ def conv(channels: int, out: int, kernel: int = 3, stride: int = 1) -> nn.Conv2d
 # ------------------------------------------------------------------ ordinary architectures
 
 
-class SkipEncoder(nn.Module):
-    """Returns a list that starts with the input image itself."""
+class UNet(nn.Module):
+    """Takes its skips off the encoder's list with pop(), and works on them in place.
+
+    The encoder's list starts with the input image itself.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self.stages = nn.ModuleList(
+        stages = (
             nn.Sequential(conv(a, b, stride=2), nn.ReLU(inplace=True))
             for a, b in ((3, 4), (4, 8), (8, 8))
         )
-
-    def forward(self, x: Tensor) -> list[Tensor]:
-        features = [x]
-        for stage in self.stages:
-            features.append(stage(features[-1]))
-        return features
-
-
-class UNet(nn.Module):
-    """Takes its skips off the encoder's list with pop(), and works on them in place."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.encoder = SkipEncoder()
+        self.encoder = Net(self.encode, stages=nn.ModuleList(stages))
         self.bottleneck = conv(8, 8)
         self.ups = nn.ModuleList((conv(16, 8), conv(12, 4), conv(7, 1)))
+
+    @staticmethod
+    def encode(encoder: Any, x: Tensor) -> list[Tensor]:
+        features = [x]
+        for stage in encoder.stages:
+            features.append(stage(features[-1]))
+        return features
 
     def forward(self, x: Tensor) -> Tensor:
         skips = self.encoder(x)
@@ -58,7 +68,7 @@ class UNet(nn.Module):
 
 
 @dataclass
-class Encoded(OrderedDict):  # type: ignore[type-arg]
+class Encoded(OrderedDict):
     """Keys and attributes at once, as Hugging Face's outputs."""
 
     last: Any = None
@@ -73,159 +83,131 @@ class Encoded(OrderedDict):  # type: ignore[type-arg]
         super().__setattr__(key, value)
 
 
-class Block(nn.Module):
-    def __init__(self, width: int):
-        super().__init__()
-        self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
-        self.attention = nn.MultiheadAttention(width, 2, batch_first=True)
-        self.mlp = nn.Sequential(
-            nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
-        )
-
-    def forward(self, x: Tensor, *, scale: float = 1.0) -> tuple[Tensor, None]:
-        y = self.norm1(x)
-        x = x + scale * self.attention(y, y, y, need_weights=False)[0]
-        return x + scale * self.mlp(self.norm2(x)), None
-
-
-class ViT(nn.Module):
-    def __init__(self, width: int = 8):
-        super().__init__()
-        self.patches = nn.Conv2d(3, width, 4, 4)
-        self.position = nn.Parameter(torch.randn(1, 16, width) * 0.1)
-        self.drop = nn.Dropout(0.1)
-        self.blocks = nn.ModuleList(Block(width) for _ in range(3))
-        self.norm = nn.LayerNorm(width)
-
-    def forward(self, x: Tensor, output_hidden: bool = False) -> Encoded:
-        x = self.drop(self.patches(x).flatten(2).transpose(1, 2) + self.position)
-        hidden = [x]
-        for block in self.blocks:
-            x, _ = block(x, scale=0.5)
-            hidden.append(x)
-        return Encoded(last=self.norm(x), hidden=tuple(hidden) if output_hidden else None)
-
-
-class ViTDepth(nn.Module):
+def vit() -> nn.Module:
     """A transformer with dataclass and dict outputs and keyword arguments."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.encoder = ViT()
-        self.project, self.head = nn.Linear(16, 8), conv(8, 1)
+    def attend(block: Any, x: Tensor, *, scale: float = 1.0) -> tuple[Tensor, None]:
+        y = block.norm1(x)
+        x = x + scale * block.attention(y, y, y, need_weights=False)[0]
+        return x + scale * block.mlp(block.norm2(x)), None
 
-    def forward(self, x: Tensor) -> dict[str, Tensor]:
-        encoded = self.encoder(x, output_hidden=True)
-        tokens = self.project(torch.cat([encoded.last, encoded["hidden"][1]], -1))
+    def encode(encoder: Any, x: Tensor, output_hidden: bool = False) -> Encoded:
+        x = encoder.drop(encoder.patches(x).flatten(2).transpose(1, 2) + encoder.position)
+        hidden = [x]
+        for block in encoder.blocks:
+            x, _ = block(x, scale=0.5)
+            hidden.append(x)
+        return Encoded(last=encoder.norm(x), hidden=tuple(hidden) if output_hidden else None)
+
+    def depth(net: Any, x: Tensor) -> dict[str, Tensor]:
+        encoded = net.encoder(x, output_hidden=True)
+        tokens = net.project(torch.cat([encoded.last, encoded["hidden"][1]], -1))
         grid = tokens.transpose(1, 2).unflatten(2, (4, 4))
-        disparity = self.head(F.interpolate(grid, scale_factor=4.0, mode="bilinear"))
+        disparity = net.head(F.interpolate(grid, scale_factor=4.0, mode="bilinear"))
         return {"disparity": disparity.abs() + 0.5}
+
+    blocks = (
+        Net(
+            attend,
+            norm1=nn.LayerNorm(8),
+            norm2=nn.LayerNorm(8),
+            attention=nn.MultiheadAttention(8, 2, batch_first=True),
+            mlp=nn.Sequential(nn.Linear(8, 16), nn.GELU(), nn.Linear(16, 8)),
+        )
+        for _ in range(3)
+    )
+    parts = {"patches": nn.Conv2d(3, 8, 4, 4), "drop": nn.Dropout(0.1), "norm": nn.LayerNorm(8)}
+    encoder = Net(encode, blocks=nn.ModuleList(blocks), **parts)
+    encoder.position = nn.Parameter(torch.randn(1, 16, 8) * 0.1)
+    return Net(depth, encoder=encoder, project=nn.Linear(16, 8), head=conv(8, 1))
 
 
 # ------------------------------------------------------------------ one difficulty each
 
 
-class InPlace(nn.Module):
+def in_place() -> nn.Module:
     """In-place operations on recorded outputs, right behind the cut and on the input."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.a, self.b, self.c, self.d = conv(3, 4), conv(4, 4), conv(4, 4), conv(4, 1)
-        self.relu = nn.ReLU(inplace=True)
-        self.flat = nn.Flatten(2)
-
-    def forward(self, x: Tensor) -> Tensor:
+    def run(net: Any, x: Tensor) -> Tensor:
         x -= 0.5
-        a = self.a(x)
-        first = self.relu(a)  # the same tensor as a
-        b = self.b(first)
+        a = net.a(x)
+        first = net.relu(a)  # the same tensor as a
+        b = net.b(first)
         F.relu_(b)
         b = b + a if b.requires_grad else b.add_(a)
         a = a * 1.5 if a.requires_grad else a.mul_(1.5)
-        flat = self.flat(b)
+        flat = net.flat(b)
         flat.add_(0.25)  # changes b too
-        c = self.c(b)
+        c = net.c(b)
         c = c + 1 if c.requires_grad else torch.add(c, 1, out=c)
         c += x.mean()
-        return self.d(c + a).abs_().add_(1)
+        return net.d(c + a).abs_().add_(1)
+
+    parts = {"a": conv(3, 4), "b": conv(4, 4), "c": conv(4, 4), "d": conv(4, 1)}
+    return Net(run, relu=nn.ReLU(inplace=True), flat=nn.Flatten(2), **parts)
 
 
-class ResidualUnit(nn.Module):
-    """As in MiDaS: the in-place ReLU changes x itself, which is then added."""
+def midas() -> nn.Module:
+    """Forward hooks store features, which the network clears and reads; as in MiDaS.
 
-    def __init__(self, channels: int):
-        super().__init__()
-        self.conv1, self.conv2 = conv(channels, channels), conv(channels, channels)
-        self.relu = nn.ReLU(inplace=True)
+    In its residual units the in-place ReLU changes x itself, which is then added.
+    """
+    features: list[Tensor] = []
 
-    def forward(self, x: Tensor) -> Tensor:
-        out = self.conv1(self.relu(x))
-        return self.conv2(self.relu(out)) + x
+    def residual(unit: Any, x: Tensor) -> Tensor:
+        out = unit.conv1(unit.relu(x))
+        return unit.conv2(unit.relu(out)) + x
 
+    def run(net: Any, x: Tensor) -> Tensor:
+        features.clear()
+        deep = net.backbone(x)
+        first, second = features
+        y = net.unit1(first * 0.5) + second
+        return net.head(net.unit2(y + deep)).abs() + 1
 
-class MiDaSLike(nn.Module):
-    """Forward hooks store features; the network clears and reads what they stored."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.backbone = nn.Sequential(conv(3, 4), nn.ReLU(inplace=True), conv(4, 4), conv(4, 4))
-        self.unit1, self.unit2, self.head = ResidualUnit(4), ResidualUnit(4), conv(4, 1)
-        self.features: list[Tensor] = []
-        for index in (0, 2):
-            self.backbone[index].register_forward_hook(
-                lambda module, inputs, output: self.features.append(output)
-            )
-
-    def forward(self, x: Tensor) -> Tensor:
-        self.features.clear()
-        deep = self.backbone(x)
-        first, second = self.features
-        y = self.unit1(first * 0.5) + second
-        return self.head(self.unit2(y + deep)).abs() + 1
+    backbone = nn.Sequential(conv(3, 4), nn.ReLU(inplace=True), conv(4, 4), conv(4, 4))
+    for index in (0, 2):
+        backbone[index].register_forward_hook(lambda module, inputs, out: features.append(out))
+    one, two = (
+        Net(residual, conv1=conv(4, 4), conv2=conv(4, 4), relu=nn.ReLU(inplace=True))
+        for _ in range(2)
+    )
+    return Net(run, backbone=backbone, unit1=one, unit2=two, head=conv(4, 1))
 
 
-class Branching(nn.Module):
+def branching(escape: Callable[[Tensor], bool] = lambda y: bool(y.mean() > 0.3)) -> nn.Module:
     """Python branches on values, before the cut and behind it."""
 
-    def __init__(self, escape: Callable[[Tensor], bool] = lambda y: bool(y.mean() > 0.3)) -> None:
-        super().__init__()
-        self.a, self.cut, self.side = conv(3, 4), conv(4, 4), conv(4, 4)
-        self.relu = nn.ReLU(inplace=True)
-        self.head = conv(4, 1)
-        self.escape = escape
-
-    def forward(self, x: Tensor) -> Tensor:
-        a = self.a(x)
+    def run(net: Any, x: Tensor) -> Tensor:
+        a = net.a(x)
         if a.mean() > 0:
             a = -a
-        y = self.cut(a)
-        if self.escape(y.detach()):
-            y = y + self.side(a)
+        y = net.cut(a)
+        if escape(y.detach()):
+            y = y + net.side(a)
         else:
-            a = F.relu(a) if a.requires_grad else self.relu(a)
-            y = y - self.side(y) + a
-        return self.head(y).abs() + 1
+            a = F.relu(a) if a.requires_grad else net.relu(a)
+            y = y - net.side(y) + a
+        return net.head(y).abs() + 1
+
+    parts = {"a": conv(3, 4), "cut": conv(4, 4), "side": conv(4, 4), "head": conv(4, 1)}
+    return Net(run, relu=nn.ReLU(inplace=True), **parts)
 
 
-class Repeated(nn.Module):
+def repeated() -> nn.Module:
     """One submodule before the cut, at it, and behind it; shared weights under two names."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter = conv(3, 4)
-        self.same = conv(4, 4)
-        self.norm = nn.BatchNorm2d(4)
-        self.alias = self.enter
-        self.head = conv(4, 1)
-        self.tied = conv(4, 4)
-        self.tied.weight = self.same.weight
+    def run(net: Any, x: Tensor) -> Tensor:
+        x = net.norm(net.enter(x))
+        x = net.norm(net.same(x))
+        x = net.same(x).relu_()
+        x = x + net.norm(net.same(x)) + net.tied(x)
+        return net.head(x).abs() + 1
 
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.norm(self.enter(x))
-        x = self.norm(self.same(x))
-        x = self.same(x).relu_()
-        x = x + self.norm(self.same(x)) + self.tied(x)
-        return self.head(x).abs() + 1
+    enter, same, tied = conv(3, 4), conv(4, 4), conv(4, 4)
+    tied.weight = same.weight
+    parts = {"norm": nn.BatchNorm2d(4), "head": conv(4, 1), "tied": tied}
+    return Net(run, enter=enter, same=same, alias=enter, **parts)
 
 
 @dataclass(frozen=True)
@@ -235,46 +217,32 @@ class Frozen:
     scale: float = 2.0
 
 
-class Structured(nn.Module):
+MAKES: dict[str, Callable[[Tensor, Tensor], Any]] = {
+    "tuple": lambda a, b: (a, b),
+    "dict": lambda a, b: {"deep": a, "shallow": b},
+    "dataclass": Frozen,
+    "nested": lambda a, b: {"out": [(a, 3), {"x": b}], 5: "text"},
+}
+
+
+def structured(kind: str) -> nn.Module:
     """The cut layer returns a structure; the network changes the rest of it in place."""
 
-    makes: dict[str, Callable[[Tensor, Tensor], Any]] = {  # noqa: RUF012
-        "tuple": lambda a, b: (a, b),
-        "dict": lambda a, b: {"deep": a, "shallow": b},
-        "dataclass": Frozen,
-        "nested": lambda a, b: {"out": [(a, 3), {"x": b}], 5: "text"},
-    }
-
-    def __init__(self, kind: str):
-        super().__init__()
-        self.kind = kind
-        self.enter, self.cut = conv(3, 4), StructuredCut(kind)
-        self.head = conv(4, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        out = self.cut(self.enter(x))
-        if self.kind == "nested":
+    def run(net: Any, x: Tensor) -> Tensor:
+        out = net.cut(net.enter(x))
+        if kind == "nested":
             deep, shallow = out["out"][0][0], out["out"][1]["x"]
             out["out"].pop()
-        elif self.kind == "dict":
+        elif kind == "dict":
             deep, shallow = out.pop("deep"), out.pop("shallow")
-        elif self.kind == "dataclass":
-            deep, shallow = out.deep, out.shallow
         else:
-            deep, shallow = out
+            deep, shallow = out if kind == "tuple" else (out.deep, out.shallow)
         shallow += 1
         shallow.relu_()
-        return self.head(deep * shallow).abs() + 1
+        return net.head(deep * shallow).abs() + 1
 
-
-class StructuredCut(nn.Module):
-    def __init__(self, kind: str):
-        super().__init__()
-        self.make = Structured.makes[kind]
-        self.a, self.b = conv(4, 4), conv(4, 4)
-
-    def forward(self, x: Tensor) -> Any:
-        return self.make(self.a(x), self.b(x))
+    cut = Net(lambda part, x: MAKES[kind](part.a(x), part.b(x)), a=conv(4, 4), b=conv(4, 4))
+    return Net(run, enter=conv(3, 4), cut=cut, head=conv(4, 1))
 
 
 class Counting(nn.Module):
@@ -289,75 +257,53 @@ class Counting(nn.Module):
         return self.inner(*args, **kwargs)
 
 
-class Detached(nn.Module):
-    """A branch that depends on z, but not by any gradient."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.branch = conv(4, 4)
-
-    def forward(self, z: Tensor) -> Tensor:
-        chosen = torch.arange(4)[:, None, None] == z.argmax(1, keepdim=True)
-        return self.branch(chosen.float())
-
-
-class TwoBranches(nn.Module):
+def two_branches() -> nn.Module:
     """Behind the cut, one branch looks at the image only, one at z only through argmax."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.front, self.cut = Counting(conv(3, 4)), conv(4, 4)
-        self.guide = Counting(nn.Sequential(conv(3, 4), nn.ReLU(inplace=True), conv(4, 4)))
-        self.detached = Counting(Detached())
-        self.head = Counting(conv(4, 1))
+    def chosen(part: Any, z: Tensor) -> Tensor:
+        return part.branch((torch.arange(4)[:, None, None] == z.argmax(1, keepdim=True)).float())
 
-    def forward(self, x: Tensor) -> Tensor:
-        z = self.cut(self.front(x))
-        guide = self.guide(x)
+    def run(net: Any, x: Tensor) -> Tensor:
+        z = net.cut(net.front(x))
+        guide = net.guide(x)
         guide += 0.1
-        return self.head(z * guide + self.detached(z)).abs() + 1
+        return net.head(z * guide + net.detached(z)).abs() + 1
+
+    return Net(
+        run,
+        front=Counting(conv(3, 4)),
+        cut=conv(4, 4),
+        guide=Counting(nn.Sequential(conv(3, 4), nn.ReLU(inplace=True), conv(4, 4))),
+        detached=Counting(Net(chosen, branch=conv(4, 4))),
+        head=Counting(conv(4, 1)),
+    )
 
 
-class Appends(nn.Module):
-    """Gives its features to a list it was handed, and returns its input."""
+class Box:
+    """An object that hides a tensor."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv = conv(4, 4)
+    def __init__(self, tensor: Tensor):
+        self.tensor = tensor
 
-    def forward(self, x: Tensor, into: list[Tensor]) -> Tensor:
-        into.append(self.conv(x))
+
+def side_effects() -> nn.Module:
+    """Parts that give features to a list they are handed; one that hides tensors."""
+
+    def append(part: Any, x: Tensor, into: list[Tensor]) -> Tensor:
+        into.append(part.conv(x))
         return x
 
-
-class SideEffects(nn.Module):
-    """Parts that change their list argument; an object that hides tensors."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter, self.one, self.two, self.cut = conv(3, 4), Appends(), Appends(), conv(4, 4)
-        self.hide, self.head = Hides(), conv(4, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
+    def run(net: Any, x: Tensor) -> Tensor:
         tensors: list[Tensor] = []
-        x = self.two(self.one(self.enter(x), tensors), into=tensors)
-        hidden = self.hide(x)
+        x = net.two(net.one(net.enter(x), tensors), into=tensors)
+        hidden = net.hide(x)
         hidden.tensor += 1
-        z = self.cut(x) + hidden.tensor
-        return self.head(z * tensors[0] + tensors[1]).abs() + 1
+        z = net.cut(x) + hidden.tensor
+        return net.head(z * tensors[0] + tensors[1]).abs() + 1
 
-
-class Hides(nn.Module):
-    class Box:
-        def __init__(self, tensor: Tensor):
-            self.tensor = tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv = conv(4, 4)
-
-    def forward(self, x: Tensor) -> Any:
-        return self.Box(self.conv(x))
+    one, two = (Net(append, conv=conv(4, 4)) for _ in range(2))
+    hide = Net(lambda part, x: Box(part.conv(x)), conv=conv(4, 4))
+    return Net(run, enter=conv(3, 4), one=one, two=two, cut=conv(4, 4), hide=hide, head=conv(4, 1))
 
 
 class Updating(nn.Module):
@@ -414,152 +360,120 @@ class Methods(nn.Module):
         return self.a(x) * 2
 
 
-class Scripted(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter = torch.jit.script(nn.Sequential(conv(3, 4), nn.ReLU()))
-        self.cut, self.tail = conv(4, 4), torch.jit.script(conv(4, 4))
-        self.frozen = torch.jit.freeze(torch.jit.script(conv(4, 1).eval()))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.frozen(self.tail(self.cut(self.enter(x)))).abs() + 1
-
-
-class Checkpointed(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter, self.cut, self.a, self.b = conv(3, 4), conv(4, 4), conv(4, 4), conv(4, 4)
-        self.head = conv(4, 1)
-
-    def block(self, y: Tensor, x: Tensor) -> Tensor:
-        return self.b(torch.sigmoid(self.a(y)) * self.enter(x)).sin()
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.cut(self.enter(x))
-        y = checkpoint(self.block, y, x, use_reentrant=False)
-        return self.head(y).abs() + 1
+def scripted() -> nn.Module:
+    return Net(
+        lambda net, x: net.frozen(net.tail(net.cut(net.enter(x)))).abs() + 1,
+        enter=torch.jit.script(nn.Sequential(conv(3, 4), nn.ReLU())),
+        cut=conv(4, 4),
+        tail=torch.jit.script(conv(4, 4)),
+        frozen=torch.jit.freeze(torch.jit.script(conv(4, 1).eval())),
+    )
 
 
-class HalfInference(nn.Module):
+def checkpointed() -> nn.Module:
+    """The part behind the cut runs again in the backward pass."""
+
+    def run(net: Any, x: Tensor) -> Tensor:
+        def block(y: Tensor, x: Tensor) -> Tensor:
+            return net.b(torch.sigmoid(net.a(y)) * net.enter(x)).sin()
+
+        y = net.cut(net.enter(x))
+        return net.head(checkpoint(block, y, x, use_reentrant=False)).abs() + 1
+
+    parts = {"enter": conv(3, 4), "cut": conv(4, 4), "a": conv(4, 4), "b": conv(4, 4)}
+    return Net(run, head=conv(4, 1), **parts)
+
+
+def half_inference() -> nn.Module:
     """An encoder under inference_mode, a decoder outside it."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter, self.cut, self.head = InferenceConv(), conv(4, 4), conv(4, 1)
+    def run(net: Any, x: Tensor) -> Tensor:
+        x = net.enter(x)
+        return net.head(net.cut(x) * x).abs() + 1
 
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.enter(x)
-        return self.head(self.cut(x) * x).abs() + 1
-
-
-class InferenceConv(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.inner = conv(3, 4)
-
-    @torch.inference_mode()
-    def forward(self, x: Tensor) -> Tensor:
-        return self.inner(x)
-
-
-def native_scale(x: Tensor) -> Tensor:
-    """As an extension in C++ does it: the values get over without a tensor operation."""
-    out = torch.empty(x.shape)
-    with torch._C.DisableTorchFunction(), torch.utils._python_dispatch._disable_current_modes():
-        out.copy_(x.detach() * 2)
-    return out
+    enter = Net(torch.inference_mode()(lambda part, x: part.inner(x)), inner=conv(3, 4))
+    return Net(run, enter=enter, cut=conv(4, 4), head=conv(4, 1))
 
 
 class NativeFunction(torch.autograd.Function):
+    """As an extension in C++ does it: the values get over without a tensor operation."""
+
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        return native_scale(x)
+        out = torch.empty(x.shape)
+        with torch._C.DisableTorchFunction(), torch.utils._python_dispatch._disable_current_modes():
+            out.copy_(x.detach() * 2)
+        return out
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         return gradient * 2
 
 
-class NativeLayer(nn.Module):
-    def forward(self, x: Tensor) -> Tensor:
-        return NativeFunction.apply(x)
-
-
-class Native(nn.Module):
+def native() -> nn.Module:
     """An operator from outside torch whose reading of z no dispatcher sees."""
+    return Net(
+        lambda net, x: net.head(net.after(net.native(net.cut(net.enter(x))))).abs() + 1,
+        enter=conv(3, 4),
+        cut=conv(4, 4),
+        native=Net(lambda part, x: NativeFunction.apply(x)),
+        after=conv(4, 4),
+        head=conv(4, 1),
+    )
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter, self.cut, self.native = conv(3, 4), conv(4, 4), NativeLayer()
-        self.after, self.head = conv(4, 4), conv(4, 1)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.head(self.after(self.native(self.cut(self.enter(x))))).abs() + 1
-
-
-class Catches(nn.Module):
+def catches() -> nn.Module:
     """A part that takes another way after any exception, in a part that does so too."""
 
-    class Inner(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.cut, self.other = conv(4, 4), conv(4, 4, 1)
-
-        def forward(self, x: Tensor) -> Tensor:
-            try:
-                return self.cut(x).relu()
-            except Exception:
-                return self.other(x)
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter, self.inner, self.plain = conv(3, 4), self.Inner(), nn.Sequential(conv(4, 4))
-        self.head = conv(4, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.enter(x)
+    def run_inner(part: Any, x: Tensor) -> Tensor:
         try:
-            x = self.inner(x)
+            return part.cut(x).relu()
+        except Exception:
+            return part.other(x)
+
+    def run(net: Any, x: Tensor) -> Tensor:
+        x = net.enter(x)
+        try:
+            x = net.inner(x)
         except Exception:
             x = -x
-        return self.head(self.plain(x) + x).abs() + 1
+        return net.head(net.plain(x) + x).abs() + 1
+
+    inner = Net(run_inner, cut=conv(4, 4), other=conv(4, 4, 1))
+    plain = nn.Sequential(conv(4, 4))
+    return Net(run, enter=conv(3, 4), inner=inner, plain=plain, head=conv(4, 1))
 
 
-class UNetTail(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.a, self.b = conv(4, 4), conv(4, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.a(x)
+def in_data_parallel() -> nn.Module:
+    def run(part: Any, x: Tensor) -> Tensor:
+        y = part.a(x)
         y += x
-        return self.b(y.relu_()).abs() + 1
+        return part.b(y.relu_()).abs() + 1
 
-
-def wrapped_network() -> nn.Module:
-    wrapped = nn.DataParallel(nn.Sequential(nn.Sequential(conv(3, 4), nn.ReLU(True)), UNetTail()))
-    wrapped.device_ids = []  # on the CPU, also where there are GPUs
-    return wrapped.cpu()
+    tail = Net(run, a=conv(4, 4), b=conv(4, 1))
+    network = nn.DataParallel(nn.Sequential(nn.Sequential(conv(3, 4), nn.ReLU(True)), tail))
+    network.device_ids = []  # on the CPU, also where there are GPUs
+    return network.cpu()
 
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "unet": UNet,
-    "vit": ViTDepth,
-    "in place": InPlace,
-    "midas": MiDaSLike,
-    "branching": Branching,
-    "repeated": Repeated,
-    **{f"{kind} output": functools.partial(Structured, kind) for kind in Structured.makes},
-    "two branches": TwoBranches,
-    "side effects": SideEffects,
+    "vit": vit,
+    "in place": in_place,
+    "midas": midas,
+    "branching": branching,
+    "repeated": repeated,
+    **{f"{kind} output": functools.partial(structured, kind) for kind in MAKES},
+    "two branches": two_branches,
+    "side effects": side_effects,
     "updating": Updating,
     "direct": Direct,
-    "scripted": Scripted,
-    "checkpointed": Checkpointed,
-    "half inference": HalfInference,
-    "native": Native,
-    "catches": Catches,
-    "wrapped": wrapped_network,
+    "scripted": scripted,
+    "checkpointed": checkpointed,
+    "half inference": half_inference,
+    "native": native,
+    "catches": catches,
+    "wrapped": in_data_parallel,
 }
 
 
@@ -569,8 +483,8 @@ def build(name: str) -> nn.Module:
     network = NETWORKS[name]()
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
-            nn.init.uniform_(module.running_mean, -0.5, 0.5)  # type: ignore[arg-type]
-            nn.init.uniform_(module.running_var, 0.5, 1.5)  # type: ignore[arg-type]
+            nn.init.uniform_(module.running_mean, -0.5, 0.5)
+            nn.init.uniform_(module.running_var, 0.5, 1.5)
     return network.train()
 
 

@@ -7,7 +7,7 @@ from torch import nn
 
 from pnpdepth_cli.core.influence import InfluentialField, influential_field
 from pnpdepth_cli.core.split import Split
-from tests.core.networks import build, conv, depth_of, image
+from tests.core.networks import Net, build, conv, depth_of, image
 
 
 def field(network: nn.Module, layer: str, size: int = 32) -> InfluentialField:
@@ -34,7 +34,7 @@ def test_attention_reaches_everywhere_and_tokens_have_no_patch() -> None:
 
 
 def test_a_cut_that_does_not_reach_the_output_has_no_field() -> None:
-    network = build("two branches")
-    network.head = nn.Sequential(conv(3, 1))
-    network.forward = lambda x: (network.cut(network.front(x)), network.head(x))[1]  # type: ignore[method-assign]
+    network = Net(
+        lambda net, x: (net.cut(x), net.head(x))[1], cut=conv(3, 4), head=nn.Sequential(conv(3, 1))
+    )
     assert field(network, "cut") == InfluentialField((0, 0), (0, 0))

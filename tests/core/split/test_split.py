@@ -6,6 +6,7 @@ import gc
 import weakref
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -18,10 +19,7 @@ from tests.completion.naive import plain
 from tests.core.networks import (
     NETWORKS,
     Counting,
-    InPlace,
-    MiDaSLike,
-    Repeated,
-    TwoBranches,
+    Net,
     UNet,
     Updating,
     build,
@@ -84,30 +82,28 @@ def test_torch_transformer_layers_with_their_fast_path_come_out_the_same() -> No
             assert split.static_graph
 
 
-class ChoosesByValue(nn.Module):
+def choosing_by_value() -> nn.Module:
     """In front of the cut, one of two branches; the second changes what the first only reads."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter, self.one, self.relu = conv(3, 4), conv(4, 4), nn.ReLU(inplace=True)
-        self.cut, self.head = conv(4, 4), conv(8, 1)
+    def run(net: Any, x: Tensor) -> Tensor:
+        y = net.enter(x)
+        features = net.one(y) if bool(x.mean() > 0.4) else net.relu(y)
+        return net.head(torch.cat([net.cut(features), y], 1))
 
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.enter(x)
-        features = self.one(y) if bool(x.mean() > 0.4) else self.relu(y)
-        return self.head(torch.cat([self.cut(features), y], 1))
+    parts = {"enter": conv(3, 4), "one": conv(4, 4), "cut": conv(4, 4), "head": conv(8, 1)}
+    return Net(run, relu=nn.ReLU(inplace=True), **parts)
 
 
 @pytest.mark.parametrize(
     ("make", "layer", "frames"),
     [
-        (ChoosesByValue, "cut", [image(), image() * 0.5, image(), image() * 0.5]),
+        (choosing_by_value, "cut", [image(), image() * 0.5, image(), image() * 0.5]),
         (UNet, "bottleneck", [image(), image(32, 16), image() * 0.5]),
     ],
     ids=["chooses by value", "another size"],
 )
 def test_a_frame_that_needs_another_recording_is_learned_anew(
-    make: type[nn.Module], layer: str, frames: list[Tensor]
+    make: Callable[[], nn.Module], layer: str, frames: list[Tensor]
 ) -> None:
     torch.manual_seed(0)
     network = make()
@@ -134,7 +130,7 @@ def test_the_network_may_be_called_for_itself_while_it_is_cut() -> None:
 
 
 def test_the_front_runs_once_and_what_does_not_depend_on_z_twice_at_most() -> None:
-    network, x = TwoBranches(), image()
+    network, x = build("two branches"), image()
     with Split(network, "cut") as split, torch.no_grad():
         z = split.front(x)
         assert (network.front.calls, network.guide.calls) == (1, 0)
@@ -200,29 +196,25 @@ def test_a_name_has_its_parts(text: str, name: LayerName) -> None:
 
 
 def with_an_unused_layer() -> nn.Module:
-    network = nn.Sequential(conv(3, 1))
-    network.unused = conv(1, 1)
-    network.forward = network[0].forward  # type: ignore[method-assign]
-    return network
+    return Net(lambda net, x: net.head(x), head=conv(3, 1), unused=conv(1, 1))
 
 
 @pytest.mark.parametrize(
     ("make", "layer"),
     [
         (UNet, "botleneck"),
-        (UNet, "encoder.stage.0.0"),
         (UNet, "zzzzzzzzz"),
         (UNet, ""),
         (UNet, "ups.3"),
         (UNet, "bottleneck["),
         (UNet, "encoder.stages"),
         (with_an_unused_layer, "unused"),
-        (Repeated, "same"),
-        (Repeated, "same#4"),
+        (NETWORKS["repeated"], "same"),
+        (NETWORKS["repeated"], "same#4"),
         (NETWORKS["dict output"], "cut[wide]"),
         (NETWORKS["nested output"], "cut"),
         (NETWORKS["side effects"], "hide"),
-        (InPlace, "flat"),
+        (NETWORKS["in place"], "flat"),
     ],
 )
 def test_a_layer_that_cannot_be_cut_is_refused_on_one_line_that_names_the_way_out(
@@ -328,10 +320,10 @@ def test_the_network_is_as_before_after_an_exception_at_any_stage(
     stage: str, kind: type[BaseException]
 ) -> None:
     network, x = prepared("updating"), image()
-    network.enter = Failing(network.enter, 1 if stage == "front" else 0, kind)
-    network.head = Failing(network.head, {"first rear": 1, "second rear": 2}.get(stage, 0), kind)
+    network.enter = failing(network.enter, 1 if stage == "front" else 0, kind)
+    network.head = failing(network.head, {"first rear": 1, "second rear": 2}.get(stage, 0), kind)
     if stage == "entering":
-        network.cut.train = fail_with(kind)  # type: ignore[method-assign]
+        network.cut.train = Mock(side_effect=kind("entering"))
     before = state_of(network)
     in_network = stage not in ("inside", "entering")
     with pytest.raises(ModelError if in_network and kind is RuntimeError else kind):
@@ -339,25 +331,17 @@ def test_the_network_is_as_before_after_an_exception_at_any_stage(
     assert same(before, state_of(network))
 
 
-def fail_with(kind: type[BaseException]) -> Any:
-    def train(mode: bool = True) -> nn.Module:
-        raise kind("entering")
-
-    return train
-
-
-class Failing(nn.Module):
+def failing(inner: nn.Module, n: int, kind: type[BaseException]) -> nn.Module:
     """Raises in its n-th call; 0 for never."""
+    counted = Counting(inner)
 
-    def __init__(self, inner: nn.Module, n: int, kind: type[BaseException]):
-        super().__init__()
-        self.inner, self.n, self.kind, self.calls = inner, n, kind, 0
+    def run(net: Any, x: Tensor) -> Tensor:
+        y = counted(x)
+        if counted.calls == n:
+            raise kind("failing")
+        return y
 
-    def forward(self, x: Tensor) -> Tensor:
-        self.calls += 1
-        if self.calls == self.n:
-            raise self.kind("failing")
-        return self.inner(x)
+    return Net(run, counted=counted)
 
 
 def test_a_parameter_that_the_forward_overwrites_is_put_back() -> None:
@@ -381,7 +365,7 @@ def test_a_parameter_that_the_forward_overwrites_is_put_back() -> None:
 
 
 def test_the_networks_own_hooks_run_in_every_pass() -> None:
-    network, x = MiDaSLike().eval(), image()
+    network, x = build("midas").eval(), image()
     calls = Counting(nn.Identity())
     network.backbone[1].register_forward_hook(lambda module, inputs, output: calls(None))
     with Split(network, "unit1") as split, torch.no_grad():

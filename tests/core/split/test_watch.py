@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,21 +11,19 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
-from tests.core.networks import Branching, Counting, conv, image
+from tests.core.networks import Counting, Net, branching, conv, image
 
 
-class Behind(nn.Module):
-    """A branch behind the cut whose input is `operation` of z and y."""
+def behind(operation: Callable[[Tensor, Tensor], Tensor]) -> nn.Module:
+    """A network with a branch behind the cut whose input is `operation` of z and y."""
 
-    def __init__(self, operation: Callable[[Tensor, Tensor], Tensor]) -> None:
-        super().__init__()
-        self.enter, self.cut, self.head = conv(3, 4), conv(4, 4), conv(4, 1)
-        self.operation, self.branch = operation, Counting(conv(4, 4))
+    def run(net: Any, x: Tensor) -> Tensor:
+        y = net.enter(x)
+        z = net.cut(y)
+        return net.head(z + net.branch(operation(z, y)))
 
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.enter(x)
-        z = self.cut(y)
-        return self.head(z + self.branch(self.operation(z, y)))
+    parts = {"enter": conv(3, 4), "cut": conv(4, 4), "head": conv(4, 1)}
+    return Net(run, branch=Counting(conv(4, 4)), **parts)
 
 
 DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
@@ -58,7 +57,7 @@ INDEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 @pytest.mark.parametrize("operation", [*DEPENDENT, *INDEPENDENT])
 def test_a_branch_runs_again_where_it_depends_on_z_by_any_operation(operation: str) -> None:
     torch.manual_seed(0)
-    network, x = Behind((DEPENDENT | INDEPENDENT)[operation]), image()
+    network, x = behind((DEPENDENT | INDEPENDENT)[operation]), image()
     with Split(network, "cut") as split, torch.no_grad():
         z = split.front(x)
         for each in (z, z + 1):
@@ -83,7 +82,7 @@ def test_a_branch_runs_again_where_it_depends_on_z_by_any_operation(operation: s
 )
 def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], bool]) -> None:
     torch.manual_seed(0)
-    network, x = Branching(escape), image()
+    network, x = branching(escape), image()
     for sign in (1, -1):
         with Split(network, "cut") as split, torch.no_grad():
             z = split.front(x)
