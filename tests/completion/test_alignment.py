@@ -22,14 +22,11 @@ def scene(count: int, seed: int = 0) -> Tensor:
     return 1 + 9 * torch.rand(count, generator=torch.Generator().manual_seed(seed))
 
 
-def spoiled(depth: Tensor, fraction: float = 0.2) -> Tensor:
-    """The first points replaced by depths far off, on both sides."""
-    spoiled_depth = depth.clone()
-    count = round(fraction * len(depth))
-    spoiled_depth[:count] = (
-        spoiled_depth[:count] * torch.tensor([0.2, 3.0, 6.0]).repeat(count)[:count]
-    )
-    return spoiled_depth
+def spoiled(depth: Tensor) -> Tensor:
+    """The first fifth of the depths replaced by others far off, on both sides."""
+    count = len(depth) // 5
+    off = torch.tensor([0.2, 3.0, 6.0]).repeat(count)[:count]
+    return torch.cat([depth[:count] * off, depth[count:]])
 
 
 def output_for(depth: Tensor, space: str, scale: float, shift: float) -> Tensor:
@@ -62,7 +59,7 @@ def test_20_percent_gross_outliers_move_the_fit_by_less_than_2_percent(
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_auto_aligns_a_disparity_network_from_30_points_with_20_percent_outliers(
     sign: int, seed: int
 ) -> None:
@@ -87,15 +84,15 @@ def test_auto_aligns_a_disparity_network_from_30_points_with_20_percent_outliers
         (lambda d: -9 / d, ("inverse", "scale")),
     ],
 )
-@pytest.mark.parametrize("seed", range(4))
 def test_auto_takes_the_simplest_reading_that_explains_the_points(
-    output: Callable[[Tensor], Tensor], wanted: tuple[str, str], seed: int
+    output: Callable[[Tensor], Tensor], wanted: tuple[str, str]
 ) -> None:
-    d = scene(100, seed)
-    noise = torch.randn(100, generator=torch.Generator().manual_seed(seed + 50))
-    noisy = output(d * (1 + 0.02 * noise))
-    alignment = align(noisy, points_of(d), ("depth", "inverse"), "auto")
-    assert (alignment.space, alignment.kind) == wanted
+    for seed in range(4):
+        d = scene(100, seed)
+        noise = torch.randn(100, generator=torch.Generator().manual_seed(seed + 50))
+        noisy = output(d * (1 + 0.02 * noise))
+        alignment = align(noisy, points_of(d), ("depth", "inverse"), "auto")
+        assert (alignment.space, alignment.kind) == wanted
 
 
 def test_depth_at_or_behind_infinity_reads_as_ten_times_the_farthest_point() -> None:
@@ -118,13 +115,15 @@ def test_a_value_held_at_a_bound_still_has_a_gradient() -> None:
     assert float(below.grad) == pytest.approx(1.0, rel=1e-4)
 
 
-def test_what_cannot_be_aligned_is_refused() -> None:
-    d = scene(20)
-    with pytest.raises(ModelError):
-        align(torch.ones(20), points_of(d), ("depth",), "affine")
-    with pytest.raises(NoPointsError):
-        align(torch.ones(1), points_of(d[:1]), ("depth",), "affine")
-    with pytest.raises(ModelError):
-        align(torch.full((20,), math.nan), points_of(d), ("depth",), "scale")
-    with pytest.raises(ModelError, match="zero"):
-        align(torch.zeros(20), points_of(d), ("depth",), "scale")
+@pytest.mark.parametrize(
+    ("x", "kind", "error"),
+    [
+        (torch.ones(20), "affine", ModelError),
+        (torch.ones(1), "affine", NoPointsError),
+        (torch.full((20,), math.nan), "scale", ModelError),
+        (torch.zeros(20), "scale", ModelError),
+    ],
+)
+def test_what_cannot_be_aligned_is_refused(x: Tensor, kind: str, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        align(x, points_of(scene(len(x))), ("depth",), kind)

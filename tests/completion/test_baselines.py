@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.completion.alignment import BEYOND, align_prediction
@@ -14,26 +13,17 @@ from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import RIDGE
 from tests.completion.scenes import random_points, scene_depth
 
-SIZE = (30, 40)
-
-
-def ground_truth() -> Tensor:
-    y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
-    return 1 + 0.05 * x + 0.1 * y + ((x - 20).square() + (y - 15).square() < 50) * 2.0
-
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_a_baseline_is_near_the_ground_truth_and_does_not_change_its_arguments(name: str) -> None:
-    depth = ground_truth()
-    points, prediction = random_points(depth, 80), depth / 3
-    kept = (points.xy.clone(), points.depth.clone(), prediction.clone())
+    depth = scene_depth()
+    points, prediction = random_points(depth, 200), depth / 3
+    given = (points.xy, points.depth, prediction)
+    before = [each.clone() for each in given]
     dense = BASELINES[name].depth(points, prediction)
-    assert dense.shape == SIZE
-    assert dense.dtype == torch.float32
+    assert (dense.shape, dense.dtype) == (depth.shape, torch.float32)
     assert float((dense.log() - depth.log()).abs().mean()) < 0.1
-    assert all(
-        torch.equal(a, b) for a, b in zip(kept, (points.xy, points.depth, prediction), strict=True)
-    )
+    assert all(torch.equal(one, other) for one, other in zip(before, given, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -47,19 +37,16 @@ def test_a_baseline_is_near_the_ground_truth_and_does_not_change_its_arguments(n
         ("local", lambda d: (d + 2) / 7),
     ],
 )
-def test_each_alignment_restores_the_prediction_it_models(name, prediction) -> None:  # type: ignore[no-untyped-def]
-    depth = ground_truth()
+def test_each_alignment_restores_the_prediction_it_models(name, prediction) -> None:
+    depth = scene_depth()
     dense = BASELINES[name].depth(random_points(depth, 80), prediction(depth))
     assert torch.allclose(dense, depth, rtol=1e-3)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 30, 400])
-def test_a_prediction_that_is_a_line_away_everywhere_is_restored(count: int) -> None:
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_factor_is_all_that_one_and_two_points_show(count: int) -> None:
     gt = scene_depth()
-    # a factor is all that one and two points show
-    prediction = gt / 3 if count < 3 else (gt + 0.3) / 0.7
-    dense = align_locally(prediction, random_points(gt, count))
-    assert torch.allclose(dense, gt, rtol=1e-3)
+    assert torch.allclose(align_locally(gt / 3, random_points(gt, count)), gt, rtol=1e-3)
 
 
 def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve_points() -> None:
@@ -89,9 +76,8 @@ def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve
 
 
 def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:
-    gt = scene_depth()
-    points = random_points(gt, 100)
-    prediction = gt.clone()
+    prediction = scene_depth()
+    points = random_points(prediction, 100)
     prediction[0, 0], prediction[0, 1] = 1e6, 1e-6
     dense = align_locally(prediction, points)
     assert float(dense.max()) <= float(points.depth.max()) * BEYOND * (1 + 1e-5)

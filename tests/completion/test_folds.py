@@ -10,14 +10,13 @@ from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.points import SparsePoints
 
 
-def points_at(xy: torch.Tensor, size: tuple[int, int]) -> SparsePoints:
+def points_at(xy: torch.Tensor, size: tuple[int, int] = (160, 300)) -> SparsePoints:
     return SparsePoints(xy=xy.float(), depth=torch.ones(len(xy)), size=size)
 
 
-def strewn(count: int, size: tuple[int, int] = (90, 120), seed: int = 0) -> SparsePoints:
-    generator = torch.Generator().manual_seed(seed)
-    xy = torch.rand(count, 2, generator=generator) * torch.tensor([size[1] - 1, size[0] - 1])
-    return points_at(xy, size)
+def on_lines(gap: int, step: int) -> SparsePoints:
+    y, x = torch.meshgrid(torch.arange(10, 150, gap), torch.arange(0, 300, step), indexing="ij")
+    return points_at(torch.stack([x.flatten(), y.flatten()], dim=1))
 
 
 @settings(deadline=None, max_examples=40)
@@ -25,7 +24,8 @@ def strewn(count: int, size: tuple[int, int] = (90, 120), seed: int = 0) -> Spar
 def test_every_point_has_a_fold_and_the_folds_are_about_equally_large(
     count: int, folds: int, seed: int
 ) -> None:
-    fold = spatial_folds(strewn(count, seed=seed), folds, seed=seed)
+    xy = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed)) * 89
+    fold = spatial_folds(points_at(xy, (90, 90)), folds, seed=seed)
     assert fold.shape == (count,)
     assert int(fold.min()) >= 0
     assert int(fold.max()) < folds
@@ -35,8 +35,7 @@ def test_every_point_has_a_fold_and_the_folds_are_about_equally_large(
 
 @pytest.mark.parametrize("gap", [4, 8])
 def test_points_on_lines_are_held_out_as_far_off_as_pixels_are(gap: int) -> None:
-    y, x = torch.meshgrid(torch.arange(40, 120, gap), torch.arange(300), indexing="ij")
-    points = points_at(torch.stack([x.flatten(), y.flatten()], dim=1), (160, 300))
+    points = on_lines(gap, 1)
     held = spatial_folds(points, 4) == 0
     kept = points.select(~held)
     apart = nearest_points(kept, points.xy[held].double(), 1)[0].median()
@@ -47,9 +46,7 @@ def test_points_on_lines_are_held_out_as_far_off_as_pixels_are(gap: int) -> None
 
 
 def test_neighbouring_scan_lines_are_in_different_folds() -> None:
-    y, x = torch.meshgrid(torch.arange(10, 150, 5), torch.arange(0, 300, 2), indexing="ij")
-    points = points_at(torch.stack([x.flatten(), y.flatten()], dim=1), (160, 300))
-    fold = spatial_folds(points, 4, seed=3).reshape(y.shape)
+    fold = spatial_folds(on_lines(5, 2), 4, seed=3).reshape(28, 150)
     assert bool((fold == fold[:, :1]).all())
     assert bool((fold[1:, 0] != fold[:-1, 0]).all())
     assert len(fold[:, 0].unique()) == 4

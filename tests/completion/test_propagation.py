@@ -53,7 +53,7 @@ def test_one_point_moves_all_by_its_factor_and_nothing_left_leaves_the_predictio
 
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
-@pytest.mark.parametrize("count", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("count", [2, 5])
 def test_few_points_bring_no_depth_beyond_what_they_say(kind: str, count: int) -> None:
     gt, rgb, prediction = scene()
     points = random_points(gt, count)
