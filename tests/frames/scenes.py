@@ -47,17 +47,6 @@ class Brightness(nn.Module):
         return 1.0 + self.layer(rgb.mean(1, keepdim=True))
 
 
-class TwicePrior(nn.Module):
-    """Depth is twice the prior, or 5 m without one."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layer = nn.Identity()
-
-    def forward(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Tensor:
-        return self.layer(torch.full_like(sparse, 5.0) if prior is None else 2.0 * prior)
-
-
 class Nearest(nn.Module):
     """Depth is the mean of the points, 3 m where there is none."""
 
@@ -80,7 +69,8 @@ def member(
         build=build,
         layers=("layer",),
         input_kind=kind,
-        **({"size": Multiple(4), "takes_prior": build is TwicePrior} | of_definition),
+        size=Multiple(4),
+        **of_definition,
     )
     network = Network(
         definition=definition, module=build().eval(), device=torch.device("cpu"), checkpoint=None

@@ -16,6 +16,7 @@ import pnpdepth_cli as pnp
 from pnpdepth_cli.frames import adapt
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import prepare
+from tests.core.networks import Net, conv
 from tests.frames.scenes import frame_in_memory
 
 SETTINGS = pnp.Settings(iterations=0)
@@ -48,21 +49,20 @@ def test_learnt_weights_are_used_while_the_refiner_is_open(
     before = copy.deepcopy(network.module.state_dict())
     own = pnp.refine(network, *FRAMES[0], SETTINGS)
     with pnp.Refiner(network, SETTINGS, adapt=FRAMES) as refiner:
-        learnt = refiner.refine(*FRAMES[0])
-        again = refiner.refine(*FRAMES[0])
+        learnt, again = (refiner.refine(*FRAMES[0]) for _ in range(2))
     assert any("% loss at hidden points of 4 frames" in note for note in learnt.notes)
     assert np.array_equal(learnt.depth, again.depth)
-    frame = frame_in_memory(seed=0)
     expected = adapt.learn(network, named(range(8)))
     with adapt.weights_in_place(network, expected.weights):
         by_hand = pnp.refine(network, *FRAMES[0], SETTINGS)
     assert np.array_equal(learnt.depth, by_hand.depth)
-    residuals = [(frame.points.sample(torch.from_numpy(depth.depth)) - frame.points.depth).abs()
-                 for depth in (own, learnt)]  # fmt: skip
-    assert residuals[1].mean() < residuals[0].mean()
+    points = FRAMES[0][1]
+    residuals = [
+        float((points.sample(torch.from_numpy(each.depth)) - points.depth).abs().mean())
+        for each in (own, learnt)
+    ]
+    assert residuals[1] < residuals[0]
     assert all(torch.equal(network.module.state_dict()[name], before[name]) for name in before)
-    after = pnp.refine(network, *FRAMES[0], SETTINGS)
-    assert np.array_equal(after.depth, own.depth)
 
 
 @pytest.mark.parametrize(
@@ -87,19 +87,17 @@ def test_without_proof_the_weights_of_the_network_stay(
     assert np.array_equal(refined.depth, own.depth)
 
 
-def test_a_network_without_points_cannot_learn_from_them() -> None:
+@pytest.mark.parametrize(
+    ("name", "count", "error"),
+    [("fcrn-tiny", 60, pnp.UsageError), ("sparse2dense-tiny", 1, pnp.NoPointsError)],
+)
+def test_a_network_without_points_and_a_frame_of_one_point_are_refused(
+    name: str, count: int, error: type[pnp.PnpDepthError]
+) -> None:
+    frames = [*FRAMES, pair(8, count)]
     with (
-        pnp.Refiner(pnp.load_network("fcrn-tiny"), adapt=FRAMES) as refiner,
-        pytest.raises(pnp.UsageError, match="sparse"),
-    ):
-        refiner.refine(*FRAMES[0])
-
-
-def test_a_frame_to_learn_from_needs_two_points(network: pnp.Network) -> None:
-    frames = [*FRAMES, pair(8, count=1)]
-    with (
-        pnp.Refiner(network, SETTINGS, adapt=frames) as refiner,
-        pytest.raises(pnp.NoPointsError, match=r"frame 8: 1 points; hiding some needs 2"),
+        pnp.Refiner(pnp.load_network(name), SETTINGS, adapt=frames) as refiner,
+        pytest.raises(error),
     ):
         refiner.refine(*FRAMES[0])
 
@@ -151,31 +149,24 @@ def test_a_loss_that_is_not_finite_ends_the_learning(
     network: pnp.Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(adapt, "LR", 1e30)
-    with pytest.raises(pnp.DivergedError, match="not finite after"):
+    with pytest.raises(pnp.DivergedError):
         adapt.learn(network, named(range(8)))
-
-
-class NoSky(torch.nn.Module):
-    """Depth that is infinite in the upper quarter."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layer = torch.nn.Conv2d(4, 1, 3, 1, 1)
-
-    def forward(self, rgb: torch.Tensor, sparse: torch.Tensor) -> torch.Tensor:
-        depth = 3 + self.layer(torch.cat([rgb, sparse], dim=1))
-        sky = torch.arange(depth.shape[-2])[:, None] < depth.shape[-2] // 4
-        return torch.where(sky, torch.inf, depth)
 
 
 def test_points_where_the_network_is_infinite_teach_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    def infinite_above(net: Net, rgb: torch.Tensor, sparse: torch.Tensor) -> torch.Tensor:
+        depth = 3 + net.layer(torch.cat([rgb, sparse], dim=1))
+        sky = torch.arange(depth.shape[-2])[:, None] < depth.shape[-2] // 4
+        return torch.where(sky, torch.inf, depth)
+
     monkeypatch.setattr(adapt, "STEPS", 12)
+    module = Net(infinite_above, layer=conv(4, 1))
     definition = pnp.ModelDefinition(
-        name="no-sky", input_kind="rgb+sparse", size=pnp.Multiple(4), build=NoSky, complete=True
+        name="no-sky", input_kind="rgb+sparse", size=pnp.Multiple(4), build=lambda: module
     )
-    network = pnp.load_network(NoSky(), definition=definition)
+    network = pnp.load_network(module, definition=definition)
     learnt = adapt.learn(network, named(range(8)))
     assert np.isfinite(learnt.before).all()
     assert learnt.after.mean() < learnt.before.mean()

@@ -35,14 +35,12 @@ DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "a view": lambda z, y: z.detach()[:, [0]].expand(-1, 4, -1, -1),
     "written into a new tensor": lambda z, y: torch.zeros_like(y).copy_(z.detach()),
     "written by out=": lambda z, y: torch.add(z.detach(), 1, out=torch.empty_like(y)),
-    "written by out= alone": lambda z, y: torch.neg(z.detach(), out=torch.empty_like(y)),
     "written into a part": lambda z, y: y.clone().add_(z[0, 0].detach()),
     "a value": lambda z, y: y * float(z.detach().mean()),
     "numpy": lambda z, y: torch.from_numpy(z.detach().numpy() * 2),
     "an array": lambda z, y: torch.from_numpy(np.asarray(z.detach()) * 2),
     "dlpack": lambda z, y: torch.from_numpy(np.from_dlpack(z.detach()) * 2),
     "a list": lambda z, y: torch.tensor(z.detach().tolist()),
-    "argmax as a list": lambda z, y: y + z.argmax(1).flatten().tolist()[5],
     "a mask": lambda z, y: y + y[z > 0].sum(),
     "foreach": lambda z, y: torch._foreach_add([y], [z.detach()])[0],
 }
@@ -73,11 +71,9 @@ def test_a_branch_runs_again_where_it_depends_on_z_by_any_operation(operation: s
     "escape",
     [
         lambda y: bool(y.mean() > 0),
-        lambda y: y.mean().item() > 0,
         lambda y: y.mean((0, 2, 3)).tolist()[0] > 0,
         lambda y: y.numpy().mean() > 0,
         lambda y: len(y[y > 0]) > 400,
-        lambda y: int((y > 0).sum()) > 400,
     ],
 )
 def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], bool]) -> None:
