@@ -16,14 +16,15 @@ from pnpdepth_cli.io.atomic import atomic_path
 _CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
 """Metadata that a plot lacks, by its suffix, so that the same runs give the same bytes."""
 _SIDE_INCHES = 3.2
+_SEED = "seed"  # an option whose values are draws of the same
 
 
 def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = False) -> None:
     """Writes a plot of each measure over a varied option, and of its improvement by refinement.
 
     Numbers, and of several options the one of most values, lie along the axis; each combination of
-    the others is a line. The means before refinement are dashed; the improvement is in per cent of
-    them.
+    the others is a line. A point is the mean over random seeds, where these vary. The means before
+    refinement are dashed; the improvement is in per cent of them.
 
     Raises:
         UsageError: The runs are not of `batch --vary` with the same options, the suffix is of no
@@ -42,10 +43,11 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
         raise UsageError("--plot needs matplotlib: pip install 'pnpdepth[plot]'") from None
     # where each value lies, and the runs of each line in this order
     across, positions = _axis(comparison.runs)
-    lines: dict[str, list[ComparedRun]] = {}
+    lines: dict[str, dict[float, list[ComparedRun]]] = {}
     for run in sorted(comparison.runs, key=lambda run: positions[run.varied[across]]):
-        others = [f"{name}={value}" for name, value in run.varied.items() if name != across]
-        lines.setdefault(", ".join(others), []).append(run)
+        others = [f"{k}={value}" for k, value in run.varied.items() if k not in (across, _SEED)]
+        line = lines.setdefault(", ".join(others), {})
+        line.setdefault(positions[run.varied[across]], []).append(run)
     # a column of two panels for each measure
     measures = comparison.measures
     size = _SIDE_INCHES * len(measures) + 1, 2 * _SIDE_INCHES
@@ -53,11 +55,13 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
         figure = Figure(size, layout="constrained", dpi=150)
         panels = figure.subplots(2, len(measures), squeeze=False, sharex=True)
         for measure, above, below in zip(measures, *panels, strict=True):
-            for number, (label, runs) in enumerate(lines.items()):
-                x = [positions[run.varied[across]] for run in runs]
-                means = [[run.before[measure.key], run.mean[measure.key]] for run in runs]
-                # None becomes NaN
-                before, after = np.array(means, np.float64).T * measure.shown_factor
+            for number, (label, line) in enumerate(lines.items()):
+                x, key = [*line], measure.key
+                means = [
+                    np.mean(np.array([[run.before[key], run.mean[key]] for run in runs], float), 0)
+                    for runs in line.values()
+                ]  # None becomes NaN
+                before, after = np.array(means).T * measure.shown_factor
                 improved = gain(before, after, measure.sign)
                 above.plot(x, before, f"C{number}--", linewidth=0.8)
                 above.plot(x, after, f"C{number}o-", label=label or "after refinement")
@@ -81,7 +85,8 @@ def _axis(runs: Sequence[ComparedRun]) -> tuple[str, dict[str, float]]:
     options = {tuple(run.varied) for run in runs}
     if len(options) > 1 or () in options:
         raise UsageError("--plot needs results of `batch --vary`, all of the same options")
-    values = {name: [*dict.fromkeys(run.varied[name] for run in runs)] for name in options.pop()}
+    names = [name for name in options.pop() if name != _SEED] or [_SEED]
+    values = {name: [*dict.fromkeys(run.varied[name] for run in runs)] for name in names}
     across = max(values, key=lambda name: (_numbers(values[name]) is not None, len(values[name])))
     places = {value: float(place) for place, value in enumerate(values[across])}
     return across, _numbers(values[across]) or places

@@ -57,6 +57,15 @@ def test_numbers_lie_along_the_axis_and_names_make_lines(
     assert named == ["loss=x", "loss=y", "before refinement"]
 
 
+def test_a_point_is_the_mean_over_seeds(tmp_path: Path, figures: list[Any]) -> None:
+    errors = {("20", "0"): 0.75, ("20", "1"): 0.25, ("100", "0"): 0.5}
+    runs = [batch(tmp_path, mae, sample=count, seed=seed) for (count, seed), mae in errors.items()]
+    plot_comparison(compare(runs), tmp_path / "p.svg")
+    above, below = figures[0].axes
+    lines = [line.get_xydata().tolist() for line in above.get_lines()]
+    assert (below.get_xlabel(), lines) == ("sample", [[[20, 1], [100, 1]], [[20, 0.5], [100, 0.5]]])
+
+
 def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path, figures: list[Any]) -> None:
     runs = [batch(tmp_path, 0.5, method=name) for name in ("paper", "fused")]
     for name in ("one.png", "two.png"):
