@@ -87,8 +87,7 @@ def layers(every: bool, as_json: bool, **values: Any) -> None:
     from pnpdepth_cli.cli.printing import print_table
     from pnpdepth_cli.commands.tables import Table
 
-    costs, fields = ("cost\nbehind", "time\nbehind"), ("field\nin z", "field\nin depth")
-    columns = ("layer", "z", "stride", "params", *costs, *fields)
+    columns = ("layer", "z", "stride", "cost\nbehind", "field\nin z", "field\nin depth")
     title = f"layers of {choice.model}"
     print_table(Table(title=title, columns=columns, rows=[_cells(row) for row in rows]))
 
@@ -96,14 +95,12 @@ def layers(every: bool, as_json: bool, **values: Any) -> None:
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     if row["problem"]:
         reason = row["problem"].partition(": ")[2] or row["problem"]
-        return (row["name"], "–", *[""] * 4, reason)
+        return (row["name"], "–", *[""] * 3, reason)
     return (
         row["name"],
         "×".join(str(n) for n in row["shape"]),
         f"{row['stride']:g}" if row["stride"] else "–",
-        f"{row['parameters'] / 1000:,.0f} k",
         f"{row['cost_behind']:.0%}" if row["cost_behind"] is not None else "–",
-        f"{1000 * row['seconds_behind']:.0f} ms",
         "{}×{}".format(*row["field_in_z"]) if row["field_in_z"] else "–",
         "{}×{}".format(*row["field_in_output"]),
     )

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +13,6 @@ from torch.utils.flop_counter import FlopCounterMode
 from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice
 from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.io.rgb import read_rgb
@@ -28,40 +25,31 @@ DEFAULT_SIZE = (240, 320)
 """Rows and columns of the synthetic frame of a network without a size of its own."""
 
 
-def list_models() -> list[dict[str, Any]]:
+def list_models() -> list[dict[str, object]]:
     """Returns every network that can be named, in the order of `registry.names`.
 
-    Most values are those of `ModelDefinition`. `family` is the file or entry point that defines it.
+    The values are those of `ModelDefinition`, and the number of parameters.
     """
-    listed: dict[str, dict[str, Any]] = {}
-    for family, definitions in families().items():
+    by_name = dict[str, ModelDefinition]()
+    for definitions in families().values():
         for definition in definitions.values():
-            listed.setdefault(definition.name, _describe(definition, family))
-    return list(listed.values())
+            by_name.setdefault(definition.name, definition)
+    return [_describe(definition) for definition in by_name.values()]
 
 
-def _describe(definition: ModelDefinition, family: str) -> dict[str, Any]:
+def _describe(definition: ModelDefinition) -> dict[str, object]:
     # On the meta device counting needs no memory.
     with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
     defaults, path = definition.defaults.closed(), definition.checkpoint
+    stated = ("name", "summary", "paper", "licence", "input_kind", "output_kind", "layers")
     return {
-        "name": definition.name,
-        "family": family,
-        "summary": definition.summary,
-        "paper": definition.paper,
-        "licence": definition.licence,
-        "input_kind": definition.input_kind,
+        **{key: getattr(definition, key) for key in stated},
         "size": _size(definition.size),
-        "output_kind": definition.output_kind,
         "parameters": _parameters_of(module),
         "checkpoint": str(path) if path and path.is_file() else None,
-        "layers": definition.layers,
         "layer": definition.default_layer,
-        "iterations": defaults.iterations,
-        "lr": defaults.lr,
-        "loss": defaults.loss,
-        "update": defaults.update,
+        **{key: getattr(defaults, key) for key in ("iterations", "lr", "loss", "update")},
     }
 
 
@@ -84,7 +72,7 @@ def _synthetic_map(network: Network) -> FrameMap:
     return FrameMap.fit(size, *own)
 
 
-def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict[str, Any]:
+def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict[str, object]:
     """Loads a network, runs it once, and cuts it at every layer of its definition.
 
     At each layer the cut network must return what the whole one does, bit for bit, and a gradient
@@ -160,17 +148,14 @@ class MeasuredLayer:
     """A layer and what a cut there costs and reaches; all but the name is None with a problem.
 
     stride: network pixels per element of z; None if z has no two spatial axes. cost_behind:
-    fraction of the network's floating-point operations behind the cut, which every update repeats;
-    seconds_behind: time of one pass of that part. parameters: weights of the layer itself. Fields:
-    rows and columns that one point influences, see `InfluentialField`.
+    fraction of the network's floating-point operations behind the cut, which every update repeats.
+    Fields: rows and columns that one point influences, see `InfluentialField`.
     """
 
     name: str
     shape: tuple[int, ...] | None = None
     stride: float | None = None
     cost_behind: float | None = None
-    seconds_behind: float | None = None
-    parameters: int | None = None
     field_in_z: tuple[int, int] | None = None
     field_in_output: tuple[int, int] | None = None
     problem: str | None = None
@@ -223,20 +208,14 @@ def _measure(
             split.rear(z)  # the first pass learns the cut
             with FlopCounterMode(display=False) as behind:
                 split.rear(z)
-            start = time.perf_counter()
-            split.rear(z)
-            seconds = time.perf_counter() - start
             field = influential_field(split, z, network.known_of)
     except ModelError as error:
         return MeasuredLayer(name=name, problem=str(error))
-    module = dict(network.module.named_modules())[LayerName.parse(name).module]
     return MeasuredLayer(
         name=name,
         shape=tuple(z.shape),
         stride=frame.network[0] / z.shape[-2] if z.ndim == 4 else None,
         cost_behind=behind.get_total_flops() / whole_flops if whole_flops else None,
-        seconds_behind=seconds,
-        parameters=_parameters_of(module),
         field_in_z=field.in_z,
         field_in_output=field.in_output,
     )

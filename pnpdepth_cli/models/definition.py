@@ -51,11 +51,6 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 _MAX_SHOWN = 60  # characters of a wrong value that are shown
-_SYNONYMS = {
-    "disparity": "; disparity is 'inverse'",
-    "relative": "; relative depth is 'scale' (up to a factor) or 'affine' (a shift as well)",
-}
-"""Hints for words that others use."""
 
 
 def _check(owner: object, field: str, good: bool, wanted: str) -> None:
@@ -70,9 +65,8 @@ def _check(owner: object, field: str, good: bool, wanted: str) -> None:
 
 
 def _check_choice(owner: object, field: str, valid: Collection[str]) -> None:
-    value = getattr(owner, field)
-    hint = _SYNONYMS.get(value, "") if isinstance(value, str) else ""
-    _check(owner, field, value in valid, f"one of {', '.join(map(repr, valid))}{hint}")
+    good = getattr(owner, field) in valid
+    _check(owner, field, good, f"one of {', '.join(map(repr, valid))}")
 
 
 def _check_whole(owner: object, *fields: str) -> None:

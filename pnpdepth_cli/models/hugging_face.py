@@ -16,12 +16,11 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.choices import OutputKind, OutputScale
-from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import (
@@ -31,7 +30,6 @@ from pnpdepth_cli.models.definition import (
     Near,
     Normalisation,
 )
-from pnpdepth_cli.points import SparsePoints
 
 _MOST_JSON_BYTES = 1 << 24
 _MAX_SIDE = 1 << 16  # pixels
@@ -97,12 +95,8 @@ def _pixels(side: float | None) -> int:
     return round(1 / side) if isinstance(side, float) else side
 
 
-PROMPT_SIZE = (192, 256)
-"""Rows and columns of the depth that Prompt Depth Anything was trained with, a phone's LiDAR."""
-
 _FAMILIES: dict[str, tuple[OutputKind, OutputScale, int]] = {
     "depth_anything": ("inverse", "affine", 14),
-    "prompt_depth_anything": ("depth", "metric", 14),
     # Intel's DPT give inverse depth, Meta's on DINOv2 give depth; their configurations do not say.
     "dpt": ("unknown", "affine", 16),
     "zoedepth": ("depth", "metric", 32),
@@ -148,11 +142,10 @@ def hf_definition(folder: Path) -> ModelDefinition:
             " save_pretrained"
         )
     # The definition, whose network is built when it is needed.
-    prompted = kind == "prompt_depth_anything"
     return ModelDefinition(
         name=folder.resolve().name,
         summary=f"Hugging Face {kind}",
-        input_kind="rgb+sparse" if prompted else "rgb",
+        input_kind="rgb",
         size=size,
         normalisation=processing.normalisation(),
         output_kind=output_kind,
@@ -160,7 +153,6 @@ def hf_definition(folder: Path) -> ModelDefinition:
         build=lambda: _build(folder),
         complete=True,
         checkpoint=weights,
-        arguments=_with_prompt if prompted else None,
         output=lambda output: output.predicted_depth,
         defaults=UNTUNED_DEFAULTS,
     )
@@ -183,19 +175,6 @@ def _check_settings(config: Mapping[str, Any], file: Path) -> None:
                     )
             pending.append(setting)
         pending += value if isinstance(value, list) else []
-
-
-def _with_prompt(rgb: Tensor | None, sparse: Tensor | None) -> tuple[Tensor, ...]:
-    """The image and coarse dense depth (1, 1, 192, 256), interpolated linearly from the points."""
-    assert rgb is not None
-    assert sparse is not None
-    rows, columns = torch.nonzero(sparse[0, 0], as_tuple=True)
-    points = SparsePoints(
-        xy=torch.stack([columns, rows], dim=1).float(),
-        depth=sparse[0, 0, rows, columns],
-        size=(sparse.shape[-2], sparse.shape[-1]),
-    )
-    return rgb, linear(points.resized(*PROMPT_SIZE))[None, None].to(sparse)
 
 
 def _read(file: Path, kind: type[_Kind]) -> _Kind:

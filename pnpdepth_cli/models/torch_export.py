@@ -2,16 +2,13 @@
 
 `torch.export.load` trusts its file: it unpickles inputs, evaluates expressions of sizes and the
 code of guards, and finds functions by dotted names. Here the graph is read from its JSON, tensors
-are plain bytes, and nothing but operators of torch and small arithmetic is called. Whatever else
+are plain bytes, and nothing but operators of torch is called; no size is computed. Whatever else
 lies in the archive is left alone (layout and schema: torch/_export/serde/schema.py).
 """
 
 from __future__ import annotations
 
-import functools
 import json
-import math
-import operator
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -31,10 +28,6 @@ from pnpdepth_cli.models.weights.torch_file import refuse_inflated
 
 _OPERATOR = re.compile(r"torch\.ops\.(aten|prims?)\.(\w+)\.(\w+)")
 _TOUCHES_FILES = re.compile("file|save|load")
-_ARITHMETIC = re.compile(
-    r"_operator\.(add|sub|mul|truediv|floordiv|mod|neg|pos|abs|eq|ne|lt|le|gt|ge|and_|or_|not_"
-    r"|getitem)|math\.(ceil|floor|trunc|sqrt)|torch\.(_?sym_\w+)"
-)
 _DTYPES = {
     1: torch.uint8, 2: torch.int8, 3: torch.int16, 4: torch.int32, 5: torch.int64,
     6: torch.float16, 7: torch.float32, 8: torch.float64, 12: torch.bool, 13: torch.bfloat16,
@@ -111,15 +104,13 @@ class ExportedGraph(nn.Module):
                 yield self._step(node["target"], node["inputs"], node["outputs"])
 
     def _step(self, target: str, inputs: list[Any], outputs: list[Any]) -> Step:
-        run, inputs = _function(target), [dict(one) for one in inputs]
+        run, inputs = ExportedOperation(_function(target)), [dict(one) for one in inputs]
         named = [one for output in outputs for one in _outputs_in(output)]
         alone = len(outputs) == 1 and "as_tensors" not in outputs[0]
-        if any(kind in output for output in outputs for kind in ("as_tensor", "as_tensors")):
-            run = ExportedOperation(run)
-            name = str(named[0] if alone else target.split(".")[-2]).replace(".", "_")
-            while hasattr(self, name):  # as a node named `to`, a method of every module
-                name += "_"
-            self._modules[name] = run
+        name = str(named[0] if alone else target.split(".")[-2]).replace(".", "_")
+        while hasattr(self, name):  # as a node named `to`, a method of every module
+            name += "_"
+        self._modules[name] = run
         return Step(
             run=run,
             arguments=[_argument(one["arg"]) for one in inputs if one.get("kind") != 2],
@@ -187,7 +178,7 @@ def _tensor(content: bytearray, meta: Mapping[str, Any]) -> Tensor:
 
 
 def _function(target: str) -> Callable[..., Any]:
-    """The operator or arithmetic of this name, and nothing else."""
+    """The operator of this name, and nothing else."""
     found = _OPERATOR.fullmatch(target)
     if found is not None and not _TOUCHES_FILES.search(found[2]):
         called: Any = torch.ops
@@ -195,24 +186,7 @@ def _function(target: str) -> Callable[..., Any]:
             called = getattr(called, part, None)
         if isinstance(called, torch._ops.OpOverload):  # and no other attribute on the way
             return called
-    found = _ARITHMETIC.fullmatch(target)
-    if found is None:
-        raise BrokenFileError(f"it calls {target[:80]!r}, which is no operator of torch")
-    place: Any = {"_": operator, "m": math, "t": torch}[target[0]]
-    arithmetic: Callable[..., Any] | None = getattr(place, found[1] or found[2] or found[3], None)
-    if arithmetic is None:
-        raise BrokenFileError(f"it calls {target[:80]!r}, which this version of torch lacks")
-    return arithmetic if found[1] == "getitem" else functools.partial(_compute, arithmetic)
-
-
-def _compute(arithmetic: Callable[..., Any], *numbers: Any) -> Any:
-    """The result of arithmetic on numbers of 64 bits and tensors; not on lists and texts."""
-    if not all(isinstance(each, int | float | Tensor) for each in numbers):
-        raise ModelError("the exported program computes with what is no number")
-    result = arithmetic(*numbers)
-    if isinstance(result, int) and abs(result) >= 1 << 63:
-        raise ModelError("the exported program computes an integer beyond 64 bits")
-    return result
+    raise BrokenFileError(f"it calls {target[:80]!r}, which is no operator of torch")
 
 
 def _argument(stated: Mapping[str, Any]) -> Any:
@@ -221,8 +195,6 @@ def _argument(stated: Mapping[str, Any]) -> Any:
     match kind.removeprefix("as_").replace("optional_", "").replace("sym_", ""):
         case "none":
             return None
-        case "name":
-            return Value(value)
         case "tensor" if "name" in value:
             return Value(value["name"])
         case "float" if not isinstance(value, Mapping):
@@ -251,7 +223,6 @@ def _outputs_in(stated: Mapping[str, Any]) -> list[str | None]:
         return [one["name"] for one in value]
     if kind == "as_none":
         return [None]
-    name = value.get("name", value.get("as_name")) if isinstance(value, Mapping) else None
-    if not isinstance(name, str):
-        raise BrokenFileError(f"it has an output {str(kind)[:40]!r}")
-    return [name]
+    if kind != "as_tensor":
+        raise BrokenFileError(f"it computes {str(kind)[:40]!r}; export it with fixed sizes")
+    return [str(value["name"])]

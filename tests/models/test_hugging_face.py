@@ -34,12 +34,12 @@ DINO = {
 NECK = {"neck_hidden_sizes": [8, 8, 16, 16], "fusion_hidden_size": 8}
 
 
-def depth_anything(kind: str = "relative", prompted: str = "") -> Any:
-    config = getattr(transformers, f"{prompted}DepthAnythingConfig")(
+def depth_anything() -> Any:
+    config = transformers.DepthAnythingConfig(
         backbone_config=transformers.Dinov2Config(**DINO), reassemble_hidden_size=24,
-        head_hidden_size=8, depth_estimation_type=kind, max_depth=20, patch_size=14, **NECK,
+        head_hidden_size=8, depth_estimation_type="relative", max_depth=20, patch_size=14, **NECK,
     )  # fmt: skip
-    return getattr(transformers, f"{prompted}DepthAnythingForDepthEstimation")(config)
+    return transformers.DepthAnythingForDepthEstimation(config)
 
 
 def lively(network: Any, deviation: float = 0.3) -> Any:
@@ -99,7 +99,6 @@ def depth_pro() -> Any:
 
 MAKERS = {
     "depth_anything": depth_anything,
-    "prompt_depth_anything": lambda: lively(depth_anything("metric", "Prompt"), 0.1),
     "dpt": dpt,
     "zoedepth": zoedepth,
     "glpn": glpn,

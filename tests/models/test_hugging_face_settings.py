@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import Fixed, Near
@@ -20,7 +19,6 @@ ASPECT = {"keep_aspect_ratio": True, "do_resize": True}
 SQUARE = {"height": 56, "width": 56}
 PROCESSING: dict[str, dict[str, Any]] = {
     "depth_anything": {**IMAGENET, **ASPECT, "size": SQUARE, "ensure_multiple_of": 14},
-    "prompt_depth_anything": {**IMAGENET, **ASPECT, "size": SQUARE, "ensure_multiple_of": 14},
     "dpt": {**HALF, "size": {"height": 64, "width": 64}},
     "zoedepth": {
         **HALF,
@@ -46,18 +44,6 @@ def saved(folder: Path, name: str) -> Path:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     return saved(tmp_path / "net", "glpn")
-
-
-def test_prompt_depth_anything_receives_the_points_as_coarse_dense_depth(tmp_path: Path) -> None:
-    definition = hf_definition(saved(tmp_path / "p", "prompt_depth_anything"))
-    assert definition.input_kind == "rgb+sparse"
-    sparse = torch.zeros(1, 1, 384, 512)  # twice the prompt's size: a plane that rises to the right
-    for row, column in ((0, 0), (0, 511), (383, 0), (383, 511), (100, 300)):
-        sparse[0, 0, row, column] = 1 + column / 511
-    _, prompt = definition.call_arguments(torch.rand(1, 3, 384, 512), sparse)
-    assert prompt.shape == (1, 1, 192, 256)
-    rising = 1 + (2 * torch.arange(256) + 0.5) / 511
-    assert torch.allclose(prompt[0, 0, 1:-1, 1:-1], rising[1:-1].expand(190, -1), atol=1e-3)
 
 
 def changed(folder: Path, name: str, change: dict[str, Any]) -> Path:
@@ -125,7 +111,6 @@ def test_normalisation_is_that_of_an_image_from_0_to_1(
     ("name", "output"),
     [
         ("depth_anything", ("inverse", "affine")),
-        ("prompt_depth_anything", ("depth", "metric")),
         ("dpt", ("unknown", "affine")),
         ("zoedepth", ("depth", "metric")),
         ("glpn", ("depth", "metric")),

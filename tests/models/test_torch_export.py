@@ -129,8 +129,8 @@ def test_a_definition_names_a_graph_of_image_sparse_depth_and_intrinsics(
         load_network(str(tmp_path / f"net{suffix}"), None)
 
 
-class Dynamic(nn.Module):
-    """Computed sizes, an equation, attention and constants."""
+class Various(nn.Module):
+    """An equation, attention, constants, parts and infinite numbers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -152,20 +152,17 @@ class Dynamic(nn.Module):
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("archive")
     torch.manual_seed(0)
-    sides = {2: 32 * Dim("rows", min=1, max=64), 3: 32 * Dim("columns", min=1, max=64)}
-    net, image = Dynamic().eval(), torch.rand(1, 3, 64, 96)
-    program = torch.export.export(net, (image,), dynamic_shapes=(sides,))
+    program = torch.export.export(Various().eval(), (torch.rand(1, 3, 64, 96),))
     torch.export.save(program, folder / "net.pt2")
     return folder / "net.pt2"
 
 
-def test_a_program_for_many_sizes_gives_what_the_network_gives_and_its_gradients(
+def test_a_program_gives_what_the_network_gives_and_its_gradients(
     archive: Path,
 ) -> None:
     network = load_network(str(archive), None)
-    assert network.definition.size == Multiple(32)
     torch.manual_seed(0)
-    net, rgb = Dynamic().eval(), torch.rand(1, 3, 96, 32, requires_grad=True)
+    net, rgb = Various().eval(), torch.rand(1, 3, 64, 96, requires_grad=True)
     depth, expected = network.raw_of(network.module(rgb)), net(rgb)
     assert torch.equal(depth, expected)
     ours, theirs = (torch.autograd.grad(one.sum(), rgb)[0] for one in (depth, expected))
@@ -222,7 +219,7 @@ HOSTILE: dict[str, tuple[str, Change, str]] = {
         for target in (
             "torch.os.system", "torch.ops.load_library", "torch.ops.aten.from_file.default",
             "torch.ops.aten.save.default", "torch.ops.torchvision.write_file.default",
-            "_operator.methodcaller", "math.__loader__",
+            "_operator.methodcaller", "math.ceil",
             "torch.ops.aten.__class__.mro", "torch.ops.aten.add.__call__",
             "torch.load", "os.system", "torch.ops.higher_order.wrap_with_set_grad_enabled",
             "torch.ops.higher_order.run_const_graph",
@@ -250,21 +247,19 @@ def test_what_could_do_more_than_compute_is_refused_in_one_line(archive: Path, k
     assert len(str(error.value)) < 500
 
 
-def first_node(target: str, *arguments: Any, output: str | None = None) -> Change:
+def first_node(target: str, *arguments: Any) -> Change:
     """The first node is another one, whose result the next takes."""
 
     def change(program: Any) -> None:
         nodes = program["graph_module"]["graph"]["nodes"]
         inputs = [{"name": "x", "arg": argument, "kind": 1} for argument in arguments]
-        named = {"as_sym_int": {"as_name": output}} if output else nodes[0]["outputs"][0]
-        node = {"target": target, "inputs": inputs, "outputs": [named], "metadata": {}}
-        nodes[0:1] = [node] * (80 if output else 1)
+        outputs = [nodes[0]["outputs"][0]]
+        nodes[0] = {"target": target, "inputs": inputs, "outputs": outputs, "metadata": {}}
 
     return edited(change)
 
 
-ONE = {"as_sym_int": {"as_int": 10**9}}
-INFLATING: dict[str, Change] = {
+INFLATING = {
     "a constant": first_node(
         "torch.ops.aten.full.default", {"as_ints": [1, 8, 10**5, 10**4]}, {"as_float": 1.0}
     ),
@@ -273,29 +268,28 @@ INFLATING: dict[str, Change] = {
         {"as_tensor": {"name": "rgb"}},
         {"as_ints": [1, 9, 999, 999]},
     ),
-    "an integer": first_node("_operator.mul", ONE, ONE, output="x"),
-    "a list": first_node("_operator.mul", {"as_ints": [0]}, {"as_int": 10**10}, output="x"),
 }
 
 
 @pytest.mark.parametrize("kind", INFLATING)
 def test_a_small_archive_makes_nothing_far_larger_than_its_image(archive: Path, kind: str) -> None:
-    if kind == "an integer":  # squared again and again
-        chained = edited(
-            lambda p: [
-                node["inputs"][k].update(arg={"as_sym_int": {"as_name": "x"}})
-                for node in p["graph_module"]["graph"]["nodes"][1:80]
-                for k in (0, 1)
-            ]
-        )
-        change = INFLATING[kind]
-        path = rewritten(archive, MODEL, lambda content: chained(change(content)))
-    else:
-        path = rewritten(archive, MODEL, INFLATING[kind])
+    path = rewritten(archive, MODEL, INFLATING[kind])
     with little():
         definition = find_definition(str(path))
         with pytest.raises(ModelError), torch.no_grad():
-            definition.build()(torch.rand(1, 3, 32, 48))
+            definition.build()(torch.rand(1, 3, 64, 96))
+
+
+def test_a_program_that_computes_sizes_is_refused_with_a_way_out(tmp_path: Path) -> None:
+    sides = {2: 32 * Dim("rows", min=1, max=64), 3: 32 * Dim("columns", min=1, max=64)}
+    for net in (Net(), Various()):
+        program = torch.export.export(
+            net.eval(), (torch.rand(1, 3, 64, 96),), dynamic_shapes=(sides,)
+        )
+        torch.export.save(program, tmp_path / f"{type(net).__name__}.pt2")
+    assert find_definition(str(tmp_path / "Net.pt2")).size == Multiple(32)
+    with pytest.raises(ModelError, match="fixed sizes"):
+        find_definition(str(tmp_path / "Various.pt2"))
 
 
 def test_an_input_larger_than_the_largest_image_is_refused(

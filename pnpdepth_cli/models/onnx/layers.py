@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -100,49 +101,38 @@ def _pads_of_transposed(node: Node, x: Tensor, stride: Sequence[int], full: Sequ
     return pads if auto == "SAME_UPPER" else [(end, begin) for begin, end in pads]
 
 
-def _pooling(node: Node, x: Tensor) -> tuple[list[int], list[int], list[int], Pads, Pads]:
-    """Kernel, stride, dilation, pads, and the pads with those that ceil_mode adds at the end."""
-    rank = x.ndim - 2
-    kernel = list(node.get("kernel_shape"))
-    stride = list(node.get("strides", [1] * rank))
-    dilation = list(node.get("dilations", [1] * rank))
-    pads = _pads(node, x.shape[2:], kernel, stride, dilation)
-    if not node.get("ceil_mode", 0):
-        return kernel, stride, dilation, pads, pads
-    padded = []
-    for n, k, s, d, (begin, end) in zip(x.shape[2:], kernel, stride, dilation, pads, strict=True):
-        window = (k - 1) * d + 1
-        out = math.ceil((n + begin + end - window) / s) + 1
-        if (out - 1) * s >= n + begin:  # no window begins in the padding at the end
-            out -= 1
-        padded.append((begin, max(end, (out - 1) * s + window - n - begin)))
-    return kernel, stride, dilation, pads, padded
+def _pooling(node: Node, x: Tensor) -> tuple[dict[str, Any], list[int]]:
+    """Arguments of torch's pooling, and the pads that it cannot have, in the order of F.pad."""
+    kernel, ones = node.get("kernel_shape"), [1] * (x.ndim - 2)
+    stride, dilation = node.get("strides", ones), node.get("dilations", ones)
+    pads, ceil = _pads(node, x.shape[2:], kernel, stride, dilation), bool(node.get("ceil_mode", 0))
+    called = {"kernel_size": kernel, "stride": stride, "ceil_mode": ceil}
+    if all(begin == end <= k // 2 for (begin, end), k in zip(pads, kernel, strict=True)):
+        return called | {"padding": [begin for begin, _ in pads]}, []
+    if ceil:
+        raise Unsupported("ceil_mode and such pads")
+    return called, _sides(pads)
 
 
 @operator("MaxPool")
 def max_pool(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
-    kernel, stride, dilation, _, padded = _pooling(node, x)
-    if any(n for pair in padded for n in pair):
-        x = F.pad(x, _sides(padded), value=-math.inf)
-    return _MAX_POOL[x.ndim - 2](x, kernel, stride, 0, dilation)
+    called, sides = _pooling(node, x)
+    x = F.pad(x, sides, value=-math.inf) if sides else x
+    pool: Callable[..., Tensor] = _MAX_POOL[x.ndim - 2]
+    return pool(x, dilation=node.get("dilations", 1), **called)
 
 
 @operator("AveragePool")
 def average_pool(node: Node, inputs: Inputs) -> Tensor:
-    x = inputs[0]
-    kernel, stride, dilation, pads, padded = _pooling(node, x)
-    if x.ndim != 4 or any(d != 1 for d in dilation):
+    x, with_pads = inputs[0], bool(node.get("count_include_pad", 0))
+    if x.ndim != 4 or any(d != 1 for d in node.get("dilations", [])):
         raise Unsupported("other than two spatial axes, or dilations")
-    if not any(n for pair in padded for n in pair):
-        return F.avg_pool2d(x, kernel, stride)
-    area = math.prod(kernel)
-    total = F.avg_pool2d(F.pad(x, _sides(padded)), kernel, stride) * area
-    inside = torch.ones_like(x[:1, :1])
-    if node.get("count_include_pad", 0):
-        inside = F.pad(inside, _sides(pads), value=1.0)
-        padded = [(0, g[1] - p[1]) for g, p in zip(padded, pads, strict=True)]
-    return total / (F.avg_pool2d(F.pad(inside, _sides(padded)), kernel, stride) * area)
+    called, sides = _pooling(node, x)
+    mean = F.avg_pool2d(F.pad(x, sides), count_include_pad=with_pads, **called)
+    if with_pads or not sides:
+        return mean
+    return mean / F.avg_pool2d(F.pad(torch.ones_like(x[:1, :1]), sides), **called)
 
 
 register(
