@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +40,7 @@ _MUCH = 0.1
 """Part of an image outside of the points from which it is said."""
 
 LARGEST_VIEW = 200_000
-"""Most points of a 3D view."""
+"""Most points of a 3D view, but for what its borders round."""
 
 _RAY_NODES = 64
 """Nodes of the grid of directions along the longer side: exact to 1e-4 of it for strong lenses."""
@@ -188,7 +187,7 @@ def _write_view(path: Path, image: Image | None, inputs: Frame, frame: Refined) 
     assert inputs.camera is not None
     # Depths without the points between surfaces, on a grid of few enough pixels.
     height, width = inputs.size
-    stride = _stride((height, width))
+    stride = math.ceil(math.sqrt(height * width / LARGEST_VIEW))
     thinned = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     maps = {"before": frame.before, "after": frame.after}
     maps |= {} if inputs.gt is None else {"gt": inputs.gt}
@@ -218,15 +217,6 @@ def _write_view(path: Path, image: Image | None, inputs: Frame, frame: Refined) 
             "depths": {name: _text(_codes(d, near, far), "<u2") for name, d in depths.items()},
             "colours": _text(_colours(image, frame)[thinned], "|u1"),
         },
-    )
-
-
-def _stride(size: tuple[int, int]) -> int:
-    """The least n for which every n-th row and column, from the n/2-th, are few enough pixels."""
-    return next(
-        n
-        for n in itertools.count(1)
-        if math.prod(len(range(n // 2, side, n)) for side in size) <= LARGEST_VIEW
     )
 
 

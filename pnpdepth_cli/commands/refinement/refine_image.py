@@ -37,7 +37,7 @@ from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import normalisation_name, with_input_range
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.file_bytes import fingerprint
-from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION
 
@@ -157,7 +157,7 @@ def _record_of(
 ) -> FrameRecord:
     """The record of a refined frame, without its outputs and times."""
     # What the frame is called, and what the networks say.
-    network, files = method.network, request.files
+    network, weights, files = method.network, method.network.checkpoint, request.files
     first = files.image_file or files.sparse
     of_networks = [note for member in method.members for note in member.network.notes]
     own_used = len(frame.own) - len(refined.held_out)
@@ -172,7 +172,12 @@ def _record_of(
         inputs=dict(frame.sources),
         neighbours=list(frame.neighbours),
         camera=CameraRecord.of(frame.camera, frame.pose) if frame.camera else None,
-        model=_model_record(network, request.network.model),
+        model=ModelRecord(
+            name=network.definition.name,
+            spec=request.network.model,
+            checkpoint=str(weights) if weights else None,
+            checkpoint_sha256=fingerprint(weights).sha256 if weights else None,
+        ),
         method=MethodRecord(
             kind="default" if method.is_default else "fixed",
             reason=method.asked.fixed_by or "default",
@@ -204,17 +209,6 @@ def _record_of(
         loss=list(refined.losses),
         errors=_errors_of(refined, frame, with_baselines=request.hold_out.baselines),
         notes=[note for note in (*frame.notes, *of_networks, *refined.notes) if note],
-    )
-
-
-def _model_record(network: Network, spec: str) -> ModelRecord:
-    """What a record keeps of a network; `spec` is what the user called it."""
-    checkpoint = network.checkpoint
-    return ModelRecord(
-        name=network.definition.name,
-        spec=spec,
-        checkpoint=str(checkpoint) if checkpoint else None,
-        checkpoint_sha256=fingerprint(checkpoint).sha256 if checkpoint else None,
     )
 
 

@@ -243,16 +243,12 @@ def _some_frames(
 
 def _calibration_text(calibration: Calibration) -> str:
     camera, scanner = calibration.camera, calibration.scanner
-    fields: dict[str, Any] = {"K": camera.intrinsics.ravel().tolist()}
+    fields = {"K": camera.intrinsics.ravel().tolist(), "distortion": list(camera.distortion)}
     if scanner is not None:
-        fields["R"] = scanner.rotation.ravel().tolist()
-        fields["t"] = scanner.translation.tolist()
-    if camera.distortion:
-        fields["distortion"] = list(camera.distortion)
+        fields |= {"R": scanner.rotation.ravel().tolist(), "t": scanner.translation.tolist()}
     if camera.size is not None:
         fields["size"] = [camera.size[1], camera.size[0]]
-    lines = [f"{name}: {json.dumps(value)}\n" for name, value in fields.items()]
-    return "".join([*lines, f"lens: {camera.lens}\n"])
+    return "".join(f"{n}: {json.dumps(v)}\n" for n, v in fields.items()) + f"lens: {camera.lens}\n"
 
 
 def _write_poses(

@@ -63,9 +63,9 @@ class SparseTarget:
         command: str,
         points: Points,
         settings: dict[str, Any],
-        *,
         inputs: Mapping[str, FileRecord],
         notes: Sequence[str],
+        *,
         rgb: NDArray[np.float32] | None = None,
     ) -> dict[str, Any]:
         """Writes the sparse depth, its record and the overlay, and returns the record.
@@ -122,20 +122,15 @@ def project_scan(
         options: The calibration.
         target: Files to write.
         image: The camera's image, which gives the size and the ground of the overlay.
-        scale: Numbers of the scan per metre, for `read_scan_points`.
+        scale: Numbers of the scan per metre.
     """
     target.check((scan, image, options.calib, options.extrinsics), drawn=True)
     rgb = read_rgb(image).values
     size = (rgb.shape[0], rgb.shape[1])
     projected = read_scan_points(scan, options, size, image, scale=scale)
-    return target.write(
-        "project",
-        projected.points,
-        plain(asdict(options)),
-        inputs={"image": record_of(image), "scan": projected.record},
-        notes=projected.notes,
-        rgb=rgb,
-    )
+    inputs = {"image": record_of(image), "scan": projected.record}
+    settings = plain(asdict(options))
+    return target.write("project", projected.points, settings, inputs, projected.notes, rgb=rgb)
 
 
 def sample_depth(
@@ -168,7 +163,7 @@ def sample_depth(
         notes.append(f"warning: the image has {len(points):,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
     settings = {"pattern": asdict(pattern), "seed": seed}
-    return target.write("sample", points, settings, inputs=inputs, notes=notes)
+    return target.write("sample", points, settings, inputs, notes)
 
 
 def simulate_scan(
@@ -199,7 +194,7 @@ def simulate_scan(
     settings = {"sensor": plain(asdict(sensor)), "seed": seed}
     read_as = FileRecord(path=str(calib), read_as=calibration.camera.source)
     inputs = {"depth": record_of(depth), "calibration": read_as}
-    return target.write("simulate", points, settings, inputs=inputs, notes=notes)
+    return target.write("simulate", points, settings, inputs, notes)
 
 
 def _dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[str]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.outputs import LARGEST_VIEW, _rays, _stride
+from pnpdepth_cli.commands.refinement.outputs import _rays
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
@@ -96,11 +95,3 @@ def test_interpolated_directions_are_exact_to_a_twentieth_of_a_pixel() -> None:
     rays = np.stack([map_coordinates(nodes[:, :, axis], at, order=1) for axis in (0, 1)], axis=1)
     exact = rays_of(camera, np.column_stack([x, y]))
     assert np.abs(rays - exact).max() * focal_px < 0.05
-
-
-@pytest.mark.parametrize("size", [(375, 1242), (480, 640), (3000, 4000), (448, 447), (8, 9)])
-def test_a_cloud_has_at_most_the_largest_number_of_points(size: tuple[int, int]) -> None:
-    stride = _stride(size)
-    count = math.prod(len(range(stride // 2, side, stride)) for side in size)
-    assert count <= LARGEST_VIEW
-    assert stride == 1 or math.prod(size) / (stride - 1) ** 2 > 0.98 * LARGEST_VIEW
