@@ -1,6 +1,6 @@
 """The error measures of depth: what each is called, how it is shown, and its formula.
 
-`MEASURES` are computed everywhere, `TABLE` has those that `eval --measures` computes on request. A
+`MEASURES` are computed everywhere, `TABLE` has those that `eval --columns` computes on request. A
 measure is one entry of either, and nowhere else. Importing this module imports no library.
 
 Sources: Eigen et al. 2014 (RMSE, RMSE of the logarithm, AbsRel = MRE, SqRel, δ < 1.25^k, SILog),
@@ -53,8 +53,8 @@ class Pixels:
 
     @cached_property
     def inverse_error(self) -> Tensor:
-        """1/p − 1/g, 1/m."""
-        return 1 / self.predicted - 1 / self.truth
+        """1/p − 1/g, 1/km."""
+        return 1000 / self.predicted - 1000 / self.truth
 
     @cached_property
     def ratio(self) -> Tensor:
@@ -71,19 +71,14 @@ def mean(term: OfPixels, factor: float = 1.0) -> OfPixels:
     return lambda pixels: factor * term(pixels).mean()
 
 
-def root_mean_square(term: OfPixels, factor: float = 1.0) -> OfPixels:
-    """Returns the formula factor · √ mean of the squared term."""
-    return lambda pixels: factor * term(pixels).square().mean().sqrt()
+def rms(term: OfPixels) -> OfPixels:
+    """Returns the formula √ mean of the squared term."""
+    return lambda pixels: term(pixels).square().mean().sqrt()
 
 
 def deviation(term: OfPixels, factor: float = 1.0) -> OfPixels:
     """Returns the formula factor · standard deviation of the term."""
-
-    def of_pixels(pixels: Pixels) -> Tensor:
-        values = term(pixels)
-        return factor * (values.square().mean() - values.mean().square()).clamp_min(0).sqrt()
-
-    return of_pixels
+    return lambda pixels: factor * (term(pixels) - term(pixels).mean()).square().mean().sqrt()
 
 
 def fraction_below(number: int) -> OfPixels:
@@ -91,7 +86,7 @@ def fraction_below(number: int) -> OfPixels:
     return mean(lambda pixels: (pixels.ratio < pixels.thresholds[number - 1]).double())
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Measure:
     """A measure: its name, how it is shown, and its formula."""
 
@@ -119,14 +114,10 @@ class Measure:
     where there is no value."""
 
     @property
-    def table_unit(self) -> str:
-        """The unit in tables; empty for ratios and percentages."""
-        return self.shown_unit or self.unit
-
-    @property
     def heading(self) -> str:
         """A title such as `RMSE [m] ↓`."""
-        unit = f" [{self.table_unit}]" if self.table_unit else ""
+        unit = self.shown_unit or self.unit
+        unit = f" [{unit}]" if unit else ""
         arrow = {"lower": " ↓", "higher": " ↑", "neither": ""}[self.better]
         return f"{self.title}{unit}{arrow}"
 
@@ -190,43 +181,27 @@ class FrameMeans:
 
 
 MEASURES = (
+    Measure("rmse", "RMSE", unit="m", main=True, of_pixels=rms(lambda p: p.error)),
+    Measure("mae", "MAE", unit="m", main=True, of_pixels=mean(lambda p: p.error.abs())),
+    Measure("mre", "MRE", main=True, of_pixels=mean(lambda p: p.error.abs() / p.truth)),
+    Measure("sq_rel", "SqRel", unit="m", of_pixels=mean(lambda p: p.error.square() / p.truth)),
+    Measure("log10", "log10", of_pixels=mean(lambda p: p.log_error.abs(), 1 / math.log(10))),
+    Measure("rmse_log", "RMSE log", of_pixels=rms(lambda p: p.log_error)),
+    Measure("irmse", "iRMSE", unit="1/km", decimals=2, of_pixels=rms(lambda p: p.inverse_error)),
     Measure(
-        key="rmse", title="RMSE", unit="m", main=True, of_pixels=root_mean_square(lambda p: p.error)
-    ),
-    Measure(key="mae", title="MAE", unit="m", main=True, of_pixels=mean(lambda p: p.error.abs())),
-    Measure(key="mre", title="MRE", main=True, of_pixels=mean(lambda p: p.error.abs() / p.truth)),
-    Measure(
-        key="sq_rel", title="SqRel", unit="m", of_pixels=mean(lambda p: p.error.square() / p.truth)
-    ),
-    Measure(
-        key="log10", title="log10", of_pixels=mean(lambda p: p.log_error.abs(), 1 / math.log(10))
-    ),
-    Measure(key="rmse_log", title="RMSE log", of_pixels=root_mean_square(lambda p: p.log_error)),
-    Measure(
-        key="irmse",
-        title="iRMSE",
-        unit="1/km",
-        decimals=2,
-        of_pixels=root_mean_square(lambda p: p.inverse_error, 1000),
+        "imae", "iMAE", unit="1/km", decimals=2, of_pixels=mean(lambda p: p.inverse_error.abs())
     ),
     Measure(
-        key="imae",
-        title="iMAE",
-        unit="1/km",
-        decimals=2,
-        of_pixels=mean(lambda p: p.inverse_error.abs(), 1000),
-    ),
-    Measure(
-        key="silog",
-        title="SILog",
+        "silog",
+        "SILog",
         unit="100·log m",
         decimals=2,
         of_pixels=deviation(lambda p: p.log_error, 100),
     ),
     *(
         Measure(
-            key=f"delta{number}",
-            title=f"δ{number}",
+            f"delta{number}",
+            f"δ{number}",
             better="higher",
             percent=True,
             decimals=2,
@@ -237,7 +212,7 @@ MEASURES = (
     ),
 )
 """The measures that are computed everywhere, in the order of all tables."""
-COVERAGE = Measure(key="coverage", title="coverage", better="higher", percent=True, decimals=2)
+COVERAGE = Measure("coverage", "coverage", better="higher", percent=True, decimals=2)
 """The fraction of the ground truth that has a prediction, which stands beside the measures."""
 
 
@@ -282,22 +257,12 @@ _RATIOS = tuple(1.05 + 0.2 * step / 9 for step in range(10))
 """A pixel is on a boundary if its neighbour is farther by such a factor: ten from 1.05 to 1.25."""
 
 
-def boundary_f1(predicted: Image, truth: Image) -> float:
-    """Returns the scale-invariant F1 of the boundaries as Depth Pro's code prints it.
-
-    Precision and recall are means over the four directions to a neighbour, and F1 is the mean over
-    the ratios weighted by the ratio. Depth Pro scores dense ground truth; here pairs with an
-    unknown pixel are left out.
-
-    Args:
-        predicted: (H, W) metres, 0 where unknown; an unknown pixel is on no boundary.
-        truth: (H, W) metres, 0 where unknown.
-
-    Returns:
-        0 without any boundary, NaN without any pair of known neighbours.
-    """
+def _boundary_f1(predicted: Image, truth: Image) -> float:
+    """Scale-invariant F1 of the boundaries as Depth Pro's code prints it; NaN without any pair."""
     import numpy as np
 
+    # Precision and recall are means over four directions; F1 is weighted by the ratio. Depth Pro
+    # scores dense ground truth; here pairs with an unknown pixel are left out.
     sides = ((0, 1), (0, -1), (1, 0), (-1, 0))
     both, own, true = _boundary_counts(predicted, truth, sides, margin=0)
     recall = (both / np.maximum(true, 1)).sum(axis=0) / 4
@@ -305,18 +270,10 @@ def boundary_f1(predicted: Image, truth: Image) -> float:
     return _weigh(2 * recall * precision, recall + precision, _RATIOS)
 
 
-def boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
-    """Returns the F1 of the boundaries as MoGe's code prints it.
-
-    Pairs are of a pixel and all others within the radius. F1 is of all pairs together, and its mean
-    over the ratios is weighted by the ratio − 1. Pixels nearer than the radius to the border are
-    neighbours alone.
-
-    Args:
-        predicted: (H, W) metres, 0 where unknown.
-        truth: (H, W) metres, 0 where unknown.
-        radius: Pixels, 1 to 3 in MoGe's tables.
-    """
+def _boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
+    """F1 of the boundaries as MoGe's code prints it, with neighbours within `radius` pixels."""
+    # All pairs count together, and F1 is weighted by the ratio − 1. Pixels nearer than the radius
+    # to the border are neighbours alone.
     span = range(-radius, radius + 1)
     disc = [(down, right) for down in span for right in span if down**2 + right**2 <= radius**2]
     counts = _boundary_counts(predicted, truth, disc, margin=radius)
@@ -360,21 +317,21 @@ def _boundary_counts(
 
 def _weigh(hits: Counts, of: Counts, weights: Sequence[float]) -> float:
     """The weighted mean of hits / of, which is 0 where there is nothing."""
-    shares = zip(weights, hits.tolist(), of.tolist(), strict=True)
-    total = sum(weight * (hit / each if each else 0.0) for weight, hit, each in shares)
-    return total / sum(weights)
+    import numpy as np
+
+    return float(np.average(hits / np.where(of > 0, of, 1), weights=weights))
 
 
 TABLE = {
     measure.key: measure
     for measure in (
-        Measure(key="boundary_f1", title="boundary F1", better="higher", formula=boundary_f1),
+        Measure("boundary_f1", "boundary F1", better="higher", formula=_boundary_f1),
         *(
             Measure(
-                key=f"boundary_f1_{radius}px",
-                title=f"boundary F1, {radius} px",
+                f"boundary_f1_{radius}px",
+                f"boundary F1, {radius} px",
                 better="higher",
-                formula=partial(boundary_f1_within, radius=radius),
+                formula=partial(_boundary_f1_within, radius=radius),
             )
             for radius in (1, 2, 3)
         ),
@@ -383,38 +340,20 @@ TABLE = {
 """The measures that are computed on request alone."""
 
 
-def within_sigma(predicted: Image, truth: Image, sigma: Image, factor: int) -> float:
-    """Returns the fraction of errors that are at most `factor` standard deviations.
-
-    Args:
-        predicted: (H, W) metres, 0 where unknown.
-        truth: (H, W) metres, 0 where unknown.
-        sigma: (H, W) standard deviation of the prediction in metres, 0 where unknown.
-        factor: Number of standard deviations.
-
-    Returns:
-        NaN if no pixel has all three.
-    """
+def _within_sigma(predicted: Image, truth: Image, sigma: Image, factor: int) -> float:
+    """Fraction of errors that are at most `factor` standard deviations; NaN without any pixel."""
     errors, deviations = _errors_with_sigma(predicted, truth, sigma)
     return float((errors <= factor * deviations).mean()) if len(errors) else math.nan
 
 
-def sparsification_error(predicted: Image, truth: Image, sigma: Image) -> float:
-    """Returns the area under the sparsification error in units of the MAE, 0 is best.
-
-    Sparsification is the MAE of the pixels that remain when the most uncertain ones are removed;
-    its error is the difference from removing those of the largest error (Ilg et al., ECCV 2018).
-
-    Args:
-        predicted: (H, W) metres, 0 where unknown.
-        truth: (H, W) metres, 0 where unknown.
-        sigma: (H, W) standard deviation of the prediction in metres, 0 where unknown.
-    """
+def _sparsification_error(predicted: Image, truth: Image, sigma: Image) -> float:
+    """Area under the sparsification error (Ilg et al., ECCV 2018) in units of the MAE."""
     import numpy as np
 
     errors, deviations = _errors_with_sigma(predicted, truth, sigma)
     if not len(errors):
         return math.nan
+    # the MAE of what remains when the most uncertain pixels are removed, or those of largest error
     removed = np.arange(20) / 20
     kept = np.maximum(1, np.round((1 - removed) * len(errors))).astype(int)
     by_sigma, by_error = (
@@ -438,18 +377,20 @@ def _errors_with_sigma(predicted: Image, truth: Image, sigma: Image) -> tuple[An
 OF_SIGMA = (
     *(
         Measure(
-            key=f"within_{factor}_sigma",
-            title=f"errors within {factor}σ (normal: {normal})",
+            f"within_{factor}_sigma",
+            f"errors within {factor}σ (normal: {normal})",
             better="neither",
             percent=True,
             decimals=1,
-            formula=partial(within_sigma, factor=factor),
+            formula=partial(_within_sigma, factor=factor),
         )
         for factor, normal in ((1, "68.3 %"), (2, "95.4 %"))
     ),
-    Measure(key="ause", title="AUSE of σ", formula=sparsification_error),
+    Measure("ause", "AUSE of σ", formula=_sparsification_error),
 )
-"""The measures of a predicted standard deviation, which frames with one have."""
+"""The measures of a predicted standard deviation, which frames with one have.
+
+Their functions take the deviation (H, W) in metres too, 0 where unknown."""
 
 
 def parse_keys(text: str) -> tuple[str, ...]:

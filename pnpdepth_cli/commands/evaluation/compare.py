@@ -30,10 +30,12 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.text_files import plain, read_json
-from pnpdepth_cli.measures import MEASURES, FrameMeans, Measure, choose_measures
+from pnpdepth_cli.measures import COVERAGE, MEASURES, FrameMeans, Measure, choose_measures
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.stages import AFTER, BEFORE, GT
 
+Means = dict[str, float | None]
+"""Means by the key of their measure; None where no frame has it."""
 ALPHA = 0.05
 _SUMMARY = "summary.json"
 _STARS = (0.05, 0.01, 0.001)
@@ -60,14 +62,10 @@ class Run:
         """Returns the scores of a frame at that stage, else at the run's own."""
         return self.frames[frame].errors[GT].get(stage or self.stage, {})
 
-    def coverage(self, frames: Sequence[str]) -> float:
-        """Returns the fraction of the ground truth of these frames that is scored."""
-        pixels = known = 0.0
-        for own in map(self.scores, frames):
-            scored, share = own.get("pixels") or 0, own.get("coverage")
-            pixels += scored
-            known += own.get("known") or (round(scored / share) if share else 0)
-        return pixels / known if known else math.nan
+    def means(self, frames: Sequence[str], keys: Sequence[str], stage: str = "") -> Means:
+        """Returns the means of these values over these frames at that stage, else its own."""
+        scores = (self.scores(frame, stage) for frame in frames)
+        return FrameMeans({key: own.get(key) for key in keys} for own in scores).means()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,11 +91,11 @@ class ComparedRun:
 
     name: str
     path: str
-    mean: dict[str, float | None]
-    before: dict[str, float | None]
+    mean: Means
+    before: Means
     """The mean before refinement, where the run has it."""
     varied: dict[str, str]
-    coverage: float
+    coverage: float | None
     gains: dict[str, Gain]
     """Gains by measure; empty for the first run."""
 
@@ -186,11 +184,9 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
                 name=name,
                 path=run.path,
                 mean=mean,
-                before=FrameMeans(
-                    {key: run.scores(frame, BEFORE).get(key) for key in keys} for frame in names
-                ).means(),
+                before=run.means(names, keys, BEFORE),
                 varied=run.varied,
-                coverage=run.coverage(names),
+                coverage=run.means(names, [COVERAGE.key])[COVERAGE.key],
                 gains=of_first,
             )
             for run, name, mean, of_first in compared
@@ -212,7 +208,7 @@ def _shared_measures(runs: Sequence[Run], columns: Sequence[str] | None) -> tupl
 
 def _gains(
     values: NDArray[np.float64],
-    means: Sequence[dict[str, float | None]],
+    means: Sequence[Means],
     measures: Sequence[Measure],
     clusters: Clusters,
 ) -> list[dict[str, Gain]]:
@@ -253,10 +249,11 @@ def _notes_on_frames(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]
             )
     pixels = (len({run.scores(name).get("pixels") for run in runs}) for name in names)
     if others := sum(count > 1 for count in pixels):
-        shares = ", ".join(f"{run.coverage(names):.2%} in {run.path}" for run in runs)
+        means = (run.means(names, [COVERAGE.key])[COVERAGE.key] for run in runs)
+        shares = ", ".join(map(COVERAGE.text, means))
         yield (
             f"warning: {count_of(others, 'frame')} with other numbers of scored pixels in the runs"
-            f" (coverage {shares}), and a run that leaves hard pixels empty looks better; this is"
+            f" (coverage: {shares}), and a run that leaves hard pixels empty looks better; this is"
             " no ranking"
         )
 

@@ -84,14 +84,14 @@ class EvalRequest:
     )
 
     def __post_init__(self) -> None:
-        for flag, scale in (("--pred-scale", self.pred_scale), ("--gt-scale", self.gt_scale)):
-            if scale is not None and not (math.isfinite(scale) and scale > 0):
-                raise UsageError(f"{flag} must be a finite number above 0, got {scale:g}")
-        low, high = self.rules.min_depth, self.rules.max_depth
-        if high is not None and not (math.isfinite(high) and high > low):
-            raise UsageError(f"--max-depth must be metres above {low:g}, got {high:g}")
-        if not 1 < self.rules.delta < 1000:
-            raise UsageError("--delta must be above 1: δ counts ratios below it")
+        for flag, value, least in (
+            ("--pred-scale", self.pred_scale, 0.0),
+            ("--gt-scale", self.gt_scale, 0.0),
+            ("--max-depth", self.max_depth, self.rules.min_depth),
+            ("--delta", self.delta, 1.0),
+        ):
+            if value is not None and not (math.isfinite(value) and value > least):
+                raise UsageError(f"{flag} must be a finite number above {least:g}, got {value:g}")
         near, far = self.depth_limits or (1.0, 2.0)
         if not (0 < near < far and math.isfinite(far)):
             raise UsageError(f"--by-depth must be two rising depths in metres: {near:g} {far:g}")

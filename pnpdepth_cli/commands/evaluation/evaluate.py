@@ -17,9 +17,9 @@ from pnpdepth_cli.commands.evaluation.eval_request import (
 )
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.pairing import pair_frames, some_names
-from pnpdepth_cli.commands.evaluation.scoring import FILES, is_missing, score_pair, scores_of
+from pnpdepth_cli.commands.evaluation.scoring import FILES, score_pair, scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
-from pnpdepth_cli.commands.statistics import LEVEL, MIN_CLUSTERS, Clusters, find_clusters, interval
+from pnpdepth_cli.commands.statistics import MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.commands.tables import Table, count_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord
@@ -32,8 +32,6 @@ from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, FrameMeans, Measure
 from pnpdepth_cli.points import METRES
 
 _LISTED = 3
-_FRAMES_SHOWN = 12
-_FRAME_COLUMNS = 6
 _COUNTS = ("pixels", "known", COVERAGE.key, "given", "median_ratio", "factor", "shift")
 _OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
 
@@ -75,13 +73,6 @@ class Evaluation:
         """The measures of tables."""
         return self.measures if self.request.columns is None else self.request.shown
 
-    def describe_unscored(self) -> str:
-        """Returns why frames are in no mean; empty if all are."""
-        missing = sum(map(is_missing, self.frames))
-        faulty = len(self.frames) - len(self.scored) - missing
-        reasons = ((missing, "without prediction"), (faulty, "with a faulty file"))
-        return ", ".join(f"{count:,} {reason}" for count, reason in reasons if count)
-
     def to_json(self) -> dict[str, Any]:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
         # What was scored and how, the results, and the frames.
@@ -91,20 +82,17 @@ class Evaluation:
             "versions": versions(),
             "prediction": request.prediction,
             "truth": request.ground_truth,
-            "scales": {"prediction": request.pred_scale, "truth": request.gt_scale},
             "protocol": request.protocol,
             "scoring": scoring_of(request.rules, request.scale_by),
             "measures": [measure.to_json() for measure in self.measures],
             "counts": {
                 "frames": len(self.frames),
                 "scored": len(self.scored),
-                "missing": sum(map(is_missing, self.frames)),
                 "pixels": self.pixels,
                 "coverage": self.coverage,
             },
             "mean": self.mean,
             "interval": self.interval,
-            "level": LEVEL,
             "clusters": self.clusters.to_json(),
             "frames": [frame.to_json() for frame in self.frames],
             "notes": self.notes,
@@ -194,40 +182,31 @@ def _notes_on_files(rows: Sequence[FrameRecord]) -> Iterator[str]:
         if texts:
             yield f"{side}: {some_names(texts)}"
     # Frames that are in no mean, and what was made of ground truth that is none.
-    if missing := [row.name for row in rows if is_missing(row)]:
-        count = count_of(len(missing), "frame")
-        yield f"warning: {count} without prediction: {some_names(missing)}"
-    faulty = [
+    failed = [
         f"warning: frame {one_line(row.name)} was not scored: {row.message}"
         for row in rows
-        if row.status == "failed" and not is_missing(row)
+        if row.status == "failed"
     ]
     noted = [f"frame {one_line(row.name)}: {note}" for row in rows for note in row.notes]
-    for lines in (faulty, noted):
+    for lines in (failed, noted):
         yield from lines[:_LISTED]
         if (more := len(lines) - _LISTED) > 0:
-            yield f"{count_of(more, 'more note')} of that kind; --csv or --json has all"
+            yield f"{count_of(more, 'more frame')} like that; --csv or --json has all"
 
 
 def _notes_on_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
     """Pixels of the ground truth without prediction, and those that the network was given."""
     known = sum(_numbers(scored, "known"))
-    treatment = "lowers the coverage and is in no error"
-    if request.rules.missing == "min":
-        treatment = f"is scored as {request.rules.min_depth:g} m"
-    elif request.is_devkit:
-        treatment = "was filled in from its neighbours before scoring"
     if empty := known - sum(_numbers(scored, "predicted")):
         yield (
             f"warning: {count_of(round(empty), 'pixel')} ({empty / known:.2%}) of the ground truth"
-            f" without prediction; what is missing {treatment}"
+            " without prediction"
         )
     given = round(sum(_numbers(scored, "given")))
     if given and not request.rules.exclude_sparse:
-        known = sum(_numbers([f for f in scored if scores_of(f)["given"] is not None], "pixels"))
         yield (
-            f"{given:,} of the scored pixels ({given / known:.2%}) have a point of the sparse"
-            " input; --exclude-sparse leaves them out"
+            f"{given:,} of the scored pixels have a point of the sparse input; --exclude-sparse"
+            " leaves them out"
         )
 
 
@@ -260,11 +239,11 @@ def _notes_on_scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
 
 def means_table(evaluation: Evaluation) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
-    intervals, all_frames = evaluation.interval, count_of(len(evaluation.frames), "frame")
-    title, pixels = f"Means over {all_frames}", count_of(evaluation.pixels, "pixel")
-    if reasons := evaluation.describe_unscored():
-        title = f"Means and coverage over {len(evaluation.scored):,} of {all_frames} ({reasons})"
-    title += f", {pixels}"
+    intervals, scored = evaluation.interval, f"{len(evaluation.scored):,} of "
+    if len(evaluation.scored) == len(evaluation.frames):
+        scored = ""
+    title = f"Means and coverage over {scored}{count_of(len(evaluation.frames), 'frame')}"
+    title += f", {count_of(evaluation.pixels, 'pixel')}"
     columns = ["", "mean"]
     if intervals is not None:
         columns.append("95 %")
@@ -290,21 +269,3 @@ def frames_table(evaluation: Evaluation) -> Table:
     counts = [COVERAGE if name == COVERAGE.key else name for name in _COUNTS]
     columns = ["name", "group", *FILES, *counts, *evaluation.shown, "error"]
     return Table(columns=columns, rows=rows)
-
-
-def worst_frames(evaluation: Evaluation) -> Table:
-    """Returns a row for each scored frame, of many the worst: the chosen measures, or the first."""
-    title, frames = "Frames", evaluation.scored
-    if len(frames) > _FRAMES_SHOWN:
-        title = f"The {_FRAMES_SHOWN} worst by RMSE; --csv has all"
-        frames = sorted(frames, key=lambda frame: -(scores_of(frame)["rmse"] or 0.0))
-    is_chosen = evaluation.request.columns is not None
-    shown = [*evaluation.shown[: None if is_chosen else _FRAME_COLUMNS], COVERAGE]
-    return Table(
-        title=title + WITHOUT_SPARSE * evaluation.request.rules.exclude_sparse,
-        columns=["name", *shown],
-        rows=[
-            [frame.name, *(scores_of(frame).get(m.key) for m in shown)]
-            for frame in frames[:_FRAMES_SHOWN]
-        ],
-    )

@@ -12,8 +12,6 @@ relative errors by 100.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,13 +50,7 @@ def fill_background(depth: Floats) -> Floats:
 
 
 DEVKIT_MEASURES = tuple(
-    Measure(
-        key=title.lower().replace(" ", "_"),
-        title=title,
-        unit=unit,
-        decimals=6,
-        main=bool(unit),
-    )
+    Measure(title.lower().replace(" ", "_"), title, unit, decimals=6, main=bool(unit))
     for title, unit in (
         ("MAE", "m"),
         ("RMSE", "m"),
@@ -105,10 +97,11 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
     return {m.key: float(value) for m, value in zip(DEVKIT_MEASURES, values, strict=True)}
 
 
-def devkit_mean(values: NDArray[Any]) -> NDArray[np.float64]:
+def devkit_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns (M,) the mean of (N, M) values of N frames, summed in order in single precision."""
-    total = np.cumsum(values, axis=0, dtype=np.float32)[-1] / np.float32(len(values))
-    return np.asarray(total, np.float64)
+    return np.asarray(
+        np.cumsum(values, axis=0, dtype=np.float32)[-1] / np.float32(len(values)), float
+    )
 
 
 def _sum(values: Floats) -> np.float32:

@@ -108,11 +108,6 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
     return replace(record, status="done", notes=notes, errors={GT: {AFTER: scores}})
 
 
-def is_missing(record: FrameRecord) -> bool:
-    """Returns whether the frame has no prediction."""
-    return "prediction" not in record.inputs
-
-
 def scores_of(record: FrameRecord) -> Scores:
     """Returns the scores of a frame, with the counts of its pixels; empty if it was not read."""
     return record.errors.get(GT, {}).get(AFTER, {})

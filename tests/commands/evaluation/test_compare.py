@@ -156,7 +156,7 @@ def test_other_pixels_cause_a_warning(tmp_path: Path) -> None:
     less = run(tmp_path, "less", {"a": [1.0, -10.0]})
     (note,) = compare([one, less]).notes
     assert note.startswith("warning: 1 frame with other numbers of scored pixels")
-    assert "50.00% in" in note
+    assert "100.00%, 50.00%" in note
 
 
 SCORES: dict[str, Scores] = {
