@@ -243,4 +243,3 @@ PROTOCOLS = tuple(protocols.PROTOCOLS)
 """How frames are cut, given points and scored: `pnpdepth_cli.protocols`."""
 
 SCALINGS = ("none", "median", "affine", "affine-disparity")  # of each image to its truth
-PREDICTION_KINDS = ("depth", "disparity")

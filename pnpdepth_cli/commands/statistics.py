@@ -41,8 +41,8 @@ class Clusters:
 
     ids: NDArray[np.int64]
     """(N,) the cluster of each frame, from 0 to count − 1."""
-    unit: str
-    """What a cluster is, in the plural."""
+    text: str
+    """What they are, such as `12 groups of frames`."""
 
     @property
     def count(self) -> int:
@@ -51,12 +51,7 @@ class Clusters:
 
     def to_json(self) -> dict[str, object]:
         """Returns what JSON files have of it."""
-        return {"count": self.count, "unit": self.unit}
-
-    def describe(self) -> str:
-        """Returns text such as `12 groups of frames`."""
-        noun, space, of = self.unit.partition(" ")
-        return count_of(self.count, noun.removesuffix("s")) + space + of
+        return {"count": self.count, "text": self.text}
 
     def notes(self) -> list[str]:
         """Returns that frames are not independent, unless each of them is a cluster."""
@@ -64,7 +59,7 @@ class Clusters:
             return []
         return [
             f"frames of one sequence are not independent: {len(self.ids):,} frames count as"
-            f" {self.describe()}"
+            f" {self.text}"
         ]
 
 
@@ -78,15 +73,16 @@ def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
     number = {name: index for index, name in enumerate(dict.fromkeys(groups))}
     frames = len(groups)
     if 1 < len(number) < frames:
-        return Clusters(ids=np.array([number[own] for own in groups]), unit="groups of frames")
+        ids = np.array([number[own] for own in groups])
+        return Clusters(ids=ids, text=f"{len(number):,} groups of frames")
     length = block_length(series) if len(number) == 1 else 1
     if length == 1:
-        return Clusters(ids=np.arange(frames), unit="frames")
+        return Clusters(ids=np.arange(frames), text=count_of(frames, "frame"))
     blocks = max(1, min(MAX_BLOCKS, frames // length))
     return Clusters(
         ids=np.arange(frames) * blocks // frames,
-        unit=f"blocks of about {round(frames / blocks):,} consecutive frames of one sequence,"
-        " as their errors are correlated",
+        text=f"{count_of(blocks, 'block')} of about {round(frames / blocks):,} consecutive frames"
+        " of one sequence, as their errors are correlated",
     )
 
 

@@ -45,9 +45,9 @@ class Table:
 
     title: str = ""
     columns: Sequence[Measure | str]
-    """A measure for values of it, or the heading of any other column."""
+    """A measure, or the heading of any other column."""
     rows: Sequence[Sequence[Any]]
-    """Texts, values of the column's measure, other numbers, and None."""
+    """Texts, numbers, and None."""
 
     @property
     def headings(self) -> list[str]:
@@ -57,7 +57,7 @@ class Table:
     @property
     def texts(self) -> list[list[str]]:
         """The cells as they are shown."""
-        return [list(map(_text, self.columns, row)) for row in self.rows]
+        return [list(map(_text, row)) for row in self.rows]
 
     def csv(self) -> str:
         """Returns the cells as they are, below the keys of the measures, as `write_csv` does."""
@@ -79,11 +79,9 @@ class Table:
         return "\n".join(lines)
 
 
-def _text(column: Measure | str, cell: Any) -> str:
+def _text(cell: Any) -> str:
     if isinstance(cell, str):
         return cell
-    if isinstance(column, Measure):
-        return column.text(cell)
     return "" if cell is None else f"{cell:,}"
 
 

@@ -26,7 +26,7 @@ from pnpdepth_cli.dataset.frame_files import groups_by_name
 
 
 def clusters_of(ids: list[int] | np.ndarray) -> Clusters:
-    return Clusters(ids=np.asarray(ids), unit="frames")
+    return Clusters(ids=np.asarray(ids), text="frames")
 
 
 def interval(values: np.ndarray, ids: object = None) -> list[float]:
@@ -145,14 +145,14 @@ def autoregression(correlation: float, frames: int, seed: int) -> np.ndarray:
 def test_groups_are_clusters_in_the_order_of_the_frames() -> None:
     clusters = find_clusters(["b", "a", "b", "c"], np.zeros((4, 1)))
     assert clusters.ids.tolist() == [0, 1, 0, 2]
-    assert clusters.describe() == "3 groups of frames"
-    assert find_clusters(["b", "a"], np.zeros((2, 1))).describe() == "2 frames"
+    assert clusters.text == "3 groups of frames"
+    assert find_clusters(["b", "a"], np.zeros((2, 1))).text == "2 frames"
 
 
 def test_one_sequence_of_independent_frames_has_a_cluster_for_each() -> None:
     lengths = [block_length(autoregression(0.0, 100, seed)) for seed in range(40)]
     assert np.mean([length == 1 for length in lengths]) >= 0.7  # 84 % in the long run
-    assert find_clusters([""] * 6, np.arange(6.0)[:, None] % 2).describe() == "6 frames"
+    assert find_clusters([""] * 6, np.arange(6.0)[:, None] % 2).text == "6 frames"
 
 
 def test_one_correlated_sequence_is_cut_into_a_few_long_blocks() -> None:
@@ -162,7 +162,7 @@ def test_one_correlated_sequence_is_cut_into_a_few_long_blocks() -> None:
     assert length == pytest.approx(14, abs=3)
     clusters = find_clusters(["drive"] * 1000, series)
     assert clusters.ids.tolist() == [number // 100 for number in range(1000)]
-    assert "blocks of about 100 consecutive frames" in clusters.describe()
+    assert "blocks of about 100 consecutive frames" in clusters.text
     short = autoregression(0.5, 60, 0)
     correlation = np.corrcoef(short[1:, 0], short[:-1, 0])[0, 1]
     correlation += (1 + 3 * correlation) / 60  # Kendall's correction

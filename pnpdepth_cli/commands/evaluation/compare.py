@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, scoring_of
 from pnpdepth_cli.commands.evaluation.pairing import some_names
 from pnpdepth_cli.commands.statistics import (
-    MIN_CLUSTERS,
-    PERMUTATIONS,
     Clusters,
     find_clusters,
     gain,
@@ -109,18 +107,12 @@ class Comparison:
     scoring: dict[str, Any]
     runs: tuple[ComparedRun, ...]
     clusters: Clusters
-    exact_p_values: bool
-    """Whether all swaps were tried, not `PERMUTATIONS` random ones."""
-    tests: int
     notes: list[str]
 
     def to_json(self) -> dict[str, Any]:
         """Returns what `--json` prints."""
-        own = {
-            "clusters": self.clusters.to_json(),
-            "measures": [measure.to_json() for measure in self.measures],
-            "permutations": PERMUTATIONS,
-        }
+        measures = [measure.to_json() for measure in self.measures]
+        own = {"clusters": self.clusters.to_json(), "measures": measures}
         result: dict[str, Any] = plain({"command": "compare", **vars(self), **own})
         return result
 
@@ -174,7 +166,6 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     if len({*run_names}) < len(runs):
         run_names = [run.path for run in runs]
     compared = zip(runs, run_names, means, [{}, *gains], strict=True)
-    tests = len(gains) * len(measures)
     return Comparison(
         frames=names,
         measures=measures,
@@ -192,9 +183,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
             for run, name, mean, of_first in compared
         ),
         clusters=clusters,
-        exact_p_values=2**clusters.count <= PERMUTATIONS,
-        tests=tests,
-        notes=[*_notes_on_frames(runs, names), *_notes_on_tests(measures, known, clusters, tests)],
+        notes=[*_notes_on_frames(runs, names), *_notes_on_tests(measures, known, clusters, runs)],
     )
 
 
@@ -259,7 +248,10 @@ def _notes_on_frames(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]
 
 
 def _notes_on_tests(
-    measures: Sequence[Measure], known: NDArray[np.bool_], clusters: Clusters, tests: int
+    measures: Sequence[Measure],
+    known: NDArray[np.bool_],
+    clusters: Clusters,
+    runs: Sequence[Run],
 ) -> Iterator[str]:
     """Measures that frames lack, and whether frames are too dependent or too few to conclude."""
     for measure, has in zip(measures, known.T, strict=True):
@@ -267,13 +259,12 @@ def _notes_on_tests(
             of = f"{has.sum():,} of {len(has):,} frames"
             yield f"{measure.title}: over {of}; the others lack it in a run"
     yield from clusters.notes()
-    smallest = 2.0 ** (1 - clusters.count)
+    smallest, tests = 2.0 ** (1 - clusters.count), len(measures) * (len(runs) - 1)
     if len(known) > 1 and tests * smallest >= ALPHA:
-        few = f"; there is no interval below {MIN_CLUSTERS}" * (clusters.count < MIN_CLUSTERS)
         yield (
-            f"warning: {clusters.describe()} are too few independent ones to conclude anything from"
-            f" {tests} tests: the smallest possible p is {smallest:.2g}, adjusted"
-            f" {min(1.0, tests * smallest):.2g}{few}"
+            f"warning: {clusters.text} are too few independent ones to conclude anything from"
+            f" {tests} tests: p is at least {smallest:.2g}, adjusted"
+            f" {min(1.0, tests * smallest):.2g}"
         )
 
 
@@ -336,13 +327,11 @@ def comparison_table(comparison: Comparison) -> Table:
                 style = "good" if found.percent > 0 else "bad"
             p = "–" if math.isnan(found.p_adjusted) else f"{found.p_adjusted:.4f}"
             rows.append([*row, Cell(texts[0], style), *texts[1:], p])
-    # What was tested, in the title.
-    swaps = "all" if comparison.exact_p_values else f"{PERMUTATIONS:,} random"
     return Table(
         title=(
             f"{count_of(len(comparison.frames), 'shared frame')}; gains in per cent of the error of"
-            f" {comparison.runs[0].name}, positive is better; intervals (95 %) and p-values, from"
-            f" {swaps} swaps, {_describe_tests(comparison)}"
+            f" {comparison.runs[0].name}, positive is better; intervals (95 %) and p-values"
+            f" {_describe_tests(comparison)}"
         ),
         columns=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
         rows=rows,
@@ -378,5 +367,5 @@ def methods_table(comparison: Comparison) -> Table:
 def _describe_tests(comparison: Comparison) -> str:
     others, measures = len(comparison.runs) - 1, len(comparison.measures)
     tests = count_of(measures, "measure") + (f" of {others} runs" if others > 1 else "")
-    tested = f"over {comparison.clusters.describe()}, p adjusted for {tests} (Holm)"
+    tested = f"over {comparison.clusters.text}, p adjusted for {tests} (Holm)"
     return tested + WITHOUT_SPARSE * bool(comparison.scoring.get("exclude_sparse"))

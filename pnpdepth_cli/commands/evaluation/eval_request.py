@@ -52,15 +52,9 @@ class EvalRequest:
     )
     scale_by: str = option(
         "none",
-        "Scale each image to its ground truth, for relative predictions.",
+        "Scale each image to its ground truth, for relative predictions. affine-disparity takes"
+        " disparity.",
         choices=choices.SCALINGS,
-        show_default=True,
-    )
-    prediction_kind: str = option(
-        "depth",
-        "What predictions are.",
-        flag="--pred-kind",
-        choices=choices.PREDICTION_KINDS,
         show_default=True,
     )
     depth_limits: tuple[float, float] | None = option(

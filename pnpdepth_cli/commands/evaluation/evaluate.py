@@ -141,7 +141,7 @@ def evaluate(
     notes += clusters.notes()
     if len(scored) > 1 and not ends:
         notes.append(
-            f"no interval: {clusters.describe()} are too few to tell how sure the means are;"
+            f"no interval: {clusters.text} are too few to tell how sure the means are;"
             f" {MIN_CLUSTERS} are needed"
         )
     notes += _notes_on_files(rows)
@@ -247,7 +247,7 @@ def means_table(evaluation: Evaluation) -> Table:
     columns = ["", "mean"]
     if intervals is not None:
         columns.append("95 %")
-        title += f"; 95 % interval over {evaluation.clusters.describe()}"
+        title += f"; 95 % interval over {evaluation.clusters.text}"
     rows = []
     mean = evaluation.mean | {COVERAGE.key: evaluation.coverage}
     for measure in (*evaluation.shown, COVERAGE):

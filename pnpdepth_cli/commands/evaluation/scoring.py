@@ -79,14 +79,14 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
                 f"{files.gt} has no known depth where protocol {request.protocol} scores"
             )
         values, of_prediction = _read_prediction(pair, truth.shape, request)
-        depth, fit = scale_prediction(values, truth, request.prediction_kind, request.scale_by)
+        depth, fit = scale_prediction(values, truth, request.scale_by)
         depth = _within_bounds(depth, request.rules)
         both, known = (truth > 0) & (depth > 0), int((truth > 0).sum())
         if not both.any() and not request.is_devkit:
             raise InputError(f"{result.depth} holds no valid depth where the truth is known")
         # The measures, and the numbers of pixels.
         scores = _measure(depth, truth, request)
-        if result.sigma is not None and fit is None and request.prediction_kind == "depth":
+        if result.sigma is not None and fit is None:
             sigma = result.of_size(result.sigma, depth)
             scores |= {m.key: m.value(depth, truth, sigma) for m in OF_SIGMA}
     except PnpDepthError as error:
@@ -245,50 +245,39 @@ def _different(pair: FramePair, what: str, shape: Size, size: Size, advice: str 
     )
 
 
-def scale_prediction(
-    values: Depth, gt: Depth, kind: str, scale_by: str
-) -> tuple[Depth, Fit | None]:
+def scale_prediction(values: Depth, gt: Depth, scale_by: str) -> tuple[Depth, Fit | None]:
     """Returns the prediction in metres, fitted to the ground truth of its image, and the fit.
 
     The fits are
 
     - median: ratio of the medians (Zhou et al. 2017, monodepth2),
     - affine: least squares in depth (Ke et al. 2024, Marigold),
-    - affine-disparity: least squares in 1/m (Ranftl et al. 2020, MiDaS).
+    - affine-disparity: least squares in 1/m of predicted disparity (Ranftl et al. 2020, MiDaS).
 
     A fitted value that is not above 0 becomes unknown (0).
 
     Args:
-        values: (H, W) predictions of the kind, 0 where unknown.
+        values: (H, W) predicted depth, of affine-disparity disparity, 0 where unknown.
         gt: (H, W) ground truth in metres, 0 where it is not scored.
-        kind: One of choices.PREDICTION_KINDS.
         scale_by: One of choices.SCALINGS.
 
     Raises:
         InputError: If fewer than two pixels have both, or the prediction is constant.
     """
-    depth = _inverse(values) if kind == "disparity" else values
     if scale_by == "none":
-        return depth, None
-    both = (gt > 0) & (depth > 0)
+        return values, None
+    both, in_disparity = (gt > 0) & (values > 0), scale_by == "affine-disparity"
     if np.count_nonzero(both) < 2:
         raise InputError(f"--scale-by {scale_by} needs 2 pixels with ground truth and prediction")
-    in_disparity = scale_by == "affine-disparity"
-    if in_disparity:
-        depth = values if kind == "disparity" else _inverse(depth)
-    p, g = depth[both].astype(np.float64), gt[both].astype(np.float64)
-    factor, shift = 1.0, 0.0
+    p, g = values[both].astype(np.float64), gt[both].astype(np.float64)
     if scale_by == "median":
-        factor = float(np.median(g) / np.median(p))
+        factor, shift = float(np.median(g) / np.median(p)), 0.0
+    elif p.min() == p.max():
+        raise InputError("the prediction is constant, so that no scale and shift can be fitted")
     else:
-        if p.min() == p.max():
-            raise InputError("the prediction is constant, so that no scale and shift can be fitted")
         factor, shift = np.polyfit(p, 1 / g if in_disparity else g, 1).tolist()
-    fitted = depth * np.float64(factor) + shift
-    result = np.where((depth > 0) & (fitted > 0), fitted, 0).astype(np.float32)
-    return _inverse(result) if in_disparity else result, (factor, shift)
-
-
-def _inverse(values: Depth) -> Depth:
-    known = values > 0
-    return np.where(known, 1 / np.where(known, values, 1).astype(np.float64), 0).astype(np.float32)
+    fitted = values * np.float64(factor) + shift
+    fitted = np.where((values > 0) & (fitted > 0), fitted, 0)
+    if in_disparity:
+        fitted = np.divide(1, fitted, out=np.zeros_like(fitted), where=fitted > 0)
+    return fitted.astype(np.float32), (factor, shift)

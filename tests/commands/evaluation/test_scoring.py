@@ -19,20 +19,13 @@ WHERE = RNG.random(GT.shape) < 0.7
 """Where the ground truth is known."""
 
 
-def test_without_scaling_disparity_becomes_depth_and_nothing_else() -> None:
-    disparity = np.where(WHERE, 1 / GT, 0).astype(np.float32)
-    depth, fit = scale_prediction(disparity, GT, "disparity", "none")
-    assert fit is None
-    assert depth == pytest.approx(np.where(WHERE, GT, 0), rel=1e-6)
-
-
 def test_median_is_that_of_monodepth2_and_empty_predictions_stay_empty() -> None:
     predicted = (GT * RNG.uniform(0.2, 0.4, GT.shape)).astype(np.float32)
     predicted[:, :10] = 0
     both = WHERE & (predicted > 0)
     # evaluate_depth.py: ratio = np.median(gt_depth) / np.median(pred_depth), both masked
     ratio = np.median(GT[both]) / np.median(predicted[both])
-    depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), "depth", "median")
+    depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), "median")
     assert fit is not None
     assert fit == pytest.approx((ratio, 0), rel=1e-6)
     assert depth == pytest.approx(predicted * ratio, rel=1e-6)
@@ -48,8 +41,7 @@ def test_affine_is_the_least_squares_fit_of_marigold_and_midas(scale_by: str) ->
     both = WHERE & (predicted > 0)
     a = np.stack([predicted[both], np.ones(both.sum())], axis=1).astype(np.float64)
     (s, t), *_ = np.linalg.lstsq(a, target[both].astype(np.float64), rcond=None)
-    kind = "depth" if in_depth else "disparity"
-    depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), kind, scale_by)
+    depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), scale_by)
     assert fit is not None
     assert fit == pytest.approx((s, t), rel=1e-5)
     assert not depth[:3].any()
@@ -59,9 +51,9 @@ def test_affine_is_the_least_squares_fit_of_marigold_and_midas(scale_by: str) ->
 
 def test_a_constant_prediction_and_too_few_pixels_are_refused() -> None:
     with pytest.raises(InputError, match="constant"):
-        scale_prediction(np.ones_like(GT), GT, "depth", "affine")
+        scale_prediction(np.ones_like(GT), GT, "affine")
     with pytest.raises(InputError, match="needs 2 pixels"):
-        scale_prediction(GT, np.zeros_like(GT), "depth", "median")
+        scale_prediction(GT, np.zeros_like(GT), "median")
 
 
 def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
