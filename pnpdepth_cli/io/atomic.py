@@ -47,31 +47,23 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """Adds what is written to the yielded empty folder to `folder`; untouched if anything fails.
+    """Replaces `folder` by what is written to the yielded one; untouched if anything fails.
 
-    Files of the same name are replaced, others stay. The yielded folder is in `folder`, which is
-    created, and removed again if the block fails. OSErrors become OutputErrors.
+    The yielded folder is beside it. OSErrors become OutputErrors.
     """
-    existed = folder.exists()
-    make_folder(folder)
-    temporary = folder / f".{secrets.token_hex(6)}"
+    target = folder.resolve()
+    make_folder(target.parent)
+    temporary = target.with_name(f".{secrets.token_hex(6)}")
     try:
         temporary.mkdir()
         yield temporary
-        for directory, _, names in os.walk(temporary, topdown=False):
-            target = folder / Path(directory).relative_to(temporary)
-            target.mkdir(exist_ok=True)
-            for name in names:
-                Path(directory, name).replace(target / name)
-    except OutputError as error:  # of a file in the temporary folder
-        raise type(error)(str(error).replace(str(temporary), str(folder))) from error
+        if target.exists():
+            shutil.rmtree(target)
+        temporary.rename(target)
     except OSError as error:
         raise cannot_write(folder, error) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        if not existed:
-            with suppress(OSError):
-                folder.rmdir()  # fails where files are in it: then they are complete
 
 
 @contextmanager
@@ -147,9 +139,6 @@ def _empty_file_beside(target: Path) -> Path:
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
-        if not target.parent.exists():
-            message = f"{target}: its folder does not exist; create it first"
-            raise OutputError(message) from error
         raise cannot_write(target, error) from error
     return temporary
 
@@ -195,8 +184,6 @@ def _hold(path: Path, timeout_s: float | None = None) -> Iterator[None]:
         lock.acquire(timeout=_TRIED_S if timeout_s is None else timeout_s)
     except Timeout:
         raise OutputError(f"another batch writes to {path.parent}; wait for it to end") from None
-    except NotImplementedError as error:
-        raise OutputError(f"{path} cannot be locked; choose another output folder") from error
     except OSError as error:
         raise cannot_write(path, error) from error
     try:

@@ -11,9 +11,8 @@ separate, and a value may continue over several lines:
     size: [1242, 375]                          # optional: width and height
 
 Bare numbers are K alone: 9, 16 of a 4×4 matrix (ScanNet), or fx fy cx cy [width height]. Record3D's
-metadata.json has K by columns. YAML is OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain,
-with the intrinsics of the raw image; a matrix T_camera_lidar there is the pose of the scanner. A
-folder is KITTI's raw data or KITTI-360.
+metadata.json has K by columns. YAML is OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain;
+a matrix T_camera_lidar there is the pose of the scanner. A folder is KITTI's raw data or KITTI-360.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -31,8 +29,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.extrinsics import check_pose, numbers_in, pose_of_matrix
-from pnpdepth_cli.io.file_bytes import check_pixel_count, check_text_size, one_line, read_bytes
-from pnpdepth_cli.io.formats import kind_of
+from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_text
 from pnpdepth_cli.io.text_files import parse_yaml, read_json
 
 CAMERA = 2
@@ -42,12 +39,9 @@ _PERSPECTIVE, _FROM_CAMERA_0 = "perspective.txt", "calib_cam_to_velo.txt"  # of 
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
 _YAML_MARKS = ("camera_matrix:", "distortion_model:", "camera_model:", "distortion_coeffs:")
-_MATRICES = ("camera_matrix", "cameraMatrix", "CameraMat", "camera_mat", "K", "k")
-_DISTORTIONS = (
-    *("distortion_coefficients", "distCoeffs", "dist_coeffs", "DistCoeff", "distortion_coeffs"),
-    *("distortion", "D", "d"),
-)
-_POSES = ("T_camera_lidar", "T_cam_lidar", "T_camera_scanner", "T_cam_velo")
+_MATRICES = ("camera_matrix", "cameraMatrix", "K", "k")
+_DISTORTIONS = ("distortion_coefficients", "distCoeffs", "distortion", "D", "d")
+_POSES = ("T_camera_lidar", "T_cam_lidar")
 _LENSES = dict.fromkeys(
     ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "none", "pinhole"),
     "radial-tangential",
@@ -135,12 +129,13 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     # Files that name their kind, by their own names or by words in them.
     if path.is_dir() or path.name in (_PERSPECTIVE, *_RAW_FILES):
         return _kitti_folder(path if path.is_dir() else path.parent, camera)
-    text = _text(path)
+    is_json = path.suffix.lower() == ".json"  # of any length: Record3D's has all poses
+    text = "" if is_json else read_text(path)
     if text.lstrip().startswith("%YAML") or any(mark in text for mark in _YAML_MARKS):
         return camera_in_yaml(path, parse_yaml(path, text), camera)
     # JSON, named values, or numbers alone.
     source = "calibration"
-    if text.lstrip().startswith("{"):
+    if is_json or text.lstrip().startswith("{"):
         fields = _Fields(path, read_json(path))
         if {"K", "w", "h", "poses"} <= set(fields.values):  # Record3D's, with K by columns
             size, source = [fields.values["w"], fields.values["h"]], "Record3D's metadata"
@@ -186,11 +181,10 @@ def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibrati
 
 
 def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, Extrinsics]]:
-    """The cameras of a rectified image of camera_info, without distortion.
+    """The cameras of a rectified image of camera_info, without distortion; none without P.
 
-    Whether the transforms lead to the rectified camera (kitti2bag) or to the raw one, to which R
-    and the last column of P then lead, no file says. The first is as the definition of CameraInfo
-    has it. Empty without P, or where P describes the raw image.
+    Whether transforms lead to the rectified camera (kitti2bag) or to the raw one, which R and the
+    last column of P turn and shift into it, no file says.
     """
     p, r = (
         np.array([] if (name := fields.first(names)) is None else fields.numbers(name))
@@ -239,11 +233,11 @@ def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
     scanner = folder / (_FROM_CAMERA_0 if is_360 else _RAW_FILES[1])
     pose = None
     if scanner.is_file() and is_360:
-        pose = pose_of_matrix(scanner, "the matrix", numbers_in(_text(scanner)) or []).inverse()
+        pose = pose_of_matrix(scanner, "the matrix", numbers_in(read_text(scanner)) or []).inverse()
     elif scanner.is_file():
-        pose = _named_values(scanner, _text(scanner)).pose("T")
+        pose = _named_values(scanner, read_text(scanner)).pose("T")
     # The camera. The development kit of the raw data rotates each by camera 0's rectification.
-    fields = _named_values(cameras, _text(cameras))
+    fields = _named_values(cameras, read_text(cameras))
     number = _camera(fields, 0 if is_360 and camera is None else camera, r"P_rect_(\d\d)")
     return _rectified_calibration(
         cameras,
@@ -348,16 +342,6 @@ def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
             f"{fields.path}: {len(coefficients)} coefficients of {lens} distortion, not {wanted}"
         )
     return lens, coefficients
-
-
-def _text(path: Path) -> str:
-    if path.suffix.lower() != ".json":  # Record3D's has the poses of all frames
-        check_text_size(path)
-    data = read_bytes(path)
-    if kind_of(data) is None and b"\0" not in data:
-        with suppress(UnicodeDecodeError):
-            return data.decode("utf-8-sig")
-    raise FileFormatError(f"{path} is not a text file, as every calibration is; give another")
 
 
 def _named_values(path: Path, text: str) -> _Fields:

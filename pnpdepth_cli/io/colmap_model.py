@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import struct
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -67,10 +67,6 @@ class _CameraModel(NamedTuple):
     lens: str
     coefficients: int
 
-    @property
-    def parameters(self) -> int:
-        return self.focals + 2 + self.coefficients
-
 
 _RADIAL, _FISHEYE = "radial-tangential", "fisheye"
 MODELS = {
@@ -91,8 +87,7 @@ _NAMES = {model.number: name for name, model in MODELS.items()}
 _LARGEST = 1e9
 
 MODEL_PARTS = ("cameras", "images", "points3D")
-_LOCK = threading.Lock()
-"""So that threads that read frames of one model wait for it instead of reading it again."""
+_LOCK = threading.Lock()  # threads that read frames of one model wait for it
 _COUNT, _CAMERA = struct.Struct("<Q"), struct.Struct("<IiQQ")
 _IMAGE, _POINT = struct.Struct("<I7dI"), struct.Struct("<Q3d3BdQ")
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
@@ -177,33 +172,24 @@ def name_in_model(model: ColmapModel, image: Path) -> str:
     alike = [name for name, part in parts.items() if part[-1:] == (image.name,)]
     if len(alike) == 1:
         return alike[0]
-    if alike:
-        raise InputError(
-            f"{image} could be any of {_listing(alike)} of {model.folder}; give it in the image"
-            " folder of the model"
-        )
+    names = ", ".join(sorted(alike or parts)[:3])
     raise InputError(
-        f"{image} is not among the {len(model.images):,} images of {model.folder}"
-        f" ({_listing(model.images)}); COLMAP did not register it, or its name has changed"
+        f"{image} is {len(alike)} of the {len(parts):,} images of {model.folder} ({names}, …), not"
+        " one; COLMAP did not register it, or give it in the image folder of the model"
     )
-
-
-def _listing(names: Iterable[str]) -> str:
-    first = sorted(names)
-    return ", ".join(first[:3]) + (", …" if len(first) > 3 else "")
 
 
 def _damaged(path: Path, fact: str) -> FileFormatError:
     return damaged(path, "COLMAP model", fact)
 
 
-def _camera_model(path: Path, name: str) -> _CameraModel:
+def _parameter_count(path: Path, name: str) -> int:
     if name not in MODELS:
         raise FileFormatError(
             f"{path}: camera model {one_line(name)[:40]!r} is not one of {', '.join(MODELS)};"
             " `colmap image_undistorter` writes images and a model of pinhole cameras"
         )
-    return MODELS[name]
+    return MODELS[name].focals + 2 + MODELS[name].coefficients
 
 
 def _camera(path: Path, name: str, size: tuple[int, int], parameters: Sequence[float]) -> Camera:
@@ -272,7 +258,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for _ in range(reader.count(_CAMERA.size)):
         number, model, width, height = reader.unpack(_CAMERA)
         name = _NAMES.get(model, f"number {model}")
-        parameters = reader.unpack(struct.Struct(f"<{_camera_model(path, name).parameters}d"))
+        parameters = reader.unpack(struct.Struct(f"<{_parameter_count(path, name)}d"))
         yield number, _camera(path, name, (height, width), parameters)
 
 
@@ -306,8 +292,8 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for line, text in _lines(path):
         with _naming(path, line):
             number, name, width, height, *parameters = text.split()
-            if len(parameters) != (needed := _camera_model(path, name).parameters):
-                raise ValueError(f"a {name} camera has {needed} parameters")
+            if len(parameters) != _parameter_count(path, name):
+                raise ValueError(f"a {name} camera has other parameters")
             size = int(height), int(width)
             yield int(number), _camera(path, name, size, [float(word) for word in parameters])
 

@@ -1,12 +1,8 @@
-"""The pose of a scanner in its camera's coordinates, as a matrix, a quaternion or a ROS transform.
+"""The pose of a scanner in its camera's coordinates: a matrix, a quaternion or a ROS transform.
 
-x_camera = rotation · x_scanner + translation. A file holds one of
-
-    16 or 12 numbers              the matrix [R t], by rows
-    7 numbers                     tx ty tz qx qy qz qw, as ROS and TUM write them
-    translation: [x, y, z]        YAML or JSON; the quaternion is x, y, z, w. `ros2 topic echo
-    rotation: [x, y, z, w]        /tf_static` and fields x: y: z: w: are read too, with the camera
-                                  as frame_id and the scanner as child_frame_id
+x_camera = rotation · x_scanner + translation. A file holds 12 or 16 numbers, the matrix [R t] by
+rows; or 7 numbers, tx ty tz qx qy qz qw, as ROS and TUM write them; or what `ros2 topic echo
+/tf_static` prints, with the camera as frame_id and the scanner as child_frame_id.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import FileFormatError
-from pnpdepth_cli.io.file_bytes import check_text_size, one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import one_line, read_text
 from pnpdepth_cli.io.text_files import parse_yaml
 
 Floats = NDArray[np.float64]
@@ -37,11 +33,10 @@ def read_extrinsics(path: Path) -> Extrinsics:
     Raises:
         FileFormatError: The file holds no pose.
     """
-    check_text_size(path)
-    text = read_bytes(path).decode("utf-8", "replace")
+    text = read_text(path)
     numbers = numbers_in(re.sub(r"#.*", "", text))
     if numbers is None:
-        return _pose_of_fields(path, parse_yaml(path, text))
+        return _pose_of_transform(path, parse_yaml(path, text))
     if len(numbers) == 7:
         return pose_of_quaternion(path, numbers[:3], numbers[3:])
     if len(numbers) in (12, 16):
@@ -123,36 +118,17 @@ def rotation_of(wxyz: Floats) -> Floats:
     )
 
 
-def _pose_of_fields(path: Path, fields: object) -> Extrinsics:
-    """The pose in a mapping; tf nests it: transforms: - header, transform: translation, …."""
-    for _ in range(3):
-        if isinstance(fields, list) and fields:
-            fields = fields[0]
-        if not isinstance(fields, Mapping):
-            break
-        shift = next((fields[n] for n in ("translation", "t", "T") if n in fields), None)
-        turn = next((fields[n] for n in ("rotation", "quaternion", "R") if n in fields), None)
-        if shift is not None and turn is not None:
-            translation, numbers = (
-                _components(path, *pair) for pair in ((shift, "xyz"), (turn, "xyzw"))
-            )
-            if len(numbers) == 9 and len(translation) == 3:
-                rotation = np.reshape(numbers, (3, 3))
-                return check_pose(path, "rotation", rotation, np.array(translation))
-            return pose_of_quaternion(path, translation, numbers)
-        name = next((n for n in fields if str(n).startswith(("T_", "matrix"))), None)
-        if name is not None:
-            return pose_of_matrix(path, str(name), _components(path, fields[name], ""))
-        fields = fields.get("transforms", fields.get("transform"))
-    kinds = "a matrix, tx ty tz qx qy qz qw, or translation and rotation"
+def _pose_of_transform(path: Path, content: object) -> Extrinsics:
+    """The pose in a ROS transform, or in the first of several."""
+    match content:
+        case {"transforms": [inner, *_]} | {"transform": inner}:
+            return _pose_of_transform(path, inner)
+        case {
+            "translation": {"x": x, "y": y, "z": z},
+            "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
+        }:
+            numbers = numbers_in([x, y, z, qx, qy, qz, qw])
+            if numbers is not None and len(numbers) == 7:
+                return pose_of_quaternion(path, numbers[:3], numbers[3:])
+    kinds = "a matrix, tx ty tz qx qy qz qw, or a transform of ROS"
     raise FileFormatError(f"{path} holds no extrinsics; give {kinds}")
-
-
-def _components(path: Path, value: object, names: str) -> list[float]:
-    """The numbers of a list, or of the fields of these names."""
-    if isinstance(value, Mapping) and "data" not in value:
-        value = [value.get(name) for name in names]
-    numbers = numbers_in(value)
-    if numbers is None:
-        raise FileFormatError(f"{path}: {one_line(value)[:60]} is not made of numbers; correct it")
-    return numbers

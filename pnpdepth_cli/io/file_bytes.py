@@ -43,10 +43,14 @@ def numbered_lines(data: bytes) -> Iterator[tuple[int, str]]:
             yield number, text
 
 
-def check_text_size(path: Path) -> None:
-    """Raises FileFormatError if a calibration or the like is larger than any is."""
+def read_text(path: Path) -> str:
+    """Returns a calibration or the like. Raises FileFormatError if it is larger than any is."""
     size = size_of_regular_file(path)
     check_claim(f"{path} has {size:,} bytes", size, _LONGEST_TEXT, way_out="give another file")
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path} is not a text file; give another") from error
 
 
 def size_of_regular_file(path: Path) -> int:

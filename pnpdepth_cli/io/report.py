@@ -21,14 +21,8 @@ from markupsafe import Markup
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import InputError, OutputError
-from pnpdepth_cli.io.atomic import (
-    atomic_folder,
-    atomic_path,
-    cannot_write,
-    make_folder,
-    remove_leftovers,
-)
-from pnpdepth_cli.io.figure import LOGARITHMIC_FROM, DepthScale, hex_colours
+from pnpdepth_cli.io.atomic import atomic_folder, atomic_path, cannot_write
+from pnpdepth_cli.io.figure import LOGARITHMIC_FROM, DepthScale, hex_colours, signed_bar
 from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.measures import Measure
 
@@ -36,7 +30,6 @@ PAGE = "index.html"
 IMAGES = "images"
 VIEWER = "viewer.js"
 _MADE_OF = "report.json"
-_IMAGE = re.compile(r"[0-9a-f]{20}_[a-z_]+\.(?:png|js)")
 _INVISIBLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -44,25 +37,19 @@ _INVISIBLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u
 class Head:
     """What a page shows of all frames together."""
 
-    kind: str
     title: str
     facts: Sequence[tuple[str, str]] = ()
     notes: Sequence[str] = ()
     tables: Sequence[Any] = ()
     """Each has title, headings and texts, as `commands.tables.Table`."""
-    without_title: str = ""
     without: Sequence[tuple[str, str]] = ()
+    """Names of frames that were not refined, and why."""
     columns: Sequence[Measure] = ()
     """Measures of a frame's values; the main ones are in the list of frames."""
     signed: Sequence[str] = ()
     """Keys of the columns whose values below 0 are better and above 0 worse."""
     sort_by: str = ""
     """Key of the column that the page is sorted by at first."""
-    labels: Mapping[str, str]
-    """Titles of the views: `first` and `second` of the slider, `map`, and the others."""
-    thumb: str = "first"
-    """The view in the list of a frame that has no `image`."""
-    map_colours: Sequence[str] = ()
     unit: str = "m"
 
 
@@ -75,7 +62,7 @@ def check_report_folder(
         folder: The report's folder.
         inputs: Files and folders that are read.
         made_of: Sources of an earlier report in it, as given to `write_report`.
-        overwrite: Whether any other content may be replaced.
+        overwrite: Whether another report may be replaced.
     """
     there = next((path for path in (folder, *folder.parents) if path.exists()), folder)
     if there.is_file():
@@ -88,15 +75,15 @@ def check_report_folder(
         if read.is_relative_to(resolved):
             raise OutputError(f"{folder} holds {source}, which is read; name another folder")
     try:
-        # hidden files are of a writer that was killed
-        empty = not folder.exists() or all(path.name[0] == "." for path in folder.iterdir())
+        names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     except OSError as error:
         raise cannot_write(folder, error) from error
     before = None
     with suppress(InputError):
         before = read_json(folder / _MADE_OF)
-    if not (empty or overwrite or (before is not None and before == plain(made_of))):
-        raise OutputError(f"{folder} is not empty; add --overwrite, or name another folder")
+    known = before is not None and (overwrite or before == plain(made_of))
+    if names and not (known and names <= {PAGE, IMAGES, VIEWER, _MADE_OF}):
+        raise OutputError(f"{folder} is not empty; name another folder, or --overwrite a report")
 
 
 def image_key(name: str) -> str:
@@ -127,14 +114,11 @@ def write_report(
             report.js shows it. Its `key` is that of its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
     """
-    remove_leftovers(folder)  # of a writer that was killed
     with atomic_folder(folder) as temporary:
         images = temporary / IMAGES
-        make_folder(images, below=temporary)
+        images.mkdir()
         write_json(temporary / _MADE_OF, made_of)
         _write_page(temporary, head, frames(images), viewer=viewer)
-        used = {path.name for path in images.iterdir()}
-    _remove_unused(folder, used | ({VIEWER} if viewer else set()))
 
 
 def _write_page(
@@ -145,10 +129,8 @@ def _write_page(
         "columns": [measure.to_json() for measure in head.columns],
         "signed": head.signed,
         "sort_by": next((n for n, c in enumerate(head.columns) if c.key == head.sort_by), 0),
-        "labels": head.labels,
-        "thumb": head.thumb,
         "unit": head.unit,
-        "map_colours": head.map_colours,
+        "map_colours": hex_colours(signed_bar("gain", 9)),
         "depth_colours": hex_colours(DepthScale(low_m=1, high_m=2).paint(np.linspace(1, 2, 17))),
         "logarithmic_from": LOGARITHMIC_FROM,
     }
@@ -184,16 +166,6 @@ def save_view_3d(source: Path, target: Path) -> float:
 def _write_text(path: Path, text: str) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _remove_unused(folder: Path, used: set[str]) -> None:
-    """Removes images and views of a report that are not in use, and no other file."""
-    try:
-        for path in (folder / VIEWER, *(folder / IMAGES).iterdir()):
-            if path.name not in used and (path.name == VIEWER or _IMAGE.fullmatch(path.name)):
-                path.unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
 
 
 def _environment() -> jinja2.Environment:

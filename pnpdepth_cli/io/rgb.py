@@ -6,6 +6,7 @@ import functools
 import math
 import threading
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +36,8 @@ _PLAUSIBLE = (0.2, 50.0)
 _FRAMES_IN_MEMORY = 8
 """Frames of a video that are kept, as threads ask for them slightly out of order."""
 _VIDEO_LOCK = threading.Lock()
+
+Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,8 +82,7 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
             if kind == "TIFF":  # OpenCV applies the orientation of a TIFF, not that of a PNG
                 orientation = 1
         else:
-            # Only a JPEG's previews are further images that are not worth a note.
-            frames = 1 if kind == "JPEG" else getattr(image, "n_frames", 1)
+            frames = 1 if kind == "JPEG" else getattr(image, "n_frames", 1)  # a JPEG has previews
             note = f"first of {frames} images" if frames > 1 else None
             image.seek(0)
             pixels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
@@ -146,9 +148,7 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
         values = values.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):
         values = values[::-1]
-    if orientation in (2, 3, 6, 7):
-        values = values[:, ::-1]
-    return values
+    return values[:, ::-1] if orientation in (2, 3, 6, 7) else values
 
 
 def _from_linear_light(path: Path, data: bytes) -> RgbImage:
@@ -178,16 +178,16 @@ def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
         FileFormatError: It is damaged, beyond the budget, or holds no single image.
     """
     channels = read_exr_channels(path, data)
-    layers = [n[:-1] for n in channels if all(n[:-1] + letter in channels for letter in "RGB")]
-    layers = [""] if "" in layers else sorted(set(layers))
-    if len(layers) == 1:
-        return np.stack([channels[layers[0] + letter] for letter in "RGB"], axis=2)
+    reds = [name for name in channels if name.rpartition(".")[2] == "R"]
+    layer = reds[0][:-1] if len(reds) == 1 else ""
+    names = [layer + letter for letter in "RGB"]
     grey = [name for name in channels if name != "A"]
-    if not layers and len(grey) == 1:
-        return np.repeat(channels[grey[0]][:, :, None], 3, axis=2)
-    raise FileFormatError(
-        f"{path} has no single image in its channels ({', '.join(channels)}); export R, G and B"
-    )
+    if len(grey) == 1:
+        names = grey * 3
+    if not channels.keys() >= {*names}:
+        listing = ", ".join(channels)
+        raise FileFormatError(f"{path} has no one image in ({listing}); export R, G and B")
+    return np.stack([channels[name] for name in names], axis=2)
 
 
 def read_focal_length(path: Path, size: tuple[int, int]) -> tuple[float, str] | None:
@@ -223,51 +223,42 @@ def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
     size_of_regular_file(path)
     opened = path, path.stat().st_mtime_ns
     with _VIDEO_LOCK:
-        if index < _open_video(*opened).first:
+        frames, last = _open_video(*opened)
+        if last and index < last[0][0]:  # no longer in memory
             _open_video.cache_clear()
-        bgr = _open_video(*opened).frame(index)
+            frames, last = _open_video(*opened)
+        while (bgr := dict(last).get(index)) is None:
+            decoded = next(frames, None)
+            if decoded is None:
+                raise InputError(f"{path} has no frame {index:,}")
+            last.append(decoded)
     return np.divide(bgr[:, :, ::-1], np.float32(255), dtype=np.float32)
 
 
-class _Video:
-    """A video that is being decoded, and the last of its frames.
-
-    A frame is reached by decoding all before it: seeking is exact at a constant frame rate only,
-    which phones do not keep.
-    """
-
-    def __init__(self, path: Path) -> None:
-        import cv2
-
-        with path.open("rb") as file:
-            if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow the addresses in a playlist
-                raise FileFormatError(f"{path} is not an MP4 or MOV video; convert it")
-        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        if not self._capture.isOpened():
-            raise damaged(path, "video", "cannot be decoded")
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        sides = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-        width, height = (int(self._capture.get(side)) for side in sides)
-        check_pixel_count(path, width, height, channels=3)
-        self._path, self._done = path, 0
-        self._last = deque[NDArray[np.uint8]](maxlen=_FRAMES_IN_MEMORY)
-
-    @property
-    def first(self) -> int:
-        """Number of the first frame that can still be had."""
-        return self._done - len(self._last)
-
-    def frame(self, index: int) -> NDArray[np.uint8]:
-        """Returns a frame (H, W, 3), blue first."""
-        while self._done <= index:
-            found, pixels = self._capture.read()
-            if not found:
-                raise InputError(f"{self._path} has {self._done:,} frames, so no frame {index:,}")
-            self._last.append(np.asarray(pixels, np.uint8))
-            self._done += 1
-        return self._last[index - self._done]
-
-
 @functools.lru_cache(maxsize=1)
-def _open_video(path: Path, mtime_ns: int) -> _Video:
-    return _Video(path)
+def _open_video(
+    path: Path, mtime_ns: int
+) -> tuple[Iterator[tuple[int, Pixels]], deque[tuple[int, Pixels]]]:
+    """The frames of a video that are still to be decoded, and the last that were."""
+    return enumerate(_decode_video(path)), deque(maxlen=_FRAMES_IN_MEMORY)
+
+
+def _decode_video(path: Path) -> Iterator[Pixels]:
+    """Yields the frames (H, W, 3), blue first.
+
+    No frame is sought: that is exact at a constant rate only, which phones do not keep.
+    """
+    import cv2
+
+    with path.open("rb") as file:
+        if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow the addresses in a playlist
+            raise FileFormatError(f"{path} is not an MP4 or MOV video; convert it")
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise damaged(path, "video", "cannot be decoded")
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    sides = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+    width, height = (int(capture.get(side)) for side in sides)
+    check_pixel_count(path, width, height, channels=3)
+    while (read := capture.read())[0]:
+        yield np.asarray(read[1], np.uint8)

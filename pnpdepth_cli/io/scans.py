@@ -8,6 +8,7 @@ the file claims.
 from __future__ import annotations
 
 import io
+import itertools
 import shutil
 import struct
 from collections.abc import Callable, Iterable
@@ -27,17 +28,9 @@ from pnpdepth_cli.io.text_files import read_rows
 
 _FIELD_COUNTS = (3, 4, 5, 6, 7, 8)
 _BIN_SOURCES = {4: "KITTI scan", 5: "nuScenes scan"}
-"""x, y, z, reflectance; nuScenes adds the laser's index."""
-
-_SMALLEST = 1e-3
-"""Numbers near 0 are alike."""
-
-_AS_MUCH = 0.85
-"""Fraction of the variance that the best count explains: what its divisors do not reach."""
-
-_LEAST_EXPLAINED = 0.03
-"""Least explained fraction of the variance; numbers in any order have less."""
-
+_SMALLEST = 1e-3  # numbers near 0 are alike
+_AS_MUCH = 0.85  # of the variance that the best count explains; its divisors explain less
+_LEAST_EXPLAINED = 0.03  # of the variance; numbers in any order have less
 _PCD_TYPES = {k + n: k.lower() + n for k in "IUF" for n in "1248" if k + n not in ("F1", "F2")}
 """NumPy types by TYPE and SIZE of a PCD."""
 _PLY_KINDS = {
@@ -91,16 +84,11 @@ def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
         fact = f"{len(data):,} bytes are no multiple of {fields} float32 numbers a point"
         raise FileFormatError(f"{path}: {fact}; it is cut short, or points have other fields")
     points = np.frombuffer(data, "<f4").reshape(-1, fields)
-    source = _BIN_SOURCES.get(fields, f"scan of {fields} fields a point")
-    return np.ascontiguousarray(points[:, :3], np.float32), source
+    return _first_columns(points), _BIN_SOURCES.get(fields, f"scan of {fields} fields a point")
 
 
 def _fields_of_bin(path: Path, data: bytes) -> int:
-    """How many numbers a point has: those of one field are alike, those of two are not.
-
-    For each count, the fraction of the variance of the numbers that the field explains is taken
-    from the whole file. A multiple of the true count explains as much, so the least one counts.
-    """
+    """How many numbers a point has: those of one field are alike, those of two are not."""
     numbers = np.frombuffer(data, "<f4", len(data) // 4).astype(np.float64)
     numbers = np.where(np.isfinite(numbers), numbers, 0)
     # by sign, order of magnitude, and whether it is a whole number, such as the index of a laser
@@ -110,7 +98,7 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     zeros = np.convolve(numbers == 0, np.ones(max(_FIELD_COUNTS) + 1), "same")[: len(numbers)]
     counted = zeros <= max(_FIELD_COUNTS)
     explained = {count: _explained_variance(features, counted, count) for count in _FIELD_COUNTS}
-    most = max(explained.values())
+    most = max(explained.values())  # which multiples of the true count reach, too
     if most < _LEAST_EXPLAINED:
         fact = f"which of {', '.join(map(str, _FIELD_COUNTS))} numbers a point has"
         raise FileFormatError(f"{path} does not tell {fact}; save its x, y, z as NPY (N, 3)")
@@ -120,10 +108,7 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
 def _explained_variance(
     features: NDArray[np.float64], counted: NDArray[np.bool_], count: int
 ) -> float:
-    """Mean fraction of the variance of features (F, N) that N modulo `count` explains, 0…1.
-
-    Only numbers that are `counted`, (N,) bool, have a part in it.
-    """
+    """Mean fraction 0…1 of the variance of features (F, N) that N modulo `count` explains."""
     rows = features.shape[1] // count
     fields = features[:, : rows * count].reshape(len(features), rows, count)
     weight = counted[: rows * count].reshape(rows, count).astype(np.float64)
@@ -144,13 +129,9 @@ def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
         raise FileFormatError(f"{path} is not an NPY file; save it with numpy.save")
     array = parse_npy(path, data)
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind != "f":
-        shape = "×".join(str(n) for n in array.shape)
-        raise FileFormatError(
-            f"{path} holds {array.dtype} of shape {shape}; a scan is float, one point a row, with"
-            " x y z in the first columns"
-        )
-    with np.errstate(over="ignore"):
-        return np.ascontiguousarray(array[:, :3], np.float32), "NPY scan"
+        fact = f"holds {array.dtype} of shape {array.shape}"
+        raise FileFormatError(f"{path} {fact}; a scan is (N, 3 or more) floats, x y z first")
+    return _first_columns(array), "NPY scan"
 
 
 Column = tuple[str, str, int]
@@ -203,30 +184,23 @@ def _decompress_rows(path: Path, columns: list[Column], number: int, body: bytes
 
 
 def _lzf(packed: bytes) -> bytes | None:
-    """Decompresses LZF: literals, and copies of what is already there; None for other bytes.
-
-    A byte below 32 is followed by that many literals and one. Any other byte has the length of a
-    copy, less 2, in its first 3 bits (7: the next byte is added), and 13 bits of the distance back,
-    less 1, in the rest and the next byte.
-    """
-    out, at, end = bytearray(), 0, len(packed)
-    while at < end:
-        control = packed[at]
-        at += 1
+    """Decompresses LZF: literals, and copies of what is already there; None for other bytes."""
+    out, rest = bytearray(), iter(packed)
+    for control in rest:
+        # A byte below 32 is followed by that many literals and one.
         if control < 32:
-            out += packed[at : at + control + 1]
-            at += control + 1
+            out += bytes(itertools.islice(rest, control + 1))
             continue
-        length = control >> 5
-        if length == 7 and at < end:
-            length += packed[at]
-            at += 1
-        start = len(out) - ((control & 31) << 8) - (packed[at] if at < end else 0) - 1
-        at += 1
+        # Another has the length of a copy, less 2, in 3 bits (7: the next byte is added), and 13
+        # bits of the distance back, less 1, in the rest and the next byte.
+        length = (control >> 5) + 2
+        if length == 9:
+            length += next(rest, 0)
+        start = len(out) - ((control & 31) << 8) - next(rest, 0) - 1
         if start < 0:
             return None
-        copied = out[start : start + length + 2]  # shorter where a copy repeats itself
-        out += (copied * (length + 2))[: length + 2]
+        copied = out[start : start + length]  # shorter where a copy repeats itself
+        out += (copied * length)[:length]
     return bytes(out)
 
 
@@ -291,8 +265,7 @@ def _xyz(
             raise damaged(path, kind, fact)
         rows = np.frombuffer(body, layout, count=number)
         values = [rows[f"f{index}"] for index in wanted]
-    with np.errstate(over="ignore"):
-        return np.column_stack(values).astype(np.float32)
+    return _first_columns(np.column_stack(values))
 
 
 def _table(path: Path, kind: str, number: int, body: bytes, width: int) -> NDArray[np.float64]:
@@ -319,9 +292,12 @@ def _whole(path: Path, text: str) -> int:
 
 def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:
     """The first numbers of lines of text."""
-    rows, _ = read_rows(path, data)
+    return _first_columns(read_rows(path, data)[0]), "text scan"
+
+
+def _first_columns(rows: NDArray[np.generic]) -> Points:
     with np.errstate(over="ignore"):
-        return np.ascontiguousarray(rows[:, :3], np.float32), "text scan"
+        return np.ascontiguousarray(rows[:, :3], np.float32)
 
 
 _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
@@ -340,7 +316,7 @@ _PROPERTIES = {
 }
 """NumPy type and properties of what a PLY has of each point."""
 
-Part = tuple[Points, "Points | None", "NDArray[np.uint8] | None"]
+Part = tuple[Points, Points | None, NDArray[np.uint8] | None]
 """(N, 3) points; (N, 3) unit normals, 0 where unknown, or None; (N, 3) colours 0…255, or None."""
 
 

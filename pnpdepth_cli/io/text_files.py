@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import json
 import math
 import re
@@ -28,7 +27,6 @@ _OPENCV_HEADER = re.compile(r"\A\s*%YAML:1\.\d\s*$", re.MULTILINE)
 PIXELS = ["x", "y", "depth"]
 _HEADERS = (PIXELS, ["x", "y", "z"])
 _SEPARATOR = re.compile(r"[\s,;]+")
-_STARTS_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def write_json(path: Path, mapping: Mapping[str, object]) -> None:
@@ -155,24 +153,5 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
 
 
 def write_csv(file: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Writes RFC 4180 with lines that end in \\n, each text as `text_cell`, None as nothing."""
-    writer = csv.writer(file, lineterminator="\n")
-    for row in itertools.chain([header], rows):
-        writer.writerow([text_cell(each) if isinstance(each, str) else each for each in row])
-
-
-def text_cell(text: str) -> str:
-    """Returns the text so that no spreadsheet takes it for a formula: with a "'" before a "=".
-
-    The same holds for "+", "-", "@", tab and carriage return, unless the text is a number; frame
-    names and file names are other people's.
-    """
-    return f"'{text}" if text.startswith(_STARTS_FORMULA) and not _is_number(text) else text
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return text[0] in "+-"
+    """Writes RFC 4180 with lines that end in \\n, None as nothing."""
+    csv.writer(file, lineterminator="\n").writerows([header, *rows])

@@ -75,12 +75,8 @@ POSES = {
     "matrix of 16": "0 -1 0 0.1\n0 0 -1 -0.2\n1 0 0 -0.3\n0 0 0 1\n",
     "matrix of 12": "[[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3]]  # by rows",
     "quaternion": "0.1 -0.2 -0.3 0.5 -0.5 0.5 0.5",
-    "two lists": "translation: [0.1, -0.2, -0.3]\nrotation: [0.5, -0.5, 0.5, 0.5]\n",
-    "json": '{"translation": [0.1, -0.2, -0.3], "quaternion": [0.5, -0.5, 0.5, 0.5]}',
     "tf": "transforms:\n- transform:\n    translation: {x: 0.1, y: -0.2, z: -0.3}\n"
     "    rotation: {x: 0.5, y: -0.5, z: 0.5, w: 0.5}\n",
-    "named matrix": "T_cam_lidar: [[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3]]",
-    "R and t": "R: [0, -1, 0, 0, 0, -1, 1, 0, 0]\nt: [0.1, -0.2, -0.3]\n",
 }
 
 ODD = [
@@ -325,6 +321,7 @@ def test_extrinsics_are_read_in_each_form(form: str, tmp_path: Path) -> None:
         "0 0 0 1 1 1 1",
         "1e9 0 0 0 0 0 1",
         "hello: 3",
+        "translation: {x: 1, y: 2, z: 3}\nrotation: {x: 0, y: 0, z: 0, w: one}",
     ],
 )
 def test_what_is_no_pose_is_one_line(text: str, tmp_path: Path) -> None:

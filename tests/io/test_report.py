@@ -18,15 +18,13 @@ from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.report import (
     Head,
     check_report_folder,
-    image_key,
     link_image,
     visible,
     write_report,
 )
 from tests.commands.report_pages import page_data
 
-LABELS = {"first": "Before", "second": "After", "map": "Change"}
-HEAD = Head(kind="Test", title="a report", labels=LABELS)
+HEAD = Head(title="a report")
 NAMES = [
     "</script><script>alert(1)</script>",
     "<!-- \"'&amp; -->",
@@ -46,7 +44,7 @@ def written(folder: Path, head: Head, frames: Iterable[dict[str, Any]]) -> None:
 
 
 def test_names_are_data_whatever_they_say(tmp_path: Path) -> None:
-    head = Head(kind="Test", title=NAMES[0], without=[(n, n) for n in NAMES], labels=LABELS)
+    head = Head(title=NAMES[0], without=[(n, n) for n in NAMES])
     written(tmp_path, head, (frame(name) for name in NAMES))
     data, text = page_data(tmp_path), (tmp_path / "index.html").read_text()
     assert data["title"] == NAMES[0]
@@ -58,7 +56,7 @@ def test_names_are_data_whatever_they_say(tmp_path: Path) -> None:
 @given(st.text(st.characters(codec=None)))
 def test_text_ends_no_element_and_opens_none(text: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        head = Head(kind=text, title="t", facts=[("a", text)], notes=[text], labels={"map": text})
+        head = Head(title=text, facts=[("a", text)], notes=[text])
         written(Path(folder), head, [frame(text)])
         page = (Path(folder) / "index.html").read_bytes()
     ends = (f"</{each}>".encode() for each in ("script", "li", "dt", "dd", "h1", "td"))
@@ -79,19 +77,13 @@ def test_the_page_names_no_address_and_lets_nothing_run_but_itself(tmp_path: Pat
         assert f"{element}-src 'sha256-{digest}'" in policy
 
 
-def test_images_of_the_report_before_are_removed_and_nothing_else(tmp_path: Path) -> None:
-    written(tmp_path, HEAD, [])
-    kept, stale, images = image_key("a"), image_key("b"), tmp_path / "images"
-    for name in (f"{kept}_map.png", f"{stale}_map.png", "mine.png", f"{stale}.txt"):
-        (images / name).write_bytes(b"x")
-
-    def frames(images: Path) -> list[dict[str, Any]]:
-        (images / f"{kept}_map.png").write_bytes(b"y")
-        return []
-
-    write_report(tmp_path, {}, HEAD, frames)
-    left = {path.name: path.read_bytes() for path in images.iterdir()}
-    assert left == {f"{kept}_map.png": b"y", "mine.png": b"x", f"{stale}.txt": b"x"}
+def test_a_report_replaces_the_one_before_with_its_images(tmp_path: Path) -> None:
+    written(tmp_path / "r", HEAD, [])
+    (tmp_path / "r/images/stale_map.png").write_bytes(b"x")
+    written(tmp_path / "r", HEAD, [frame("new")])
+    assert [each["name"] for each in page_data(tmp_path / "r")["frames"]] == ["new"]
+    assert not any((tmp_path / "r/images").iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]
 
 
 def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:

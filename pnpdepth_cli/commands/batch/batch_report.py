@@ -22,7 +22,6 @@ from pnpdepth_cli.commands.error_tables import (
 )
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import OutputError
-from pnpdepth_cli.io.figure import hex_colours, signed_bar
 from pnpdepth_cli.io.report import (
     IMAGES,
     Head,
@@ -202,19 +201,14 @@ def _head(
     # The columns and tables.
     columns = _columns(basis, unit)
     return Head(
-        kind="Batch refinement",
         title=summary.output,
         facts=_facts(summary, results),
         notes=notes,
         tables=means_tables(summary.errors, unit, summary.columns),
-        without_title=f"Not refined: {len(failed):,}",
         without=failed,
         columns=columns,
         signed=[measure.key for measure in columns if measure.key.endswith(_CHANGE)],
         sort_by="rmse_after" if basis == USED else columns[0].key,
-        labels=_LABELS,
-        thumb="second",
-        map_colours=hex_colours(signed_bar("gain", 9)),
         unit=unit,
     )
 

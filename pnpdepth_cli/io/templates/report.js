@@ -7,6 +7,8 @@ const columns = data.columns.map((measure) => ({
   ...measure, unit: measure.shown_unit || measure.unit, factor: measure.shown_factor,
   higher_is_better: measure.better === "higher", signed: data.signed.includes(measure.key),
 }));
+const LABELS = { first: "Before", second: "After", map: "Change of error", image: "Image",
+  sparse: "Sparse depth", gt: "Ground truth" };
 const NAME = -1; // the "column" of the names
 const PAGE = 1000; // rows that are made at once
 const BINS = 24;
@@ -208,7 +210,7 @@ function makeRow(index) {
   const frame = frames[index];
   const name = visible(frame.name);
   const thumbs = make("span", { class: "thumbs" });
-  for (const view of frame.key ? ["image" in frame.views ? "image" : data.thumb, "map"] : []) {
+  for (const view of frame.key ? ["image" in frame.views ? "image" : "second", "map"] : []) {
     thumbs.append(picture(frame, view, { loading: "lazy", decoding: "async", alt: "" }, 4 / 3));
   }
   const button = make("button", { type: "button", class: "open", text: name,
@@ -313,7 +315,7 @@ function viewsOf(frame) {
 
 function bigPicture(frame, view) {
   return picture(frame, view, { draggable: "false",
-    alt: `${data.labels[view]} of ${visible(frame.name)}` });
+    alt: `${LABELS[view]} of ${visible(frame.name)}` });
 }
 
 function legend(colours, low, high, remark) {
@@ -325,7 +327,7 @@ function legend(colours, low, high, remark) {
 }
 
 function slider(frame) {
-  const { first, second } = data.labels;
+  const { first, second } = LABELS;
   const over = make("div", { class: "over" }, bigPicture(frame, "first"));
   const handle = make("div", { class: "handle", "aria-hidden": "true" });
   const range = make("input", { type: "range", min: "0", max: "100", value: "50", step: "1",
@@ -351,13 +353,13 @@ function mapView(frame) {
   const { ends, unknown, footer } = frame.map;
   const remark = footer + (unknown ? `; dark: ${unknown}` : "");
   return make("figure", {}, make("div", { class: "stage" }, bigPicture(frame, "map"),
-    make("span", { class: "label left", text: data.labels.map, "aria-hidden": "true" })),
+    make("span", { class: "label left", text: LABELS.map, "aria-hidden": "true" })),
   make("figcaption", {}, ...legend(data.map_colours, ends[0], ends[1], remark)));
 }
 
 function plainView(frame, view) {
   return make("figure", {}, make("div", { class: "stage" }, bigPicture(frame, view),
-    make("span", { class: "label left", text: data.labels[view], "aria-hidden": "true" })));
+    make("span", { class: "label left", text: LABELS[view], "aria-hidden": "true" })));
 }
 
 // ---- the 3D view, whose scripts are loaded when it is first opened ----
@@ -403,7 +405,7 @@ async function loadSpace(frame, figure, stage) {
 
 function fillSpace(frame, figure, stage, content) {
   const canvas = pnpdepthViewer.show(content);
-  const names = { before: data.labels.first, after: data.labels.second, gt: data.labels.gt };
+  const names = { before: LABELS.first, after: LABELS.second, gt: LABELS.gt };
   const count = make("span", { class: "count", role: "status" });
   const choose = (name) => {
     const label = `${names[name]} in 3D, ${visible(frame.name)}`;
