@@ -7,7 +7,6 @@ import os
 import re
 import secrets
 import shutil
-import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -32,8 +31,14 @@ def atomic_path(path: Path) -> Iterator[Path]:
     The yielded path is an empty file in the same folder with the same suffix. A link is not
     followed: it is replaced itself. OSErrors become OutputErrors.
     """
-    _check_target(path)
-    temporary = _empty_file_beside(path)
+    # The name does not contain the target's, so a name of the longest length still works.
+    temporary = path.with_name(f".{secrets.token_hex(6)}{path.suffix}")
+    try:
+        if path.exists() and not path.is_file():  # nobody wants /dev/stdout replaced
+            raise OutputError(f"{path} is no regular file; give the name of a file to write")
+        temporary.touch(exist_ok=False)
+    except OSError as error:
+        raise cannot_write(path, error) from error
     try:
         yield temporary
         temporary.replace(path)
@@ -118,29 +123,6 @@ def cannot_write(path: Path, error: OSError) -> OutputError:
     kind = OutputError if error.errno in _OF_THE_NAME else StorageError
     room = "make room, or " if error.errno in _FULL else ""
     return kind(f"{path} cannot be written ({reason}); {room}choose another output folder")
-
-
-def _check_target(target: Path) -> None:
-    try:
-        mode = target.stat().st_mode  # behind a link: nobody wants /dev/stdout replaced
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise cannot_write(target, error) from error
-    if stat.S_ISDIR(mode):
-        raise OutputError(f"{target} is a folder; give the name of a file to write")
-    if not stat.S_ISREG(mode):
-        raise OutputError(f"{target} is not a regular file; choose another output file")
-
-
-def _empty_file_beside(target: Path) -> Path:
-    # The name does not contain the target's, so a name of the longest length still works.
-    temporary = target.with_name(f".{secrets.token_hex(6)}{target.suffix}")
-    try:
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-    except OSError as error:
-        raise cannot_write(target, error) from error
-    return temporary
 
 
 @contextmanager

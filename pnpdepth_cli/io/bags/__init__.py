@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from pnpdepth_cli.budget import budget
-from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes, size_of_regular_file
 from pnpdepth_cli.io.text_files import parse_yaml
 
@@ -89,12 +89,10 @@ def open_bag(path: Path) -> Iterator[Bag]:
         from rosbags.rosbag2 import Reader as Reader2
     except ImportError:
         raise UsageError(f"reading {path} needs rosbags: pip install 'pnpdepth[ros]'") from None
-    if not path.exists():
-        raise InputError(f"{path}: no such file; check the path")
     ros1 = path.suffix.lower() == ".bag"
     bound_decompression()
     with _as_our_errors(path):
-        check_bag(path)
+        _check_bag(path)
         reader: Any = Reader1(path) if ros1 else Reader2(path)
         reader.open()
     try:
@@ -132,23 +130,18 @@ def choose_topic(bag: Bag, wanted: Sequence[str], topics: Mapping[str, int], wha
     names = [n for n in wanted if n in topics] or [n for n in topics if n not in copies]
     if len(names) != 1:
         listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
-        number = "several topics" if names else "no topic"
-        raise UsageError(
-            f"{bag.path} has {number} of {what}; choose with --topic of `pnpdepth frames`:"
-            f" {listing or 'none'}"
-        )
+        fact = f"{bag.path} has {len(names)} topics of {what}, not one"
+        raise UsageError(f"{fact}; choose with --topic of `pnpdepth frames`: {listing or 'none'}")
     return names[0]
 
 
 def check_topics(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> None:
     """Raises UsageError for a topic that is not there, or not of these message types."""
     topics = bag.topics(kinds)
-    for name in wanted:
-        if name not in topics:
-            raise UsageError(
-                f"{bag.path} has no topic {name} of images, points or poses; there are"
-                f" {', '.join(topics) or 'none'}"
-            )
+    if other := [name for name in wanted if name not in topics]:
+        listing = ", ".join(topics) or "none"
+        fact = f"{bag.path} has no topic {other[0]} of images, points or poses"
+        raise UsageError(f"{fact}; there are {listing}")
 
 
 @contextmanager
@@ -189,7 +182,7 @@ _COMPUTED = """
 """Views, triggers, virtual tables, and tables with generated columns."""
 
 
-def check_bag(path: Path) -> None:
+def _check_bag(path: Path) -> None:
     """Raises FileFormatError if a bag is compressed as a whole, or its database computes values."""
     files = [path]
     if path.is_dir():
@@ -202,14 +195,16 @@ def check_bag(path: Path) -> None:
 
 
 def _check_metadata(path: Path) -> None:
-    content = parse_yaml(path, read_bytes(path).decode("utf-8", "replace"))
-    fields = content.get("rosbag2_bagfile_information") if isinstance(content, Mapping) else None
-    if not isinstance(fields, Mapping):
-        raise FileFormatError(f"{path} is not the metadata of a bag; repair it: ros2 bag reindex")
-    mode = str(fields.get("compression_mode") or "none").lower()
-    if mode != "none":
-        fact = f"has the compression_mode {one_line(mode)[:20]!r}"
-        raise FileFormatError(f"{path} {fact}; `ros2 bag convert` it to MCAP")
+    match parse_yaml(path, read_bytes(path).decode("utf-8", "replace")):
+        case {"rosbag2_bagfile_information": {"compression_mode": mode}}:
+            if str(mode).lower() not in ("", "none"):
+                raise FileFormatError(
+                    f"{path}: the bag is compressed; `ros2 bag convert` it to MCAP"
+                )
+        case {"rosbag2_bagfile_information": {}}:
+            pass
+        case _:
+            raise FileFormatError(f"{path} is no metadata of a bag; repair it: ros2 bag reindex")
 
 
 def _check_database(path: Path) -> None:
