@@ -53,8 +53,8 @@ def write_bag(
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.
-    With `poses`, base moves 0.3 m along x from one image to the next: "odometry" or "tf", or the
-    camera does: "pose". `compression` is rosbags' of the chunks. `view` replaces image, scan and
+    With `poses`, base moves 0.3 m along x from one image to the next: "odometry", or the camera
+    does: "pose". `compression` is rosbags' of the chunks. `view` replaces image, scan and
     camera_info. `clock_s` is added to the stamps of the scans. With `depth`, an encoding such as
     "16UC1" or "32FC1; compressedDepth", `depth_m` is there instead of scans.
     """
@@ -145,11 +145,12 @@ def _link(make: Make, header: Any, child: str, shift: Sequence[float], xyzw: Any
 def _moved(make: Make, header: Any, x: float, kind: str) -> tuple[str, int, Any]:
     """The pose of base, or for "pose" of the camera, at x metres."""
     time_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
-    link = _link(make, header, "base", (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    if kind == "tf":
-        return "/tf", time_ns, make("tf2_msgs/TFMessage", transforms=[link])
     point = make("geometry_msgs/Point", x=x, y=0.0, z=0.0)
-    pose = make("geometry_msgs/Pose", position=point, orientation=link.transform.rotation)
+    pose = make(
+        "geometry_msgs/Pose",
+        position=point,
+        orientation=make("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+    )
     if kind == "pose":
         return "/vio/pose", time_ns, make("geometry_msgs/PoseStamped", header=header, pose=pose)
     still, unknown = make("geometry_msgs/Vector3", x=0.0, y=0.0, z=0.0), np.zeros(36)

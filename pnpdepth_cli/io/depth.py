@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,7 +117,7 @@ def depth_from_stored(
     return DepthFile(values=known_metres(metres), reading=reading)
 
 
-def known_metres(values: NDArray[Any]) -> NDArray[np.float32]:
+def known_metres(values: NDArray[np.generic]) -> NDArray[np.float32]:
     """Returns float32 of the same shape with 0 for everything but a finite depth above 0."""
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         metres = np.array(values, dtype=np.float32, order="C")
@@ -126,7 +125,7 @@ def known_metres(values: NDArray[Any]) -> NDArray[np.float32]:
     return metres
 
 
-def _as_image(path: Path, values: NDArray[Any]) -> NDArray[Any]:
+def _as_image(path: Path, values: NDArray[np.generic]) -> NDArray[np.generic]:
     """The array (H, W) of one channel, also of a batch of one as networks give it."""
     image = values[0] if values.ndim == 4 and len(values) == 1 else values
     if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]):
@@ -151,10 +150,10 @@ def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_
         raise OutputError(f"{path}: the suffix for depth is one of {', '.join(DEPTH_SUFFIXES)}")
     if depth.ndim != 2 or 0 in depth.shape:
         raise SizeError(f"{path}: depth of shape {depth.shape} is no image; give (H, W)")
-    values: NDArray[Any] = known_metres(depth)
+    values: NDArray[np.generic] = known_metres(depth)
     text = dict[str, str]()
     if depth_format.integer:
-        values = _codes(path, values, scale)
+        values = _codes(path, known_metres(depth), scale)
         text[SCALE_KEY] = repr(float(scale)).removesuffix(".0")
     with atomic_path(path) as temporary:
         depth_format.write(temporary, values, text)
@@ -174,7 +173,7 @@ def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.
 
 
 def describe_range(
-    depth: NDArray[Any],
+    depth: NDArray[np.generic],
     reading: Reading,
     *,
     noun: str = "points",

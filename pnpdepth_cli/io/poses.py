@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,7 +80,7 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
     content = read_json(path)
     try:
         entries = [(each["file_path"], each["transform_matrix"]) for each in content["frames"]]
-        listed: dict[str, list[tuple[str, Any]]] = {}
+        listed: dict[str, list[tuple[str, object]]] = {}
         for file, matrix in entries:
             whole = PurePosixPath(file).with_suffix("").as_posix()
             listed.setdefault(whole.rpartition("/")[2], []).append((f"/{whole}", matrix))

@@ -91,7 +91,7 @@ def _finite(text: str) -> float:
     return number
 
 
-def parse_yaml(path: Path, text: str) -> Any:
+def parse_yaml(path: Path, text: str) -> object:
     """Returns the content of a YAML or JSON text, of several documents the first.
 
     Values are texts, also those of numbers. Tags are ignored, so that OpenCV's matrices are
@@ -112,7 +112,7 @@ def parse_yaml(path: Path, text: str) -> Any:
     class Loader(yaml.BaseLoader):  # type: ignore[misc]
         """BaseLoader without aliases, which can make a small file large."""
 
-        def compose_node(self, parent: Any, index: Any) -> Any:
+        def compose_node(self, parent: object, index: object) -> object:
             if self.check_event(yaml.AliasEvent):
                 raise yaml.YAMLError("it has an alias (*name), which is not allowed here")
             return super().compose_node(parent, index)

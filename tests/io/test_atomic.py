@@ -82,9 +82,7 @@ def test_a_folder_in_the_output_is_no_link_but_the_output_itself_may_be(tmp_path
     assert not (tmp_path / "c").exists()
 
 
-@pytest.mark.parametrize(
-    "name", ["missing/out.png", "file.txt/out.png", "folder", "/proc/out.png", "/dev/null"]
-)
+@pytest.mark.parametrize("name", ["missing/out.png", "file.txt/out.png", "folder", "/dev/null"])
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / "file.txt").write_text("x")
     (tmp_path / "folder").mkdir()
@@ -94,7 +92,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> N
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".exr", ".npy", ".pfm", ".tiff"])
+@pytest.mark.parametrize("suffix", [".png", ".exr", ".npy"])
 def test_a_full_disk_is_an_output_error_that_names_the_file(tmp_path: Path, suffix: str) -> None:
     target = tmp_path / f"depth{suffix}"
     depth = np.random.default_rng(0).uniform(1, 9, (40, 50)).astype(np.float32)
@@ -133,32 +131,18 @@ def test_a_folder_left_by_a_killed_writer_is_removed(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [".mine"]
 
 
-@pytest.mark.parametrize(
-    ("held", "refused", "allowed"),
-    [
-        ([None], [None, (1, 2)], []),
-        ([(1, 3), (3, 3)], [(1, 3), (3, 3), None], [(2, 3)]),
-    ],
-)
-def test_shards_run_together_but_not_twice_nor_beside_a_whole_run(
-    tmp_path: Path, held: list, refused: list, allowed: list
-) -> None:
-    def hold(shards: list) -> None:
-        if shards:
-            with lock_folder(tmp_path, shards[0]):
-                hold(shards[1:])
-        else:
-            for shard in refused:
+def test_shards_run_together_but_not_twice_nor_beside_a_whole_run(tmp_path: Path) -> None:
+    for _ in range(2):  # the second time they are free again
+        with lock_folder(tmp_path):
+            for shard in (None, (1, 2)):
                 with pytest.raises(OutputError), lock_folder(tmp_path, shard):
                     pass
-            for shard in allowed:
-                with lock_folder(tmp_path, shard):
+        with lock_folder(tmp_path, (1, 3)), lock_folder(tmp_path, (3, 3)):
+            for shard in (None, (1, 3), (3, 3)):
+                with pytest.raises(OutputError), lock_folder(tmp_path, shard):
                     pass
-            raise ZeroDivisionError  # after which they are free again
-
-    for _ in range(2):
-        with pytest.raises(ZeroDivisionError):
-            hold(held)
+            with lock_folder(tmp_path, (2, 3)):
+                pass
     with pytest.raises(StorageError), lock_folder(tmp_path / "no"):
         pass
 

@@ -67,19 +67,13 @@ def test_a_count_that_lies_allocates_nothing(part: str, offset: int, tmp_path: P
         read_model(tmp_path)
 
 
-def test_the_camera_models_have_the_numbers_of_pycolmap() -> None:
-    pycolmap = pytest.importorskip("pycolmap")
-    theirs = {name: int(each) for name, each in pycolmap.CameraModelId.__members__.items()}
-    assert {name: model.number for name, model in MODELS.items()}.items() <= theirs.items()
-
-
 @pytest.mark.parametrize("name", CAMERAS)
 def test_points_project_as_in_pycolmap_for_every_camera_model(name: str, tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     write_text_model(tmp_path, camera=name)
     ours = read_model(tmp_path).images["a.png"].camera
     theirs = pycolmap.Reconstruction(str(tmp_path)).cameras[1]
-    assert theirs.model.name == name
+    assert (theirs.model.name, int(theirs.model)) == (name, MODELS[name].number)
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)]) * 3
     expected = theirs.img_from_cam(points) - 0.5  # pixel centres are at .5 in COLMAP
@@ -118,14 +112,12 @@ IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"
     [
         ("cameras", "1 EQUIRECTANGULAR 64 32 64 32\n"),
         ("cameras", "5 PINHOLE 64 48 50 52 32 24\n"),
-        ("cameras", "# x\n1 PINHOLE 64\n"),
         ("cameras", "1 PINHOLE 64 48\n"),
         ("cameras", "\n\n1 PINHOLE 64 48 1 2 3 x\n"),
         ("images", f"{IMAGE}5 5 -1\n\n{IMAGE}"),
         ("images", f"{IMAGE}5 5\n"),
         ("images", "1 1 0 0 0 0 0 0 1\n\n"),
         ("points3D", "# x\n7 1 2 3 9 8 7 0.5 1\n"),
-        ("points3D", "7 1 2 3 9 8 7\n"),
     ],
 )
 def test_a_faulty_line_of_a_text_model_is_named(part: str, text: str, tmp_path: Path) -> None:

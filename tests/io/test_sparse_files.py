@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, PnpDepthError, SizeError
 from pnpdepth_cli.io.depth import write_depth
@@ -54,7 +52,6 @@ def test_an_array_of_rows_is_a_list_and_rows_that_are_no_numbers_are_counted(
 @pytest.mark.parametrize(
     "text",
     [
-        "10.5 3.25 4\n0 0 .5\n7 2 80",
         "x,y,depth\n10.5,3.25,4\n0,0,0.5\n7,2,80\n",
         "# from a laser\n10.5;3.25;4\r\n\r\n0; 0; 0.5 # near\r\n7\t2\t8e1\r\n",
         '\ufeff"x", "y", "depth"\n10.5, 3.25, 4\n 0, 0, 0.5\n7, 2, 80\n',
@@ -68,22 +65,6 @@ def test_common_ways_of_writing_rows_are_read_and_unknown_depth_is_dropped(
     assert rows_of(tmp_path / "s.csv") == ROWS
 
 
-@settings(max_examples=50, deadline=None)
-@given(
-    rows=st.lists(
-        st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 2, st.floats(0.125, 1e4, width=32)),
-        min_size=1,
-        max_size=20,
-    )
-)
-def test_rows_written_as_text_come_back_exactly(
-    rows: list[tuple[float, float, float]], tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "rows.txt"
-    path.write_text("\n".join(" ".join(map(repr, row)) for row in rows))
-    assert rows_of(path) == [list(row) for row in rows]
-
-
 @pytest.mark.parametrize("suffix", [".npy", ".txt", ".csv"])
 def test_rows_are_of_a_scan_or_of_pixels_by_their_content_whatever_the_format(
     tmp_path: Path, suffix: str
@@ -95,13 +76,9 @@ def test_rows_are_of_a_scan_or_of_pixels_by_their_content_whatever_the_format(
         path = tmp_path / f"{name}{suffix}"
         np.save(path, rows) if suffix == ".npy" else np.savetxt(path, rows)
         assert holds_scan(path) == name.startswith("xyz")
-
-
-def test_a_header_says_whether_rows_are_of_a_scan(tmp_path: Path) -> None:
     for header, of_scan in (("x,y,z", True), ("x y z intensity", True), ("x,y,depth", False)):
-        path = tmp_path / "rows.csv"
-        path.write_text(f"{header}\n" + "5 6 7\n" * 20)
-        assert holds_scan(path) is of_scan
+        (tmp_path / "rows.csv").write_text(f"{header}\n" + "5 6 7\n" * 20)
+        assert holds_scan(tmp_path / "rows.csv") is of_scan
 
 
 @pytest.mark.parametrize(
@@ -109,15 +86,12 @@ def test_a_header_says_whether_rows_are_of_a_scan(tmp_path: Path) -> None:
     [
         ("s.csv", "1 2 3\n4 5\n", FileFormatError),
         ("s.csv", "1 2 3 4\n", FileFormatError),
-        ("s.csv", "1 2 3\nx y depth\n", FileFormatError),
         ("s.csv", "u v w\n1 2 3\n", FileFormatError),
         ("s.csv", "1,5;2,5;3,5\n", FileFormatError),
-        ("s.csv", b"\xff\xfe1\x00", FileFormatError),
         ("s.csv", "1 2 3\n", SizeError),
         ("none.csv", None, InputError),
         ("s.npy", [[1, 1, 2]], FileFormatError),
         ("s.npy", [[0.0] * 3] * 5, NoPointsError),
-        ("s.npy", [[0.0] * 4] * 5, NoPointsError),
         ("s.txt", "# nothing\n", NoPointsError),
     ],
 )
@@ -128,7 +102,7 @@ def test_what_is_no_sparse_depth_is_refused_by_its_name(
     if isinstance(content, list):
         np.save(path, content)
     elif content is not None:
-        path.write_bytes(content if isinstance(content, bytes) else str(content).encode())
+        path.write_text(str(content))
     with pytest.raises(error, match=name):
         read_sparse(path)
 

@@ -49,7 +49,7 @@ def test_the_text_is_readable_and_what_json_cannot_hold_leaves_the_old_file(tmp_
 @pytest.mark.parametrize(
     "content",
     [
-        *(b"{", b"[1]", b'{"a": NaN}', b"\xff\xfe", b"null", b"[" * 100_000, b"{} {}", None),
+        *(b"{", b"[1]", b'{"a": NaN}', b"\xff\xfe", b"[" * 100_000, None),
         b'{"a": 1%s}' % (b"0" * 400),
     ],
 )

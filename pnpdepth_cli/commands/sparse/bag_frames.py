@@ -32,7 +32,6 @@ from pnpdepth_cli.io.bags import (
     IMAGES,
     ODOMETRY,
     POSES,
-    TRANSFORMS,
     Bag,
     check_topics,
     open_bag,
@@ -86,7 +85,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
     _check_output(request)
     with open_bag(request.bag) as bag:
         # The topics, and what their clocks differ by.
-        check_topics(bag, request.topics, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES, *TRANSFORMS))
+        check_topics(bag, request.topics, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES))
         sensors = sensors_of(bag, request.topics, say)
         say(f"topics: images of {sensors.images}, points of {sensors.points}")
         _clear(request)

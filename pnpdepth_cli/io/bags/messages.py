@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -50,13 +50,6 @@ _CHANNELS |= {name: 1 for name in _TO_BGR if name.startswith("bayer_")}
 
 _STATIC = "/tf_static"
 """End of the name of the topic of fixed transforms."""
-
-_STILL = 1e-9
-"""Largest change of a number of a transform that does not move."""
-
-Links = dict[str, dict[str, Extrinsics]]
-"""Pose of the second frame in the first."""
-Floats = NDArray[np.float64]
 
 
 def image_file(message: Message, topic: str) -> tuple[str, bytes]:
@@ -265,13 +258,29 @@ def frame_of(message: Message) -> str:
 
 def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
     """Returns the scanner's pose in the camera's coordinates, by /tf_static; None without one."""
-    return _chain(_static_links(bag), camera, scanner)
+    # The transforms, each in both directions.
+    links: dict[str, dict[str, Extrinsics]] = {}
+    topics = [name for name in bag.topics(TRANSFORMS) if name.endswith(_STATIC)]
+    for _, _, message in bag.messages(topics):
+        for each in message.transforms:
+            parent, child = frame_of(each), str(each.child_frame_id).lstrip("/")
+            pose = _pose_in(bag, each.transform.translation, each.transform.rotation)
+            links.setdefault(parent, {})[child] = pose
+            links.setdefault(child, {})[parent] = pose.inverse()
+    # The shortest chain of them.
+    poses, waiting = {camera: SAME_PLACE}, deque([camera])
+    while waiting and scanner not in poses:
+        frame = waiting.popleft()
+        for other, pose in links.get(frame, {}).items():
+            if other not in poses:
+                poses[other] = poses[frame] @ pose
+                waiting.append(other)
+    return poses.get(scanner)
 
 
 def poses_topics(bag: Bag, wanted: Sequence[str]) -> tuple[str, ...]:
-    """Returns the named topics of poses, else those of odometry, poses, or moving transforms."""
-    moving = tuple(sorted(set(bag.topics(TRANSFORMS)) - set(_static_topics(bag))))
-    kinds = tuple(bag.topics(ODOMETRY)), tuple(bag.topics(POSES)), moving
+    """Returns the named topics of poses, else those of odometry, else of poses."""
+    kinds = tuple(bag.topics(ODOMETRY)), tuple(bag.topics(POSES))
     named = tuple(name for name in wanted if any(name in names for names in kinds))
     return named or next((names for names in kinds if names), ())
 
@@ -280,92 +289,20 @@ def camera_trajectory(bag: Bag, topic: str, camera: str) -> Trajectory | None:
     """Returns the poses of the camera; None if nothing ties it to what the topic moves.
 
     An odometry message names the frame_id that it moves, and /tf_static gives the camera in it. A
-    pose message names none, so its pose is the camera's own. Of transforms, the first above the
-    camera that changes is taken. It is that of odometry, without later corrections of the map.
+    pose message names none, so its pose is the camera's own.
     """
-    if topic in bag.topics(TRANSFORMS):
-        return _of_transforms(bag, topic, camera)
     times, poses, body = [], [], camera
     for _, logged_ns, message in bag.messages([topic]):
         body = str(getattr(message, "child_frame_id", "")).lstrip("/") or camera
         pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
         times.append(seconds_of(message, logged_ns))
         poses.append(_pose_in(bag, pose.position, pose.orientation).square())
-    return _of_camera(times, poses, _chain(_static_links(bag), body, camera))
-
-
-def _of_transforms(bag: Bag, topic: str, camera: str) -> Trajectory | None:
-    series: dict[tuple[str, str], tuple[list[float], list[Floats]]] = {}
-    for link, time_s, pose in _transforms(bag, [topic]):
-        times, poses = series.setdefault(link, ([], []))
-        times.append(time_s)
-        poses.append(pose.square())
-    links, moving = _static_links(bag), []
-    for link, (_, poses) in series.items():
-        if np.ptp(np.stack(poses), axis=0).max() > _STILL:
-            moving.append(link)
-        else:  # ROS 1 repeats fixed transforms
-            _add_link(links, link, Extrinsics(poses[0][:3, :3], poses[0][:3, 3]))
-    above = [
-        link
-        for link in moving
-        if _chain(links, link[1], camera) is not None and _chain(links, link[0], camera) is None
-    ]
-    if len(above) != 1:
-        return None
-    return _of_camera(*series[above[0]], _chain(links, above[0][1], camera))
-
-
-def _of_camera(
-    times: list[float], poses: list[Floats], in_body: Extrinsics | None
-) -> Trajectory | None:
+    in_body = static_pose(bag, body, camera)
     if not poses or in_body is None:
         return None
     return trajectory_of(np.array(times), (np.stack(poses) @ in_body.square())[:, :3])
 
 
-def _static_topics(bag: Bag) -> list[str]:
-    return [name for name in bag.topics(TRANSFORMS) if name.endswith(_STATIC)]
-
-
-def _static_links(bag: Bag) -> Links:
-    """The transforms of /tf_static, each in both directions."""
-    links: Links = {}
-    for link, _, pose in _transforms(bag, _static_topics(bag)):
-        _add_link(links, link, pose)
-    return links
-
-
-def _transforms(
-    bag: Bag, topics: Sequence[str]
-) -> Iterator[tuple[tuple[str, str], float, Extrinsics]]:
-    """Yields (parent, child), seconds and the pose of the child in the parent."""
-    for _, logged_ns, message in bag.messages(topics):
-        for each in message.transforms:
-            link = frame_of(each), str(each.child_frame_id).lstrip("/")
-            pose = _pose_in(bag, each.transform.translation, each.transform.rotation)
-            yield link, seconds_of(each, logged_ns), pose
-
-
-def _pose_in(bag: Bag, shift: Any, turn: Any) -> Extrinsics:
+def _pose_in(bag: Bag, shift: Message, turn: Message) -> Extrinsics:
     xyzw = [turn.x, turn.y, turn.z, turn.w]
     return pose_of_quaternion(bag.path, [shift.x, shift.y, shift.z], xyzw)
-
-
-def _add_link(links: Links, link: tuple[str, str], pose: Extrinsics) -> None:
-    parent, child = link
-    links.setdefault(parent, {})[child] = pose
-    links.setdefault(child, {})[parent] = pose.inverse()
-
-
-def _chain(links: Links, start: str, end: str) -> Extrinsics | None:
-    """The pose x_start = pose · x_end along the shortest chain of links; None if none."""
-    poses = {start: SAME_PLACE}
-    waiting = deque([start])
-    while waiting and end not in poses:
-        frame = waiting.popleft()
-        for other, pose in links.get(frame, {}).items():
-            if other not in poses:
-                poses[other] = poses[frame] @ pose
-                waiting.append(other)
-    return poses.get(end)

@@ -22,8 +22,7 @@ from pnpdepth_cli.commands.sparse.bag_frames import RECORD, write_frames
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import FileFormatError, OutputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.bags import open_bag
-from pnpdepth_cli.io.bags.messages import Stamped, camera_trajectory, nearest_pairs
+from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.poses import read_poses
@@ -233,17 +232,14 @@ FORWARD = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("poses", "topic"), [("odometry", "/odom"), ("tf", "/tf")])
-def test_the_camera_moves_as_the_body_that_it_is_fixed_to(
-    kind: str, poses: str, topic: str, tmp_path: Path
-) -> None:
-    messages = written(write_bag(tmp_path / kind, poses=poses), tmp_path / "frames")
-    assert messages[-1] == f"poses: of {topic}"
+def test_the_camera_moves_as_the_body_that_it_is_fixed_to(kind: str, tmp_path: Path) -> None:
+    messages = written(write_bag(tmp_path / kind, poses="odometry"), tmp_path / "frames")
+    assert messages[-1] == "poses: of /odom"
     rows = read_poses(tmp_path / "frames/poses.txt")
     assert rows.shape == (3, 3, 4)
     np.testing.assert_allclose(rows[:, :, :3], [FORWARD] * 3, atol=1e-9)
     np.testing.assert_allclose(rows[:, :, 3], [[1, 0, 0], [1.3, 0, 0], [1.6, 0, 0]], atol=1e-5)
-    assert read_json(tmp_path / "frames/frames.json")["poses"] == topic
+    assert read_json(tmp_path / "frames/frames.json")["poses"] == "/odom"
 
 
 def test_a_pose_message_is_the_cameras_own(tmp_path: Path) -> None:
@@ -283,14 +279,6 @@ def test_a_topic_without_poses_is_refused_with_those_that_there_are(tmp_path: Pa
     bag = write_bag(tmp_path / "drive.mcap", poses="odometry")
     with pytest.raises(UsageError, match=r"no topic /gps of .*/odom"):
         written(bag, tmp_path / "frames", topics=("/gps",))
-
-
-def test_a_fixed_transform_that_is_repeated_is_no_motion(tmp_path: Path) -> None:
-    with open_bag(write_bag(tmp_path / "drive.mcap", poses="tf")) as bag:
-        trajectory = camera_trajectory(bag, "/tf", "camera")
-        assert trajectory is not None
-        assert len(trajectory.times_s) == 4
-        assert camera_trajectory(bag, "/tf_static", "camera") is None
 
 
 def test_a_batch_of_a_bag_accumulates_with_its_poses(tmp_path: Path) -> None:
