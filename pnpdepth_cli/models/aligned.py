@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from torch import Tensor
 
@@ -36,7 +35,7 @@ class AlignedDepth:
         self.alignment: Alignment | None = None
         self.notes: tuple[str, ...] = ()
 
-    def __call__(self, output: Any) -> Tensor:
+    def __call__(self, output: object) -> Tensor:
         """Returns depth in metres, (1, 1, h, w), from the network's output; NaN where unknown."""
         if self._kind == "none":
             depth = self._network.depth_of(output)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -105,7 +105,7 @@ def wanted_field(size: tuple[int, int], point_count: int) -> float:
 
 
 def suggest_layers(
-    module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[Any], Tensor]
+    module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[object], Tensor]
 ) -> tuple[str, ...]:
     """Returns the bottleneck and, behind it, the last layer of each finer resolution.
 
@@ -178,13 +178,13 @@ def _last_of_each_resolution(areas: Mapping[str, int]) -> list[str]:
 
 
 def _observe(
-    module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[Any], Tensor]
+    module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[object], Tensor]
 ) -> tuple[Tensor, Maps]:
     """One pass: the prediction, and the maps that gradients reach of submodules that ran once."""
     maps: Maps = {}
     ran: Counter[str] = Counter()
 
-    def keep(name: str, output: Any) -> None:
+    def keep(name: str, output: object) -> None:
         ran[name] += 1
         if isinstance(output, Tensor) and output.ndim == 4 and output.requires_grad:
             maps[name] = output

@@ -118,7 +118,7 @@ def hf_definition(folder: Path) -> ModelDefinition:
         CheckpointError: Its weights are missing, or are pickles.
     """
     # The type of network, which must be known.
-    config = _read(folder / "config.json", dict[str, Any])
+    config = _read(folder / "config.json", dict[str, object])
     kind = config.get("model_type")
     if not isinstance(kind, str) or kind not in _FAMILIES:
         raise ModelError(
@@ -158,9 +158,9 @@ def hf_definition(folder: Path) -> ModelDefinition:
     )
 
 
-def _check_settings(config: Mapping[str, Any], file: Path) -> None:
+def _check_settings(config: Mapping[str, object], file: Path) -> None:
     """ModelError for a huge number, or an attention that transformers may fetch and run."""
-    pending: list[Any] = [config]
+    pending: list[object] = [config]
     while pending:
         value = pending.pop()
         if isinstance(value, int | float) and not abs(value) <= _LARGEST_NUMBER:

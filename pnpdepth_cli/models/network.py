@@ -6,7 +6,6 @@ import math
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -136,14 +135,14 @@ class Network:
             note = self.definition.verify(self.module, arguments)
         return (str(note),) if note else ()
 
-    def depth_of(self, output: Any) -> Tensor:
+    def depth_of(self, output: object) -> Tensor:
         """Returns depth (1, 1, h, w) of what a module returns whose output needs no alignment."""
         tensor = self.raw_of(output)
         if self.definition.output_kind == "inverse":
             return tensor.clamp_min(1 / FARTHEST_DEPTH).reciprocal()
         return tensor.exp() if self.definition.output_kind == "log" else tensor
 
-    def raw_of(self, output: Any) -> Tensor:
+    def raw_of(self, output: object) -> Tensor:
         """Returns the prediction (1, 1, h, w) in float32, in the network's own numbers.
 
         NaN where it is not finite, as networks say of the sky. No gradient comes from there.
@@ -187,7 +186,7 @@ class Network:
         _read_nan_gradients_as_zero(tensor)
         return torch.where(known, tensor, torch.nan)
 
-    def known_of(self, output: Any) -> Tensor:
+    def known_of(self, output: object) -> Tensor:
         """Returns `raw_of` the output, 0 where it is not finite."""
         return self.raw_of(output).nan_to_num()
 

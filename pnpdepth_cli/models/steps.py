@@ -46,8 +46,8 @@ class Step:
     """
 
     run: Callable[..., Any]
-    arguments: Sequence[Any]
-    keywords: Mapping[str, Any] = field(default_factory=dict)
+    arguments: Sequence[object]
+    keywords: Mapping[str, object] = field(default_factory=dict)
     outputs: str | Sequence[str | None]
     name: str = ""  # for messages
     last_read: frozenset[str] = frozenset()
@@ -84,7 +84,7 @@ class Steps:
         self._kind, self._stored = kind, stored
         self._allowed: set[tuple[torch.Size, ...]] = set()
 
-    def run(self, values: dict[str, Any], sizes: tuple[torch.Size, ...]) -> None:
+    def run(self, values: dict[str, object], sizes: tuple[torch.Size, ...]) -> None:
         """Adds the results to the values, which begin with inputs of these sizes and weights.
 
         Raises:
@@ -105,7 +105,7 @@ class Steps:
                     )
         self._allowed.add(sizes)
 
-    def _run(self, values: dict[str, Any]) -> Iterator[Step]:
+    def _run(self, values: dict[str, object]) -> Iterator[Step]:
         """Adds the results; yields each step before what ends there is removed."""
         for step in self._steps:
             keywords = {name: _resolve(value, values) for name, value in step.keywords.items()}
@@ -119,15 +119,16 @@ class Steps:
                 values.pop(name, None)
 
 
-def _resolve(argument: Any, values: Mapping[str, Any]) -> Any:
+def _resolve(argument: object, values: Mapping[str, object]) -> Any:
     """The argument, or the list, with the values that it names."""
     if isinstance(argument, Value):
         return values[argument.name]
-    is_list = isinstance(argument, list | tuple)
-    return [_resolve(one, values) for one in argument] if is_list else argument
+    if isinstance(argument, list | tuple):
+        return [_resolve(one, values) for one in argument]
+    return argument
 
 
-def _elements(values: dict[str, Any]) -> int:
+def _elements(values: dict[str, object]) -> int:
     return sum(value.numel() for value in values.values() if isinstance(value, Tensor))
 
 
@@ -178,5 +179,5 @@ def _shaped_result(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         return None
 
 
-def _tensors_in(value: Any) -> list[Tensor]:
+def _tensors_in(value: object) -> list[Tensor]:
     return [leaf for leaf in tree_leaves(value) if isinstance(leaf, Tensor)]

@@ -42,11 +42,11 @@ _STRIDED = 7
 class ExportedOperation(nn.Module):
     """One operation of the exported graph."""
 
-    def __init__(self, operation: Callable[..., Any]) -> None:
+    def __init__(self, operation: Callable[..., object]) -> None:
         super().__init__()
         self._operation = operation
 
-    def forward(self, *args: Any, **kwargs: Any) -> Any:
+    def forward(self, *args: object, **kwargs: object) -> object:
         """Returns the operation's result."""
         try:
             return self._operation(*args, **kwargs)
@@ -83,9 +83,9 @@ class ExportedGraph(nn.Module):
         steps = list(self._steps_of(module["graph"]))
         self._steps = Steps(steps, self._outputs, kind="operation")
 
-    def forward(self, *inputs: Tensor) -> Any:
+    def forward(self, *inputs: Tensor) -> object:
         """Returns the output, or a tuple of several."""
-        values: dict[str, Any] = dict(zip(self.inputs, inputs, strict=True))
+        values: dict[str, object] = dict(zip(self.inputs, inputs, strict=True))
         values |= {name: getattr(self, attribute) for name, attribute in self.held.items()}
         self._steps.run(values, tuple(each.shape for each in inputs))
         outputs = tuple(values[name] for name in self._outputs)
@@ -177,7 +177,7 @@ def _tensor(content: bytearray, meta: Mapping[str, Any]) -> Tensor:
     return view_of(flat, meta["storage_offset"]["as_int"], shape, stride)
 
 
-def _function(target: str) -> Callable[..., Any]:
+def _function(target: str) -> Callable[..., object]:
     """The operator of this name, and nothing else."""
     found = _OPERATOR.fullmatch(target)
     if found is not None and not _TOUCHES_FILES.search(found[2]):

@@ -24,7 +24,7 @@ HOST_INPUTS: dict[str, tuple[int, ...]] = {}
 """Indices of an operator's inputs that are read as Python numbers; they stay on the CPU."""
 
 
-ONLY: dict[str, Any] = {
+ONLY: dict[str, int | str] = {
     "antialias": 0,
     "batch_dims": 0,
     "detect_negative": 1,

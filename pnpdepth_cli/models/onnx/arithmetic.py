@@ -20,9 +20,10 @@ from pnpdepth_cli.models.onnx import (
     stated,
 )
 
-_UNARY = (
+_SAME_NAME = (
     *("Relu", "Sigmoid", "Tanh", "Erf", "Exp", "Log", "Sqrt", "Reciprocal", "Abs", "Neg", "Floor"),
     *("Ceil", "Round", "Sign", "Sin", "Cos", "IsNaN", "IsInf", "Softplus", "HardSwish", "Mish"),
+    *("Add", "Sub", "Mul", "Greater", "Less", "MatMul", "Where"),
 )
 """Named as in torch, but for capitals."""
 
@@ -31,42 +32,27 @@ def _divide(a: Tensor, b: Tensor) -> Tensor:
     return a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")
 
 
-_BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Equal": torch.eq, "Greater": torch.gt,
-    "Less": torch.lt, "GreaterOrEqual": torch.ge, "LessOrEqual": torch.le,
-    "And": torch.logical_and, "Or": torch.logical_or, "Div": _divide,
+_PLAIN: dict[str, Callable[..., Tensor]] = {
+    **{n: getattr(torch, n.lower(), None) or getattr(F, n.lower()) for n in _SAME_NAME},
+    "Equal": torch.eq, "GreaterOrEqual": torch.ge, "LessOrEqual": torch.le, "Div": _divide,
+    "And": torch.logical_and, "Or": torch.logical_or, "Not": torch.logical_not,
+    "Identity": torch.clone, "Dropout": lambda x, *_: x.clone(),
     "Pow": lambda base, exponent: torch.pow(base, exponent).to(base.dtype),
+    "Max": lambda *each: functools.reduce(torch.maximum, each),
+    "Min": lambda *each: functools.reduce(torch.minimum, each),
+    "Sum": lambda *each: functools.reduce(torch.add, each),
 }  # fmt: skip
-
-_FOLDED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "Max": torch.maximum,
-    "Min": torch.minimum,
-    "Sum": torch.add,
-}
+"""Functions of the inputs alone."""
 
 
-def _unary(name: str) -> Operator:
-    function = getattr(torch, name.lower(), None) or getattr(F, name.lower())
-    return lambda _, inputs: function(inputs[0])
+def _plain(function: Callable[..., Tensor]) -> Operator:
+    return lambda _, inputs: function(*inputs)
 
 
-def _binary(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
-    return lambda _, i: function(i[0], i[1])
-
-
-def _fold(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
-    return lambda _, inputs: functools.reduce(function, inputs)
-
-
-register({name: _unary(name) for name in _UNARY})
-register({name: _binary(function) for name, function in _BINARY.items()})
-register({name: _fold(function) for name, function in _FOLDED.items()})
+register({name: _plain(function) for name, function in _PLAIN.items()})
 register(
     {
-        **dict.fromkeys(("Identity", "Dropout"), lambda _, i: i[0].clone()),
-        "Not": lambda _, i: torch.logical_not(i[0]),
         "Mod": lambda node, i: (torch.fmod if node.get("fmod", 0) else torch.remainder)(i[0], i[1]),
-        "Where": lambda _, i: torch.where(i[0], i[1], i[2]),
         "LeakyRelu": lambda node, i: F.leaky_relu(i[0], node.get("alpha", 0.01)),
         "Elu": lambda node, i: F.elu(i[0], node.get("alpha", 1.0)),
         "Einsum": lambda node, i: torch.einsum(node.get("equation"), *i),
@@ -74,7 +60,6 @@ register(
             torch.mul(i[0], node.get("alpha", 0.2)), node.get("beta", 0.5)
         ).clamp(0, 1),
         "Gelu": lambda node, i: F.gelu(i[0], approximate=node.get("approximate", "none")),
-        "MatMul": lambda _, i: torch.matmul(i[0], i[1]),
     }
 )
 

@@ -127,16 +127,6 @@ def depth_to_space(node: Node, inputs: Inputs) -> Tensor:
     return x.reshape(n, c // b**2, h * b, w * b)
 
 
-@operator("SpaceToDepth")
-def space_to_depth(node: Node, inputs: Inputs) -> Tensor:
-    x, b = inputs[0], node.get("blocksize")
-    if node.get("mode", "DCR") == "CRD":
-        return F.pixel_unshuffle(x, b)
-    n, c, h, w = x.shape
-    x = x.reshape(n, c, h // b, b, w // b, b).permute(0, 3, 5, 1, 2, 4)
-    return x.reshape(n, c * b * b, h // b, w // b)
-
-
 @operator("Cast")
 def cast(node: Node, inputs: Inputs) -> Tensor:
     kind = node.get("to")

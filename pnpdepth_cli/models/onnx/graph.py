@@ -10,7 +10,7 @@ import functools
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -27,6 +27,9 @@ from pnpdepth_cli.models.onnx import (  # noqa: F401  (each file registers its o
     layers,
 )
 from pnpdepth_cli.models.steps import SizeLimit, Step, Steps, Unsupported, Value
+
+if TYPE_CHECKING:
+    from onnx import AttributeProto, ModelProto, NodeProto, TensorProto
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
@@ -95,15 +98,14 @@ class OnnxGraph(nn.Module):
     Everything is computed in float32; weights in half precision are widened.
 
     Args:
-        model: The onnx.ModelProto with one output, without functions of its own, its nodes in
-            order.
+        model: The onnx.ModelProto with one output, its nodes in order.
         path: File of the model, for messages.
 
     Raises:
         ModelError: An operator is not covered; the message names every one.
     """
 
-    def __init__(self, model: Any, path: Path) -> None:
+    def __init__(self, model: ModelProto, path: Path) -> None:
         super().__init__()
         graph = model.graph
         _check_operators(graph.node, path)
@@ -122,7 +124,11 @@ class OnnxGraph(nn.Module):
             raise ModelError(f"ONNX file {path}: its output depends on no input")
 
     def _steps_of(
-        self, nodes: Iterable[tuple[str, Any]], opset: int, constants: dict[str, Tensor], path: Path
+        self,
+        nodes: Iterable[tuple[str, NodeProto]],
+        opset: int,
+        constants: dict[str, Tensor],
+        path: Path,
     ) -> list[Step]:
         shapes, given = set[str](), {*self.input_names}
         steps = []
@@ -163,10 +169,12 @@ class OnnxGraph(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Returns the output."""
-        values: dict[str, Tensor] = dict(zip(self.input_names, inputs, strict=True))
+        values: dict[str, object] = dict(zip(self.input_names, inputs, strict=True))
         self._device = inputs[0].device
         self._steps.run(values, tuple(one.shape for one in inputs))
-        return values[self.output_name]
+        output = values[self.output_name]
+        assert isinstance(output, Tensor)
+        return output
 
     def _run(self, module: OnnxNode, on_shapes: bool, *inputs: Tensor) -> Sequence[Tensor]:
         """The node's outputs. Arithmetic on shapes stays on the CPU."""
@@ -196,7 +204,7 @@ def _fold(
     return dict(zip(outputs, result if isinstance(result, tuple) else (result,), strict=False))
 
 
-def _check_operators(nodes: Sequence[Any], path: Path) -> None:
+def _check_operators(nodes: Sequence[NodeProto], path: Path) -> None:
     unknown: Counter[str] = Counter()
     for proto in nodes:
         standard = proto.domain in _STANDARD
@@ -219,7 +227,7 @@ def _check_covered(node: Node) -> None:
             raise Unsupported(f"{name} {node.get(name)!r}")
 
 
-def _names(nodes: Iterable[Any]) -> list[str]:
+def _names(nodes: Iterable[NodeProto]) -> list[str]:
     """Unique names of the nodes for --layer; a node without a name has operator and output."""
     names: list[str] = []
     taken: Counter[str] = Counter()
@@ -235,7 +243,7 @@ def _names(nodes: Iterable[Any]) -> list[str]:
     return names
 
 
-def _attribute(proto: Any, path: Path) -> Any:
+def _attribute(proto: AttributeProto, path: Path) -> Any:
     from onnx import AttributeProto, helper
 
     if proto.type == AttributeProto.TENSOR:
@@ -246,7 +254,7 @@ def _attribute(proto: Any, path: Path) -> Any:
     return list(value) if proto.type in (AttributeProto.INTS, AttributeProto.FLOATS) else value
 
 
-def _tensor(proto: Any, path: Path) -> Tensor:
+def _tensor(proto: TensorProto, path: Path) -> Tensor:
     from onnx import numpy_helper
 
     try:

@@ -217,14 +217,12 @@ def _by_torch(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> 
 
 def _along(x: Tensor, axis: int, index: Tensor, weight: Tensor) -> Tensor:
     """Σ_k weight (n, k) · x taken at index (n, k) along the axis."""
-    index, shape = index.to(x.device), [1] * x.ndim
+    shape = [1] * x.ndim
     shape[axis] = -1
-    taken = [x.index_select(axis, index[:, k]) for k in range(index.shape[1])]
-    if len(taken) == 1:
-        return taken[0]
-    weight = weight.to(x)
-    parts = [t * weight[:, k].reshape(shape) for k, t in enumerate(taken)]
-    return torch.stack(parts).sum(dim=0) if len(parts) > 2 else parts[0] + parts[1]
+    columns = zip(index.to(x.device).unbind(1), weight.to(x).unbind(1), strict=True)
+    return torch.stack([x.index_select(axis, i) * w.reshape(shape) for i, w in columns]).sum(
+        0, dtype=x.dtype
+    )
 
 
 def _taps(node: Node, size: int, out: int, factor: float) -> tuple[Tensor, Tensor]:

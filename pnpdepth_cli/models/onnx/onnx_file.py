@@ -6,12 +6,11 @@ pnpdepth[onnx]`.
 
 from __future__ import annotations
 
-import functools
 import graphlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -27,10 +26,11 @@ from pnpdepth_cli.models.definition import (
 )
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
 
+if TYPE_CHECKING:
+    from onnx import ModelProto, NodeProto, ValueInfoProto
+
 _OPSETS = range(7, 25)  # onnxruntime runs none that is older
 _MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
-_MAX_WRITTEN_OUT = 1 << 28  # bytes
-_NODE_BYTES = 1 << 12  # that a node takes in memory at least; depth networks have up to 10,000
 _SHARED = 2  # tensors that may have the same bytes of a file beside the model
 
 MISMATCH = 1e-3
@@ -51,7 +51,7 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
     Raises:
         ModelError: The file cannot be read, or the network cannot be run.
     """
-    model = _inlined(_read(file), file)
+    model = _read(file)
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
     is_part = _prune(model, _choose_output(model, output, file), file)
@@ -67,7 +67,7 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
     )  # fmt: skip
 
 
-def _read(file: Path) -> Any:
+def _read(file: Path) -> ModelProto:
     """The onnx.ModelProto with its weights, of an opset that is covered."""
     # The file, and the packages that read it.
     if not file.is_file():
@@ -91,14 +91,15 @@ def _read(file: Path) -> Any:
     # A graph whose names are text, of an opset that is covered.
     if not model.graph.node:
         raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
-    for node in (*model.graph.node, *(node for f in model.functions for node in f.node)):
+    if model.functions:
+        raise ModelError(
+            f"ONNX file {file} has functions of its own; onnx.inliner.inline_local_functions writes"
+            " them out"
+        )
+    for node in model.graph.node:
         words = (node.name, node.op_type, node.domain, *node.input, *node.output)
         if not all(isinstance(word, str) for word in words):
             raise ModelError(f"ONNX file {file} cannot be read: its names are not text in UTF-8")
-        if any(attribute.graphs or attribute.HasField("g") for attribute in node.attribute):
-            raise ModelError(
-                f"ONNX file {file}: {node.op_type}, with a graph of its own, is not covered"
-            )
     if _opset(model) not in _OPSETS:
         raise ModelError(
             f"ONNX file {file} is of opset {_opset(model)}; export it with one from"
@@ -107,7 +108,7 @@ def _read(file: Path) -> Any:
     return model
 
 
-def _load_external(model: Any, folder: Path) -> None:
+def _load_external(model: ModelProto, folder: Path) -> None:
     """Reads the tensors that lie in files beside the model into it.
 
     ValueError if they claim more than these files have, or more than memory holds.
@@ -128,41 +129,16 @@ def _load_external(model: Any, folder: Path) -> None:
     external.load_external_data_for_model(model, str(folder))
 
 
-def _inlined(model: Any, file: Path) -> Any:
-    """The model without functions of its own, which may call each other and become endless."""
-    if not model.functions:
-        return model
-    functions = {(f.domain, f.name, f.overload): f for f in model.functions}
-
-    @functools.cache
-    def size_of_function(key: tuple[str, str, str]) -> int:
-        return int(functions[key].ByteSize()) + size(functions[key])
-
-    def size(graph: Any) -> int:
-        calls = [(n.domain, n.op_type, n.overload) for n in graph.node]
-        return sum(size_of_function(call) if call in functions else _NODE_BYTES for call in calls)
-
-    try:
-        claimed = size(model.graph)
-    except RecursionError:
-        raise ModelError(f"ONNX file {file}: its functions call each other without end") from None
-    claim = f"ONNX file {file}: its functions, written out, are {claimed:,} bytes"
-    check_claim(claim, claimed, _MAX_WRITTEN_OUT, error=ModelError)
-    from onnx import inliner
-
-    return inliner.inline_local_functions(model)
-
-
-def _opset(model: Any) -> int:
+def _opset(model: ModelProto) -> int:
     return max((o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), default=1)
 
 
-def _shape(value: Any) -> list[int | str]:
+def _shape(value: ValueInfoProto) -> list[int | str]:
     dims = value.type.tensor_type.shape.dim
     return [d.dim_value if d.dim_value > 0 else d.dim_param or "?" for d in dims]
 
 
-def _choose_output(model: Any, wanted: str | None, file: Path) -> str:
+def _choose_output(model: ModelProto, wanted: str | None, file: Path) -> str:
     outputs: dict[str, str] = {o.name: "×".join(map(str, _shape(o))) for o in model.graph.output}
     if wanted is None and len(outputs) == 1:
         return next(iter(outputs))
@@ -176,7 +152,7 @@ def _choose_output(model: Any, wanted: str | None, file: Path) -> str:
     )
 
 
-def _prune(model: Any, output: str, file: Path) -> bool:
+def _prune(model: ModelProto, output: str, file: Path) -> bool:
     """Leaves in the model one output and the nodes that it needs. True if others were there."""
     graph, needed, nodes = model.graph, {output}, []
     for node in reversed(_in_order(graph.node, file)):
@@ -193,7 +169,7 @@ def _prune(model: Any, output: str, file: Path) -> bool:
     return is_part
 
 
-def _in_order(nodes: Sequence[Any], file: Path) -> list[Any]:
+def _in_order(nodes: Sequence[NodeProto], file: Path) -> list[NodeProto]:
     """The nodes, each after those it reads; files converted to half precision are not in order."""
     producer = {name: n for n, node in enumerate(nodes) for name in node.output if name}
     reads = {n: {producer[i] for i in nodes[n].input if i in producer} for n in range(len(nodes))}
@@ -210,7 +186,7 @@ def _as_map(output: Tensor) -> Tensor:
     return output.permute(0, 3, 1, 2) if last else output
 
 
-def _patch_size(model: Any) -> int | None:
+def _patch_size(model: ModelProto) -> int | None:
     """The patch size of a vision transformer: a convolution that steps by its own kernel."""
     for node in model.graph.node:
         if node.op_type == "Conv":

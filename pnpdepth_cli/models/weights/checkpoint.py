@@ -110,7 +110,7 @@ def _read_folder(folder: Path, notes: list[str]) -> dict[str, Tensor]:
     return state
 
 
-def _state_in(content: Any, path: Path, key: str, notes: list[str]) -> dict[str, Tensor]:
+def _state_in(content: object, path: Path, key: str, notes: list[str]) -> dict[str, Tensor]:
     """The state dict in what a torch file holds: the one that the key names, or a usual one."""
     if not isinstance(content, Mapping):
         kind = _short(content.path) if isinstance(content, StandIn) else type(content).__name__
@@ -137,7 +137,7 @@ def _state_in(content: Any, path: Path, key: str, notes: list[str]) -> dict[str,
     raise CheckpointError(f"checkpoint {path} has {fact}; it holds {held}{way_out * bool(states)}")
 
 
-def _only_tensors(mapping: Mapping[Any, Any]) -> bool:
+def _only_tensors(mapping: Mapping[Any, object]) -> bool:
     return all(isinstance(k, str) and isinstance(v, Tensor) for k, v in mapping.items())
 
 
@@ -152,7 +152,7 @@ def _short(word: str) -> str:
 
 
 def _without_prefixes(
-    state: dict[str, Tensor], path: Path, notes: list[str], own: Mapping[str, Any] | None = None
+    state: dict[str, Tensor], path: Path, notes: list[str], own: Mapping[str, object] | None = None
 ) -> dict[str, Tensor]:
     """The tensors without prefixes of wrappers that a network's own names lack."""
     own, stripped = own or {}, list[str]()
@@ -167,7 +167,7 @@ def _without_prefixes(
     return state
 
 
-def _prefix(state: Mapping[str, Any]) -> str | None:
+def _prefix(state: Mapping[str, object]) -> str | None:
     """The one of `_PREFIXES` that all names have."""
     return next((p for p in _PREFIXES if state and all(n.startswith(p) for n in state)), None)
 

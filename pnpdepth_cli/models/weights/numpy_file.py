@@ -52,16 +52,16 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
     return tensors
 
 
-def _state_of_array(value: Any) -> tuple[Any, ...]:
+def _state_of_array(value: object) -> tuple[Any, ...]:
     """(version, shape, type, order, data) of a pickled numpy array; nothing for anything else."""
-    is_array = isinstance(value, StandIn) and value.path in _RECONSTRUCT
-    state = value.state if is_array else None
+    found = value if isinstance(value, StandIn) and value.path in _RECONSTRUCT else None
+    state = found.state if found else None
     return state if isinstance(state, tuple) and len(state) == 5 else (None,) * 5
 
 
 def _entries(
-    content: Mapping[Any, Any], prefix: str = "", depth: int = 1
-) -> Iterator[tuple[str, Any]]:
+    content: Mapping[Any, object], prefix: str = "", depth: int = 1
+) -> Iterator[tuple[str, object]]:
     """All that lies in the dict and in the dicts in it, by name; "." joins the keys."""
     if depth > _MAX_DEPTH:
         raise BrokenFileError("its dicts are nested deeper than the layers of any network")
@@ -72,7 +72,7 @@ def _entries(
             yield f"{prefix}{key}", value
 
 
-def _unpickle(value: Any, name: str, most: int) -> Tensor:
+def _unpickle(value: object, name: str, most: int) -> Tensor:
     """The tensor of a pickled array of at most so many bytes."""
     _, shape, dtype, fortran, data = _state_of_array(value)
     if not isinstance(shape, tuple):

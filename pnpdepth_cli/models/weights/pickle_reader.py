@@ -73,7 +73,7 @@ class StandIn:
 
 def read_pickle(
     file: Any, load_storage: Callable[[tuple[Any, ...]], Tensor] | None = None
-) -> tuple[Any, list[str]]:
+) -> tuple[object, list[str]]:
     """Returns the content of one pickle, and the functions and classes of its stand-ins.
 
     A broken pickle raises BrokenFileError or what its parts raise.
@@ -169,20 +169,20 @@ class _Machine:
         del self.stack[start:]
         return values
 
-    def _extend(self, values: list[Any]) -> None:
+    def _extend(self, values: list[object]) -> None:
         if isinstance(self.stack[-1], list):  # and not the stand-in of another class
             self.stack[-1].extend(values)
 
-    def _set_items(self, values: list[Any]) -> None:
+    def _set_items(self, values: list[object]) -> None:
         if isinstance(self.stack[-1], dict):
             self.stack[-1].update(self._mapping(values))
 
-    def _mapping(self, values: list[Any]) -> dict[Any, Any]:
+    def _mapping(self, values: list[object]) -> dict[object, object]:
         """Keys and values in turn as a dict; a key that may be costly to hash becomes its type."""
         self.charge(len(values))
         return dict(zip(map(_key, values[::2]), values[1::2], strict=True))
 
-    def _name(self, module: Any, name: Any) -> Name:
+    def _name(self, module: object, name: object) -> Name:
         """The name itself, that of Python 3."""
         if not isinstance(module, str) or not isinstance(name, str):
             raise BrokenFileError("its pickle has a name that is no text")
@@ -191,16 +191,16 @@ class _Machine:
         module = {"__builtin__": "builtins", "copy_reg": "copyreg"}.get(module, module)
         return Name(f"{module}.{name}")
 
-    def _persistent(self, pid: Any) -> Any:
+    def _persistent(self, pid: object) -> object:
         """The storage, or the class without its source text, that the id stands for."""
-        kind = pid[0] if isinstance(pid, tuple) and len(pid) >= 4 else None
-        if kind == "module":
-            return pid[1]
-        if kind != "storage" or self._load_storage is None:
-            raise BrokenFileError("its pickle refers to something outside it")
-        return self._load_storage(pid)
+        if isinstance(pid, tuple) and len(pid) >= 4:
+            if pid[0] == "module":
+                return pid[1]
+            if pid[0] == "storage" and self._load_storage is not None:
+                return self._load_storage(pid)
+        raise BrokenFileError("its pickle refers to something outside it")
 
-    def _call(self, function: Any, arguments: Any) -> Any:
+    def _call(self, function: object, arguments: Any) -> Any:
         """The result of a call if it is a tensor or a plain container, else what stands for it."""
         if not isinstance(arguments, tuple) or not isinstance(function, Name):
             raise BrokenFileError("its pickle calls something other than a function")
@@ -231,7 +231,7 @@ class _Machine:
         return StandIn(function.path, arguments)
 
 
-def _key(key: Any) -> Any:
+def _key(key: object) -> object:
     small = isinstance(key, int) and abs(key) < 1 << 63
     return key if small or isinstance(key, str | float | None) else type(key).__name__
 

@@ -13,7 +13,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
@@ -42,7 +42,7 @@ _DTYPES: dict[str, torch.dtype] = {
 }  # fmt: skip
 
 
-def read_torch_file(path: Path) -> tuple[Any, list[str]]:
+def read_torch_file(path: Path) -> tuple[object, list[str]]:
     """Returns the content of a torch file, and the functions and classes that its pickle names.
 
     The content is tensors in plain containers, the state dict of each whole module, and a `StandIn`
@@ -58,14 +58,14 @@ def read_torch_file(path: Path) -> tuple[Any, list[str]]:
     return _with_state(content), names
 
 
-def _with_state(value: Any) -> Any:
+def _with_state(value: object) -> object:
     """The state dict of a whole pickled module, as the module itself would have given it."""
     return dict(_walk(value, "", itertools.count())) if _is_module(value) else value
 
 
-def _is_module(value: Any) -> bool:
-    is_state = isinstance(value, StandIn) and isinstance(value.state, Mapping)
-    return is_state and "_parameters" in value.state
+def _is_module(value: object) -> TypeGuard[StandIn]:
+    state = value.state if isinstance(value, StandIn) else None
+    return isinstance(state, Mapping) and "_parameters" in state
 
 
 def _walk(module: StandIn, prefix: str, visited: Iterator[int]) -> Iterator[tuple[str, Tensor]]:
@@ -84,7 +84,7 @@ def _walk(module: StandIn, prefix: str, visited: Iterator[int]) -> Iterator[tupl
                 yield f"{prefix}{name}", value
 
 
-def _read_archive(path: Path) -> tuple[Any, list[str]]:
+def _read_archive(path: Path) -> tuple[object, list[str]]:
     with zipfile.ZipFile(path) as archive:
         entries = {info.filename: info for info in archive.infolist()}
         if any("/code/" in name for name in entries):
@@ -109,7 +109,7 @@ def refuse_inflated(archive: zipfile.ZipFile, path: Path) -> None:
     check_claim(f"its entries have {claimed:,} bytes", claimed, most, error=BrokenFileError)
 
 
-def _read_row_of_pickles(file: mmap) -> tuple[Any, list[str]]:
+def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
     """The content of a torch file of before PyTorch 1.6, and the names in its pickle.
 
     Such a file has pickles of a magic number, the protocol, the system, the content, and the keys
@@ -139,10 +139,12 @@ def _read_row_of_pickles(file: mmap) -> tuple[Any, list[str]]:
     content, named = read_pickle(file, storages.load)
     # The bytes of each storage.
     keys, _ = read_pickle(file)
-    plain = isinstance(keys, list) and all(isinstance(key, str | int) for key in keys)
-    if not plain or {*map(str, keys)} != storages.contents.keys():
+    names = (
+        [str(key) for key in keys if isinstance(key, str | int)] if isinstance(keys, list) else []
+    )
+    if {*names} != storages.contents.keys():
         raise BrokenFileError("its storages are not those that its pickle names")
-    for key in map(str, keys):
+    for key in names:
         memory = storages.contents[key]
         stored = int.from_bytes(file.read(8), "little") * storages.dtypes[key].itemsize
         part = file.read(len(memory))
@@ -178,7 +180,7 @@ class _Storages:
         return torch.frombuffer(data, dtype=dtype, count=count, offset=start * dtype.itemsize)
 
 
-def _dtype(kind: Any) -> torch.dtype:
+def _dtype(kind: object) -> torch.dtype:
     name = kind.path.rpartition(".")[2] if isinstance(kind, Name) else ""
     if name not in _DTYPES:
         raise BrokenFileError(f"a storage of type {name[:40] or '?'}")
