@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from pathlib import Path
-
-import click
-import pytest
 
 from pnpdepth_cli.cli.batch_command import batch
-from pnpdepth_cli.cli.options import take_options
-from pnpdepth_cli.cli.refine_command import refine
-from pnpdepth_cli.commands.refinement.refine_request import OutputOptions, RefineRequest
-from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
 from pnpdepth_cli.settings import PAPER, Settings, options_of
@@ -34,18 +27,6 @@ def test_settings_are_the_users_then_the_networks_then_the_papers() -> None:
     asked = replace(METHOD, update="adam", lr="2%", schedule="linear", blur=0.0, iterations=3)
     settings = resolve_settings(STRANGER, asked)
     assert {name: getattr(settings, name) for name in asked.given()} == asked.given()
-
-
-@pytest.mark.parametrize("command", [refine, batch])
-def test_options_reach_the_settings(command: click.Command) -> None:
-    arguments = ["a", "-o", "b", "--normalise", "bytes", "--unit-scale", "2"]
-    arguments += ["--extrinsics", "pose.txt"]
-    arguments += ["--sparse", "s"] if command is refine else ["--format", "exr"]
-    params = dict(command.make_context("command", arguments).params)
-    assert params["normalise"] == "bytes"
-    assert take_options(ScanOptions, params)["extrinsics"] == Path("pose.txt")
-    assert take_options(ReadOptions, params)["unit_scale"] == 2
-    assert take_options(OutputOptions, params).get("format", "exr") == "exr"
 
 
 def test_every_field_belongs_to_one_group_and_its_option_is_one_of_batch() -> None:

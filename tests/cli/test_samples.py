@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.depth import read_depth
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 INDOOR = f"refine {SAMPLES}/indoor/rgb.png --sparse {SAMPLES}/indoor/sparse.png"
@@ -59,24 +59,6 @@ def test_refine_writes_its_files_and_lowers_the_error(
     assert {path.name for path in Path("out").iterdir()} == FILES | more
     mae = [record["errors"]["ground_truth"][stage]["mae"] for stage in ("before", "after")]
     assert mae == pytest.approx([before, after], rel=0.02)
-
-
-@pytest.mark.parametrize("network", ["fcrn-tiny", "sparse2dense-tiny"])
-def test_a_network_that_leaves_the_depth_file_as_it_is_has_no_part_which_is_said(
-    network: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    # A quarter of the sample, refined without and with the network.
-    part = (slice(120, 360), slice(160, 480))
-    cv2.imwrite("rgb.png", cv2.imread(f"{SAMPLES}/indoor/rgb.png")[part])
-    depth = read_depth(SAMPLES / "indoor" / "sparse.png")
-    write_depth(Path("s.png"), depth.values[part], scale=1000)
-    output(capsys, "refine rgb.png --sparse s.png -o without")
-    assert run(f"refine rgb.png --sparse s.png -o with --model {network}".split()) == 0
-    said = f"{network} has no part in the result" in capsys.readouterr().err
-    files = [Path(folder, "rgb_depth.png").read_bytes() for folder in ("without", "with")]
-    assert said or files[0] != files[1]
-    weights = json.loads(Path("with/rgb.json").read_text())["weights"]
-    assert said == (sum(w for expert, w in weights.items() if network in expert) < 0.01)
 
 
 def test_refine_takes_a_scan_with_its_calibration(capsys: pytest.CaptureFixture[str]) -> None:

@@ -208,29 +208,20 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("lens", "distortion", "message"),
-    [
-        (
-            "radial-tangential",
-            [0.1] * 8,
-            r"does not know \(radial-tangential, 8 coefficients\); undistort the images first",
-        ),
-        ("fisheye", [0.1] * 4, r"of different kinds \(fisheye, radial-tangential\), but Nerf"),
-    ],
+    ("lens", "distortion"), [("radial-tangential", [0.1] * 8), ("fisheye", [0.1] * 4)]
 )
 def test_a_lens_that_nerfstudio_does_not_know_is_refused_and_nothing_is_written(
-    root: Path, lens: str, distortion: list[float], message: str
+    root: Path, lens: str, distortion: list[float]
 ) -> None:
     folder = results(root)
     camera = json.loads((folder / "b.json").read_text())["camera"]
-    camera |= {"lens": lens, "distortion": distortion}
-    change(folder / "b.json", camera=camera)
-    with pytest.raises(InputError, match=message):
+    change(folder / "b.json", camera=camera | {"lens": lens, "distortion": distortion})
+    with pytest.raises(InputError, match=lens):
         export(folder, "nerfstudio", root / "scene")
     assert list((root / "scene").rglob("*.*")) == []
 
 
-NO_CAMERA: dict[str, Any] = {
+CAMERA: dict[str, Any] = {
     "intrinsics": np.eye(3).tolist(),
     "lens": "radial-tangential",
     "distortion": [],
@@ -239,76 +230,68 @@ NO_CAMERA: dict[str, Any] = {
 }
 BAD_CAMERAS: list[dict[str, Any]] = [
     {"intrinsics": [[math.inf, 0, 0], [0, 1, 0], [0, 0, 1]]},
-    {"intrinsics": [[0, 0, 0]] * 3},
     {"intrinsics": [1, 2]},
     {"pose": [1, 2]},
     {"lens": "pinhole"},
 ]
-BAD_NAMES = ["../../../ESC", "/etc/x.png", "a\nb.png", "..", "a\\b.png", "x/../../y"]
+BAD_NAMES = ["../../../ESC", "/etc/x.png", "a\nb.png", "..", "a\\b.png"]
 
 
 def change(path: Path, **entries: Any) -> None:
-    text = json.dumps(json.loads(path.read_text()) | entries)
-    path.write_text(text.replace("Infinity", "1e999"))
+    """Changes entries of a record; of `inputs`, those of its sparse depth."""
+    record = json.loads(path.read_text())
+    if entries.get("inputs"):
+        sparse = record["inputs"]["sparse"] | entries["inputs"]["sparse"]
+        entries["inputs"] = record["inputs"] | {"sparse": sparse}
+    path.write_text(json.dumps(record | entries).replace("Infinity", "1e999"))
 
 
 @pytest.mark.parametrize(
-    ("entries", "error", "message"),
+    ("entries", "error"),
     [
-        ({"camera": None}, InputError, "a_depth.exr lacks a record with its camera"),
-        ({"inputs": {}}, InputError, "a_depth.exr lacks its image; run this in the"),
-        ({"unit": "m"}, InputError, "in different units"),
-        ({"inputs": {"sparse": {"image": "b.png"}}}, InputError, "two frames have one image name"),
-        ({"size": [9, 9]}, SizeError, "--protocol whole"),
-        *(
-            (entries, FileFormatError, r"a(_depth\.exr|\.json)")
-            for entries in (
-                *({"camera": NO_CAMERA | change} for change in BAD_CAMERAS),
-                {"inputs": {"sparse": {"unit_scale": -1}}},
-                *({"inputs": {"sparse": {"image": name}}} for name in BAD_NAMES),
-            )
-        ),
+        ({"camera": None}, InputError),
+        ({"inputs": {}}, InputError),
+        ({"unit": "m"}, InputError),  # the others are in model units
+        ({"inputs": {"sparse": {"image": "b.png"}}}, InputError),  # as of the next frame
+        ({"size": [9, 9]}, SizeError),
+        ({"inputs": {"sparse": {"unit_scale": -1}}}, FileFormatError),
+        *(({"camera": CAMERA | change}, FileFormatError) for change in BAD_CAMERAS),
+        *(({"inputs": {"sparse": {"image": name}}}, FileFormatError) for name in BAD_NAMES),
     ],
 )
 def test_results_that_cannot_be_exported_are_one_line(
-    root: Path, entries: dict[str, Any], error: type[PnpDepthError], message: str
+    root: Path, entries: dict[str, Any], error: type[PnpDepthError]
 ) -> None:
     folder = results(root)
-    inputs = entries.get("inputs")
-    if inputs:
-        known = json.loads((folder / "a.json").read_text())["inputs"]
-        entries = {"inputs": known | {"sparse": known["sparse"] | inputs["sparse"]}}
     change(folder / "a.json", **entries)
     before = sorted(root.parent.rglob("*"))
-    with pytest.raises(error, match=message) as caught:
+    with pytest.raises(error, match=r"a(_depth\.exr|\.json)|out|model units") as caught:
         export(folder, "colmap", root / "dense")
     assert "\n" not in str(caught.value)
     assert sorted(root.parent.rglob("*")) == before
 
 
-def test_results_need_depth_a_folder_to_go_to_and_masks_of_their_size(root: Path) -> None:
-    folder = results(root)
-    with pytest.raises(InputError, match=r"images has no files NAME_depth\.png"):
-        export(root / "images", "colmap", root / "dense")
-    unknown = results(project(root / "unknown"), np.zeros_like(DEPTH))
-    with pytest.raises(InputError, match="no frame has a pixel with known depth"):
-        export(unknown, "gaussian-splatting", root / "dense")
-    with pytest.raises(OutputError, match=r"a\.json is a file; name a folder"):
-        export(folder, "colmap", folder / "a.json")
-    cv2.imwrite(str(folder / "a_valid.png"), np.zeros((2, 2), np.uint8))
-    with pytest.raises(SizeError, match=r"a_valid\.png is not of the size of .*a_depth\.exr"):
-        export(folder, "colmap", root / "dense")
-
-
-def test_depth_without_poses_is_no_scene_of_nerfstudio_and_files_are_kept_without_overwrite(
+def test_results_need_depth_and_masks_of_their_size_and_nothing_is_replaced_unasked(
     root: Path,
 ) -> None:
     folder = results(root)
-    camera = json.loads((folder / "c.json").read_text())["camera"]
-    change(folder / "c.json", camera=camera | {"pose": None})
-    with pytest.raises(InputError, match=r"c_depth\.exr lacks a pose"):
-        export(folder, "nerfstudio", root / "scene")
+    with pytest.raises(InputError, match="NAME_depth"):
+        export(root / "images", "colmap", root / "dense")
+    unknown = results(project(root / "unknown"), np.zeros_like(DEPTH))
+    with pytest.raises(InputError, match="known depth"):
+        export(unknown, "gaussian-splatting", root / "dense")
+    with pytest.raises(OutputError, match=r"a\.json is a file"):
+        export(folder, "colmap", folder / "a.json")
     export(folder, "colmap", root / "dense")
     with pytest.raises(OutputError, match="--overwrite"):
         export(folder, "colmap", root / "dense")
     export(folder, "colmap", root / "dense", overwrite=True)
+    change(
+        folder / "c.json",
+        camera=json.loads((folder / "c.json").read_text())["camera"] | {"pose": None},
+    )
+    with pytest.raises(InputError, match="c_depth"):
+        export(folder, "nerfstudio", root / "scene")
+    cv2.imwrite(str(folder / "a_valid.png"), np.zeros((2, 2), np.uint8))
+    with pytest.raises(SizeError, match="a_valid"):
+        export(folder, "colmap", root / "other")

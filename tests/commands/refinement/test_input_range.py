@@ -96,15 +96,6 @@ def test_the_frames_that_decide_are_spread_from_the_first_to_the_last() -> None:
     assert [spread(count) for count in (1, 3)] == [[0], [0, 1, 2]]
 
 
-def test_a_single_frame_decides_alone(tmp_path: Path, seen: Counter[str]) -> None:
-    assert settings_and_notes(pairs_on_disk(tmp_path / "drive", ("a",)))[0] == "imagenet"
-
-
-def test_a_stated_range_needs_no_further_frame(tmp_path: Path, seen: Counter[str]) -> None:
-    batch(pairs_on_disk(tmp_path / "drive"))
-    assert not seen
-
-
 def test_a_frame_without_points_in_view_does_not_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -117,15 +117,6 @@ def test_the_frames_of_a_batch_share_a_registration_that_none_shows_alone(
     assert all(each == registrations[0] for each in registrations)
 
 
-def test_arrays_in_memory_are_registered_too() -> None:
-    rgb, points = frame(0, UNREGISTERED)
-    network = load_network("compact")
-    fixed = Settings(propagate="none")
-    with Refiner(network, fixed) as auto, Refiner(network, fixed, registration="off") as off:
-        assert any("moved into the frame" in note for note in auto.refine(rgb, points).notes)
-        assert not any("moved into" in note for note in off.refine(rgb, points).notes)
-
-
 def test_arrays_of_a_sequence_share_a_registration_that_one_alone_does_not_show() -> None:
     frames = [frame(seed, UNREGISTERED, 80) for seed in range(8)]
     network, fixed = load_network("compact"), Settings(propagate="none")
