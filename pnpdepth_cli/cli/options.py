@@ -19,9 +19,11 @@ from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Option, Settings, options_of
 
 FILE = click.Path(path_type=Path)
+Command = Callable[..., None]
+Decorator = Callable[[Command], Command]
 
 
-def click_option(declared: Option) -> Callable[[Any], Any]:
+def click_option(declared: Option) -> Decorator:
     """Returns the click option of a field of a request."""
     details: dict[str, Any] = {"type": _type_of(declared)}
     if declared.type == "bool":
@@ -46,8 +48,8 @@ class _Names(click.Choice):  # type: ignore[type-arg]
         super().__init__(list(names))
         self._names = names
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        is_file = str(value).endswith(".py") and value in self._names
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        is_file = value.endswith(".py") and value in self._names
         return value if is_file else super().convert(value, param, ctx)
 
 
@@ -63,7 +65,7 @@ def _type_of(declared: Option) -> Any:
     return (pairs | plain)[declared.type]
 
 
-def options_of_groups(*groups: type, without: Collection[str] = ()) -> Callable[[Any], Any]:
+def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator:
     """Returns a decorator that adds the options of these groups of a request to a command.
 
     Args:
@@ -71,7 +73,7 @@ def options_of_groups(*groups: type, without: Collection[str] = ()) -> Callable[
         without: Names of fields that are left out.
     """
 
-    def decorate(command: Any) -> Any:
+    def decorate(command: Command) -> Command:
         wanted = [each for group in groups for each in options_of(group)]
         for each in reversed(wanted):
             command = command if each.name in without else click_option(each)(command)
@@ -80,7 +82,7 @@ def options_of_groups(*groups: type, without: Collection[str] = ()) -> Callable[
     return decorate
 
 
-def refinement(*, without: Collection[str] = ()) -> Callable[[Any], Any]:
+def refinement(*, without: Collection[str] = ()) -> Decorator:
     """Returns a decorator that adds the options of how a frame is refined.
 
     Args:
@@ -88,7 +90,7 @@ def refinement(*, without: Collection[str] = ()) -> Callable[[Any], Any]:
     """
     groups = (ScanOptions, ReadOptions, NetworkChoice, Settings, HoldOut, OutputOptions)
 
-    def decorate(command: Any) -> Any:
+    def decorate(command: Command) -> Command:
         return models(options_of_groups(*groups, without=["model", *without])(command))
 
     return decorate
@@ -123,7 +125,7 @@ sparse_output = click.option(
 )
 
 
-def table_files(*, csv: str, latex: str | None = None) -> Callable[[Any], Any]:
+def table_files(*, csv: str, latex: str | None = None) -> Decorator:
     """Returns a decorator that adds the options of `tables.TableFiles`.
 
     Args:
@@ -131,7 +133,7 @@ def table_files(*, csv: str, latex: str | None = None) -> Callable[[Any], Any]:
         latex: Help text of `--latex`. None: the command has no such option.
     """
 
-    def decorate(command: Any) -> Any:
+    def decorate(command: Command) -> Command:
         command = overwrite(as_json(command))
         for flag, help in (("--latex", latex), ("--csv", csv)):
             if help is not None:

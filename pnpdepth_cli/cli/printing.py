@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from rich.box import SIMPLE_HEAD
@@ -26,7 +26,10 @@ from pnpdepth_cli.stages import GT, HELD_OUT
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.summary import BatchSummary
+    from pnpdepth_cli.commands.sparse.make import SparseSummary
 
+_WIDE = 1000
+"""Columns of what is no terminal."""
 _COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
 
 
@@ -81,6 +84,8 @@ class _Console(Console):
 def print_table(table: Table, *, err: bool = False) -> None:
     """Prints a table on stdout or stderr, as wide as needed unless that is a terminal."""
     console = _Console(stderr=err, highlight=False)
+    if not console.is_terminal:
+        console.width = _WIDE
     title = escape(printable(table.title))
     shown = RichTable(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     first, *others = map(escape, table.headings)
@@ -89,9 +94,6 @@ def print_table(table: Table, *, err: bool = False) -> None:
         shown.add_column(heading, overflow="fold", justify="right")
     for row in table.texts:
         shown.add_row(*map(_markup, row))
-    if not console.is_terminal:
-        wide = console.options.update(max_width=1000)
-        console.width = max(console.width, console.measure(shown, options=wide).maximum)
     console.print(shown)
 
 
@@ -159,10 +161,9 @@ def print_batch(summary: BatchSummary) -> None:
     say(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")
 
 
-def print_sparse(record: Mapping[str, Any]) -> None:
+def print_sparse(summary: SparseSummary) -> None:
     """Prints the end of `pnpdepth project`, `sample` and `simulate`: notes, points, files."""
-    print_notes(record["notes"])
-    points, (width, height) = record["points"], record["size"]
-    share = f"{points['fraction_of_pixels']:.2%} of {width}×{height} pixels"
-    paths = "  ".join(path for path in record["outputs"].values() if path)
-    say(f"wrote {points['count']:,} points, {share}: {paths}")
+    print_notes(summary.notes)
+    count, (height, width) = len(summary.points), summary.points.size
+    share = f"{count / (height * width):.2%} of {width}×{height} pixels"
+    say(f"wrote {count:,} points, {share}: {'  '.join(map(str, summary.files))}")

@@ -168,5 +168,4 @@ def frames(bag: Path, output: Path, **values: Any) -> None:
     from pnpdepth_cli.commands.sparse.bag_frames import write_frames
 
     request = FramesRequest(bag=bag, output=output, **values)
-    record = write_frames(request, say)
-    say(f"wrote {record['frames']:,} frames to {output}")
+    say(f"wrote {write_frames(request, say):,} frames to {output}")

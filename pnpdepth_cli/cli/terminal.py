@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -36,7 +36,7 @@ def say(text: object) -> None:
         click.echo(printable(text), err=True)
 
 
-def print_json(value: Any) -> None:
+def print_json(value: object) -> None:
     """Prints a value of JSON's own types on stdout."""
     click.echo(json.dumps(value, indent=2))
 
@@ -47,7 +47,7 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
 
     Not on a terminal, it prints a line per minute. The time counts from the first call of `show`.
     """
-    bar: tqdm[Any] | None = None
+    bar: tqdm[None] | None = None
     began = printed_at = 0.0
 
     def show(done: int, total: int, text: str = "") -> None:

@@ -67,8 +67,7 @@ def unpack(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     between = None if whole else (0, request.every * (request.limit or 1) - 1)
     frames = FramesRequest(bag=request.source, output=folder, between=between, overwrite=True)
     if not has_frames(frames):
-        record = write_frames(frames, say)
-        say(f"bag: wrote {record['frames']:,} frames to {folder}")
+        say(f"bag: wrote {write_frames(frames, say):,} frames to {folder}")
     return replace(request, source=folder)
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -76,7 +75,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     return [f"depth: {clipped:,} pixels beyond {limit}, the largest of 16 bits, are unknown"]
 
 
-def _entry(folder: Path, frame: ExportFrame) -> dict[str, Any]:
+def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
     """The frame's entry in transforms.json."""
     # The coefficients of the lens, if the program has all of them.
     camera, pose = frame.camera, frame.pose

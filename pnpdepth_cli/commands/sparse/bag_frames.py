@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +62,7 @@ _LONGEST_GAP_S = 0.5
 """Longest time between two poses that one is interpolated from."""
 
 
-def _identity(request: FramesRequest) -> dict[str, Any]:
+def _identity(request: FramesRequest) -> dict[str, object]:
     """The beginning of the record, which is the same for the same frames."""
     bag = request.bag
     paths = sorted(bag.iterdir()) if bag.is_dir() else [bag]
@@ -72,8 +71,8 @@ def _identity(request: FramesRequest) -> dict[str, Any]:
     return {"command": "frames", **stated, "bag": str(bag), "bag_files": files}
 
 
-def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
-    """Writes the frames of a bag in the layout `pairs`, one at a time, and returns the record.
+def write_frames(request: FramesRequest, say: Say) -> int:
+    """Writes the frames of a bag in the layout `pairs`, one at a time, and returns their number.
 
     `say` receives what was guessed, and warnings.
 
@@ -118,7 +117,7 @@ def write_frames(request: FramesRequest, say: Say) -> dict[str, Any]:
         "images_without_scan": lost,
     }
     write_json(request.output / RECORD, record)
-    return record
+    return len(times)
 
 
 def has_frames(request: FramesRequest) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,15 @@ from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, ideal_lidar, simulate_lidar
 from pnpdepth_cli.sensors.pixels import Points, as_depth_image
 from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
+
+
+class SparseSummary(NamedTuple):
+    """What was written."""
+
+    points: Points
+    notes: Sequence[str]
+    """Lines for a person."""
+    files: Sequence[Path]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,13 +71,13 @@ class SparseTarget:
         self,
         command: str,
         points: Points,
-        settings: dict[str, Any],
+        settings: Mapping[str, object],
         inputs: Mapping[str, FileRecord],
         notes: Sequence[str],
         *,
         rgb: NDArray[np.float32] | None = None,
-    ) -> dict[str, Any]:
-        """Writes the sparse depth, its record and the overlay, and returns the record.
+    ) -> SparseSummary:
+        """Writes the sparse depth, its record and the overlay; returns what was written.
 
         Args:
             command: Name of the command that made the points.
@@ -80,14 +89,14 @@ class SparseTarget:
         """
         # The points, as a map or a list, and over the image.
         make_folder(self.output.parent)
-        image = as_depth_image(points)
+        image, record = as_depth_image(points), self.output.with_suffix(".json")
         write_sparse(self.output, points.xy, points.depth, image)
         if rgb is not None:
             overlay(rgb, points.xy, points.depth, self.overlay)
+        drawn = None if rgb is None else self.overlay
+        outputs = {"sparse": self.output, "overlay": drawn, "record": record}
         # The record.
-        path = self.output.with_suffix(".json")
-        drawn = None if rgb is None else str(self.overlay)
-        record = {
+        content = {
             "command": command,
             "version": __version__,
             **settings,
@@ -101,10 +110,10 @@ class SparseTarget:
             },
             "size": [points.size[1], points.size[0]],
             "notes": list(notes),
-            "outputs": {"sparse": str(self.output), "overlay": drawn, "record": str(path)},
+            "outputs": plain(outputs),
         }
-        write_json(path, record)
-        return record
+        write_json(record, content)
+        return SparseSummary(points, notes, [path for path in outputs.values() if path])
 
 
 def project_scan(
@@ -114,8 +123,8 @@ def project_scan(
     image: Path,
     *,
     scale: float | None = None,
-) -> dict[str, Any]:
-    """Writes the scan's points that the camera sees, and returns the record.
+) -> SparseSummary:
+    """Writes the scan's points that the camera sees; returns what was written.
 
     Args:
         scan: File of the scan.
@@ -141,8 +150,8 @@ def sample_depth(
     image: Path | None = None,
     seed: int = 0,
     scale: float | None = None,
-) -> dict[str, Any]:
-    """Writes points of a dense depth map, and returns the record.
+) -> SparseSummary:
+    """Writes points of a dense depth map; returns what was written.
 
     Args:
         depth: The file of the map.
@@ -174,8 +183,8 @@ def simulate_scan(
     *,
     seed: int = 0,
     scale: float | None = None,
-) -> dict[str, Any]:
-    """Writes the points of a sensor at the camera's place in a dense depth map; returns the record.
+) -> SparseSummary:
+    """Writes the points of a sensor at the camera's place; returns what was written.
 
     Args:
         depth: The file of the map.
