@@ -10,7 +10,6 @@ from torch import Tensor
 
 from model_zoo_defs._compact.cloud import Cloud
 from model_zoo_defs._compact.points import Points
-from model_zoo_defs._compact.prior import Prior
 from model_zoo_defs.compact import Compact, definitions
 from pnpdepth_cli.core.split import Split, gradient_at
 
@@ -73,17 +72,6 @@ def test_inputs_ten_times_as_far_give_depth_ten_times_as_far(
     torch.testing.assert_close(depth, expected, rtol=1e-3, atol=0.0)
 
 
-@pytest.mark.parametrize("with_prior", [False, True])
-def test_samples_of_a_batch_do_not_see_each_other(shaken: Compact, with_prior: bool) -> None:
-    one, other = frame(64, 96, 30, seed=1), frame(64, 96, 700, seed=2)
-    batch = [torch.cat(pair) for pair in zip(one, other, strict=True)]
-    priors = [torch.cat([prior_of(one[1]), torch.zeros(1, 1, 64, 96)])] if with_prior else []
-    with torch.no_grad():
-        together = shaken(*batch, *priors)
-        apart = torch.cat([shaken(*one, *(p[:1] for p in priors)), shaken(*other)])
-    torch.testing.assert_close(together, apart, rtol=1e-3, atol=1e-4)
-
-
 def prior_of(sparse: Tensor, seed: int = 3) -> Tensor:
     """A rough depth near that of the points, with a window in which it is unknown."""
     generator = torch.Generator().manual_seed(seed)
@@ -93,15 +81,6 @@ def prior_of(sparse: Tensor, seed: int = 3) -> Tensor:
     error = 0.9 + 0.2 * torch.rand(sparse.shape, generator=generator)
     prior = torch.where(sparse > 0, sparse * error, prior)
     prior[..., 10:30, 20:60] = 0.0
-    return prior
-
-
-def shuffled(sparse: Tensor, seed: int = 4) -> Tensor:
-    """A prior with the depths of other points at every point."""
-    at = sparse > 0
-    order = torch.randperm(int(at.sum()), generator=torch.Generator().manual_seed(seed))
-    prior = torch.full_like(sparse, 2.0)
-    prior[at] = sparse[at][order]
     return prior
 
 
@@ -130,14 +109,6 @@ def test_a_prior_that_is_unknown_everywhere_changes_nothing(shaken: Compact) -> 
         )
 
 
-@pytest.mark.parametrize("useless", ["constant", "shuffled"])
-def test_a_prior_that_does_not_explain_the_points_is_unknown_everywhere(useless: str) -> None:
-    rgb, sparse = frame(96, 128, 200)
-    points = Points(sparse)
-    prior = torch.full_like(sparse, 3.0) if useless == "constant" else shuffled(sparse)
-    assert not bool(Prior.of(prior, points, Cloud.of(points, rgb)).valid.any())
-
-
 @pytest.mark.parametrize("with_prior", [False, True])
 @pytest.mark.parametrize("layer", definition.layers)
 def test_rear_of_front_is_the_network_bit_for_bit_and_errors_reach_every_layer(
@@ -154,30 +125,6 @@ def test_rear_of_front_is_the_network_bit_for_bit_and_errors_reach_every_layer(
         gradient = gradient_at(z, (depth - sparse)[sparse > 0].abs().mean())
     assert gradient is not None
     assert float((gradient != 0).float().mean()) > 0.3
-
-
-@pytest.mark.parametrize("with_prior", [False, True])
-def test_no_gradient_is_infinite(shaken: Compact, with_prior: bool) -> None:
-    """Cells with one point have variance 0, where the gradient of the square root is infinite."""
-    net = copy.deepcopy(shaken).train()
-    rgb, sparse = frame(64, 96, 40)
-    outputs = net.outputs(rgb, sparse, prior_of(sparse) if with_prior else None)
-    loss = sum(depth.log().abs().mean() for depth in outputs.depths) + net.sigma(outputs).mean()
-    assert isinstance(loss, Tensor)
-    loss.backward()
-    for name, parameter in net.named_parameters():
-        if parameter.grad is not None:
-            assert bool(torch.isfinite(parameter.grad).all()), name
-
-
-def test_sigma_is_positive_and_its_gradient_reaches_no_depth(shaken: Compact) -> None:
-    net = copy.deepcopy(shaken)
-    depth, sigma = net.with_sigma(*frame(64, 96, 50))
-    assert depth.shape == sigma.shape
-    assert bool((sigma > 0).all())
-    sigma.mean().backward()
-    reached = {name.split(".")[0] for name, p in net.named_parameters() if p.grad is not None}
-    assert reached == {"scale"}
 
 
 @pytest.mark.skipif(

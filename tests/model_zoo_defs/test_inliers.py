@@ -2,42 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from torch import Tensor, nn
 
 from model_zoo_defs._compact import cloud as clouds
-from model_zoo_defs._compact.cloud import NEIGHBOURS, Cloud, neighbours
-from model_zoo_defs._compact.inliers import InlierWeights
-from model_zoo_defs._compact.points import Points
-
-SIZE = (64, 96)
-
-
-def sparse_map(count: int, seed: int = 0) -> Tensor:
-    """(1, 1, 64, 96) metres with `count` points."""
-    generator = torch.Generator().manual_seed(seed)
-    sparse = torch.zeros(SIZE[0] * SIZE[1])
-    at = torch.randperm(len(sparse), generator=generator)[:count]
-    sparse[at] = 1.0 + 4.0 * torch.rand(len(at), generator=generator)
-    return sparse.view(1, 1, *SIZE)
-
-
-def images(count: int, seed: int = 0) -> Tensor:
-    """(count, 3, 64, 96) normalised."""
-    return torch.randn(count, 3, *SIZE, generator=torch.Generator().manual_seed(seed))
-
-
-@pytest.fixture(scope="module")
-def shaken() -> InlierWeights:
-    """A layer with random weights everywhere."""
-    torch.manual_seed(1)
-    layer = InlierWeights()
-    for parameter in layer.parameters():
-        nn.init.normal_(parameter, std=0.2)
-    return layer
+from model_zoo_defs._compact.cloud import NEIGHBOURS, neighbours
 
 
 @given(seed=st.integers(0, 10_000), count=st.integers(1, 200))
@@ -56,11 +26,3 @@ def test_neighbours_are_the_nearest_points_of_the_cells_around(seed: int, count:
     distance = (position[near] - position[:, None]).square().sum(2)
     for row, own, known in zip(expected, distance, found, strict=True):
         torch.testing.assert_close(own[known], row[row < torch.inf], rtol=1e-3, atol=1e-4)
-
-
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_points_without_neighbours_have_a_weight(shaken: InlierWeights, count: int) -> None:
-    points = Points(sparse_map(count))
-    weights = shaken(points, Cloud.of(points, images(1)))
-    assert bool(((weights >= 0) & (weights <= 1)).all())
-    assert torch.equal(weights != 1, points.mask > 0)

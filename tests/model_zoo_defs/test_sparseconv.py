@@ -4,18 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from model_zoo_defs.sparseconv import SparseConv, definitions
-from pnpdepth_cli.core.split import Split
-from tests.model_zoo_defs.cuts import built
-
-
-def sparse_depth(height: int, width: int, fraction: float = 0.1) -> Tensor:
-    generator = torch.Generator().manual_seed(1)
-    depth = 1 + 9 * torch.rand(1, 1, height, width, generator=generator)
-    return depth * (torch.rand(depth.shape, generator=generator) < fraction)
+from model_zoo_defs.sparseconv import SparseConv
 
 
 def looped(x: Tensor, mask: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -55,14 +46,3 @@ def test_a_layer_is_the_sum_over_known_pixels_over_their_number(kernel: int) -> 
 
 
 # ------------------------------------------------------------------ the cut
-
-
-def test_z_is_the_features_behind_the_first_layer_and_the_mask_stays() -> None:
-    network = built(definitions["sparseconv"])
-    sparse = sparse_depth(64, 96, 0.001)
-    with torch.no_grad(), Split(network.module, "sparse_convs.0[0]") as split:
-        z = split.front(sparse)
-        known = F.max_pool2d((sparse > 0).float(), 11, 1, 5)
-        moved = split.rear(z + (1 - known))  # only where the mask says nothing is known
-        assert torch.equal(moved, network.module(sparse))
-        assert not torch.equal(split.rear(z + known), moved)

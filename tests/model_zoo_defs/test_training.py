@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -74,18 +73,6 @@ def test_the_same_state_draws_the_same_and_leaves_the_depth_as_it_is(seed: int) 
         assert (one.dtype, one.shape) == (np.float32, SHAPE)
         assert bool(np.isfinite(one).all())
         assert one.min() > 0 if number > 1 else one.min() >= 0
-
-
-def test_the_best_sigma_is_the_mean_absolute_error_of_log_depth() -> None:
-    ground_truth, depth = torch.ones(1, 1, 4, 4), torch.full((1, 1, 4, 4), 1.1)
-    error = float(np.log(1.1))
-    losses = {
-        factor: float(
-            train.sigma_loss(torch.full_like(ground_truth, factor * error), depth, ground_truth)
-        )
-        for factor in (0.7, 1.0, 1.4)
-    }
-    assert min(losses, key=lambda factor: losses[factor]) == 1.0
 
 
 def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(

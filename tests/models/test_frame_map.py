@@ -71,22 +71,6 @@ def test_a_point_goes_where_its_pixel_goes(
     torch.testing.assert_close(there.xy[:, 1], (y + 0.5) * scale[1] - 0.5, atol=1e-4, rtol=1e-5)
 
 
-@given(st.integers(1, 40), sides, sides)
-def test_padding_moves_neither_a_point_nor_a_bit_of_image_or_depth(
-    multiple: int, height: int, width: int
-) -> None:
-    frame = FrameMap.fit(Multiple(multiple), height, width)
-    here = every_pixel(height, width)
-    assert torch.equal(frame.points_to_network(here).xy, here.xy)
-    rgb = torch.rand(1, 3, height, width)
-    padded = frame.rgb_to_network(rgb)
-    assert torch.equal(padded[..., :height, :width], rgb)
-    assert torch.equal(padded[..., -1, :width], rgb[..., -1, :])
-    assert torch.equal(padded[..., :height, -1], rgb[..., -1])
-    depth = torch.rand(1, 1, *frame.network)
-    assert torch.equal(frame.depth_to_image(depth), depth[0, 0, :height, :width])
-
-
 @pytest.mark.parametrize("fit", ["stretch", "crop"])
 @pytest.mark.parametrize("size", [(48, 64), (24, 20), (97, 131)])
 def test_what_a_point_reads_in_the_network_is_what_is_at_its_pixel(

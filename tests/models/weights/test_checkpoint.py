@@ -19,7 +19,7 @@ from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.torch_export import exported_definition
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
-from tests.models.weights.files import little, npy_of, pickled, refused
+from tests.models.weights.files import npy_of, pickled, refused
 from tests.models.weights.test_tensor_bundle import bundle, entry
 
 LARGE = 100 << 30  # bytes
@@ -250,36 +250,6 @@ def test_a_file_cut_anywhere_is_refused(
     for length in range(0, len(whole) - 1, max(1, len(whole) // 60)):
         path.write_bytes(whole[:length])
         refused(path)
-
-
-def tensor(kind: str | None = "F32", shape: Any = (2,), at: Any = (0, 8)) -> dict[str, Any]:
-    """An entry of a safetensors header."""
-    return {"dtype": kind, "shape": shape, "data_offsets": at}
-
-
-LYING = {
-    "a negative offset": ({"a": tensor(at=(-8, 0))}, 8),
-    "an offset of 2⁶²": ({"a": tensor(at=(0, 2**62))}, 8),
-    "tensors that overlap": ({"a": tensor(), "b": tensor(at=(4, 12))}, 8),
-    "an unknown type": ({"a": tensor("F33")}, 8),
-    "a type that torch lacks": ({"a": tensor("F6_E2M3", (8,), (0, 6))}, 6),
-    "a shape whose product overflows": ({"a": tensor(shape=(2**32, 2**32))}, 8),
-    "an empty one that overflows": ({"a": tensor(shape=(2**62, 2**62, 0), at=(0, 0))}, 0),
-    "a list": ([], 8),
-}
-"""Headers, and how many bytes of tensors follow."""
-
-
-@pytest.mark.parametrize(("header", "size"), LYING.values(), ids=LYING)
-@pytest.mark.parametrize("length", [None, 2**64 - 1])
-def test_a_safetensors_header_that_lies_is_refused(
-    header: Any, size: int, length: int | None, tmp_path: Path
-) -> None:
-    text = json.dumps(header).encode()
-    start = struct.pack("<Q", len(text) if length is None else length)
-    (tmp_path / "w.safetensors").write_bytes(start + text + bytes(size))
-    with little():
-        refused(tmp_path / "w.safetensors")
 
 
 # ------------------------------------------------------------------ files larger than memory

@@ -18,7 +18,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from pnpdepth_cli.models.weights import pickle_reader
 from pnpdepth_cli.models.weights.torch_file import read_torch_file
 from tests.models.weights.files import Hostile, hostile, little, refused
 
@@ -130,42 +129,20 @@ def nested_tuples(depth: int) -> bytes:
 
 
 NESTED = nested_tuples(200)
-LONG_NAME = b"X" + struct.pack("<I", 10**6) + b"a" * 10**6
 BOMBS = {
     "a tensor repeated by strides of 0": tensor_pickle(1, (10**12,), (0,)),
     "a tensor beyond its storage": tensor_pickle(1, (10**9,), (1,)),
-    "a side without end": tensor_pickle(1, (float("inf"),), (1,)),
     "a storage larger than stored": tensor_pickle(10**12, (10**12,), (1,)),
-    "a negative stride": tensor_pickle(1, (2,), (-1,)),
     "text longer than the file": b"\x80\x02X" + struct.pack("<I", 2**32 - 1) + b"a.",
     "bytes longer than the file": b"\x80\x05\x96" + struct.pack("<Q", 2**62) + b"a.",
-    "a number longer than the file": b"\x80\x02\x8b" + struct.pack("<i", 2**31 - 1) + b"a.",
-    "an unknown index in the memo": b"\x80\x02j" + struct.pack("<I", 2**32 - 1) + b".",
-    "a far index of the memo": b"\x80\x02]r" + struct.pack("<I", 2**32 - 1) + b".",
     "tuples, printed": b"\x80\x02" + NESTED + b".",
     "tuples as a key": b"\x80\x02}" + NESTED + b"K\x01s.",
     "tuples as a key of a dict call": b"\x80\x02ccollections\nOrderedDict\n]("
     + NESTED
     + b"K\x01\x86e\x85R.",
     "tuples in a set": b"\x80\x04\x8f(" + NESTED + b"\x90.",
-    "tuples in a frozenset": b"\x80\x04(" + NESTED + b"\x91.",
     "tuples as a storage": b"\x80\x02(X\x07\x00\x00\x00storage" + NESTED * 4 + b"tQ.",
-    "tuples as a dtype": b"\x80\x02cnumpy\ndtype\n" + NESTED + b"\x85R.",
-    "tuples as a name": b"\x80\x04" + NESTED + b"2\x93.",
     "a call for memory": b"\x80\x02cbuiltins\nbytearray\n\x8a\x05\x00\xe4\x0b\x54\x02\x85R.",
-}
-LONG_BOMBS = {
-    "a dict copied again and again": b"\x80\x02ccollections\nOrderedDict\nq\x00]("
-    + b"K\x01K\x02\x86" * 10**3
-    + b"eq\x01\x85q\x02R("
-    + b"h\x00h\x02R" * 10**3
-    + b"t.",
-    "a long name joined again and again": b"\x80\x04"
-    + LONG_NAME
-    + b"q\x00h\x00\x93("
-    + b"h\x00h\x00\x93" * 10**4
-    + b"t.",
-    "steps without end": b"\x80\x02" + b"]0" * 10**5 + b"N.",
 }
 
 
@@ -177,17 +154,6 @@ def test_a_small_pickle_takes_no_time_and_no_memory(kind: str, tmp_path: Path) -
     with little(megabytes=50):
         refused(path)
         refused(tmp_path / "alone.pt")
-
-
-@pytest.mark.parametrize("kind", LONG_BOMBS)
-def test_a_pickle_of_many_steps_is_refused(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pickle_reader, "MAX_STEPS", 10**5)
-    path = archive_of(tmp_path / "bomb.pt", LONG_BOMBS[kind])
-    with little(megabytes=20, seconds=3):
-        message = refused(path)
-    assert "without end" in message or "more than 100,000 steps" in message
 
 
 def test_a_compressed_archive_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
