@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -91,31 +90,3 @@ def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(
 
 
 # the fully connected layers of eigen take one size only
-WINDOWS = {"eigen-tiny": (228, 304)}
-
-
-@pytest.mark.parametrize("name", tiny.RECIPES)
-def test_every_tiny_edition_can_be_trained(name: str, shards: Path, tmp_path: Path) -> None:
-    definition = tiny.tiny_definition(name)
-    assert definition.name == name
-    window = WINDOWS.get(name, (64, 96))
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    depth = np.tile(slope(0), (5, 5))[None, : max(window[0], 70), : max(window[1], 100)]
-    rgb = np.repeat((depth * 40.0).astype(np.uint8)[..., None], 3, axis=-1)
-    np.savez(folder / "shard_00000.npz", rgb=rgb, depth=depth)
-    recipe = tiny.RECIPES[name]
-    stages = tuple(replace(stage, window=window, shown=None) for stage in recipe.stages)
-    recipe = replace(recipe, stages=stages, batch=2)
-    run = tiny.TinyRun(definition, recipe, settings(folder, tmp_path, steps=20))
-    batch = run.batch(0)
-    before = [parameter.clone() for parameter in run.learnt]
-    for stage in range(len(stages)):
-        run.step = math.ceil(20 * stages[stage - 1].until) if stage else 0
-        # a layer that starts flat lets nothing through to the two in front of it at first
-        assert all(np.isfinite(run.learn(batch)) for _ in range(3))
-    moved = [not torch.equal(a, b) for a, b in zip(before, run.learnt, strict=True)]
-    assert np.mean(moved) > 0.9
-    known = run.depth(batch)
-    assert known.shape[:2] == (2, 1)
-    assert bool(torch.isfinite(known).all())

@@ -27,7 +27,6 @@ PROCESSING: dict[str, dict[str, Any]] = {
         "ensure_multiple_of": 32,
     },
     "glpn": {"size_divisor": 32, "do_rescale": True},
-    "depth_pro": {**HALF, "size": {"height": 64, "width": 64}},
 }
 """A preprocessor_config.json by the type of the network."""
 
@@ -114,7 +113,6 @@ def test_normalisation_is_that_of_an_image_from_0_to_1(
         ("dpt", ("unknown", "affine")),
         ("zoedepth", ("depth", "metric")),
         ("glpn", ("depth", "metric")),
-        ("depth_pro", ("inverse", "scale")),
     ],
 )
 def test_a_type_of_network_says_what_its_numbers_are(

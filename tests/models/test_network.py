@@ -73,20 +73,6 @@ def test_the_only_tensor_of_a_structure_is_the_output_and_several_need_a_choice(
     assert torch.equal(chosen.depth_of({"a": depth, "b": [depth]}), depth * 2)
 
 
-@pytest.mark.parametrize(
-    ("more", "output"),
-    [
-        ({"output": lambda output: output["x"]}, {}),
-        ({"output": lambda output: output}, {}),
-        ({}, None),
-        ({}, {"depth": None}),
-    ],
-)
-def test_an_output_without_a_tensor_is_named(more: dict[str, Any], output: Any) -> None:
-    with pytest.raises(ModelError):
-        network(**more).depth_of(output)
-
-
 # ------------------------------------------------------------------ loading
 
 FILE = """

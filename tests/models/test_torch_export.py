@@ -201,24 +201,22 @@ def call(target: str) -> Change:
     return edited(lambda p: p["graph_module"]["graph"]["nodes"][0].update(target=target))
 
 
-def first_weight(**meta: Any) -> Change:
+def first_weight(**stated: Any) -> Change:
     def change(config: Any) -> None:
-        stated = next(iter(config["config"].values()))
-        stated.update({k: v for k, v in meta.items() if k in stated})
-        stated["tensor_meta"].update({k: v for k, v in meta.items() if k not in stated})
+        weight = next(iter(config["config"].values()))
+        for key, value in stated.items():
+            (weight if key in weight else weight["tensor_meta"])[key] = value
 
     return edited(change)
 
 
 MODEL = "models/model.json"
 WEIGHTS = "data/weights/model_weights_config.json"
-HUGE = [{"as_int": 10**12}]
 HOSTILE: dict[str, tuple[str, Change, str]] = {
     **{
         target: (MODEL, call(target), f"it calls '{target}'")
         for target in (
             "torch.os.system", "torch.ops.load_library", "torch.ops.aten.from_file.default",
-            "torch.ops.aten.save.default", "torch.ops.torchvision.write_file.default",
             "_operator.methodcaller", "math.ceil",
             "torch.ops.aten.__class__.mro", "torch.ops.aten.add.__call__",
             "torch.load", "os.system", "torch.ops.higher_order.wrap_with_set_grad_enabled",
@@ -226,12 +224,8 @@ HOSTILE: dict[str, tuple[str, Change, str]] = {
         )
     },
     "pickled weights": (WEIGHTS, first_weight(use_pickle=True), "is pickled"),
-    "a large weight": (WEIGHTS, first_weight(sizes=HUGE, strides=HUGE), "elements, more than"),
-    "a repeated weight": (
-        WEIGHTS, first_weight(sizes=HUGE, strides=[{"as_int": 0}]), "elements, more than"
-    ),
+    "a large weight": (WEIGHTS, first_weight(sizes=[{"as_int": 10**12}] * 4), "more than"),
     "a weight outside": (WEIGHTS, first_weight(path_name="../../../etc/hostname"), "KeyError"),
-    "a negative offset": (WEIGHTS, first_weight(storage_offset={"as_int": -1}), "offset"),
     "no JSON": (MODEL, lambda _: b"[" * 100_000, "RecursionError"),
     "a number without end": (MODEL, lambda _: b"9" * 10_000, "ValueError"),
 }  # fmt: skip
@@ -247,35 +241,15 @@ def test_what_could_do_more_than_compute_is_refused_in_one_line(archive: Path, k
     assert len(str(error.value)) < 500
 
 
-def first_node(target: str, *arguments: Any) -> Change:
-    """The first node is another one, whose result the next takes."""
-
+def test_a_small_archive_makes_nothing_far_larger_than_its_image(archive: Path) -> None:
     def change(program: Any) -> None:
         nodes = program["graph_module"]["graph"]["nodes"]
-        inputs = [{"name": "x", "arg": argument, "kind": 1} for argument in arguments]
-        outputs = [nodes[0]["outputs"][0]]
-        nodes[0] = {"target": target, "inputs": inputs, "outputs": outputs, "metadata": {}}
+        given = ({"as_tensor": {"name": "rgb"}}, {"as_ints": [1, 9, 999, 999]})
+        nodes[0]["inputs"] = [{"name": "x", "arg": one, "kind": 1} for one in given]
+        nodes[0]["target"] = "torch.ops.aten.repeat.default"
 
-    return edited(change)
-
-
-INFLATING = {
-    "a constant": first_node(
-        "torch.ops.aten.full.default", {"as_ints": [1, 8, 10**5, 10**4]}, {"as_float": 1.0}
-    ),
-    "a repeated input": first_node(
-        "torch.ops.aten.repeat.default",
-        {"as_tensor": {"name": "rgb"}},
-        {"as_ints": [1, 9, 999, 999]},
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", INFLATING)
-def test_a_small_archive_makes_nothing_far_larger_than_its_image(archive: Path, kind: str) -> None:
-    path = rewritten(archive, MODEL, INFLATING[kind])
     with little():
-        definition = find_definition(str(path))
+        definition = find_definition(str(rewritten(archive, MODEL, edited(change))))
         with pytest.raises(ModelError), torch.no_grad():
             definition.build()(torch.rand(1, 3, 64, 96))
 
@@ -290,16 +264,6 @@ def test_a_program_that_computes_sizes_is_refused_with_a_way_out(tmp_path: Path)
     assert find_definition(str(tmp_path / "Net.pt2")).size == Multiple(32)
     with pytest.raises(ModelError, match="fixed sizes"):
         find_definition(str(tmp_path / "Various.pt2"))
-
-
-def test_an_input_larger_than_the_largest_image_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    exported = torch.export.export(Net().eval(), (torch.rand(1, 3, 32, 48),))
-    torch.export.save(exported, tmp_path / "net.pt2")
-    monkeypatch.setattr("pnpdepth_cli.budget._chosen", 32 * 48 - 1)
-    with pytest.raises(ModelError, match="48×32"):
-        find_definition(str(tmp_path / "net.pt2"))
 
 
 def test_what_is_no_exported_program_is_refused(archive: Path, tmp_path: Path) -> None:

@@ -138,19 +138,6 @@ def test_a_state_dictionary_of_another_name_is_read_if_it_is_named(tmp_path: Pat
     assert equal(loaded(tmp_path / "w.pth:ema")[0], weights())
 
 
-def test_the_files_of_a_folder_are_parts_by_their_names(tmp_path: Path) -> None:
-    module = {f"module.{name}": tensor for name, tensor in parts()["conv"].items()}
-    torch.save({"state_dict": module}, tmp_path / "conv.pth.tar")
-    save_file(parts()["norm"], tmp_path / "norm.safetensors")
-    (tmp_path / "README.md").write_text("weights")
-    state, notes = loaded(tmp_path)
-    assert equal(state, weights())
-    assert notes == [
-        f"checkpoint {tmp_path.name}: conv.pth.tar, norm.safetensors",
-        "checkpoint conv.pth.tar: prefix 'module.' of every key stripped",
-    ]
-
-
 def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     for value in (float("nan"), float("inf")):
         state = weights()
@@ -163,12 +150,6 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     state["conv.weight"][:] = 60000.0  # whose sum is infinite in half precision
     torch.save(state, tmp_path / "w.pth")
     assert loaded(tmp_path / "w.pth")[0]["conv.weight"].max() == 60000.0
-
-
-def test_a_definition_may_rename_what_a_published_file_holds(tmp_path: Path) -> None:
-    torch.save({f"module.net.{k}": v for k, v in weights().items()}, tmp_path / "w.pth")
-    rename = {"read_checkpoint": lambda s: {k.removeprefix("net."): v for k, v in s.items()}}
-    assert equal(loaded(tmp_path / "w.pth", **rename)[0], weights())
 
 
 @pytest.mark.parametrize("save", [torch.save, save_older])
