@@ -98,7 +98,7 @@ def test_the_exact_p_value_is_the_fraction_of_all_swaps_that_differ_as_much(
 
 
 def test_the_sampled_p_value_is_near_the_exact_one_and_never_zero() -> None:
-    values = np.random.default_rng(0).normal(0.4, 1, 14)
+    values = np.random.default_rng(0).normal(0.4, 1, 14)  # 2^14 swaps are more than are tried
     swaps = np.array([*product((1, -1), repeat=14)]) @ values
     assert p_value_of(values) == pytest.approx(np.mean(abs(swaps) >= values.sum()), abs=0.01)
     assert p_value_of(np.ones(100)) == 2 / 10_001
