@@ -129,7 +129,7 @@ def styled(table: Table) -> list[list[tuple[str, str]]]:
 def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -> None:
     def gain(percent: float, p: float) -> Gain:
         return Gain(
-            percent=percent, low_percent=nan, high_percent=1.0, difference=nan, p_value=nan,
+            percent=percent, low_percent=nan, high_percent=1.0, p_value=nan,
             p_adjusted=p,
         )  # fmt: skip
 

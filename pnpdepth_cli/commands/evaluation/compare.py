@@ -75,8 +75,6 @@ class Gain:
     low_percent: float
     """Lower end of the 95 % interval of `percent`."""
     high_percent: float
-    difference: float
-    """Mean of the run minus mean of the first."""
     p_value: float
     """Probability of such a difference between equal runs."""
     p_adjusted: float
@@ -133,21 +131,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     if len(paths) < 2:
         raise UsageError("two runs at least are needed to compare")
     runs = [read_run(path) for path in paths]
-    first = runs[0]
-    for run in runs[1:]:
-        for rule in sorted({*first.scoring, *run.scoring}):
-            own, others = first.scoring.get(rule), run.scoring.get(rule)
-            if own != others:
-                raise InputError(
-                    f"{first.path} and {run.path} were scored by different rules ({rule} {own} and"
-                    f" {others}); score both by one protocol"
-                )
-    # the frames and the measures that all runs have
-    names = tuple(name for name in first.frames if all(name in run.frames for run in runs))
-    if not names:
-        own, other = (some_names(run.frames) or "none" for run in (first, runs[-1]))
-        raise InputError(f"the runs have no scored frame in common: {own}; and {other}")
-    measures = _shared_measures(runs, columns)
+    names, measures = _shared(runs, columns)
     keys = [measure.key for measure in measures]
     scores = [[[*map(run.scores(name).get, keys)] for name in names] for run in runs]
     values = np.array(scores, np.float64)  # (runs, frames, measures)
@@ -155,7 +139,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     values[:, ~known] = math.nan
     # the tests, over frames that count as independent
     by_name = zip(names, groups_by_name(names), strict=True)
-    groups = [first.frames[name].group or group for name, group in by_name]
+    groups = [runs[0].frames[name].group or group for name, group in by_name]
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     means = [
         FrameMeans(dict(zip(keys, row, strict=True)) for row in of_run).means()
@@ -169,7 +153,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     return Comparison(
         frames=names,
         measures=measures,
-        scoring=first.scoring,
+        scoring=runs[0].scoring,
         runs=tuple(
             ComparedRun(
                 name=name,
@@ -187,12 +171,26 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     )
 
 
-def _shared_measures(runs: Sequence[Run], columns: Sequence[str] | None) -> tuple[Measure, ...]:
-    """The measures of these keys that all runs have; the main ones for None."""
+def _shared(
+    runs: Sequence[Run], columns: Sequence[str] | None
+) -> tuple[tuple[str, ...], tuple[Measure, ...]]:
+    """The frames and the measures that all runs have. InputError if they cannot be compared."""
+    first = runs[0]
+    for run in runs[1:]:
+        for rule in sorted({*first.scoring, *run.scoring}):
+            own, others = first.scoring.get(rule), run.scoring.get(rule)
+            if own != others:
+                raise InputError(
+                    f"{first.path} and {run.path} were scored by different rules ({rule} {own} and"
+                    f" {others}); score both by one protocol"
+                )
+    names = tuple(name for name in first.frames if all(name in run.frames for run in runs))
+    if not names:
+        own, other = (some_names(run.frames) or "none" for run in (first, runs[-1]))
+        raise InputError(f"the runs have no scored frame in common: {own}; and {other}")
     shared = set.intersection(*({measure.key for measure in run.measures} for run in runs))
-    measures = [measure for measure in runs[0].measures if measure.key in shared]
-    main = tuple(measure for measure in measures if measure.main)
-    return main if columns is None and main else choose_measures(measures, columns)
+    every = [measure for measure in first.measures if measure.key in shared]
+    return names, choose_measures(every, columns or [each.key for each in every if each.main])
 
 
 def _gains(
@@ -221,7 +219,6 @@ def _gains(
             percent=float(change(before, after)),
             low_percent=low,
             high_percent=high,
-            difference=after - before,
             p_value=p_values[run][place],
             p_adjusted=adjusted[run][place],
         )
