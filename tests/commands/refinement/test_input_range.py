@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.batch.running import spread
-from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.frames import resolve
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.resolve import NORMALISATIONS, choose_input_range
@@ -56,25 +55,6 @@ def set_errors(monkeypatch: pytest.MonkeyPatch, error: Callable[[Network, Frame]
     monkeypatch.setattr(resolve, "align", lambda *_: SimpleNamespace(error=errors[-1]))
 
 
-@pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """Frames that ranges are compared on, by the range; the first one misleads."""
-    counted: Counter[str] = Counter()
-
-    def error(network: Network, frame: Frame) -> float:
-        (name,) = [
-            n for n, how in NORMALISATIONS.items() if how == network.definition.normalisation
-        ]
-        counted[name] += 1
-        first = counted[name] == 1
-        if name == "imagenet":
-            return 0.1 if first else 0.3
-        return 0.3 if first else 0.1 if name == "unit" else 1.0
-
-    set_errors(monkeypatch, error)
-    return counted
-
-
 def settings_and_notes(root: Path) -> tuple[str, str]:
     """The input range of a batch whose network states none, and the notes on it."""
     model = root / "net" / "my_net.py"
@@ -84,9 +64,22 @@ def settings_and_notes(root: Path) -> tuple[str, str]:
     return record["settings"]["normalise"], " ".join(record["notes"])
 
 
-def test_a_batch_compares_input_ranges_on_three_frames(tmp_path: Path, seen: Counter[str]) -> None:
+def test_a_batch_compares_input_ranges_on_three_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted: Counter[str] = Counter()
+
+    def error(network: Network, frame: Frame) -> float:
+        (name,) = [n for n, r in NORMALISATIONS.items() if r == network.definition.normalisation]
+        counted[name] += 1
+        first = counted[name] == 1  # which misleads
+        if name == "imagenet":
+            return 0.1 if first else 0.3
+        return 0.3 if first else 0.1 if name == "unit" else 1.0
+
+    set_errors(monkeypatch, error)
     chosen, notes = settings_and_notes(pairs_on_disk(tmp_path / "drive"))
-    assert set(seen.values()) == {3}
+    assert set(counted.values()) == {3}
     assert chosen == "unit"
     assert "mean of 3 frames" in notes
 
@@ -94,19 +87,3 @@ def test_a_batch_compares_input_ranges_on_three_frames(tmp_path: Path, seen: Cou
 def test_the_frames_that_decide_are_spread_from_the_first_to_the_last() -> None:
     assert spread(37) == [0, 2, 4, 7, 9, 12, 14, 16, 19, 21, 24, 26, 28, 31, 33, 36]
     assert [spread(count) for count in (1, 3)] == [[0], [0, 1, 2]]
-
-
-def test_a_frame_without_points_in_view_does_not_count(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: Counter[str] = Counter()
-
-    def error(network: Network, frame: Frame) -> float:
-        name = str(network.definition.normalisation)
-        calls[name] += 1
-        if calls[name] == 2:
-            raise NoPointsError("none in view")
-        return 0.1 if network.definition.normalisation == NORMALISATIONS["unit"] else 0.3
-
-    set_errors(monkeypatch, error)
-    assert "unit 10.0%" in settings_and_notes(pairs_on_disk(tmp_path / "drive"))[1]

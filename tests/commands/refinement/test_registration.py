@@ -92,29 +92,22 @@ def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> Non
     assert record.registration["right"] != whole.right
 
 
-def batch_records(folder: Path, own: FrameOnDisk, count: int) -> list[Any]:
-    """Writes eight frames, refines them as a batch, and returns the registration of each."""
-    for seed in range(8):
-        files = write_frame(folder / "in", seed, count)
-        for kind, name in (("image", "rgb"), ("sparse", "sparse")):
-            target = folder / "in" / name / f"{seed:03}.png"
-            target.parent.mkdir(exist_ok=True)
-            files[kind].rename(target)
-    network = {"model": str(own.model), "checkpoint": own.checkpoint}
-    batch(folder, source=folder / "in", refine=network)
-    records = sorted((folder / "out").glob("0*.json"))
-    return [FrameRecord.read(path).registration for path in records]
-
-
 def test_the_frames_of_a_batch_share_a_registration_that_none_shows_alone(
     tmp_path: Path, frame: FrameOnDisk
 ) -> None:
     assert refined(tmp_path / "alone", frame, count=80).registration is None
-    registrations = batch_records(tmp_path, frame, count=80)
-    assert len(registrations) == 8
-    assert registrations[0] is not None
-    assert registrations[0]["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.02)
-    assert all(each == registrations[0] for each in registrations)
+    for seed in range(8):
+        for kind, path in write_frame(tmp_path / "in", seed, 80).items():
+            target = tmp_path / "in" / {"image": "rgb", "sparse": "sparse"}[kind] / f"{seed:03}.png"
+            target.parent.mkdir(exist_ok=True)
+            path.rename(target)
+    network = {"model": str(frame.model), "checkpoint": frame.checkpoint}
+    batch(tmp_path, source=tmp_path / "in", refine=network)
+    records = (tmp_path / "out").glob("0*.json")
+    first, *others = (FrameRecord.read(path).registration for path in records)
+    assert first is not None
+    assert first["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.02)
+    assert others == [first] * 7
 
 
 def test_arrays_of_a_sequence_share_a_registration_that_one_alone_does_not_show() -> None:
