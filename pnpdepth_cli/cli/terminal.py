@@ -83,7 +83,6 @@ class BatchProgress:
 
     def __init__(self, show: Callable[..., None]) -> None:
         self.done = self.to_do = self.failed = 0
-        self._said: set[str] = set()
         self._show = show
 
     def say(self, text: str) -> None:
@@ -98,11 +97,9 @@ class BatchProgress:
         self._show(0, to_do)
 
     def frame(self, record: FrameRecord) -> None:
-        """Counts a frame, and prints why it failed if it did; what was said of it is not again."""
-        line = f"{record.status}: {record.name}: {record.message}"
-        if record.status != "done" and line not in self._said:
-            self._said.add(line)
-            self.say(line)
+        """Counts a frame, and prints why it failed if it did."""
+        if record.status != "done":
+            self.say(f"{record.status}: {record.name}: {record.message}")
         self.done += 1
         self.failed += record.status == "failed"
         self._show(self.done, self.to_do, f"{self.failed:,} failed" if self.failed else "")

@@ -44,9 +44,6 @@ _LABELS = {
 }
 """Titles of the panels of a figure, by the view of the page."""
 _CHANGE = "_change"
-_IMPROVED = Measure(
-    key="improved", title="Improved", better="higher", percent=True, decimals=1, main=True
-)
 _SETTINGS = (
     *("model", "layer", "iterations", "lr", "loss", "update", "align", "propagate", "holdout"),
     "seed",
@@ -108,7 +105,7 @@ def _source(request: BatchRequest, folder: Path) -> dict[str, object]:
 def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[str, object]:
     """A frame's values on the basis of all frames; where it has none, what it has instead."""
     own = basis if basis in record.errors else next(iter(bases_of(record.errors)), "")
-    values = _values(record, record.errors[basis]) if own == basis else {}
+    values = _values(record.errors[basis]) if own == basis else {}
     tag = BASES[own] if own not in ("", basis) else ""
     return {
         "name": record.name,
@@ -160,13 +157,11 @@ def _columns(basis: str, unit: str) -> list[Measure]:
         for stage in ("before", "after"):
             before_or_after = replace(measure, key=f"{key}_{stage}", title=f"{title} {stage}")
             columns.append(replace(before_or_after, unit=unit))
-    if basis != VALIDATION:  # the map is then of the points used
-        columns.append(_IMPROVED)
     return columns
 
 
-def _values(record: FrameRecord, stages: dict[str, Scores]) -> dict[str, float | None]:
-    values: dict[str, float | None] = {"improved": record.improved_fraction}
+def _values(stages: dict[str, Scores]) -> dict[str, float | None]:
+    values = dict[str, float | None]()
     for key in ("rmse", "mae"):
         before, after = (stages[stage].get(key) for stage in (BEFORE, AFTER))
         change = after / before - 1 if before and after is not None else None

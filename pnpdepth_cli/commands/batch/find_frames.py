@@ -11,9 +11,8 @@ from pathlib import Path, PurePosixPath
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.sequence import (
     ESTIMATED,
-    known_poses,
-    note_of_poses,
     with_neighbours,
+    with_poses,
 )
 from pnpdepth_cli.commands.refinement.output_files import outputs_in
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
@@ -22,7 +21,6 @@ from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
     Unmatched,
-    as_pose,
     file_of,
     name_problem,
 )
@@ -43,11 +41,9 @@ class BatchFrames:
 
     layout: str
     frames: Sequence[FrameFiles]
-    """All frames of the source whose results have files of their own."""
+    """All frames of the source."""
     chosen: Sequence[FrameFiles]
     """Frames of these that the names, the limit and the shard choose."""
-    refused: Sequence[tuple[FrameFiles, str]]
-    """Frames whose results would have no files of their own, and why."""
     unmatched: tuple[Unmatched, ...]
     poses: str | None
     """Where the poses of the frames are from, as a line; None without poses."""
@@ -75,7 +71,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     """Returns the frames of the source.
 
     Raises:
-        InputError: If there is none.
+        InputError: If there is none, or a result would have no files of its own.
         UsageError: If none has sparse depth.
         OutputError: If the output is a file, or holds the frames.
     """
@@ -83,32 +79,32 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     source, output = request.source, request.output
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
-    layout, found, lost = list_frames(source, request.layout)
-    folders = {source, *(path.parent for frame in found for path in source_files(frame))}
+    layout, frames, lost = list_frames(source, request.layout)
+    folders = {source, *(path.parent for frame in frames for path in source_files(frame))}
     if any(folder.is_dir() and _is_inside(folder, output) for folder in folders):
         raise OutputError(
             f"{output} holds the frames themselves; name a folder of its own, such as"
             f" {output / 'out'}"
         )
-    frames, refused = _with_own_files(found, request.refine)
-    # There must be some, with sparse depth.
-    if not found:
+    # There must be some, with sparse depth and names that are fit for results.
+    if not frames:
         first = f" ({lost[0]})" if lost else ""
         raise InputError(
             f"{source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
         )
-    if request.reading.sample is None and all(frame.sparse is None for frame in found):
+    if request.reading.sample is None and all(frame.sparse is None for frame in frames):
         raise UsageError(
             f"{source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
         )
+    _check_names(frames, request.refine)
     # Poses and neighbours, of all frames.
     frames, poses = _with_poses(request, frames)
     # The part of the frames that this run refines.
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
-    if frames and not chosen:
+    if not chosen:
         raise UsageError(
             f"no frame of {source} has a name like {request.names!r}; the first is {frames[0].name}"
         )
@@ -116,7 +112,6 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         layout=layout,
         frames=frames,
         chosen=chosen[:: request.every][: request.limit][number - 1 :: of],
-        refused=refused,
         unmatched=tuple(each for each in lost if not _is_inside(each.path, output)),
         poses=poses,
     )
@@ -130,18 +125,19 @@ def _with_poses(
     if path is None and not any(f.pose for f in frames) and beside.is_file():
         path = beside
     try:
-        known = known_poses(frames, path, request.pose_kind)
+        frames, source = with_poses(frames, path, request.pose_kind)
     except InputError as error:
         if request.poses is not None or request.accumulate:
             raise
         return frames, f"note: {error}; records get no poses"
-    frames = [
-        frame if pose is None else replace(frame, pose=as_pose(pose[0]))
-        for frame, pose in zip(frames, known, strict=True)
-    ]
     if request.accumulate:
-        return with_neighbours(frames, request.accumulate, known), note_of_poses(known, ESTIMATED)
-    return frames, note_of_poses(known, "unknown") if any(known) else None
+        frames = with_neighbours(frames, request.accumulate, source)
+    # Poses of some frames, all, or none.
+    count = sum(frame.pose is not None for frame in frames)
+    if not count:
+        return frames, f"poses: {ESTIMATED}" if request.accumulate else None
+    some = "" if count == len(frames) else f" ({count:,} of {len(frames):,} frames)"
+    return frames, f"poses: {source}{some}"
 
 
 def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
@@ -205,38 +201,28 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
         yield "calib", calib
 
 
-def _with_own_files(
-    frames: Sequence[FrameFiles], refine: RefineRequest
-) -> tuple[list[FrameFiles], list[tuple[FrameFiles, str]]]:
-    """The frames whose results have files of their own, and the others with the reason.
+def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
+    """Raises InputError for a frame whose results have no files of their own.
 
     Names that differ in Unicode normalisation only are one file on macOS.
     """
     endings = [path.name for path in outputs_in(Path(), "", refine).values()]
-    names = [unicodedata.normalize("NFC", frame.name) for frame in frames]
-    folders = {folder for name in names for folder in _folders_of(name)}
-    owners = dict[str, str]()  # names of frames by their files
-    kept, refused = list[FrameFiles](), list[tuple[FrameFiles, str]]()
-    for frame, name in zip(frames, names, strict=True):
+    owners = dict.fromkeys((CSV, JSON), "the batch")  # by the file
+    names = {frame.name: unicodedata.normalize("NFC", frame.name) for frame in frames}
+    for own, name in names.items():
         files = [name + ending for ending in endings]
-        owner = next((owners[file] for file in files if file in owners), None)
-        why = name_problem(name)
-        if name.startswith(".batch") or not {CSV, JSON}.isdisjoint([*files, *_folders_of(name)]):
-            why = why or "needs a file of the batch's own"
-        elif not folders.isdisjoint(files):
-            why = why or "needs a file where other frames have a folder"
-        elif owner is not None:
-            why = why or f"needs a file of frame {one_line(owner)!r}"
-        if why is not None:
-            refused.append((frame, f"the name {one_line(frame.name)!r} {why}; rename it"))
-            continue
-        kept.append(frame)
-        owners |= dict.fromkeys(files, frame.name)
-    return kept, refused
-
-
-def _folders_of(name: str) -> list[str]:
-    return [folder.as_posix() for folder in PurePosixPath(name).parents]
+        problem = name_problem(name)
+        if name.startswith(".batch"):
+            problem = "is one of the batch's own"
+        elif owner := next((owners[file] for file in files if file in owners), None):
+            problem = f"needs a file of {owner}"
+        if problem is not None:
+            raise InputError(f"the name of frame {one_line(repr(own))} {problem}; rename it")
+        owners |= dict.fromkeys(files, f"frame {one_line(repr(own))}")
+    for own, name in names.items():
+        for folder in PurePosixPath(name).parents:
+            if owner := owners.get(str(folder)):
+                raise InputError(f"frame {one_line(repr(own))} needs a file of {owner}; rename it")
 
 
 def _is_inside(path: Path, folder: Path) -> bool:

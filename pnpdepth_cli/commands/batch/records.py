@@ -64,10 +64,7 @@ class Records:
                 )
 
     def reason_to_refine(self, frame: FrameFiles) -> str | None:
-        """Returns why a frame is to be refined; None if it is done with its settings and files.
-
-        The reason is a word or two, with details after a colon.
-        """
+        """Returns why a frame is to be refined; None if it is done with its settings and files."""
         # The record.
         request, outputs = request_of(self.request, frame), self.outputs_of(frame)
         if not outputs["record"].exists():
@@ -83,13 +80,10 @@ class Records:
         inputs, known = dict(input_files(request)), record.batch.inputs
         if known.keys() != inputs.keys():
             return "other input files"
-        for part, path in inputs.items():
-            if not is_unchanged(path, known[part]):
-                return f"input changed: {part}"
-        for kind, path in outputs.items():
-            if kind not in IMAGES and not path.exists():
-                return f"result missing: {path.name}"
-        return None
+        if not all(is_unchanged(path, known[part]) for part, path in inputs.items()):
+            return "input changed"
+        there = all(path.exists() for kind, path in outputs.items() if kind not in IMAGES)
+        return None if there else "result missing"
 
     def record_of(self, frame: FrameFiles) -> FrameRecord | None:
         """Returns the record of a frame with its present settings; None if there is none."""

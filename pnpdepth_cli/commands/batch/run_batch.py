@@ -94,10 +94,7 @@ def run_batch(
         # All that are done are summed up; the summary of the shard that ends last stays.
         known = in_order(lambda f: records_of(f).record_of(f), found.frames, _READERS)
         with in_turn(request.output):
-            summary = write_summary(request, found, own.settings, filter(None, known))
-    for note in summary.unsure:
-        listener.say(f"warning: {note}")
-    return summary
+            return write_summary(request, found, own.settings, [*filter(None, known)])
 
 
 def _adapt(
@@ -180,8 +177,6 @@ def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
         yield found.poses
     if len(found.chosen) < len(frames):
         yield f"chosen: {count_of(len(found.chosen), 'frame')} of them"
-    for frame, why in found.refused:
-        yield f"failed: {frame.name}: {why}"
     for each in unmatched[:_MAX_LISTED]:
         yield f"warning: {each}"
     if (more := len(unmatched) - _MAX_LISTED) > 0:
@@ -190,7 +185,7 @@ def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
 
 def _plan(reasons: Sequence[str | None]) -> str:
     """How many of the frames are done, and why others are to do, given the reason of each."""
-    kinds = Counter(reason.split(":")[0] for reason in reasons if reason)
+    kinds = Counter(filter(None, reasons))
     frames, to_do = count_of(len(reasons), "frame"), kinds.total()
     if not to_do:
         return f"{frames}, all of them done already"

@@ -68,9 +68,7 @@ class BatchSummary:
     """Mean, least and largest weight of each expert of the default method, by name."""
     warnings: list[Noted]
     frame_notes: list[Noted]
-    """Notes of frames that begin with "note"."""
-    unsure: list[str]
-    """What was guessed of the network and may be wrong."""
+    """Notes that begin with "note", and unsure guesses."""
     unmatched: list[str]
     """Files that are in no frame."""
     varied: dict[str, str]
@@ -95,14 +93,13 @@ def summarise(
     results = [record for record in records if record.status != "failed"]
     statuses = Counter[str](record.status for record in records)
     worse = [w for record in results if (w := record.worse_than_linear) is not None]
-    frames = len(found.frames) + len(found.refused)
     counts = {
-        "frames": frames,
+        "frames": len(found.frames),
         **{status: statuses[status] for status in ("done", "diverged", "failed")},
         "with_warnings": sum(bool(record.warnings) for record in results),
         "compared": len(worse),
         "worse": sum(worse),
-        "pending": frames - len(records),
+        "pending": len(found.frames) - len(records),
     }
     # Weights of the networks, and what is noted of frames.
     weights = defaultdict[str, list[float]](list)
@@ -127,7 +124,6 @@ def summarise(
         },
         warnings=[each for each in noted if each.is_warning],
         frame_notes=[each for each in noted if not each.is_warning],
-        unsure=[*dict.fromkeys(n for each in results for n in each.notes if ", unsure (" in n)],
         unmatched=[str(each) for each in found.unmatched],
         varied=dict(request.varied),
     )
@@ -138,7 +134,7 @@ def _noted(records: Iterable[FrameRecord]) -> list[Noted]:
     kinds = dict[str, Noted]()
     for record in records:
         for note in record.notes:
-            if note.startswith(("warning", "note")):
+            if note.startswith(("warning", "note")) or ", unsure (" in note:
                 noted = kinds.setdefault(_NUMBER.sub("", note), Noted(note=note))
                 noted.frames += 1
                 noted.first += [record.name] if len(noted.first) < _NAMED else []
@@ -172,19 +168,12 @@ def write_summary(
     request: BatchRequest,
     found: BatchFrames,
     settings: Mapping[str, object],
-    known: Iterable[FrameRecord],
+    records: Sequence[FrameRecord],
 ) -> BatchSummary:
     """Writes `summary.json`, with the records as its list `frames`, `summary.csv` and the report.
 
-    Arguments are those of `summarise`; frames that were refused need no record.
+    Arguments are those of `summarise`.
     """
-    records = [
-        *(
-            FrameRecord(name=frame.name, group=frame.group, status="failed", message=why)
-            for frame, why in found.refused
-        ),
-        *known,
-    ]
     summary = summarise(request, found, settings, records)
     frames = [record.to_json() for record in records]
     write_json(request.output / JSON, {**asdict(summary), "frames": frames})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
-from pnpdepth_cli.commands.batch.sequence import (
-    ESTIMATED,
-    known_poses,
-    note_of_poses,
-    with_neighbours,
-)
+from pnpdepth_cli.commands.batch.sequence import with_neighbours
 from pnpdepth_cli.commands.cloud import write_depth_cloud
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import CloudRequest
@@ -94,7 +88,7 @@ def test_frames_of_another_sequence_or_camera_are_no_neighbours(tmp_path: Path) 
         FrameFiles(name=name, sparse=tmp_path / f"{name}_{camera}.png", camera=camera, pose=STILL)
         for name, camera in kinds
     ]
-    linked = with_neighbours(frames, 2, known_poses(frames))
+    linked = with_neighbours(frames, 2)
     assert [[each.files.sparse.stem for each in frame.neighbours] for frame in linked] == [
         ["a_2_2"], ["a_1_2"], [], ["a_2_3"], ["a_1_3"],
     ]  # fmt: skip
@@ -106,9 +100,7 @@ def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
         FrameFiles(name=f"a_{number}", sparse=Path("s.png"), pose=pose)
         for number, pose in enumerate((STILL, turned))
     ]
-    (of_turned,), (of_still,) = (
-        each.neighbours for each in with_neighbours(frames, 1, known_poses(frames))
-    )
+    (of_turned,), (of_still,) = (each.neighbours for each in with_neighbours(frames, 1))
     assert of_turned.motion == turned
     np.testing.assert_allclose(
         of_still.motion, [[0, 1, 0, 0], [-1, 0, 0, 4], [0, 0, 1, -1]], atol=1e-12
@@ -124,16 +116,7 @@ def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
 )
 def test_neighbours_need_points_and_images_or_poses(frame: FrameFiles, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        with_neighbours([frame, frame], 1, known_poses([frame, frame]))
-
-
-def test_the_note_names_the_poses_that_are_used() -> None:
-    own = FrameFiles(name="a_1", image=Path("i.png"), sparse=Path("s.png"), pose=STILL)
-    known = known_poses([own, own, replace(own, pose=None)])
-    assert note_of_poses(known[:2], ESTIMATED) == "poses: the layout's"
-    assert note_of_poses(known, ESTIMATED) == (
-        "poses: the layout's (2 of 3), estimated from the images (1 of 3)"
-    )
+        with_neighbours([frame, frame], 1)
 
 
 def rendered_drive(root: Path) -> Path:

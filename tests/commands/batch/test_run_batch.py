@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -260,45 +261,18 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Pa
 
 
 @pytest.mark.parametrize(
-    ("name", "why"),
+    "name",
     [
-        ("../up", "leads out of the output folder"),
-        ("/up", "leads out of the output folder"),
-        ("summary", "needs a file of the batch's own"),
-        ("summary.csv/x", "needs a file of the batch's own"),
-        (".batch.lock/x", "needs a file of the batch's own"),
-        ("fine\u0301", "needs a file of frame 'fin\u00e9'"),
+        *("../up", "/up", ".batch.lock/x", "summary", "summary.csv/x", "fine\u0301"),
+        *("ok_view", "ok_depth.png/x", "ok.json/deep/x"),
     ],
 )
-def test_a_name_without_files_of_its_own_is_a_failed_frame_in_plan_and_run(
-    root: Path, name: str, why: str
-) -> None:
+def test_a_name_without_files_of_its_own_is_refused(root: Path, name: str) -> None:
     rows = [f'rgb/a.png,sparse/a.png,"{each}"' for each in ("ok", "fin\u00e9", name)]
     (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]), encoding="utf-8")
-    request = BatchRequest(
-        source=root / "list.csv",
-        output=root / "out",
-        refine=refinement(root, uncertainty=True, iterations=0),
-    )
-    listener = RecordingListener()
-    counts = run_batch(request, listener).counts
-    assert listener.names == ["ok", "fin\u00e9"]
-    assert sum(f"{why}; rename it" in line for line in listener.messages) == 1
-    assert (counts["frames"], counts["done"], counts["failed"], counts["pending"]) == (3, 2, 1, 0)
-    assert [record.status for record in listener.records] == ["done", "done"]
-    assert not (root / "up_depth.png").exists()
-    assert why in {row["name"]: row.get("message") for row in summary(root)["frames"]}[name]
-
-
-@pytest.mark.parametrize("names", [("ok_depth.png/x", "ok"), ("ok", "ok.json/deep/x")])
-def test_a_folder_cannot_lie_where_the_results_of_a_frame_go(
-    root: Path, names: tuple[str, ...]
-) -> None:
-    rows = [f"rgb/a.png,sparse/a.png,{name}" for name in names]
-    (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]))
-    listener = RecordingListener()
-    assert batch(root, listener, source=root / "list.csv").counts["failed"] == 1
-    assert listener.names == [name for name in names if name != "ok"]
+    with pytest.raises(InputError, match=re.escape(repr(name))):
+        batch(root, source=root / "list.csv", html=root / "report", html_3d=True)
+    assert not (root / "out").exists()
 
 
 def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: Path) -> None:
@@ -490,9 +464,8 @@ def test_an_unsure_guess_of_the_input_range_is_repeated_at_the_end(root: Path) -
         path = root / "out" / f"{name}.json"
         record = json.loads(path.read_text())
         path.write_text(json.dumps(record | {"notes": [*record["notes"], note]}))
-    listener = RecordingListener()
-    assert batch(root, listener, limit=2).unsure == [note]
-    assert listener.messages[-1] == f"warning: {note}"
+    (noted,) = batch(root, limit=2).frame_notes
+    assert (noted.note, noted.first) == (note, ["a", "b"])
 
 
 def test_files_of_a_run_with_other_options_do_not_stay_beside_new_ones(root: Path) -> None:
