@@ -52,7 +52,7 @@ class ScanOptions:
         if suffix in SCAN_ONLY_SUFFIXES:
             return True
         if self.calib is not None and suffix in (".npy", ".csv", ".txt"):
-            from pnpdepth_cli.io.sparse_files import holds_scan
+            from pnpdepth_cli.io.depth import holds_scan
 
             if holds_scan(sparse):
                 return True

@@ -15,9 +15,8 @@ from pnpdepth_cli.dataset.plausible import check_pixels, divisor_to_metres, far_
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
-from pnpdepth_cli.io.depth import describe_range
+from pnpdepth_cli.io.depth import describe_range, read_sparse
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.points import METRES, SparsePoints
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import unproject

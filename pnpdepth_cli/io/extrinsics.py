@@ -87,13 +87,9 @@ def pose_of_quaternion(path: Path, translation: list[float], xyzw: list[float]) 
 def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> Extrinsics:
     """Returns the pose. Raises FileFormatError if it holds no rotation, or is of no sensor."""
     if not is_rotation(rotation):
-        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if off <= _ROTATION_TOLERANCE:
-            raise FileFormatError(
-                f"{path}: the {name} is no rotation but mirrors (determinant −1): the scan is"
-                " left-handed, as CARLA's and Unity's are; negate its y, and the second column here"
-            )
-        raise FileFormatError(f"{path}: the {name} is no rotation (R·Rᵀ is off by {off:.2g})")
+        off, turns = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation) > 0
+        why = f"R·Rᵀ is off by {off:.2g}" if turns else "it mirrors, as left-handed scans do"
+        raise FileFormatError(f"{path}: the {name} is no rotation ({why}); correct it")
     if not (np.abs(translation) < _FARTHEST_M).all():
         raise FileFormatError(f"{path}: a translation of {one_line(translation)} m is of no sensor")
     return Extrinsics(rotation, translation)

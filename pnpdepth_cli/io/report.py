@@ -69,11 +69,8 @@ def check_report_folder(
         raise OutputError(f"{there} is a file; name a folder for the report")
     resolved = folder.resolve()
     for source in inputs:
-        read = source.resolve()
-        if resolved.is_relative_to(read):
+        if resolved.is_relative_to(source.resolve()):
             raise OutputError(f"{folder} lies in {source}, which is read; name another folder")
-        if read.is_relative_to(resolved):
-            raise OutputError(f"{folder} holds {source}, which is read; name another folder")
     try:
         names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     except OSError as error:

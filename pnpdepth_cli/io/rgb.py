@@ -14,13 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.decoding import (
-    IMAGE_ERRORS,
-    check_exif,
-    open_image,
-    orientation_of,
-    raw_mode,
-)
 from pnpdepth_cli.io.file_bytes import (
     check_pixel_count,
     damaged,
@@ -28,7 +21,14 @@ from pnpdepth_cli.io.file_bytes import (
     size_of_regular_file,
 )
 from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.images import read_exr_channels
+from pnpdepth_cli.io.formats.images import (
+    IMAGE_ERRORS,
+    check_exif,
+    open_image,
+    orientation_of,
+    raw_mode,
+    read_exr_channels,
+)
 
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _PLAUSIBLE = (0.2, 50.0)

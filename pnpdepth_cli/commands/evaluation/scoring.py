@@ -22,9 +22,8 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
 from pnpdepth_cli.file_record import FileRecord
-from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored
+from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_sparse
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.sparse_files import read_sparse
 from pnpdepth_cli.measures import OF_SIGMA
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.protocols import Protocol
