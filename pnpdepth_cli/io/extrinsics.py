@@ -88,8 +88,8 @@ def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> 
     """Returns the pose. Raises FileFormatError if it holds no rotation, or is of no sensor."""
     if not is_rotation(rotation):
         off, turns = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation) > 0
-        why = f"R·Rᵀ is off by {off:.2g}" if turns else "it mirrors, as left-handed scans do"
-        raise FileFormatError(f"{path}: the {name} is no rotation ({why}); correct it")
+        why = f"R·Rᵀ is off by {off:.2g}" if turns else "determinant −1: a left-handed scan?"
+        raise FileFormatError(f"{path}: {name} is no rotation ({why}); correct it")
     if not (np.abs(translation) < _FARTHEST_M).all():
         raise FileFormatError(f"{path}: a translation of {one_line(translation)} m is of no sensor")
     return Extrinsics(rotation, translation)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import os
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -59,15 +60,19 @@ def size_of_regular_file(path: Path) -> int:
     Raises:
         InputError: There is no such file, or it is a folder, a device or a pipe.
     """
-    try:
-        status = path.stat()
-    except (OSError, ValueError) as error:
-        raise cannot_read(path, error) from error
+    status = _status(path)
     if stat.S_ISDIR(status.st_mode):
         raise InputError(f"{path} is a folder; give one file")
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path} is a device or a pipe; save its content to a file first")
     return status.st_size
+
+
+def _status(path: Path) -> os.stat_result:
+    try:
+        return path.stat()
+    except (OSError, ValueError) as error:
+        raise cannot_read(path, error) from error
 
 
 def cannot_read(path: Path, error: OSError | ValueError) -> InputError:
@@ -156,10 +161,7 @@ def is_unchanged(path: Path, known: Fingerprint) -> bool:
 
 
 def _size_and_times(path: Path) -> tuple[int, int, int]:
-    try:
-        status = path.stat()
-    except (OSError, ValueError) as error:
-        raise cannot_read(path, error) from error
+    status = _status(path)
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 

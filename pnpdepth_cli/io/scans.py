@@ -159,10 +159,7 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
     if stored == "binary_compressed":
         body = _decompress_rows(path, columns, number, body)
     points = _xyz(path, "PCD", columns, number, body, None if stored == "ascii" else "<")
-    source = f"{stored} PCD"
-    if entries.get("VIEWPOINT", []) not in ([], ["0", "0", "0", "1", "0", "0", "0"]):
-        source += ", its VIEWPOINT not applied"
-    return points, source
+    return points, f"{stored} PCD"
 
 
 def _decompress_rows(path: Path, columns: list[Column], number: int, body: bytes) -> bytes:

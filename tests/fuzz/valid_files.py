@@ -14,7 +14,6 @@ from torch import nn
 from pnpdepth_cli.io.depth import write_depth
 from tests.bags import write_bag
 from tests.colmap_models import write_binary_model, write_text_model
-from tests.data_sets import tum
 from tests.io.test_calibration import FOUR, KALIBR, KITTI, POSES, ROS, opencv_file
 from tests.io.test_scans import FILES
 from tests.models.onnx.onnx_files import write_network
@@ -123,15 +122,11 @@ def _data_sets(depth: np.ndarray) -> dict[str, str]:
     write_binary_model(Path("binary/sparse/0"))
     images = ("photos/images/a.png", "photos/images/b.png", "photos/images/c.png")
     images += ("binary/images/dir/1.png", "binary/images/dir/2.png")
-    images += ("tum/rgb/1.000.png", "tum/rgb/1.033.png", "tum/rgb/2.png")
-    images += ("tum/depth/1.015.png", "tum/depth/1.030.png")
     for name in images:
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_bytes(Path("rgb.png").read_bytes())
-    tum(Path("tum"))
     models = [path for root in ("photos", "binary") for path in Path(root, "sparse/0").iterdir()]
     return {
         "frames.csv": f"batch frames.csv {LISTING}",
         **{path.as_posix(): f"batch {path.parts[0]} {LISTING}" for path in models},
-        **{f"tum/{name}.txt": f"batch tum {LISTING} --sample 20" for name in ("rgb", "depth")},
     }

