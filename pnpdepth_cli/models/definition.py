@@ -1,23 +1,7 @@
 """What the program knows of a network: one frozen dataclass, `ModelDefinition`.
 
-Your own network is a Python file with such an object in it, named `definition`:
-
-    # my_net.py, used as: pnpdepth refine img.png --sparse s.png --model my_net.py --checkpoint w.pt
-    from pnpdepth_cli.models.definition import (
-        IMAGENET_MEAN, IMAGENET_STD, ModelDefinition, Multiple, Normalisation
-    )
-    from my_package import MyNet  # beside this file, or installed
-
-    definition = ModelDefinition(
-        name="my-net",
-        input_kind="rgb",                  # its forward takes one rgb image (1, 3, H, W)
-        size=Multiple(32),                 # of any size in multiples of 32
-        normalisation=Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
-        output_kind="inverse",             # its numbers are inverse depth,
-        output_scale="affine",             # up to a scale and a shift
-        layers=("decoder.up1",),           # where to cut; without any, they are suggested
-        build=MyNet,                       # called without arguments
-    )
+Your own network is a Python file with such an object in it, named `definition`: see "A definition"
+in docs/guides/your-network.md.
 
 Every field has a line of description below it. `pnpdepth models check my_net.py` tries the
 definition. The same file in `model_zoo_defs`, or its object as an entry point `pnpdepth.models` of

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 from torch.utils.flop_counter import flop_registry
@@ -117,6 +117,14 @@ class Steps:
             yield step
             for name in step.last_read:
                 values.pop(name, None)
+
+
+def hold(module: nn.Module, name: str, value: Tensor) -> None:
+    """Adds a weight or another constant to a module, without gradient."""
+    if value.is_floating_point():
+        module.register_parameter(name, nn.Parameter(value, requires_grad=False))
+    else:
+        module.register_buffer(name, value)
 
 
 def _resolve(argument: object, values: Mapping[str, object]) -> Any:

@@ -22,7 +22,7 @@ from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, graph_definition
-from pnpdepth_cli.models.steps import Step, Steps, Unsupported, Value
+from pnpdepth_cli.models.steps import Step, Steps, Unsupported, Value, hold
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
 from pnpdepth_cli.models.weights.torch_file import refuse_inflated
 
@@ -93,10 +93,7 @@ class ExportedGraph(nn.Module):
 
     def _hold(self, name: str, value: Tensor) -> None:
         self.held[name] = f"tensor{len(self.held)}"
-        if value.is_floating_point():
-            self.register_parameter(self.held[name], nn.Parameter(value, requires_grad=False))
-        else:
-            self.register_buffer(self.held[name], value)
+        hold(self, self.held[name], value)
 
     def _steps_of(self, graph: Mapping[str, Any]) -> Iterator[Step]:
         for node in graph["nodes"]:

@@ -22,11 +22,10 @@ from pnpdepth_cli.models.onnx import (  # noqa: F401  (each file registers its o
     ONLY,
     OPERATORS,
     Node,
-    arithmetic,
-    elements,
     layers,
+    operators,
 )
-from pnpdepth_cli.models.steps import SizeLimit, Step, Steps, Unsupported, Value
+from pnpdepth_cli.models.steps import SizeLimit, Step, Steps, Unsupported, Value, hold
 
 if TYPE_CHECKING:
     from onnx import AttributeProto, ModelProto, NodeProto, TensorProto
@@ -69,10 +68,7 @@ class OnnxNode(nn.Module):
                 self._inputs.append(value)
             else:
                 self._inputs.append(name)
-                if value.is_floating_point():
-                    self.register_parameter(name, nn.Parameter(value, requires_grad=False))
-                else:
-                    self.register_buffer(name, value)
+                hold(self, name, value)
         self.handed_in_on_host = tuple(
             index in host for index, value in enumerate(self._inputs) if value == ""
         )

@@ -75,14 +75,9 @@ def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
     x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
     rank = x.ndim - 2
     stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
-    extra = list(node.get("output_padding", [0] * rank))
-    full = [
-        (n - 1) * s + (k - 1) * d + 1 + e
-        for n, s, k, d, e in zip(
-            x.shape[2:], stride, weight.shape[2:], dilation, extra, strict=True
-        )
-    ]
+    extra = node.get("output_padding", [0] * rank)
     y: Tensor = _TRANSPOSED[rank](x, weight, None, stride, 0, 0, node.get("group", 1), dilation)
+    full = [n + e for n, e in zip(y.shape[2:], extra, strict=True)]
     crops = _pads_of_transposed(node, x, stride, full)
     sides = [(-begin, e - end) for (begin, end), e in zip(crops, extra, strict=True)]
     if any(n for pair in sides for n in pair):
