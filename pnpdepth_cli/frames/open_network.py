@@ -7,10 +7,9 @@ input; `Member` is a network as the method uses it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.split.replay import Interception
+from pnpdepth_cli.core.split.replay import Interception, Run
 from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.errors import DivergedError, NoPointsError
 from pnpdepth_cli.frames.frame import Frame
@@ -101,8 +100,8 @@ class OpenNetwork:
         self._open = ExitStack()
         self._split: Split | None = None
         self._z0: Tensor | None = None
-        self._output: Any = None
-        self._encoded: dict[str, Any] = {}
+        self._output: object = None
+        self._encoded: dict[str, object] = {}
 
     def __enter__(self) -> OpenNetwork:
         self._open.enter_context(encoding_once(self.member.network, self._encoded))
@@ -183,7 +182,7 @@ class OpenNetwork:
         self._z0 = z0 if self._of_image_only else None
         return z0
 
-    def _coarse(self) -> AbstractContextManager[list[Any]]:
+    def _coarse(self) -> AbstractContextManager[list[object]]:
         """Inside, the network gives a smaller depth for the updates, if its definition has one."""
         network = self.member.network
         coarse = network.definition.coarse if self.member.coarse else None
@@ -238,7 +237,7 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
 
 
 @contextmanager
-def encoding_once(network: Network, encoded: dict[str, Any]) -> Iterator[None]:
+def encoding_once(network: Network, encoded: dict[str, object]) -> Iterator[None]:
     """Inside, the image encoder runs once, if the definition names one; its output is kept.
 
     Args:
@@ -249,7 +248,7 @@ def encoding_once(network: Network, encoded: dict[str, Any]) -> Iterator[None]:
         yield
         return
 
-    def encode(_module: nn.Module, _inputs: Any, run: Callable[[], Any]) -> Any:
+    def encode(_module: nn.Module, _inputs: object, run: Run) -> object:
         if name not in encoded:
             encoded[name] = run()
         return encoded[name]

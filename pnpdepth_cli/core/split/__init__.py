@@ -98,7 +98,7 @@ class Split:
         z0 = None if self._replay is None else self._replay.z0
         return z0 is not None and z0.dtype == torch.float16
 
-    def front(self, *arguments: Any) -> Tensor:
+    def front(self, *arguments: object) -> Tensor:
         """Returns z_0, the output of the cut layer for these arguments of the network.
 
         In float32 if the layer gives a shorter type, in which small steps would be rounded away.
@@ -121,13 +121,13 @@ class Split:
         replay.z = z
         return self._run(replay) if replay.recording.complete else self._record_rear(replay)
 
-    def _replay_front(self, replay: Replay, arguments: Sequence[Any]) -> None:
+    def _replay_front(self, replay: Replay, arguments: Sequence[object]) -> None:
         replay.next_frame(arguments)
         if not self._run_front(replay):
             ran = {call.module for call in replay.recording.calls}
             raise self._cut.never_ran(ran, replay.calls[self._cut.module])
 
-    def _record_front(self, arguments: Sequence[Any]) -> Replay:
+    def _record_front(self, arguments: Sequence[object]) -> Replay:
         while True:
             replay = Replay(self._cut, arguments)
             watch = Watch(

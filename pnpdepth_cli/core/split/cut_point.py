@@ -6,7 +6,6 @@ import difflib
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -73,7 +72,7 @@ class CutPoint:
             around_hooks=_around_hooks(modules),
         )
 
-    def choose(self, output: Any) -> tuple[tuple[str, ...], Tensor]:
+    def choose(self, output: object) -> tuple[tuple[str, ...], Tensor]:
         """Returns the path and the tensor of z in the layer's output.
 
         Raises:

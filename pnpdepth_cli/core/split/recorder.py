@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 from torch import nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
-from pnpdepth_cli.core.split.replay import RecordedCall, Recording, Replay, shapes_of
+from pnpdepth_cli.core.split.replay import RecordedCall, Recording, Replay, Run, shapes_of
 from pnpdepth_cli.core.split.tensors import SavedTensors, tensors_in
 from pnpdepth_cli.core.split.watch import Watch
 from pnpdepth_cli.errors import LayerError
@@ -34,12 +31,12 @@ class Recorder:
         self._known = len(self._calls)  # before this pass; in the rear's, those up to the cut
         self._inside_one = False  # in a submodule that is to be cached as a whole
 
-    def run(self, module: nn.Module, run: Callable[[], Any]) -> Any:
+    def run(self, module: nn.Module, run: Run) -> object:
         """Runs a submodule, watched."""
         with self.watch.seeing_escapes_of(module):
             return run()
 
-    def record(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
+    def record(self, module: nn.Module, inputs: object, run: Run) -> object:
         """Runs a call and notes it; it is cached if its output can stand for all that it does."""
         if self._inside_one and module is not self._cut.module:
             return run()

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from pnpdepth_cli.core.split.recorder import Recorder
 
 
-Handler = Callable[[nn.Module, Any, Callable[[], Any]], Any]
+Run = Callable[[], object]
+"""Runs a call of a submodule; returns its output."""
+
+Handler = Callable[[nn.Module, object, Run], object]
 """Called with a submodule, its inputs (args, kwargs) and a function that runs it."""
 
 
@@ -54,15 +57,17 @@ class Interception:
         finally:
             self._handler = afterwards
 
-    def _stand_in(self, module: nn.Module, original: Callable[..., Any]) -> Callable[..., Any]:
+    def _stand_in(
+        self, module: nn.Module, original: Callable[..., object]
+    ) -> Callable[..., object]:
         @functools.wraps(original)
-        def forward(*args: Any, **kwargs: Any) -> Any:
+        def forward(*args: object, **kwargs: object) -> object:
             return self._handler(module, (args, kwargs), lambda: original(*args, **kwargs))
 
         return forward
 
 
-def _run_only(module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
+def _run_only(module: nn.Module, inputs: object, run: Run) -> object:
     return run()
 
 
@@ -83,7 +88,7 @@ class Recording:
     """The calls that are cached, or that contain the cut or calls of their own."""
     cut: int | None = None  # index of the call that is the cut; None before it was reached
     path: tuple[str, ...] = ()  # path of z in the output of that call
-    shapes: Any = None  # shapes and other properties of the arguments for which this holds
+    shapes: object = None  # shapes and other properties of the arguments for which this holds
     static_graph: bool = False  # whether it holds for all arguments of these shapes
     complete: bool = False  # whether the calls behind the cut are in it, too
 
@@ -92,7 +97,7 @@ class Recording:
         indices = self._indices.get(module, ())
         return indices[count] if count < len(indices) else None
 
-    def holds_for(self, arguments: Sequence[Any]) -> bool:
+    def holds_for(self, arguments: Sequence[object]) -> bool:
         """Whether a pass with these arguments makes the same calls."""
         return self.complete and self.static_graph and self.shapes == shapes_of(arguments)
 
@@ -104,7 +109,7 @@ class Recording:
         return indices
 
 
-def shapes_of(arguments: Sequence[Any]) -> Any:
+def shapes_of(arguments: Sequence[object]) -> object:
     """Returns what arguments must share for a network without branches to treat them alike."""
     tensors = [(t.shape, t.dtype, t.device) for _, t in tensors_in(tuple(arguments))]
     return tensors, repr(map_tensors(tuple(arguments), lambda _, t: t.new_empty(0)))
@@ -123,7 +128,7 @@ class Replay:
         arguments: Arguments of the network for the first frame.
     """
 
-    def __init__(self, cut: CutPoint, arguments: Sequence[Any]) -> None:
+    def __init__(self, cut: CutPoint, arguments: Sequence[object]) -> None:
         self._cut = cut
         self.recording = Recording()
         self.arguments = SavedTensors(_copies(arguments))
@@ -136,7 +141,7 @@ class Replay:
         self.recorder: Recorder | None = None
         self._fills = False  # inside a call whose output will be saved as a whole
 
-    def next_frame(self, arguments: Sequence[Any]) -> None:
+    def next_frame(self, arguments: Sequence[object]) -> None:
         """Forgets the frame at hand; `arguments` are those of the next one."""
         self.arguments = SavedTensors(_copies(arguments), self.arguments.copied)
         self.outputs, self.z0, self.z = [None] * len(self.recording.calls), None, None
@@ -150,7 +155,7 @@ class Replay:
         """Returns the exception that ends the front's pass."""
         return CutReached(f"layer {self._cut.layer!r} was reached, where the network is cut")
 
-    def handle(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
+    def handle(self, module: nn.Module, inputs: object, run: Run) -> object:
         """Returns the output of a call in a pass: saved, with z in it, or of the submodule."""
         if self._fills:
             return run()
@@ -171,13 +176,13 @@ class Replay:
             raise self.end_of_front()
         return output
 
-    def handle_outside(self, module: nn.Module, inputs: Any, run: Callable[[], Any]) -> Any:
+    def handle_outside(self, module: nn.Module, inputs: object, run: Run) -> object:
         """Returns the output of a call between passes, with z if checkpointing repeats the cut."""
         in_backward = torch._C._current_graph_task_id() != -1
         is_cut = module is self._cut.module and self.calls[module] == 1
         return self._output_with_z(run) if in_backward and is_cut else run()
 
-    def _saved_output(self, index: int, run: Callable[[], Any]) -> Any:
+    def _saved_output(self, index: int, run: Run) -> object:
         """The saved output of a recorded call. A call that may be saved runs once, others always.
 
         Calls inside the one that runs are not replayed meanwhile (`_fills`).
@@ -195,7 +200,7 @@ class Replay:
         self.outputs[index] = SavedTensors.of(output, copied=call.copied)
         return output
 
-    def _output_with_z(self, run: Callable[[], Any]) -> Any:
+    def _output_with_z(self, run: Run) -> object:
         assert self.z is not None
         assert self.z0 is not None
         assert self.recording.cut is not None
@@ -210,6 +215,6 @@ class Replay:
         return map_tensors(output, lambda path, t: z if path == self.recording.path else t)
 
 
-def _copies(arguments: Sequence[Any]) -> Any:
+def _copies(arguments: Sequence[object]) -> object:
     """The network may change its arguments in place; the caller's must not change."""
     return map_tensors(tuple(arguments), lambda _, t: t.detach().clone())

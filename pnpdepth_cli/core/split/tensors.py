@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 
 def tensors_in(
-    structure: Any, path: tuple[str, ...] = ()
+    structure: object, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Tensor]]:
     """Yields every tensor of a nested structure with its path, such as ("hidden_states", "0")."""
     if isinstance(structure, Tensor):
@@ -24,7 +24,9 @@ def tensors_in(
 
 
 def map_tensors(
-    structure: Any, change: Callable[[tuple[str, ...], Tensor], Tensor], path: tuple[str, ...] = ()
+    structure: Any,
+    change: Callable[[tuple[str, ...], Tensor], Tensor],
+    path: tuple[str, ...] = (),
 ) -> Any:
     """Returns the structure with tensor t at path p replaced by change(p, t), in new containers."""
     if isinstance(structure, Tensor):
@@ -47,7 +49,7 @@ def map_tensors(
     return result
 
 
-def is_transparent(structure: Any) -> bool:
+def is_transparent(structure: object) -> bool:
     """Whether `tensors_in` is sure to find every tensor of the structure."""
     if structure is None or isinstance(structure, Tensor | int | float | str | bool):
         return True
@@ -56,7 +58,7 @@ def is_transparent(structure: Any) -> bool:
     )
 
 
-def _children(structure: Any) -> Iterator[tuple[str, Any]]:
+def _children(structure: Any) -> Iterator[tuple[str, object]]:
     if isinstance(structure, list | tuple):
         yield from ((str(index), child) for index, child in enumerate(structure))
     elif isinstance(structure, MutableMapping):
@@ -65,7 +67,7 @@ def _children(structure: Any) -> Iterator[tuple[str, Any]]:
         yield from ((f.name, getattr(structure, f.name)) for f in dataclasses.fields(structure))
 
 
-def _is_container(structure: Any) -> bool:
+def _is_container(structure: object) -> bool:
     return isinstance(structure, MutableMapping | list | tuple) or (
         dataclasses.is_dataclass(structure) and not isinstance(structure, type)
     )
@@ -80,7 +82,7 @@ class SavedTensors:
     """Whether the network changes them in place, so that `fresh` returns clones."""
 
     @classmethod
-    def of(cls, output: Any, *, copied: bool = False) -> SavedTensors:
+    def of(cls, output: object, *, copied: bool = False) -> SavedTensors:
         """Returns the tensors of an output in new containers, clones if they are `copied`."""
         return cls(map_tensors(output, lambda _, t: t.clone() if copied else t), copied)
 

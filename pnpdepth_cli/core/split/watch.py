@@ -103,7 +103,7 @@ class Watch(TorchDispatchMode):
         """Returns this moment, for `can_stand_for`."""
         return Moment(self._operations, self._touches, len(self._writes))
 
-    def can_stand_for(self, since: Moment, inputs: Any, output: Any) -> bool:
+    def can_stand_for(self, since: Moment, inputs: object, output: object) -> bool:
         """Whether returning `output` does all that the call did which began at `since`.
 
         So it did not depend on z, changed nothing older than itself in place, and its output
@@ -166,8 +166,8 @@ class Watch(TorchDispatchMode):
         self.data_dependent |= self._is_marked(tensor)
 
     def __torch_dispatch__(
-        self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
-    ) -> Any:
+        self, func: Any, types: object, args: Sequence[Any] = (), kwargs: Any = None
+    ) -> object:
         kwargs = kwargs or {}
         facts = _facts(func)
         self._operations += 1
@@ -217,8 +217,8 @@ class _EscapeMode(TorchFunctionMode):
         self._watch = watch
 
     def __torch_function__(
-        self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
-    ) -> Any:
+        self, func: Any, types: object, args: Sequence[Any] = (), kwargs: Any = None
+    ) -> object:
         if func in _ESCAPES:
             self._watch.note_escape(args[0])
         return func(*args, **(kwargs or {}))
@@ -257,7 +257,7 @@ def _facts(func: Any) -> _Facts:
     )
 
 
-def _tensors(value: Any) -> list[Tensor]:
+def _tensors(value: object) -> list[Tensor]:
     if isinstance(value, Tensor):
         return [value]
     if isinstance(value, list | tuple):
