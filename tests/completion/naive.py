@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import copy
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -16,31 +16,15 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
 
-@contextmanager
-def untouched(network: nn.Module) -> Iterator[None]:
-    """Inside, the network is in eval mode and frozen; what its forward does to it is undone."""
-    modes = [(m, m.training) for m in network.modules() if hasattr(m, "training")]
-    buffers = [(m, name, b, b.clone()) for m in network.modules() for name, b in m._buffers.items()]
-    learning = [(p, p.requires_grad) for p in network.parameters()]
-    network.eval().requires_grad_(False)
-    try:
-        yield
-    finally:
-        for module, name, buffer, value in buffers:
-            with torch.no_grad():
-                buffer.copy_(value)
-            if not isinstance(module, torch.jit.ScriptModule):
-                module._buffers[name] = buffer
-        for module, mode in modes:
-            module.training = mode
-        for parameter, requires_grad in learning:
-            parameter.requires_grad_(requires_grad)
+def frozen_copy(network: nn.Module) -> nn.Module:
+    with torch.no_grad():
+        return copy.deepcopy(network).eval().requires_grad_(False)
 
 
 def plain(network: nn.Module, x: Tensor) -> Any:
     """What the network gives in eval mode, without a gradient."""
-    with torch.no_grad(), untouched(network):
-        return network(x.clone())
+    with torch.no_grad():
+        return frozen_copy(network)(x.clone())
 
 
 def naive_refine(
@@ -52,12 +36,12 @@ def naive_refine(
     depth_of: Callable[[Any], Tensor],
 ) -> tuple[Tensor, list[float]]:
     """(depth of z_K, L(z_0) … L(z_K))."""
-    name, settings = LayerName.parse(layer), settings
+    name = LayerName.parse(layer)
     loss_of, update = LOSSES[settings.loss], UPDATES[settings.update]()
     z: Tensor | None = None
 
-    @contextmanager
-    def replaced() -> Iterator[Tensor]:
+    def depth_with_z() -> Tensor:
+        """The depth of the whole network; the first time with its own z, which is kept."""
         calls = 0
 
         def replace(module: nn.Module, inputs: Any, output: Any) -> Any:
@@ -72,26 +56,23 @@ def naive_refine(
                 z = next(t for p, t in tensors_in(output) if p == path).detach().clone()
             return map_tensors(output, lambda p, t: z.clone() if p == path else t)
 
-        cut = dict(network.named_modules(remove_duplicate=False))[name.module]
-        hook = cut.register_forward_hook(replace, prepend=True)
-        try:
-            with untouched(network):
-                yield depth_of(network(x.clone()))
-        finally:
-            hook.remove()
+        whole = frozen_copy(network)
+        cut = dict(whole.named_modules(remove_duplicate=False))[name.module]
+        cut.register_forward_hook(replace, prepend=True)
+        return depth_of(whole(x.clone()))
 
-    with torch.no_grad(), replaced():
-        pass
+    with torch.no_grad():
+        depth_with_z()
     assert z is not None
     losses = []
     for _ in range(settings.iterations):
         z = z.detach().requires_grad_(True)
-        with torch.enable_grad(), replaced() as depth:
-            loss = loss_of(points.sample(depth), points.depth)
+        with torch.enable_grad():
+            loss = loss_of(points.sample(depth_with_z()), points.depth)
             loss.backward()
         losses.append(float(loss.detach()))
         assert z.grad is not None
         z = z.detach() - float(settings.lr) * update(z.grad)
-    with torch.no_grad(), replaced() as depth:
-        losses.append(float(loss_of(points.sample(depth), points.depth)))
-    return depth, losses
+    with torch.no_grad():
+        depth = depth_with_z()
+    return depth, [*losses, float(loss_of(points.sample(depth), points.depth))]

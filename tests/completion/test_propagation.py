@@ -8,8 +8,6 @@ from pnpdepth_cli.completion.propagation import propagate, propagate_at
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene
 
-KINDS = ("none", *PROPAGATIONS)
-
 
 def spoiled(points: SparsePoints) -> SparsePoints:
     """A fifth of the points replaced by a depth 2 to 20 times too near or too far."""
@@ -38,7 +36,7 @@ def test_a_prediction_that_drifts_is_put_right_with_and_without_an_image(
         assert mean_log_error(points.sample(depth), points.depth) < 0.01
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_one_point_moves_all_by_its_factor_and_nothing_left_leaves_the_prediction(
     kind: str,
 ) -> None:
@@ -46,10 +44,8 @@ def test_one_point_moves_all_by_its_factor_and_nothing_left_leaves_the_predictio
     exact = propagate(gt, random_points(gt, 50), rgb, kind=kind)
     assert torch.allclose(exact, gt, rtol=1e-6)
     moved = propagate(gt / 1.5, random_points(gt, 1), rgb, kind=kind)
-    assert torch.allclose(moved, gt / 1.5 if kind == "none" else gt, rtol=0.01)
-    if kind == "none":
-        same = propagate(prediction, random_points(gt, 9), rgb, kind=kind)
-        assert torch.equal(same, prediction)
+    assert torch.allclose(moved, gt, rtol=0.01)
+    assert torch.equal(propagate(prediction, random_points(gt, 9), rgb, kind="none"), prediction)
 
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)

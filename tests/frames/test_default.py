@@ -32,7 +32,7 @@ from pnpdepth_cli.frames.refined import Prediction, Refined
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
-from tests.core.split.test_split import same, state_of
+from tests.core.split.test_split import state_of
 from tests.frames.scenes import (
     SIZE,
     Brightness,
@@ -381,7 +381,7 @@ def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stay
     handle.remove()
     assert (shared.after == alone.after).all()
     assert (plain.after == alone.before).all()
-    assert same(before, state_of(network.module))
+    assert before == state_of(network.module)
 
 
 def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:
