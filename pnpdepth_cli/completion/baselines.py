@@ -8,7 +8,7 @@ each pixel, to its nearest points (`completion.propagation`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -18,37 +18,14 @@ from pnpdepth_cli.completion.alignment import align, align_prediction, where_pre
 from pnpdepth_cli.completion.interpolation import distinct, linear, nearest
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import local_lines
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 
-
-@dataclass(frozen=True, kw_only=True)
-class Baseline:
-    """Predicts dense depth (H, W) float32 metres, from the points or from a prediction."""
-
-    title: str  # what it does, for a table
-    of_points: Callable[..., Tensor] | None = None  # depth from the points alone
-    of_prediction: Callable[..., Tensor] | None = None
-    """Depth from a prediction (H, W), up to scale and shift with 0 unknown, and the points."""
-
-    def depth(self, points: SparsePoints, prediction: Tensor | None = None) -> Tensor:
-        """Returns the depth (H, W) metres, 0 = unknown.
-
-        Raises:
-            UsageError: It needs a prediction and there is none.
-        """
-        if self.of_points is not None:
-            return self.of_points(points)
-        if self.of_prediction is None or prediction is None:
-            raise UsageError(f"baseline {self.title!r} needs a network's prediction")
-        return self.of_prediction(prediction, points)
+Baseline = Callable[[SparsePoints, Tensor], Tensor]
+"""Gives depth (H, W) metres, 0 = unknown, from points and a prediction (H, W), which is up to scale
+and shift, 0 = unknown."""
 
 
-def _align_by(title: str, kind: str, space: str) -> Baseline:
-    return Baseline(title=title, of_prediction=partial(align_prediction, kind=kind, space=space))
-
-
-def align_locally(prediction: Tensor, points: SparsePoints) -> Tensor:
+def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
     """Returns the locally aligned depth (H, W) float32 metres, within a global alignment's bounds.
 
     Args:
@@ -74,17 +51,24 @@ def align_locally(prediction: Tensor, points: SparsePoints) -> Tensor:
     return torch.where(known, depth, 0.0).float().to(device)
 
 
-TABLE = {
-    "nearest": Baseline(title="nearest point", of_points=nearest),
-    "linear": Baseline(title="linear between points (Delaunay)", of_points=linear),
-    "linear-log": Baseline(
-        title="linear between points, in log depth",
-        of_points=partial(linear, space="log"),
-    ),
-    "median": _align_by("median of ratios", kind="median", space="depth"),
-    "scale": _align_by("scale", kind="scale", space="depth"),
-    "affine": _align_by("scale and shift", kind="affine", space="depth"),
-    "scale-disparity": _align_by("scale, in disparity", kind="scale", space="inverse"),
-    "affine-disparity": _align_by("scale and shift, in disparity", kind="affine", space="inverse"),
-    "local": Baseline(title="scale and shift around each pixel", of_prediction=align_locally),
+def _of_points(fill: Callable[[SparsePoints], Tensor]) -> Baseline:
+    """The baseline that takes no prediction."""
+    return lambda points, prediction: fill(points)
+
+
+def _aligned(kind: str, space: str = "depth") -> Baseline:
+    """The baseline that aligns the prediction."""
+    return lambda points, prediction: align_prediction(prediction, points, kind=kind, space=space)
+
+
+TABLE: dict[str, Baseline] = {
+    "nearest": _of_points(nearest),
+    "linear": _of_points(linear),
+    "linear-log": _of_points(partial(linear, space="log")),
+    "median": _aligned("median"),
+    "scale": _aligned("scale"),
+    "affine": _aligned("affine"),
+    "scale-disparity": _aligned("scale", "inverse"),
+    "affine-disparity": _aligned("affine", "inverse"),
+    "local": align_locally,
 }

@@ -21,8 +21,6 @@ to LiDAR.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -45,21 +43,6 @@ _AT_A_POINT = 0.5  # pixels; closer than this, a point is as close as can be
 _OUTLIER_WEIGHT = 1e-6  # what an outlier counts where no other point is near
 
 
-@dataclass(frozen=True, kw_only=True)
-class Propagation:
-    """A method that predicts the residual away from the points.
-
-    `dense` and `at` take a field whose kernel `fit` has chosen.
-    """
-
-    title: str  # what it does, in a few words
-    fit: Callable[[ResidualField], ResidualField] = lambda field: field
-    """Chooses the field's kernel."""
-    dense: Callable[[ResidualField], Tensor]  # residual (H, W) float32 at every pixel
-    at: Callable[[ResidualField, SparsePoints], Tensor] | None = None
-    """Residual (M,) at the coordinates of M points. None: it is sampled from `dense`."""
-
-
 def propagate(
     prediction: Tensor, points: SparsePoints, rgb: Tensor | None, *, kind: str = "gp"
 ) -> Tensor:
@@ -76,8 +59,8 @@ def propagate(
     known = prediction.isfinite() & (prediction > 0)
     if kind == "none":
         return torch.where(known, prediction, 0.0).float()
-    propagation, field = _fitted(kind, prediction, points, rgb)
-    factor = _clamp(propagation.dense(field), field).exp().to(prediction.device)
+    field = without_outliers(residual_field(prediction, points, rgb))
+    factor = _clamp(PROPAGATIONS[kind](field), field).exp().to(prediction.device)
     return torch.where(known, prediction * factor, 0.0).float()
 
 
@@ -97,22 +80,9 @@ def propagate_at(
     queries = SparsePoints(xy=xy, depth=torch.ones_like(xy[:, 0]), size=points.size)
     known = prediction.isfinite() & (prediction > 0)
     predicted = queries.sample(torch.where(known, prediction, torch.nan)).nan_to_num(0.0)
-    propagation, field = _fitted(kind, prediction, points, rgb)
-    queries = queries.tensors()
-    if propagation.at is None:
-        residual = queries.sample(propagation.dense(field))
-    else:
-        residual = propagation.at(field, queries)
-    return (predicted * _clamp(residual, field).exp().to(predicted.device)).float()
-
-
-def _fitted(
-    kind: str, prediction: Tensor, points: SparsePoints, rgb: Tensor | None
-) -> tuple[Propagation, ResidualField]:
-    """The propagation, and its residual field without outliers."""
-    propagation: Propagation = PROPAGATIONS[kind]
     field = without_outliers(residual_field(prediction, points, rgb))
-    return propagation, propagation.fit(field)
+    residual = PROPAGATIONS[kind](field, queries.tensors())
+    return (predicted * _clamp(residual, field).exp().to(predicted.device)).float()
 
 
 def _clamp(residual: Tensor, field: ResidualField) -> Tensor:
@@ -162,8 +132,8 @@ def _lines_at(
     return (mean - slope * mean_z)[:, 0], slope[:, 0]
 
 
-def _residual_by_lines(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
-    """The residual by lines over the predicted log depth, (H, W) or at the queries (M,)."""
+def _by_lines(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
+    """The residual by lines over the predicted log depth."""
     xy = None if queries is None else queries.xy
     depth = field.features[DEPTH] if queries is None else field.features_at(queries)[:, DEPTH]
     at, weights = field.at[:, DEPTH].double(), torch.ones_like(field.residual)
@@ -171,19 +141,15 @@ def _residual_by_lines(field: ResidualField, queries: SparsePoints | None = None
     return (shift + slope * depth).float()
 
 
-TABLE = {
-    "gp": Propagation(
-        title="Gaussian process",
-        fit=gaussian_process.fit,
-        dense=gaussian_process.predict,
-        at=lambda field, queries: gaussian_process.predict_at(
-            field, queries.xy, field.features_at(queries)
-        ),
-    ),
-    "local": Propagation(
-        title="lines through the nearest points",
-        dense=_residual_by_lines,
-        at=_residual_by_lines,
-    ),
-}
-"""The propagations by name, as in `choices.PROPAGATIONS`."""
+def _by_gaussian_process(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
+    field = gaussian_process.fit(field)
+    if queries is None:
+        return gaussian_process.predict(field)
+    return gaussian_process.predict_at(field, queries.xy, field.features_at(queries))
+
+
+TABLE = {"gp": _by_gaussian_process, "local": _by_lines}
+"""Functions of a residual field without outliers, by the names in `choices.PROPAGATIONS`.
+
+They return the residual (H, W) float32 at every pixel, or (M,) at the coordinates of M points.
+"""

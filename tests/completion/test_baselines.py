@@ -20,7 +20,7 @@ def test_a_baseline_is_near_the_ground_truth_and_does_not_change_its_arguments(n
     points, prediction = random_points(depth, 200), depth / 3
     given = (points.xy, points.depth, prediction)
     before = [each.clone() for each in given]
-    dense = BASELINES[name].depth(points, prediction)
+    dense = BASELINES[name](points, prediction)
     assert (dense.shape, dense.dtype) == (depth.shape, torch.float32)
     assert float((dense.log() - depth.log()).abs().mean()) < 0.1
     assert all(torch.equal(one, other) for one, other in zip(before, given, strict=True))
@@ -39,14 +39,14 @@ def test_a_baseline_is_near_the_ground_truth_and_does_not_change_its_arguments(n
 )
 def test_each_alignment_restores_the_prediction_it_models(name, prediction) -> None:
     depth = scene_depth()
-    dense = BASELINES[name].depth(random_points(depth, 80), prediction(depth))
+    dense = BASELINES[name](random_points(depth, 80), prediction(depth))
     assert torch.allclose(dense, depth, rtol=1e-3)
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_factor_is_all_that_one_and_two_points_show(count: int) -> None:
     gt = scene_depth()
-    assert torch.allclose(align_locally(gt / 3, random_points(gt, count)), gt, rtol=1e-3)
+    assert torch.allclose(align_locally(random_points(gt, count), gt / 3), gt, rtol=1e-3)
 
 
 def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve_points() -> None:
@@ -60,7 +60,7 @@ def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve
     mean, std = at_points.mean(), at_points.std()
     inlier = inlier_weights(points, torch.from_numpy(np.log(y / at_points))).numpy()
     assert inlier.min() == 0 < inlier.max()
-    dense = align_locally(prediction, points)
+    dense = align_locally(points, prediction)
     for row, column in ((5, 5), (47, 0), (30, 15), (20, 60)):
         distance = np.hypot(*(points.xy.numpy() - (column, row)).T)
         near = np.argsort(distance)[:12]
@@ -79,6 +79,6 @@ def test_depth_stays_within_the_bounds_of_a_global_alignment() -> None:
     prediction = scene_depth()
     points = random_points(prediction, 100)
     prediction[0, 0], prediction[0, 1] = 1e6, 1e-6
-    dense = align_locally(prediction, points)
+    dense = align_locally(points, prediction)
     assert float(dense.max()) <= float(points.depth.max()) * BEYOND * (1 + 1e-5)
     assert float(dense.min()) >= float(points.depth.min()) / BEYOND * (1 - 1e-5)

@@ -244,7 +244,7 @@ def _against_truth(
         return {}
     if with_baselines:
         before, given = torch.from_numpy(refined.before), frame.points
-        depths = _each_baseline(lambda baseline: baseline.depth(given, before))
+        depths = _each_baseline(lambda baseline: baseline(given, before))
         beside = beside | {name: d.numpy() for name, d in depths if name != LINEAR}
     known = np.where(refined.after > 0, gt, np.float32(0))
     stages = {name: depth for name, depth in refined.stages.items() if name != BEFORE}
@@ -287,6 +287,6 @@ def _at_validation_points(refined: Refined, *, with_baselines: bool) -> Stages:
     predicted, count = dict(validation.predicted), len(validation.points)
     if with_baselines:
         kept, network = validation.kept, validation.network
-        others = _each_baseline(lambda baseline: baseline.depth(kept, network))
+        others = _each_baseline(lambda baseline: baseline(kept, network))
         predicted |= {name: validation.points.sample(d) for name, d in others if name != LINEAR}
     return {name: {"mae": validation.error(at), "points": count} for name, at in predicted.items()}
