@@ -6,14 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.completion.gaussian_process import (
-    CONSTANT,
-    SLOPE,
-    fit,
-    leave_one_out,
-    predict,
-    predict_at,
-)
+from pnpdepth_cli.completion import gaussian_process as gp
+from pnpdepth_cli.completion.gaussian_process import fit, leave_one_out, predict, predict_at
 from pnpdepth_cli.completion.residual_field import ResidualField, features_of
 from pnpdepth_cli.points import SparsePoints
 
@@ -47,7 +41,7 @@ def dense_reference(field: ResidualField) -> np.ndarray:
 
     def covariance(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         apart = np.linalg.norm((p[:, None] - q[None]) / lengths, axis=2)
-        return np.exp(-apart) + CONSTANT + SLOPE * p[:, None, 2] * q[None, :, 2]
+        return np.exp(-apart) + gp.CONSTANT + gp.SLOPE * p[:, None, 2] * q[None, :, 2]
 
     inverse = np.linalg.inv(covariance(a, a) + field.kernel.noise * np.eye(len(a)))
     mean: np.ndarray = covariance(b, a) @ inverse @ field.residual.numpy()

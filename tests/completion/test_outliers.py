@@ -7,13 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pnpdepth_cli.completion.outliers import (
-    FAR,
-    far_points,
-    inlier_mask,
-    inlier_weights,
-    outliers,
-)
+from pnpdepth_cli.completion.outliers import FAR, far_points, inlier_mask, inlier_weights, outliers
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import random_points, scene
 from tests.completion.test_gaussian_process import field
@@ -51,14 +45,9 @@ def test_outliers_are_marked_in_the_order_of_the_points() -> None:
     points = random_points(ground_truth, 150)
     assert not bool(outliers(prediction, points, rgb).any())
     bad = torch.arange(150) % 6 == 0
-    outside = SparsePoints(
-        xy=torch.tensor([[-9.0, 3.0]]), depth=torch.tensor([50.0]), size=points.size
-    )
-    spoiled = SparsePoints(
-        xy=torch.cat([points.xy, outside.xy]),
-        depth=torch.cat([torch.where(bad, 3 * points.depth, points.depth), outside.depth]),
-        size=points.size,
-    )
+    outside = replace(points, xy=torch.tensor([[-9.0, 3.0]]), depth=torch.tensor([50.0]))
+    far = replace(points, depth=torch.where(bad, 3 * points.depth, points.depth))
+    spoiled = far.joined(outside)
     suspected = outliers(prediction, spoiled, rgb)
     assert int(suspected[:150][bad].sum()) > 0.9 * int(bad.sum())
     assert int(suspected.sum()) < 2 * int(bad.sum())

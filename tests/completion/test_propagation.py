@@ -96,9 +96,9 @@ def test_an_unknown_prediction_stays_unknown_and_its_points_have_no_effect(kind:
 def test_points_outside_the_frame_and_farther_ones_at_one_pixel_have_no_effect(kind: str) -> None:
     gt, rgb, prediction = scene()
     points = random_points(gt, 30)
-    xy = torch.cat([points.xy, torch.tensor([[-9.0, 5.0], [70.0, 5.0]]), points.xy[:3]])
-    depth = torch.cat([points.depth, torch.tensor([30.0, 0.1]), 2 * points.depth[:3]])
-    more = SparsePoints(xy=xy, depth=depth, size=SIZE)
+    xy = torch.cat([torch.tensor([[-9.0, 5.0], [70.0, 5.0]]), points.xy[:3]])
+    depth = torch.cat([torch.tensor([30.0, 0.1]), 2 * points.depth[:3]])
+    more = points.joined(SparsePoints(xy=xy, depth=depth, size=SIZE))
     result, again = (propagate(prediction, p, rgb, kind=kind) for p in (points, more))
     assert torch.equal(result, again)
 

@@ -322,31 +322,6 @@ class Updating(nn.Module):
         return self.head(self.cut(y * self.passes) + self.average).abs() + 1
 
 
-def wrapped(function: Callable[..., Any]) -> Callable[..., Any]:
-    @functools.wraps(function)
-    def forward(self: nn.Module, *args: Any, **kwargs: Any) -> Any:
-        return function(self, *args, **kwargs)
-
-    return forward
-
-
-class Direct(nn.Module):
-    """Calls forward() itself, methods of submodules, a decorated forward, parametrizations."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.enter = nn.utils.parametrizations.weight_norm(conv(3, 4))
-        self.spectral = nn.utils.parametrizations.spectral_norm(conv(4, 4))
-        self.methods = Methods()
-        self.head = conv(4, 1)
-
-    @wrapped
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.spectral.forward(self.enter.forward(x))
-        x = self.methods.features(x) + self.methods(x=x)
-        return self.head(x).abs() + 1
-
-
 class Methods(nn.Module):
     def __init__(self) -> None:
         super().__init__()
@@ -355,9 +330,21 @@ class Methods(nn.Module):
     def features(self, x: Tensor) -> Tensor:
         return self.b(self.a(x))
 
-    @wrapped
     def forward(self, *, x: Tensor) -> Tensor:
         return self.a(x) * 2
+
+
+def direct() -> nn.Module:
+    """Calls forward() itself, methods of submodules, and parametrizations."""
+
+    def run(net: Any, x: Tensor) -> Tensor:
+        x = net.spectral.forward(net.enter.forward(x))
+        x = net.methods.features(x) + net.methods(x=x)
+        return net.head(x).abs() + 1
+
+    enter = nn.utils.parametrizations.weight_norm(conv(3, 4))
+    spectral = nn.utils.parametrizations.spectral_norm(conv(4, 4))
+    return Net(run, enter=enter, spectral=spectral, methods=Methods(), head=conv(4, 1))
 
 
 def scripted() -> nn.Module:
@@ -467,7 +454,7 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "two branches": two_branches,
     "side effects": side_effects,
     "updating": Updating,
-    "direct": Direct,
+    "direct": direct,
     "scripted": scripted,
     "checkpointed": checkpointed,
     "half inference": half_inference,
