@@ -69,8 +69,7 @@ def member(
         build=build,
         layers=("layer",),
         input_kind=kind,
-        size=Multiple(4),
-        **of_definition,
+        **({"size": Multiple(4)} | of_definition),
     )
     network = Network(
         definition=definition, module=build().eval(), device=torch.device("cpu"), checkpoint=None
