@@ -7,7 +7,7 @@ import logging
 import os
 import socket
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +19,6 @@ from pnpdepth_cli.commands.batch.batch_request import LOCAL
 from pnpdepth_cli.commands.batch.find_frames import request_of
 from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.batch.running import open_method, refine_frames
-from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import ClusterError, UsageError
@@ -46,7 +45,6 @@ class Worker:
     """The folder that relative paths start from."""
     shared: Sequence[Path]
     """Files and folders that every node must see."""
-    versions: Mapping[str, str]
     max_pixels: int | None
     threads: int
     method: Method | None = None
@@ -61,7 +59,7 @@ class Worker:
             worked: Whether a frame was refined with these settings before.
 
         Raises:
-            ClusterError: This node has other versions than the driver, or not its files.
+            ClusterError: This node does not see the driver's files.
             PnpDepthError: As `refine_frames`.
         """
         if self.method is None:
@@ -75,14 +73,9 @@ class Worker:
         import cv2
         import torch
 
-        node, own = socket.gethostname(), versions()
-        if others := [name for name, version in self.versions.items() if own[name] != version]:
-            raise ClusterError(
-                f"node {node} has another version of {', '.join(others)} than the driver; install"
-                " the same on all nodes"
-            )
         for path in self.shared:
             if not path.exists():
+                node = socket.gethostname()
                 raise ClusterError(f"node {node} does not see {path}; all nodes must share it")
         os.chdir(self.folder)
         torch.set_num_threads(self.threads)
@@ -180,7 +173,6 @@ def _plan(
         deciding=deciding,
         folder=folder,
         shared=[folder / request.source, folder / request.output],
-        versions=versions(),
         max_pixels=max_pixels_given(),
         threads=cores,
     )

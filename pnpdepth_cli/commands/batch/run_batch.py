@@ -13,6 +13,7 @@ from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames, so
 from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
 from pnpdepth_cli.commands.batch.sequence import sequences_of
 from pnpdepth_cli.commands.batch.summary import BatchSummary, write_summary
+from pnpdepth_cli.commands.error_tables import names_of_depths
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.tables import count_of
 from pnpdepth_cli.dataset.frame_files import FrameFiles
@@ -145,20 +146,13 @@ def _refine(
 
 def _follow(records: Iterable[FrameRecord], listener: Listener) -> None:
     """Tells the listener of each record, and of the first result how it was made."""
-    is_first = True
+    told = False
     for record in records:
         listener.frame(record)
-        if not is_first or record.method is None or record.model is None:
-            continue
-        is_first = False
-        if record.method.kind == "default":
-            how = f"the default, with {' and '.join(record.method.networks)}"
-        else:
-            own = record.settings
-            how = f"{record.model.name} cut at {own['layer']}, {own['iterations']} updates of z"
-        listener.say(f"method: {how}")
-        for note in record.notes:
-            listener.say(f"{record.name}: {note}")
+        if not told and record.method is not None:
+            told = True
+            for note in (names_of_depths(record)[1], *record.notes):
+                listener.say(f"{record.name}: {note}")
 
 
 def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
