@@ -11,7 +11,7 @@ All predict twice: from all points, and the validation points from the others.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,6 @@ from pnpdepth_cli.completion.folds import spatial_folds
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import propagate_at
-from pnpdepth_cli.errors import PnpDepthError
 from pnpdepth_cli.frames.frame import Frame, is_dense
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.refined import Prediction, ValidationPoints
@@ -136,8 +135,7 @@ class Expert:
     name: str
     weight: float = 0.0  # prior weight; with 0 it has no part
     at: Tensor  # (M,) metres, 0 = unknown: at the validation points, from the others
-    dense: Callable[[], Tensor]
-    """(H, W) metres, 0 = unknown: from all points, the residual not propagated."""
+    dense: Tensor  # (H, W) metres, 0 = unknown: from all points, the residual not propagated
     whole: Prediction | None = None  # a network's, from all points
     kept: Prediction | None = None  # a network's, from the others; the same without validation
     network: OpenNetwork | None = None  # that predicts. None: linear interpolation
@@ -162,17 +160,15 @@ def predictions(
         known: What networks gave for all points already.
 
     Raises:
-        PnpDepthError: The user's network gives no depth.
+        PnpDepthError: A network gives no depth.
     """
     # The user's networks predict.
-    fusing, own = _fusing(networks), list[Expert]()
-    for each in networks:
-        try:
-            if each is not fusing:
-                own.append(_expert(each, split, each.member.name, known=known.get(each), user=each))
-        except PnpDepthError:  # a further network that fails is left out
-            if each is networks[0]:
-                raise
+    fusing = _fusing(networks)
+    own = [
+        _expert(each, split, each.member.name, known=known.get(each), user=each)
+        for each in networks
+        if each is not fusing
+    ]
     # Without a network that takes a prior, they are all.
     if fusing is None:
         return [replace(expert, weight=1 / len(own)) for expert in own]
@@ -190,9 +186,9 @@ def predictions(
             with_prior.append(replace(informed, weight=WITH_PRIOR * share))
     # The rest of the prior weights is that of the network without a prior.
     rest = 1 - sum(expert.weight for expert in (*experts, *with_prior))
-    # Linear interpolation predicts; its dense depth, which takes long, only where it has a part.
+    # Linear interpolation predicts.
     at = linear(split.kept.points, split.points.xy) if len(split.points) else torch.empty(0)
-    dense = functools.partial(linear, split.whole.points)
+    dense = linear(split.whole.points)
     interpolation = Expert(name=LINEAR, weight=WITHOUT_IMAGE, at=at, dense=dense)
     return [*experts, *with_prior, replace(alone, weight=rest), interpolation]
 
@@ -322,7 +318,7 @@ def scanner_shares(
         return {}
     limit = split.error(weighted_mean([(each.at, weights[each.name]) for each in experts]))
     points = split.whole.points
-    error = {e.name: (points.sample(e.dense()) - points.depth).abs().mean() for e in own}
+    error = {e.name: (points.sample(e.dense) - points.depth).abs().mean() for e in own}
     fit = [name for name in error if float(error[name]) <= limit]
     return {name: OWN_SCANNER / len(fit) for name in fit}
 
@@ -389,7 +385,7 @@ def _expert(
     return Expert(
         name=name,
         at=at,
-        dense=lambda: own.after,
+        dense=own.after,
         whole=own,
         kept=again,
         network=network,

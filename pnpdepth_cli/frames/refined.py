@@ -129,10 +129,12 @@ def make_refined(
         stages: (H, W) metres of stages of the method, by name.
     """
     if frame.registration is not None:
-        notes = (f"image: moved into the frame of the points by {frame.registration}", *notes)
+        moved = "image: moved to the pixel coordinates of the depth camera by"
+        notes = (f"{moved} {frame.registration}", *notes)
+    before, after = (each.numpy() for each in (own.before, depth))
     return Refined(
-        before=own.before.numpy(),
-        after=depth.numpy(),
+        before=before,
+        after=after,
         used=used,
         held_out=used.select(slice(0)) if frame.held_out is None else frame.held_out,
         refinement=own.refinement,
