@@ -111,11 +111,11 @@ def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any
     return {
         "points": len(points),
         "coverage": coverage,
-        "std_z": moved.refinement.step,
+        "std_z": moved.step,
         "diverged": sum(result.diverged is not None for result in results.values()),
         "aligned": None if (fit := results["paper"].alignment) is None else fit.kind,
         "scores": scores,
-        "loss": {n: [r.refinement.losses[i] for i in (0, -1)] for n, r in results.items()},
+        "loss": {n: [r.losses[i] for i in (0, -1)] for n, r in results.items()},
     }
 
 

@@ -167,7 +167,8 @@ class OpenNetwork:
         return Prediction(
             before=prepared.to_image(result.before),
             after=prepared.to_image(result.after),
-            refinement=result,
+            losses=result.losses,
+            step=result.step,
             diverged=diverged,
             alignment=reader.alignment,
             notes=reader.notes,

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import Alignment
 from pnpdepth_cli.completion.image_registration import ImageRegistration
-from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.errors import DivergedError
 from pnpdepth_cli.frames.frame import DepthMap, Frame
 from pnpdepth_cli.points import SparsePoints
@@ -24,7 +23,8 @@ class Prediction:
 
     before: Tensor  # (H, W) metres, 0 = unknown: aligned with the points
     after: Tensor  # (H, W) metres, 0 = unknown: z updated
-    refinement: Refinement  # the same at the network's size, with the losses
+    losses: tuple[float, ...]  # at the points, before the first update of z and after each
+    step: float  # α as a number
     diverged: DivergedError | None  # why the updates ended early. None if they did not
     alignment: Alignment | None
     notes: tuple[str, ...]
@@ -41,7 +41,10 @@ class Refined:
     used: SparsePoints
     """The points that the depth was fitted to."""
     held_out: SparsePoints
-    refinement: Refinement
+    losses: tuple[float, ...]
+    """Loss at the points before the first update and after each update."""
+    step: float
+    """Step size of the updates as a number."""
     diverged: DivergedError | None
     """Why the refinement stopped early. None if it did not."""
     alignment: Alignment | None = None
@@ -69,11 +72,6 @@ class Refined:
     def depth(self) -> DepthMap:
         """The refined depth, `after`."""
         return self.after
-
-    @property
-    def losses(self) -> tuple[float, ...]:
-        """Loss at the points before the first update and after each update."""
-        return self.refinement.losses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +135,8 @@ def make_refined(
         after=after,
         used=used,
         held_out=used.select(slice(0)) if frame.held_out is None else frame.held_out,
-        refinement=own.refinement,
+        losses=own.losses,
+        step=own.step,
         diverged=own.diverged,
         alignment=own.alignment,
         notes=(*own.notes, *notes),

@@ -188,7 +188,7 @@ def _record_of(
             "layer": method.own.layer,
             **asdict(method.settings),
             "seed": method.asked.seed,
-            "step": refined.refinement.step,
+            "step": refined.step,
             "propagate": "gp" if method.is_default else method.settings.propagate,
             "output_kind": network.definition.output_kind,
             "normalise": normalisation_name(network.definition),

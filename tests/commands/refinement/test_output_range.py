@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from pnpdepth_cli.commands.refinement.outputs import output_scale, within_range
-from pnpdepth_cli.core.refine import Refinement
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.depth import read_depth
@@ -29,13 +28,13 @@ def inputs_at(*depths: float, scale: float | None = None) -> Frame:
 
 def refined_to(*depths: float, inputs: Frame) -> Refined:
     depth = np.array([depths], np.float32)
-    dense = torch.from_numpy(depth)
     return Refined(
         before=depth,
         after=depth,
         used=inputs.points,
         held_out=inputs.points.select(slice(0)),
-        refinement=Refinement(before=dense, after=dense, losses=(0.0,), step=0.0),
+        losses=(0.0,),
+        step=0.0,
         diverged=None,
     )
 
