@@ -80,9 +80,6 @@ class _Fields:
     def __init__(self, path: Path, values: Mapping[str, object]) -> None:
         self.path, self.values = path, values
 
-    def __contains__(self, name: str) -> bool:
-        return name in self.values
-
     def first(self, names: Iterable[str]) -> str | None:
         """Returns the first of the names that is there."""
         return next((name for name in names if name in self.values), None)
@@ -289,10 +286,10 @@ def _kalibr(fields: _Fields, name: str) -> Calibration:
             f"{fields.path}: {name} is a {one_line(model)[:20]} camera with {len(values)}"
             " intrinsics; only pinhole (4) is known, so calibrate it as one"
         )
-    plain = {key: fields.values[key] for key in _POSES if key in fields}
+    plain = {key: fields.values[key] for key in _POSES if key in fields.values}
     plain |= {"K": _by_rows(*values), "lens": fields.text("distortion_model", "none")}
     plain["distortion"] = fields.values.get("distortion_coeffs", [])
-    if "resolution" in fields:
+    if "resolution" in fields.values:
         plain["size"] = fields.values["resolution"]
     return _single(_Fields(fields.path, plain), None, f"Kalibr camchain, {name}")
 
@@ -308,11 +305,11 @@ def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:
     scanner = None
     if name := fields.first(_POSES):
         scanner = pose_of_matrix(path, name, fields.numbers(name))
-    elif "R" in fields or "t" in fields:
+    elif "R" in fields.values or "t" in fields.values:
         scanner = fields.pose("t")
     # The size of the image.
     size, sides = None, [fields.first((f"image_{side}", side)) for side in ("width", "height")]
-    if "size" in fields:
+    if "size" in fields.values:
         size = _height_width(path, fields.numbers("size", 2))
     elif None not in sides:
         size = _height_width(path, [fields.numbers(str(side), 1)[0] for side in sides])
@@ -326,7 +323,7 @@ def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:
 
 def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
     model = fields.text(fields.first(("lens", "distortion_model")) or "lens", "none")
-    if "distortion_model" not in fields and fields.text("fisheye_model", "0") not in _FALSE:
+    if "distortion_model" not in fields.values and fields.text("fisheye_model", "0") not in _FALSE:
         model = "fisheye"  # of OpenCV
     lens = _LENSES.get(model)
     if lens is None:

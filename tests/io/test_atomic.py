@@ -42,20 +42,13 @@ def test_a_file_is_replaced_whole_or_not_at_all(
 ) -> None:
     target = tmp_path / name
     target.write_bytes(b"old")
-
-    def write() -> None:
-        with atomic_path(target) as temporary:
-            assert (temporary.parent, temporary.suffix) == (tmp_path, target.suffix)
-            temporary.write_bytes(b"new")
-            assert target.read_bytes() == b"old"
-            if error is not None:
-                raise error
-
-    if error is None:
-        write()
-    else:
-        with pytest.raises(type(error)):
-            write()
+    fails = pytest.raises(type(error)) if error is not None else nullcontext()
+    with fails, atomic_path(target) as temporary:
+        assert (temporary.parent, temporary.suffix) == (tmp_path, target.suffix)
+        temporary.write_bytes(b"new")
+        assert target.read_bytes() == b"old"
+        if error is not None:
+            raise error
     assert target.read_bytes() == (b"new" if error is None else b"old")
     assert list(tmp_path.iterdir()) == [target]
 
@@ -111,14 +104,11 @@ def test_a_folder_is_replaced_whole_or_not_at_all(
         folder.mkdir()
         (folder / "before").touch()
 
-    def write() -> None:
-        with atomic_folder(folder) as temporary:
-            (temporary / "after").touch()
-            if fails:
-                raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt) if fails else nullcontext():
-        write()
+    expected = pytest.raises(KeyboardInterrupt) if fails else nullcontext()
+    with expected, atomic_folder(folder) as temporary:
+        (temporary / "after").touch()
+        if fails:
+            raise KeyboardInterrupt
     left = [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")]
     kept = ["report", "report/before"] if existed else []
     assert left == (kept if fails else ["report", "report/after"])

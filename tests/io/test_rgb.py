@@ -13,7 +13,7 @@ from PIL import Image
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import rgb
-from pnpdepth_cli.io.rgb import read_focal_length, read_rgb
+from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, sizes_of
 
 COLOURS = np.random.default_rng(1).integers(0, 256, (7, 11, 3)).astype(np.uint8)
 COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.uint16)
@@ -43,31 +43,25 @@ def test_other_colour_modes_become_rgb(tmp_path: Path, mode: str) -> None:
     assert np.array_equal(read_rgb(tmp_path / "a.tif").values, np.ones((3, 5, 3), np.float32))
 
 
-# What is stored when the upright image is [[0, 1, 2], [3, 4, 5]], by EXIF orientation.
-STORED = {
-    1: [[0, 1, 2], [3, 4, 5]],
-    2: [[2, 1, 0], [5, 4, 3]],
-    3: [[5, 4, 3], [2, 1, 0]],
-    4: [[3, 4, 5], [0, 1, 2]],
-    5: [[0, 3], [1, 4], [2, 5]],
-    6: [[2, 5], [1, 4], [0, 3]],
-    7: [[5, 2], [4, 1], [3, 0]],
-    8: [[3, 0], [4, 1], [5, 2]],
-}
+UPRIGHT = np.arange(6).reshape(2, 3)
+STORED = [UPRIGHT, UPRIGHT[:, ::-1], UPRIGHT[::-1, ::-1], UPRIGHT[::-1]]
+STORED += [stored.T for stored in STORED]
+"""What is stored of the upright image, by EXIF orientation from 1."""
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "PNG16", "TIFF", "TIFF16"])
 def test_exif_rotation_is_honoured(tmp_path: Path, kind: str) -> None:
-    for orientation, stored in STORED.items():
+    for orientation, stored in enumerate(STORED, 1):
         # 16 x 16 blocks, so that JPEG keeps each one's grey
-        pixels = np.kron(np.array(stored, np.uint8) * 50, np.ones((16, 16), np.uint8))
+        pixels = np.kron(stored.astype(np.uint8) * 50, np.ones((16, 16), np.uint8))
         exif = Image.Exif()
         exif[0x0112] = orientation
         path = tmp_path / f"{orientation}.img"
         image = Image.fromarray(pixels.astype(np.uint16) * 257 if "16" in kind else pixels)
         image.save(path, kind.removesuffix("16"), exif=exif)
+        assert "TIFF" in kind or sizes_of(path) == ((32, 48), pixels.shape)
         values = read_rgb(path).values[8::16, 8::16, 0] * 255
-        assert np.allclose(values, np.arange(6).reshape(2, 3) * 50, atol=1.5), orientation
+        assert np.allclose(values, UPRIGHT * 50, atol=1.5), orientation
 
 
 @pytest.mark.parametrize(
