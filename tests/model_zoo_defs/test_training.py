@@ -8,13 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
-
-from model_zoo_defs.training.learning import patterns
-from model_zoo_defs.training.learning.priors import damaged, nonsense
-from model_zoo_defs.training.learning.priors import draw as draw_prior
 
 pytest.importorskip("safetensors")
 train = pytest.importorskip("model_zoo_defs.training.learning.train")
@@ -22,8 +16,6 @@ train = pytest.importorskip("model_zoo_defs.training.learning.train")
 pytestmark = pytest.mark.slow
 
 SHAPE = (48, 64)
-seeds = st.integers(0, 2**32 - 1)
-drawn_often = settings(max_examples=40, deadline=None)
 
 
 def room(seed: int) -> NDArray[np.float32]:
@@ -46,33 +38,6 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rgb = np.repeat((depth * 50.0).astype(np.uint8)[..., None], 3, axis=-1)
         np.savez(folder / f"shard_{number:05d}.npz", rgb=rgb, depth=depth)
     return folder
-
-
-@drawn_often
-@given(seed=seeds)
-def test_the_same_state_draws_the_same_and_leaves_the_depth_as_it_is(seed: int) -> None:
-    depth, other = room(seed), room(seed + 1)
-    before = depth.copy()
-    sparse = patterns.draw(np.random.default_rng(seed), depth, depth / 5.0)
-
-    def drawn(rng: np.random.Generator) -> list[NDArray[np.float32] | None]:
-        return [
-            patterns.draw(rng, depth, depth / 5.0),
-            draw_prior(rng, depth, depth / 5.0, sparse, other),
-            damaged(rng, depth, depth / 5.0),
-            nonsense(rng, depth.shape, depth),
-        ]
-
-    first, second = (drawn(np.random.default_rng(seed)) for _ in range(2))
-    assert np.array_equal(depth, before)
-    for number, (one, again) in enumerate(zip(first, second, strict=True)):
-        if one is None or again is None:
-            assert one is again
-            continue
-        assert np.array_equal(one, again)
-        assert (one.dtype, one.shape) == (np.float32, SHAPE)
-        assert bool(np.isfinite(one).all())
-        assert one.min() > 0 if number > 1 else one.min() >= 0
 
 
 def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(

@@ -57,7 +57,6 @@ def without(mode: Any) -> Callable[[Any], Any]:
 CUTS = {
     "no_grad": without(torch.no_grad),
     "inference_mode": without(torch.inference_mode),
-    "detach": lambda run: run().detach(),
     "numpy": lambda run: torch.from_numpy(run().detach().numpy()),
 }
 

@@ -106,22 +106,6 @@ def test_normalisation_is_that_of_an_image_from_0_to_1(
     assert normalisation.std == pytest.approx((std,) * 3)
 
 
-@pytest.mark.parametrize(
-    ("name", "output"),
-    [
-        ("depth_anything", ("inverse", "affine")),
-        ("dpt", ("unknown", "affine")),
-        ("zoedepth", ("depth", "metric")),
-        ("glpn", ("depth", "metric")),
-    ],
-)
-def test_a_type_of_network_says_what_its_numbers_are(
-    name: str, output: tuple[str, str], tmp_path: Path
-) -> None:
-    definition = hf_definition(saved(tmp_path / "net", name))
-    assert (definition.output_kind, definition.output_scale) == output
-
-
 def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
     (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
     with pytest.raises(CheckpointError, match="save_pretrained"):

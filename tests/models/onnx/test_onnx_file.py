@@ -38,23 +38,15 @@ def refused(path: Path, spec: str | None = None) -> str:
     return str(error.value)
 
 
-def test_layers_are_the_graphs_nodes_and_the_bottleneck_comes_first(tmp_path: Path) -> None:
-    network = load_network(str(write_network(tmp_path / "net.onnx")), None)
-    names = [name for name, _ in network.module.named_children()]
-    assert names == ["enc/conv.1", "enc/relu.1", "enc/conv.2", "Relu_d", "dec/conv", "dec/up",
-                     "dec/sigmoid", "dec/scale", "dec/shift"]  # fmt: skip
-    assert network.definition.layers[0] == "Relu_d"
-    assert network.checkpoint == tmp_path / "net.onnx"
-
-
 @pytest.mark.parametrize("channels_last", [False, True])
 def test_a_cut_at_any_node_gives_the_network_bit_for_bit(
     tmp_path: Path, channels_last: bool
 ) -> None:
     shape = (1, 32, 48, 3) if channels_last else (1, 3, 32, 48)
     path = write_network(tmp_path / "net.onnx", shape=shape, channels_last=channels_last)
-    module = load_network(str(path), None).module
-    x = image(*shape)
+    network = load_network(str(path), None)
+    assert network.definition.layers[0] == "Relu_d"
+    module, x = network.module, image(*shape)
     with torch.no_grad():
         whole = module(x)
         for name, _ in module.named_children():
@@ -62,9 +54,7 @@ def test_a_cut_at_any_node_gives_the_network_bit_for_bit(
                 assert torch.equal(split.rear(split.front(x)), whole), name
 
 
-@pytest.mark.parametrize(
-    "shape", [(1, 3, 32, 48), ("n", 3, "h", "w"), (1, 3, None, None), (1, 3, 32, "w")]
-)
+@pytest.mark.parametrize("shape", [(1, 3, 32, 48), ("n", 3, "h", "w"), (1, 3, None, None)])
 def test_fixed_and_free_input_sizes_agree_with_onnxruntime(
     tmp_path: Path, shape: tuple[object, ...]
 ) -> None:
@@ -172,9 +162,7 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
             assert whole.shape[-2:] == (2 * height, 2 * width)
             for name in names:
                 with Split(network.module, name) as split:
-                    z = split.front(x)
-                    assert torch.equal(split.rear(z), whole), name
-                    assert torch.equal(split.rear(z), whole), name
+                    assert torch.equal(split.rear(split.front(x)), whole), name
     assert network.verify((image(1, 3, 32, 48),))
 
 

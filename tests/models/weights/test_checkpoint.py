@@ -31,8 +31,7 @@ class Net(nn.Module):
         self.conv, self.norm = nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4)
 
 
-def definition(**more: Any) -> ModelDefinition:
-    return ModelDefinition(name="net", input_kind="rgb", size=Multiple(1), build=Net, **more)
+DEFINITION = ModelDefinition(name="net", input_kind="rgb", size=Multiple(1), build=Net)
 
 
 def weights() -> dict[str, Tensor]:
@@ -40,16 +39,9 @@ def weights() -> dict[str, Tensor]:
     return Net().state_dict()
 
 
-def parts() -> dict[str, dict[str, Tensor]]:
-    parts: dict[str, dict[str, Tensor]] = {"conv": {}, "norm": {}}
-    for name, tensor in weights().items():
-        parts[name.partition(".")[0]][name.partition(".")[2]] = tensor
-    return parts
-
-
-def loaded(path: Path, **more: Any) -> tuple[dict[str, Tensor], list[str]]:
+def loaded(path: Path) -> tuple[dict[str, Tensor], list[str]]:
     network = Net()
-    notes = load_checkpoint(network, definition(**more), path)
+    notes = load_checkpoint(network, DEFINITION, path)
     return network.state_dict(), notes
 
 
@@ -61,9 +53,8 @@ def save_older(content: Any, path: Path) -> None:
     torch.save(content, path, _use_new_zipfile_serialization=False)
 
 
-def save_layers(state: Mapping[str, Tensor], path: Path) -> None:
-    layers = {part: {n: t.numpy() for n, t in some.items()} for part, some in parts().items()}
-    npy_of(path, pickled(layers))
+def save_arrays(state: Mapping[str, Tensor], path: Path) -> None:
+    npy_of(path, pickled({name: tensor.numpy() for name, tensor in state.items()}))
 
 
 def save_beside(key: str) -> Callable[[Any, Path], None]:
@@ -86,7 +77,7 @@ def save_uncounted(state: Mapping[str, Tensor], path: Path) -> None:
         (save_file, ".safetensors"),
         *((torch.save, suffix) for suffix in (".pth", ".pt", ".pth.tar", ".ckpt", "")),
         (save_older, ".pth"),
-        (save_layers, ".npy"),
+        (save_arrays, ".npy"),
         (save_uncounted, ".pth"),
         *((save_beside(key), ".pth") for key in ("state_dict", "model_state_dict", "model", "net")),
     ],
@@ -127,14 +118,9 @@ def test_of_several_state_dictionaries_the_one_that_is_read_is_named(
     assert "'ema' is read, not 'model'" in note
     with pytest.raises(CheckpointError, match="'teacher'"):
         loaded(tmp_path / "w.pth:teacher")
-
-
-def test_a_state_dictionary_of_another_name_is_read_if_it_is_named(tmp_path: Path) -> None:
-    torch.save({"teacher": weights(), "epoch": 7}, tmp_path / "w.pth")
+    torch.save({"ema": {"state_dict": weights(), "decay": 0.9}, "epoch": 7}, tmp_path / "w.pth")
     with pytest.raises(CheckpointError):
         loaded(tmp_path / "w.pth")
-    assert equal(loaded(tmp_path / "w.pth:teacher")[0], weights())
-    torch.save({"ema": {"state_dict": weights(), "decay": 0.9}, "epoch": 7}, tmp_path / "w.pth")
     assert equal(loaded(tmp_path / "w.pth:ema")[0], weights())
 
 
@@ -177,7 +163,7 @@ def test_every_kind_of_misfit_is_listed_and_nothing_is_loaded(tmp_path: Path) ->
     network = Net()
     before = {k: v.clone() for k, v in network.state_dict().items()}
     with pytest.raises(CheckpointError) as error:
-        load_checkpoint(network, definition(), tmp_path / "w.pth")
+        load_checkpoint(network, DEFINITION, tmp_path / "w.pth")
     assert str(error.value).endswith(
         "does not fit network 'net': 2 missing (norm.weight, norm.bias); 1 complex (conv.weight);"
         " 5 unexpected (extra0, extra1, extra2, extra3 and 1 more); 1 of another shape (conv.bias"
@@ -219,7 +205,7 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
         (torch.save, ".pth"),
         (save_older, ".pth"),
         (save_file, ".safetensors"),
-        (save_layers, ".npy"),
+        (save_arrays, ".npy"),
     ],
 )
 def test_a_file_cut_anywhere_is_refused(
