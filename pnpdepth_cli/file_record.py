@@ -6,6 +6,9 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from pnpdepth_cli.choices import PATTERNS
+from pnpdepth_cli.errors import UsageError
+
 
 def what_applies(entries: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Returns the entries that are not None, false or empty, as `asdict` wants them."""
@@ -13,12 +16,36 @@ def what_applies(entries: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sampling:
-    """How points were sampled from ground truth; see `SamplePattern`."""
+class SamplePattern:
+    """Which of the pixels with known depth are sampled."""
 
-    kind: str
+    kind: str = "uniform"
+    """One of `choices.PATTERNS`."""
     count: int | None = None
+    """Number of points, or of lines for `lines`; None with a fraction."""
     fraction: float | None = None
+    """Fraction of the known pixels, 0 to 1; None with a count."""
+
+    def __post_init__(self) -> None:
+        count, fraction = self.count, self.fraction
+        if self.kind not in PATTERNS:
+            raise UsageError(f"pattern {self.kind!r} is not one of {', '.join(PATTERNS)}")
+        if (count is None) == (fraction is None):
+            raise UsageError("give a number of points or a fraction of the pixels")
+        if (count is not None and count < 1) or (fraction is not None and not 0 < fraction <= 1):
+            raise UsageError("give at least one point, or a fraction above 0 and at most 100 %")
+        if self.kind == "lines" and count is None:
+            raise UsageError("pattern 'lines' needs the number of lines as its count")
+
+    def wanted(self, known: int) -> int:
+        """Returns the number of points to sample from `known` pixels."""
+        return self.count or max(1, round((self.fraction or 0) * known))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling(SamplePattern):
+    """How points were sampled from ground truth."""
+
     seed: int = 0
 
 

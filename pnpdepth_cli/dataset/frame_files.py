@@ -104,8 +104,7 @@ class FrameFiles:
     group: str | None = None  # the sequence it belongs to; None derives it from the name
 
     def __post_init__(self) -> None:
-        paths = (self.image, self.sparse, self.sparse_mask, self.gt, self.calib, *self.masks)
-        for source in paths:
+        for source in (self.image, self.sparse, self.sparse_mask, self.gt, self.calib, *self.masks):
             if source is not None:
                 _check_path(file_of(source))
 
@@ -130,7 +129,7 @@ class Unmatched:
 
 
 def _check_path(path: Path) -> None:
-    """Raises FileFormatError for a path that no file can have: an index file may hold any text."""
+    """FileFormatError for a path that no file can have: an index file may hold any text."""
     if not _can_be_named(str(path)):
         name = str(path).encode("unicode_escape").decode()
         raise FileFormatError(f"{name}: no file can have this name; correct the list of files")
@@ -152,8 +151,8 @@ def find_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path]
     that differ in suffix only, which are left out. The folder need not exist.
     """
     problems: list[Unmatched] = []
-    paths = list(_walk(folder, frozenset(), problems)) if folder.is_dir() else []
-    paths.sort(key=lambda path: natural_order(path.as_posix()))
+    walked = _walk(folder, frozenset(), problems) if folder.is_dir() else ()
+    paths = sorted(walked, key=lambda path: natural_order(path.as_posix()))
     files, ambiguous = one_of_each(
         (path.relative_to(folder).with_suffix("").as_posix(), path)
         for path in paths

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord, what_applies
 from pnpdepth_cli.io.file_bytes import Fingerprint, one_line
 from pnpdepth_cli.io.text_files import plain, read_json, write_json
@@ -216,7 +216,7 @@ class FrameRecord:
         try:
             with _CONVERTING:
                 return msgspec.convert(entry, cls)
-        except (msgspec.ValidationError, OverflowError) as error:
+        except (msgspec.ValidationError, OverflowError, UsageError) as error:
             raise FileFormatError(
                 f"{source} is no record of a frame as this version writes it"
                 f" ({one_line(str(error))}); remove it, and run again"

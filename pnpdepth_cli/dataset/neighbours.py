@@ -19,8 +19,8 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulate
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.motion import Keypoints, MotionEstimate, keypoints_of, motion_of_images
-from pnpdepth_cli.sensors.pixels import Points
+from pnpdepth_cli.sensors.motion import Keypoints, keypoints_of, motion_of_images
+from pnpdepth_cli.sensors.pixels import Floats, Points
 
 _IN_MEMORY = 16
 """Number of images whose keypoints are kept."""
@@ -67,16 +67,16 @@ def read_neighbours(
         # The neighbour's points, and its motion, from poses or from the images.
         points, source = points_of(each.files), each.files.sparse or each.files.gt
         assert source is not None
+        poses, off = each.poses, None
         if each.motion is None:
-            motion, basis = _estimate(files, each.files, points, camera)
+            motion, basis = _motion_shown(files, each.files, points, camera)
             poses = f"{each.poses}: {basis}"
         else:
-            motion, basis, poses = np.array(each.motion), each.poses, each.poses
-        # Poses of the nearest neighbour are compared with the images.
-        off: str | None = None
-        if each.motion is not None and each.apart == 1 and all(scan.apart > 1 for scan in scans):
-            off = _off_images(files, each, points, camera)
-            notes += [off] if off else []
+            motion, basis = np.array(each.motion), each.poses
+            # Poses of the nearest neighbour are compared with the images.
+            if each.apart == 1 and all(scan.apart > 1 for scan in scans):
+                off = _off_images(files, each, points, camera)
+                notes += [off] if off else []
         # A neighbour of known motion joins.
         if motion is None:
             notes.append(
@@ -85,14 +85,13 @@ def read_neighbours(
             )
         else:
             scans.append(NeighbourScan(points=points, motion=motion, apart=each.apart))
-        records.append(
-            replace(
-                record_of(source),
-                poses=poses,
-                motion=None if motion is None else motion.tolist(),
-                contradicts_images=off is not None,
-            )
+        record = replace(
+            record_of(source),
+            poses=poses,
+            motion=None if motion is None else motion.tolist(),
+            contradicts_images=off is not None,
         )
+        records.append(record)
     # At least one must join.
     if not scans:
         raise InputError(
@@ -102,29 +101,16 @@ def read_neighbours(
     return accumulate(own, scans, camera).tensors(), records, notes
 
 
-def _estimate(
-    here: FrameFiles, there: FrameFiles, points: Points, camera: Camera
-) -> MotionEstimate:
-    """The motion that two images show; `points` are those of `there`."""
-    return motion_of_images(_keypoints_of(here), _keypoints_of(there), points, camera)
-
-
-def _keypoints_of(files: FrameFiles) -> Keypoints:
-    assert files.image is not None
-    digest = fingerprint(file_of(files.image)).sha256
-    return _keypoints(files.image, files.part, digest)
-
-
 def _off_images(
     files: FrameFiles, neighbour: Neighbour, points: Points, camera: Camera
 ) -> str | None:
     """A warning if the motion by the poses is not the one that the images of two frames show."""
     if files.image is None or neighbour.files.image is None:
         return None
-    shown = _estimate(files, neighbour.files, points, camera)
-    if shown.motion is None:
+    shown, basis = _motion_shown(files, neighbour.files, points, camera)
+    if shown is None:
         return None
-    motions = (np.array(neighbour.motion), shown.motion)
+    motions = (np.array(neighbour.motion), shown)
     xyz = unproject(camera, points.xy, points.depth)
     moved = [xyz @ motion[:, :3].T + motion[:, 3] for motion in motions]
     seen = (moved[0][:, 2] > 0) & (moved[1][:, 2] > 0)
@@ -139,9 +125,21 @@ def _off_images(
     )
     return (
         f"warning: the poses contradict the images: from {_name_of(neighbour.files)} on, the camera"
-        f" moved {given} by the poses, {other} by {shown.basis}, which puts points {off_px:.0f} px"
+        f" moved {given} by the poses, {other} by {basis}, which puts points {off_px:.0f} px"
         " elsewhere; give poses of these frames, or none"
     )
+
+
+def _motion_shown(
+    here: FrameFiles, there: FrameFiles, points: Points, camera: Camera
+) -> tuple[Floats | None, str]:
+    """The motion that two images show, and its basis; `points` are those of `there`."""
+    return motion_of_images(_keypoints_of(here), _keypoints_of(there), points, camera)
+
+
+def _keypoints_of(files: FrameFiles) -> Keypoints:
+    assert files.image is not None
+    return _keypoints(files.image, files.part, fingerprint(file_of(files.image)).sha256)
 
 
 @functools.lru_cache(maxsize=_IN_MEMORY)

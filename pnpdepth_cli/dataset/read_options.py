@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.protocols import ForegroundFilter
 from pnpdepth_cli.settings import option
 
 if TYPE_CHECKING:
     from pnpdepth_cli.dataset.frame_files import FrameFiles
-    from pnpdepth_cli.sensors.samplers import SamplePattern
 
 
 @dataclass(frozen=True, kw_only=True)

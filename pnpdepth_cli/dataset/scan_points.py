@@ -30,7 +30,6 @@ from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.pixels import Points, describe_dropped
 from pnpdepth_cli.sensors.projection import (
-    agreement_at,
     edge_agreement,
     edge_ranks,
     near_jumps,
@@ -171,7 +170,7 @@ def choose_camera(
         for name, (camera, of_raw) in raw.rectified.items()
     }
     candidates = cameras if named else {"K and distortion": raw} | cameras
-    scores = _scores(frames, candidates) if raw.scanner and len(candidates) > 1 else {}
+    scores = _mean_agreements(frames, candidates) if len(candidates) > 1 else {}
     choice = first = next(iter(candidates))
     best = max(scores, key=lambda name: scores[name], default=first)
     if best != first and scores[best] - scores[first] > _CLEARLY_BETTER:
@@ -185,30 +184,44 @@ def choose_camera(
     return candidates[choice], note
 
 
-def _scores(
+def _mean_agreements(
     frames: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
     candidates: Mapping[str, Calibration],
 ) -> dict[str, float]:
-    """The mean edge agreement of frames by camera, −1 for one that puts few points into them."""
-    agreement = {name: list[float]() for name in candidates}
-    counts = dict.fromkeys(candidates, 0)
-    for rgb, xyz in frames:
-        for name, calibration in candidates.items():
-            assert calibration.scanner is not None
-            try:
-                points = project_velodyne(
-                    xyz, calibration.camera, calibration.scanner, rgb.shape[:2]
-                )
-            except NoPointsError:
-                continue
-            counts[name] += len(points)
-            agreement[name].append(edge_agreement(points, rgb))
-    few = _FEW_INSIDE * max(counts.values())
-    return {
-        name: float(np.mean(values)) if counts[name] >= few else -1.0
-        for name, values in agreement.items()
-        if any(counts.values())
-    }
+    """How well jumps of depth meet edges in the mean of frames, by calibration; none without."""
+    first = next(iter(candidates.values()))
+    found = list[dict[str, float]]()
+    for rgb, xyz in frames if first.scanner else ():
+        assert first.scanner is not None
+        with suppress(NoPointsError):
+            points = project_velodyne(xyz, first.camera, first.scanner, rgb.shape[:2])
+            found.append(_agreements(points, rgb, first, candidates))
+    return {name: float(np.mean([each[name] for each in found])) for name in candidates if found}
+
+
+def _agreements(
+    points: Points,
+    rgb: NDArray[np.float32],
+    own: Calibration,
+    others: Mapping[str, Calibration],
+) -> dict[str, float]:
+    """The edge agreement by each calibration; −1 where it puts few of the points into the image.
+
+    The points that are seen by their own calibration, with its jumps of depth, are projected anew.
+    """
+    assert own.scanner is not None
+    ranks, jumps = edge_ranks(rgb), near_jumps(points)
+    xyz = own.scanner.inverse().apply(unproject(own.camera, points.xy, points.depth))
+    result = dict.fromkeys(others, -1.0)
+    for name, each in others.items():
+        assert each.scanner is not None
+        moved = each.scanner.apply(xyz)
+        ahead = moved[:, 2] > 0
+        xy = pixels_of(each.camera, moved[ahead])
+        inside = in_frame(xy, points.size)
+        if np.count_nonzero(inside) >= _FEW_INSIDE * len(points):
+            result[name] = edge_agreement(ranks, xy[inside], jumps[ahead][inside])
+    return result
 
 
 def check_direction(
@@ -228,8 +241,8 @@ def check_direction(
         for xyz in (pose.apply(scan) for pose in poses)
     )
     upright, upright_inverted = (_is_upright(scan, pose.rotation) for pose in poses)
-    far_more = inverted >= _MORE_IF_INVERTED * max(inside, 1) and upright is not True
-    if not far_more and not (inverted > inside and upright is False and upright_inverted):
+    far_more = inverted >= _MORE_IF_INVERTED * max(inside, 1)
+    if upright or inverted <= inside or not (far_more or upright_inverted):
         return []
     text = (
         f"the extrinsics put {inside:,} of {len(scan):,} scan points into the image, their inverse"
@@ -257,59 +270,41 @@ def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: tuple[int,
 def _better_reading(
     points: Points, own: Calibration, options: ScanOptions, image: Path
 ) -> list[str]:
-    """A warning if jumps of depth meet the image's edges clearly better by another calibration.
-
-    The jumps of the scan's points in the image are projected anew for each one.
-    """
-    # The image's edges, and the jumps of depth in the scanner's coordinates.
+    """A warning if jumps of depth meet the image's edges clearly better by another calibration."""
     rgb, scanner = read_rgb(image).values, own.scanner
     assert scanner is not None
     if len(points) < _MANY_POINTS or rgb.shape[:2] != points.size:
         return []
-    ranks, jumps = edge_ranks(rgb), near_jumps(points)
-    seen = unproject(own.camera, points.xy, points.depth)
-    xyz = scanner.inverse().apply(seen)
-
-    def agreement(moved: NDArray[np.float64], camera: Camera) -> float:
-        ahead = moved[:, 2] > 0
-        xy = pixels_of(camera, moved[ahead])
-        inside = in_frame(xy, points.size)
-        if np.count_nonzero(inside) < _FEW_INSIDE * len(points):
-            return -1.0
-        return agreement_at(ranks, xy[inside], jumps[ahead][inside])
-
-    # How well they agree as they are, and by other axes, cameras and turns.
-    found = agreement(seen, own.camera)
-    readings = dict[str, tuple[float, float]]()  # how much better it must be, and its agreement
+    # Other axes, cameras and turns, and how much better each must be.
+    readings, needed = {"": own}, {"": 0.0}
     for axis, name in ((1, "y"), (2, "z")):
-        flipped = xyz * np.where(np.arange(3) == axis, -1, 1)
+        mirror = Extrinsics(np.diag(np.where(np.arange(3) == axis, -1.0, 1.0)), np.zeros(3))
         text = f"with {name} of the scan negated, as of left-handed ones (CARLA, Unity)"
-        readings[text] = _OTHER_READING, agreement(scanner.apply(flipped), own.camera)
+        readings[text], needed[text] = replace(own, scanner=scanner @ mirror), _OTHER_READING
     for number in range(_CAMERAS) if options.extrinsics is None else ():
         with suppress(UsageError):  # there is no such camera
-            other, _ = _calibration_of(image, replace(options, camera=number))
-            assert other.scanner is not None
-            of_other = agreement(other.scanner.apply(xyz), other.camera)
-            readings[f"with --camera {number}"] = _OTHER_READING, of_other
+            text = f"with --camera {number}"
+            readings[text], _ = _calibration_of(image, replace(options, camera=number))
+            needed[text] = _OTHER_READING
     for down, right in itertools.product(_TURNS_DEG, _TURNS_DEG):
         turn = Rotation.from_euler("xy", (down, right), degrees=True).as_matrix()
         text = f"with the extrinsics turned by {down}° about the camera's x and {right}° about y"
-        readings[text] = _OTHER_TURN, agreement(seen @ turn.T, own.camera)
+        turned = Extrinsics(turn, np.zeros(3)) @ scanner
+        readings[text], needed[text] = replace(own, scanner=turned), _OTHER_TURN
     # The best must be better by more than chance.
-    text = max(readings, key=lambda text: readings[text][1] - readings[text][0])
-    needed, best = readings[text]
-    if best - found < needed or best < _AGREES:
+    found = _agreements(points, rgb, own, readings)
+    text = max(found, key=lambda text: found[text] - needed[text])
+    if not text or found[text] < _AGREES:
         return []
     return [
-        f"warning: the image's edges meet the scan's jumps of depth better {text}: {best:+.2f}"
-        f" instead of {found:+.2f}, where 0 is chance; check the calibration"
+        f"warning: the image's edges meet the scan's jumps of depth better {text}:"
+        f" {found[text]:+.2f} instead of {found['']:+.2f}, where 0 is chance; check the calibration"
     ]
 
 
-def _is_upright(scan: NDArray[np.floating], rotation: NDArray[np.float64]) -> bool | None:
-    """Whether the thin direction of the scan is the camera's y; None for a scan without one."""
+def _is_upright(scan: NDArray[np.floating], rotation: NDArray[np.float64]) -> bool:
+    """Whether the scan has a thin direction, and that is the camera's y."""
     rays = scan / np.maximum(np.linalg.norm(scan, axis=1, keepdims=True), 1e-9)
     variances, axes = np.linalg.eigh(rays.T @ rays / len(rays))
-    if variances[0] > _THIN * variances[1]:
-        return None
-    return bool(np.argmax(np.abs(rotation @ axes[:, 0])) == 1)
+    is_thin = variances[0] <= _THIN * variances[1]
+    return bool(is_thin and np.argmax(np.abs(rotation @ axes[:, 0])) == 1)

@@ -102,15 +102,19 @@ def project_velodyne(
     )
 
 
-def edge_agreement(points: Points, rgb: NDArray[np.float32]) -> float:
+def edge_agreement(ranks: NDArray[np.float64], xy: NDArray[np.floating], jumps: Mask) -> float:
     """Returns how much stronger the image's edges are at jumps of depth than elsewhere, −1 to 1.
 
-    That is the mean rank of the gradient of rgb, (H, W, 3) in 0..1, beside the points at the near
-    side of a jump, less that at all points. It tells calibrations of the same scan apart.
+    That is the mean rank of the gradient beside the points at the near side of a jump, less that at
+    all points. It tells calibrations of the same scan apart.
+
+    Args:
+        ranks: (H, W) of `edge_ranks`.
+        xy: (N, 2) pixel coordinates inside the image.
+        jumps: (N,) of `near_jumps`.
     """
-    if len(points) <= _JUMP_NEIGHBOURS:
-        return 0.0
-    return agreement_at(edge_ranks(rgb), points.xy, near_jumps(points))
+    rank = ranks.ravel()[pixel_index(xy, (ranks.shape[0], ranks.shape[1]))]
+    return float(rank[jumps].mean() - rank.mean()) if jumps.any() else 0.0
 
 
 def edge_ranks(rgb: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -123,17 +127,13 @@ def edge_ranks(rgb: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def near_jumps(points: Points) -> Mask:
-    """Returns (N,) true for points at the near side of a jump of depth, of more than a few."""
+    """Returns (N,) true for points at the near side of a jump of depth; none of a few points."""
     from scipy.spatial import cKDTree
 
+    if len(points) <= _JUMP_NEIGHBOURS:
+        return np.zeros(len(points), bool)
     _, near = cKDTree(points.xy).query(points.xy, k=_JUMP_NEIGHBOURS)
     return np.asarray(points.depth[near].max(axis=1) > _JUMP * points.depth)
-
-
-def agreement_at(ranks: NDArray[np.float64], xy: NDArray[np.floating], jumps: Mask) -> float:
-    """Returns the agreement of edges of `edge_ranks` and of jumps at pixels (N, 2) inside."""
-    rank = ranks.ravel()[pixel_index(xy, (ranks.shape[0], ranks.shape[1]))]
-    return float(rank[jumps].mean() - rank.mean()) if jumps.any() else 0.0
 
 
 def hidden_points(

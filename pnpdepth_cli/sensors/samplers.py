@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -10,36 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.sensors.pixels import Points
 
 Image = NDArray[np.float32]
 Pixels = NDArray[np.intp]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SamplePattern:
-    """Which of the pixels with known depth are sampled."""
-
-    kind: str = "uniform"  # one of `choices.PATTERNS`
-    count: int | None = None  # number of points, or of lines for `lines`; None with a fraction
-    fraction: float | None = None  # fraction of the known pixels, 0 to 1; None with a count
-
-    def __post_init__(self) -> None:
-        count, fraction = self.count, self.fraction
-        if self.kind not in PATTERNS:
-            raise UsageError(f"pattern {self.kind!r} is not one of {', '.join(PATTERNS)}")
-        if (count is None) == (fraction is None):
-            raise UsageError("give a number of points or a fraction of the pixels")
-        if (count is not None and count < 1) or (fraction is not None and not 0 < fraction <= 1):
-            raise UsageError("give at least one point, or a fraction above 0 and at most 100 %")
-        if self.kind == "lines" and count is None:
-            raise UsageError("pattern 'lines' needs the number of lines as its count")
-
-    def wanted(self, known: int) -> int:
-        """Returns the number of points to sample from `known` pixels."""
-        if self.count is not None:
-            return self.count
-        return max(1, round((self.fraction or 0) * known))
 
 
 class _Scene(NamedTuple):
@@ -85,7 +59,7 @@ def sample_points(
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
     if not known.size:
         raise NoPointsError("the depth map has no pixel with known depth to sample from")
-    chosen = np.sort(PATTERNS[pattern.kind](_Scene(known, size, image, pattern, seed)))
+    chosen = np.sort(SAMPLERS[pattern.kind](_Scene(known, size, image, pattern, seed)))
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, size[1])
@@ -113,15 +87,13 @@ def _shuffle(scene: _Scene) -> Pixels:
 def _grid(scene: _Scene) -> Pixels:
     """Known pixels of a square grid whose spacing gives a full map the wanted count."""
     height, width = scene.size
-    if scene.pattern.fraction is not None:
-        spacing = scene.pattern.fraction**-0.5
-    else:
-        spacing = max(1.0, (height * width / scene.wanted) ** 0.5)
+    fraction = scene.pattern.fraction
+    spacing = fraction**-0.5 if fraction else max(1.0, (height * width / scene.wanted) ** 0.5)
     rows, columns = (
-        (np.floor((np.arange(max(1, round(side / spacing))) + 0.5) * spacing)).astype(np.intp)
+        np.floor((np.arange(max(1, round(side / spacing))) + 0.5) * spacing).clip(max=side - 1)
         for side in (height, width)
     )
-    nodes = np.minimum(rows, height - 1)[:, None] * width + np.minimum(columns, width - 1)
+    nodes = rows.astype(np.intp)[:, None] * width + columns.astype(np.intp)
     return np.intersect1d(nodes, scene.known)
 
 
@@ -139,21 +111,17 @@ def _features(scene: _Scene) -> Pixels:
     """The strongest ORB corners with known depth, as structure from motion has its points."""
     if scene.image is None:
         raise UsageError("pattern 'features' needs the image that the depth belongs to")
-    grey = scene.image @ np.array([0.299, 0.587, 0.114], np.float32)
-    codes = np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)
+    grey = cv2.cvtColor(scene.image.clip(0, 1), cv2.COLOR_RGB2GRAY)
     # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
     wanted = scene.wanted
     detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
-    corners = sorted(detector.detect(codes), key=lambda corner: -corner.response)
-    xy = np.array([corner.pt for corner in corners], np.float64).reshape(-1, 2)
-    column, row = np.rint(xy).astype(np.intp).T
-    pixels = row * scene.size[1] + column
-    _, first = np.unique(pixels, return_index=True)
-    strongest = pixels[np.sort(first)]
-    kept: Pixels = strongest[np.isin(strongest, scene.known)][:wanted]
-    return kept
+    corners = detector.detect(np.rint(255 * grey).astype(np.uint8))
+    xy = np.array([c.pt for c in sorted(corners, key=lambda corner: -corner.response)])
+    column, row = np.rint(xy.reshape(-1, 2)).astype(np.intp).T
+    pixels = list(dict.fromkeys((row * scene.size[1] + column).tolist()))
+    return np.array(pixels, np.intp)[np.isin(pixels, scene.known)][:wanted]
 
 
 _FUNCTIONS = (_uniform, _shuffle, _grid, _lines, _features)
-PATTERNS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
-"""The patterns by name, as in `choices.PATTERNS`; each returns row-major indices of pixels."""
+SAMPLERS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
+"""What returns row-major indices of pixels, by a name of `choices.PATTERNS`."""

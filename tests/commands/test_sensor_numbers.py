@@ -22,10 +22,10 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, UsageError
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refiner import frame_of_arrays
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors.samplers import SamplePattern
 from tests.exr_files import write_exr
 
 STREET = Path(__file__).parents[2] / "samples" / "street"

@@ -14,13 +14,14 @@ from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP
 from pnpdepth_cli.sensors.pixels import Points, as_depth_image
 from pnpdepth_cli.sensors.projection import interleaved, occluded_in_map, project_velodyne
-from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
+from pnpdepth_cli.sensors.samplers import sample_points
 from pnpdepth_cli.settings import Settings
 
 SIZE = (240, 640)

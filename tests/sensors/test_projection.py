@@ -12,7 +12,13 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP
 from pnpdepth_cli.sensors.pixels import as_depth_image
-from pnpdepth_cli.sensors.projection import edge_agreement, hidden_points, project_velodyne
+from pnpdepth_cli.sensors.projection import (
+    edge_agreement,
+    edge_ranks,
+    hidden_points,
+    near_jumps,
+    project_velodyne,
+)
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 SIZE = (80, 101)
@@ -96,5 +102,6 @@ def test_edges_agree_where_they_are_beside_jumps_of_depth(
     rgb = np.zeros((60, 100, 3), np.float32)
     rgb[:, edge:] = 1
     points = SparsePoints(xy=xy, depth=depth, size=(60, 100))
-    assert edge_agreement(points, rgb) == pytest.approx(agreement, abs=0.005)
-    assert edge_agreement(points.select(slice(9, 15)), rgb) == 0  # too few to tell
+    found = edge_agreement(edge_ranks(rgb), points.xy, near_jumps(points))
+    assert found == pytest.approx(agreement, abs=0.005)
+    assert not near_jumps(points.select(slice(9, 15))).any()  # too few to tell

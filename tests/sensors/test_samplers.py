@@ -3,8 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pnpdepth_cli.choices import PATTERNS
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
-from pnpdepth_cli.sensors.samplers import PATTERNS, SamplePattern, sample_points
+from pnpdepth_cli.file_record import SamplePattern
+from pnpdepth_cli.sensors.samplers import sample_points
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)
 HOLES = np.where(np.random.default_rng(8).random((60, 80)) < 0.3, 0, DEPTH).astype(np.float32)

@@ -28,7 +28,7 @@ from pnpdepth_cli.measures import OF_SIGMA
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.protocols import Protocol
 from pnpdepth_cli.sensors.pixels import pixel_index
-from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
+from pnpdepth_cli.sensors.samplers import sample_points
 from pnpdepth_cli.stages import AFTER, GT
 
 Depth = NDArray[np.float32]
@@ -194,11 +194,10 @@ def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
     drawn = None if sparse is None else sparse.sampled
     try:
         if drawn is not None and pair.record.size == size[::-1]:
-            pattern = SamplePattern(kind=drawn.kind, count=drawn.count, fraction=drawn.fraction)
             image = None
             if drawn.kind == "features" and frame.image is not None:
                 image = frame.part.apply(read_image(frame.image))
-            xy = sample_points(gt, pattern, drawn.seed, image=image).xy
+            xy = sample_points(gt, drawn, drawn.seed, image=image).xy
         elif frame.sparse is not None:
             points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
             xy = points.xy

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.settings import Settings, option
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.sensors.samplers import SamplePattern
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,8 +149,6 @@ class RefineRequest:
 
 def parse_sample(text: str) -> SamplePattern:
     """Returns the pattern of `500`, `5%` or `lines:16`. Raises UsageError for any other text."""
-    from pnpdepth_cli.sensors.samplers import SamplePattern
-
     kind, _, number = text.rpartition(":")
     try:
         fraction = float(number.strip()[:-1]) / 100 if number.strip().endswith("%") else None

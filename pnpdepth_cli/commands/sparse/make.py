@@ -17,7 +17,7 @@ from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.file_record import FileRecord
+from pnpdepth_cli.file_record import FileRecord, SamplePattern
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import SPARSE_SUFFIXES, describe_range, read_depth, write_sparse
@@ -27,7 +27,7 @@ from pnpdepth_cli.io.text_files import plain, write_json
 from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, ideal_lidar, simulate_lidar
 from pnpdepth_cli.sensors.pixels import Points, as_depth_image
-from pnpdepth_cli.sensors.samplers import SamplePattern, sample_points
+from pnpdepth_cli.sensors.samplers import sample_points
 
 
 class SparseSummary(NamedTuple):

@@ -42,16 +42,14 @@ def _match(root: Path, name: str | None) -> str | None:
 def _nearest(root: Path) -> str:
     """What the nearest layout lacks; how to make the simplest, if no layout is near."""
     needs = {name: layout.needs for name, layout in LAYOUTS.items() if layout.needs}
-    present = {
-        name: [p for p in patterns if any(next(root.glob(s + p), None) for s in ("", "*/", "*/*/"))]
+    lacking = {
+        name: [p for p in patterns if not any(any(root.glob(s + p)) for s in ("", "*/", "*/*/"))]
         for name, patterns in needs.items()
     }
-    here = {name: sum(any(root.glob(p)) for p in patterns) for name, patterns in needs.items()}
-    best = max(needs, key=lambda name: (len(present[name]) / len(needs[name]), here[name]))
-    if present[best]:
-        lacking = [pattern for pattern in needs[best] if pattern not in present[best]]
-        fact = f"lacks {', '.join(lacking)}" if lacking else "has them, but not in one place"
-        return f"nearest is {best!r}, which needs {', '.join(needs[best])}; the folder {fact}"
+    best = min(needs, key=lambda name: len(lacking[name]) / len(needs[name]))
+    if len(lacking[best]) < len(needs[best]):
+        fact = ", ".join(lacking[best]) or "nothing, but has them in several places"
+        return f"nearest is {best!r}, which needs {', '.join(needs[best])}; the folder lacks {fact}"
     return (
         "put images into rgb/ and their sparse depth into sparse/, with equal names, or give a"
         f" CSV list with the columns image and sparse; known layouts: {', '.join(LAYOUTS)}"

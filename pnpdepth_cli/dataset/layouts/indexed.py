@@ -22,14 +22,16 @@ each frame, in ARKit's axes x right, y up, z backwards.
 
 from __future__ import annotations
 
+import io
 import math
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from pnpdepth_cli.camera import Floats
 from pnpdepth_cli.dataset.frame_files import (
     IMAGE_SUFFIXES,
     FrameFiles,
@@ -61,37 +63,29 @@ def _is_tum(root: Path) -> bool:
 
 
 def _frames_of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
-    """One frame for each image with a depth image within 0.02 s; each is used once."""
-    poses = root / "groundtruth.txt"
-    trajectory = read_trajectory(poses) if poses.is_file() else None
-    # A file of pairs, if there is one; else each image has the depth image closest in time.
+    """One frame for each image with a depth image of its own within 0.02 s."""
+    # A file of pairs, if there is one; else images and depth images that are nearest to each other.
     if (root / _ASSOCIATIONS).is_file():
-        pairs = _timed_files(root / _ASSOCIATIONS, 2)
+        pairs = [sorted(row, key=_is_depth) for row in _timed_files(root / _ASSOCIATIONS, 2)]
     else:
         images, depths = (
             sorted(timed for (timed,) in _timed_files(root / name, 1))
             for name in ("rgb.txt", "depth.txt")
         )
-        partner_of: dict[int, int] = {}
-        taken: set[int] = set()
-        for image, depth in _close_pairs(images, depths):
-            if image not in partner_of and depth not in taken:
-                partner_of[image] = depth
-                taken.add(depth)
-        pairs = [[images[i], depths[partner_of[i]]] for i in sorted(partner_of)]
-        # Files without a partner are spare.
-        for timed, used, other in ((images, partner_of, "depth"), (depths, taken, "image")):
+        pairs = _nearest_pairs(images, depths)
+        for timed, number, other in ((images, 0, "depth"), (depths, 1, "image")):
+            used = {pair[number] for pair in pairs}
             why = f"has no {other} within {LONGEST_GAP_S} s that is not another's"
-            for number, (_, path) in enumerate(timed):
-                if number not in used:
-                    yield Unmatched(path=path, why=why)
+            yield from (Unmatched(path=each[1], why=why) for each in timed if each not in used)
     # The frames, with poses where motion capture has them.
-    for (time_s, image_path), (_, depth_path) in pairs:
+    poses = root / "groundtruth.txt"
+    trajectory = read_trajectory(poses) if poses.is_file() else None
+    for (time_s, image), (_, depth) in pairs:
         pose = None if trajectory is None else trajectory.at(time_s, _LONGEST_POSE_GAP_S)
         yield FrameFiles(
-            name=image_path.stem,
-            image=image_path,
-            gt=depth_path,
+            name=image.stem,
+            image=image,
+            gt=depth,
             gt_scale=5000.0,
             one_view=True,
             pose=None if pose is None else as_pose(pose),
@@ -104,16 +98,17 @@ def _timed_files(path: Path, count: int) -> list[list[Timed]]:
     for number, line in numbered_lines(read_bytes(path)):
         words = line.split()
         try:
-            row = [(float(words[2 * i]), path.parent / words[2 * i + 1]) for i in range(count)]
-        except (ValueError, IndexError):
+            times = [float(time_s) for time_s in words[::2]]
+            row = list(zip(times, [path.parent / name for name in words[1::2]], strict=True))
+        except ValueError:
             row = []
-        known = row and all(math.isfinite(time_s) for time_s, _ in row)
-        if not known or (count == 2 and (len(words) != 4 or sum(map(_is_depth, row)) != 1)):
+        finite = all(math.isfinite(time_s) for time_s, _ in row)
+        if len(row) != count or not finite or (count == 2 and sum(map(_is_depth, row)) != 1):
             both = " of rgb, and a time and a path of depth" if count == 2 else ""
             raise FileFormatError(
                 f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path{both}"
             )
-        rows.append(sorted(row, key=_is_depth) if count == 2 else row)
+        rows.append(row)
     return rows
 
 
@@ -121,15 +116,18 @@ def _is_depth(timed: Timed) -> bool:
     return "depth" in timed[1].parts[-2:][0].lower()
 
 
-def _close_pairs(images: list[Timed], depths: list[Timed]) -> list[tuple[int, int]]:
-    """Indices of images and depths at most 0.02 s apart, the closest first; times are sorted."""
-    times, reach = [time for time, _ in depths], 2 * LONGEST_GAP_S
-    pairs = [
-        (abs(times[depth] - time), image, depth)
-        for image, (time, _) in enumerate(images)
-        for depth in range(bisect_left(times, time - reach), bisect_right(times, time + reach))
+def _nearest_pairs(images: list[Timed], depths: list[Timed]) -> list[list[Timed]]:
+    """Images and depth images at most 0.02 s apart, each the nearest of the other."""
+    if not images or not depths:
+        return []
+    times = [np.array([[time_s] for time_s, _ in timed]) for timed in (images, depths)]
+    gaps, partners = cKDTree(times[1]).query(times[0])
+    _, back = cKDTree(times[0]).query(times[1])
+    return [
+        [images[number], depths[partner]]
+        for number, (gap, partner) in enumerate(zip(gaps, partners, strict=True))
+        if gap <= LONGEST_GAP_S and back[partner] == number
     ]
-    return [(image, depth) for gap, image, depth in sorted(pairs) if gap <= LONGEST_GAP_S]
 
 
 TUM = Layout(matches=_is_tum, frames=_frames_of_tum, needs=("rgb.txt", "depth.txt"))
@@ -137,11 +135,8 @@ TUM = Layout(matches=_is_tum, frames=_frames_of_tum, needs=("rgb.txt", "depth.tx
 
 def _colmap_models(root: Path) -> list[Path]:
     """The folders of models, sparse/0 first; none without images."""
-    parents = [path for path in (root / "sparse", root / "colmap/sparse") if path.is_dir()]
-    inside = [p for sparse in parents for p in sparse.iterdir() if p.name.isdigit()]
-    numbered = sorted(inside, key=lambda p: int(p.name))
-    folders = (*numbered, *parents, root, root / _OF_ETH3D)
-    found = [folder for folder in folders if model_files(folder)]
+    numbered = [*sorted(root.glob("sparse/[0-9]*")), *sorted(root.glob("colmap/sparse/[0-9]*"))]
+    found = [p for p in (*numbered, root / "sparse", root, root / _OF_ETH3D) if model_files(p)]
     return found if _photos(root) else []
 
 
@@ -181,33 +176,30 @@ COLMAP = Layout(matches=_colmap_models, frames=_of_colmap, needs=("images", "spa
 
 
 def _of_stray_scanner(place: Path) -> Callable[[FrameFiles], FrameFiles]:
-    path, poses = place / _ODOMETRY, dict[int, Pose]()
-    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
-    for number, line in enumerate(lines[1:], start=2):
-        try:
-            _, frame, *values = map(float, line.split(",")[:9])
-            poses[int(frame)] = _pose(values[:3], values[3:])
-        except (ValueError, OverflowError):
-            raise FileFormatError(
-                f"{path}, line {number}: not timestamp, frame, x, y, z, qx, qy, qz, qw"
-            ) from None
+    path = place / _ODOMETRY
+    try:
+        rows = np.loadtxt(io.BytesIO(read_bytes(path)), delimiter=",", skiprows=1, usecols=range(9))
+        poses = {int(row[1]): _pose(row[2:5], row[5:]) for row in np.atleast_2d(rows)}
+    except (ValueError, OverflowError) as error:
+        raise FileFormatError(
+            f"{path}: not timestamp, frame, x, y, z, qx, qy, qz, qw ({one_line(error)})"
+        ) from error
     return lambda frame: replace(frame, pose=poses.get(int(frame.name)))
 
 
 def _of_record3d(place: Path) -> Callable[[FrameFiles], FrameFiles]:
     path = place / _METADATA
     try:
-        rows = [[float(value) for value in row] for row in read_json(path).get("poses", [])]
+        rows = [np.array(row, np.float64) for row in read_json(path).get("poses", [])]
         poses = {n: _pose(row[4:], row[:4], y_up=True) for n, row in enumerate(rows)}
     except (TypeError, ValueError):
         raise FileFormatError(f"{path}: poses are not rows of qx qy qz qw x y z") from None
     return lambda frame: replace(frame, pose=poses.get(int(frame.name)))
 
 
-def _pose(position: list[float], xyzw: list[float], y_up: bool = False) -> Pose:
+def _pose(position: Floats, xyzw: Floats, y_up: bool = False) -> Pose:
     """The pose with the axes x right, y down, z forward. ValueError for none."""
-    x, y, z, w = xyzw
-    turn = rotation_of(np.array([w, x, y, z]))
+    turn = rotation_of(np.roll(xyzw, 1))
     pose = np.column_stack([turn * (1, -1, -1) if y_up else turn, position])
     if pose.shape != (3, 4) or not np.isfinite(pose).all():
         raise ValueError

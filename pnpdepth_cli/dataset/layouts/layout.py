@@ -37,7 +37,7 @@ Files = dict[str, Path]
 class Layout:
     """How the files of a data set lie on disk."""
 
-    matches: Callable[[Path], Any]  # true for a folder or file of this layout
+    matches: Callable[[Path], object]  # true for a folder or file of this layout
     frames: Callable[[Path], Iterable[FrameFiles | Unmatched]]
     """The frames of a folder or file that matches, and what is in no frame."""
     needs: tuple[str, ...] = ()

@@ -19,8 +19,8 @@ from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.sensors.samplers import SamplePattern
 from tests.commands.batches import RecordingListener, batch, depths, done
 from tests.commands.drives import STEP_M, drive_on_disk, without_results
 from tests.commands.frames import frame_on_disk

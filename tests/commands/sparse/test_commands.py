@@ -25,9 +25,9 @@ from pnpdepth_cli.errors import (
     SizeError,
     UsageError,
 )
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
 from pnpdepth_cli.sensors.lidar import Lidar, ideal_lidar
-from pnpdepth_cli.sensors.samplers import SamplePattern
 from tests.commands.scan_frames import ScanOnDisk, scan_on_disk
 
 

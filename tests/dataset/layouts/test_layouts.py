@@ -370,11 +370,6 @@ def test_a_near_layout_is_proposed_for_an_unknown_one(tmp_path: Path) -> None:
             "'kitti-raw', which needs velodyne_points/data, image_0[23]/data",
             "velodyne_points/data",
         ),
-        (
-            "image_02/data/0.png proj_depth/velodyne/image_02/0.npz",
-            "'kitti-raw', which needs velodyne_points/data",
-            r"velodyne_points/data, calib_cam_to_cam\.txt",
-        ),
     ],
 )
 def test_an_unknown_folder_names_the_nearest_layout_and_what_it_lacks(
