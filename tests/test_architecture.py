@@ -25,7 +25,7 @@ GROUND_FLOOR = {
 }  # fmt: skip
 MAY_IMPORT = {
     "errors": set(),
-    "file_record": set(),
+    "file_record": {"choices", "errors"},
     "stages": set(),
     "measures": {"errors"},
     "protocols": {"errors", "measures", "camera"},

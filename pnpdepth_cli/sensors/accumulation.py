@@ -94,10 +94,8 @@ def _add(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: in
     """The points known so far, joined by those of `xyz` (M, 3) that agree with measured ones."""
     from scipy.spatial import cKDTree
 
-    xyz = xyz[xyz[:, 2] > 0]
-    xy = pixels_of(camera, xyz)
-    inside = in_frame(xy, known.size)
-    xy, depth = xy[inside], xyz[inside, 2]
+    xyz, xy = _in_image(xyz, camera, known.size)
+    depth = xyz[:, 2]
     agrees = _agrees(xy, depth, surface)
     xy, depth = xy[agrees], depth[agrees]
     free = cKDTree(known.xy).query(xy)[0] >= apart
@@ -106,6 +104,14 @@ def _add(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: in
         xy=np.concatenate([known.xy, xy[free].astype(np.float32)]),
         depth=np.concatenate([known.depth, depth[free].astype(np.float32)]),
     )
+
+
+def _in_image(xyz: Floats, camera: Camera, size: tuple[int, int]) -> tuple[Floats, Floats]:
+    """The points (M, 3) that the camera sees, and their pixel coordinates."""
+    xyz = xyz[xyz[:, 2] > 0]
+    xy = pixels_of(camera, xyz)
+    inside = in_frame(xy, size)
+    return xyz[inside], xy[inside]
 
 
 def _agrees(xy: Floats, depth: Floats, surface: Surface) -> Mask:
@@ -143,31 +149,28 @@ def refine_motion(surface: Surface, xyz: Floats, motion: Floats, camera: Camera)
     """
     from scipy.spatial.transform import Rotation
 
-    best, least = motion, np.inf
-    for _ in range(_STEPS + 1):
+    given = motion
+    for _ in range(_STEPS):
+        # Pairs of a moved point and a plane, and how far apart they are.
         moved, index = _pairs(surface, xyz @ motion[:, :3].T + motion[:, 3], camera)
         if len(index) < _MIN_PLANES:
-            return best
+            return given
         normal, depth = surface.normal[index], surface.xyz[index, 2]
         distance = np.einsum("ij,ij->i", moved - surface.xyz[index], normal) / depth
+        # A step of weighted least squares towards the planes.
         typical = max(_NORMAL_MEDIAN * float(np.median(np.abs(distance))), _LEAST_ERROR)
-        if typical < least:
-            best, least = motion, typical
         weight = (1 + (distance / (2 * typical)) ** 2) ** -2
         slope = np.column_stack([np.cross(moved, normal), normal]) / depth[:, None]
         weighted = slope * weight[:, None]
         step = -np.linalg.lstsq(weighted.T @ slope, weighted.T @ distance, rcond=None)[0]
         motion = Rotation.from_rotvec(step[:3]).as_matrix() @ motion
         motion[:, 3] += step[3:]
-    return best
+    return motion
 
 
 def _pairs(surface: Surface, moved: Floats, camera: Camera) -> tuple[Floats, NDArray[np.intp]]:
     """The points in the image with a plane beside them, and the index of that plane."""
-    moved = moved[moved[:, 2] > 0]
-    xy = pixels_of(camera, moved)
-    inside = in_frame(xy, surface.points.size)
-    moved, xy = moved[inside], xy[inside]
+    moved, xy = _in_image(moved, camera, surface.points.size)
     distance, index = surface.tree.query(xy, distance_upper_bound=_REACH * surface.spacing_px)
     near = np.isfinite(distance)
     near[near] &= surface.flat[index[near]]

@@ -8,8 +8,6 @@ y / z, to the point on the image plane z = 1 where it is seen, so all lenses her
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,20 +18,16 @@ from pnpdepth_cli.camera import Camera
 Floats = NDArray[np.float64]
 Coefficients = tuple[float, ...]
 
-_WIDEST_PLANE = 10.0
-"""Tangent of the largest angle to the axis at which a lens without angles of its own is checked."""
-
-_WIDEST_ANGLE = 1.569
-"""Radians; the same for a lens that is defined by angles."""
+_WIDEST_PLANE, _WIDEST_ANGLE = 10.0, 1.569
+"""Where a lens is checked: the tangent of the angle to the axis, and that of a fisheye, radians."""
+_RADIAL = (0, 1, 4, 5, 6, 7)
+"""Which coefficients of a radial-tangential lens are radial."""
 
 _SAMPLES = 8192
 _NEWTON_STEPS = 12
 _NEWTON_STEP = 1e-7
 _NEWTON_END = 1e-9
 """Steps below this leave an error that is smaller than rounding."""
-
-_ROWS_PIXELS = 1 << 18
-"""Pixels whose rays are computed at once, so that little more than the result is in memory."""
 
 
 def pixels_of(camera: Camera, points: NDArray[np.floating]) -> Floats:
@@ -73,12 +67,11 @@ def _rays_of_image(
     """The rays of a camera that is given by what can be a key."""
     camera = Camera(intrinsics=np.reshape(intrinsics, (3, 3)), lens=lens, distortion=distortion)
     height, width = size
-    rays = np.empty((height * width, 2))
-    for first in range(0, height * width, _ROWS_PIXELS):
-        row, column = np.divmod(np.arange(first, min(first + _ROWS_PIXELS, len(rays))), width)
-        rays[first : first + _ROWS_PIXELS] = rays_of(camera, np.column_stack([column, row]))
+    column, rays = np.arange(width), np.empty((height, width, 2))
+    for row in range(height):  # little more than the result is in memory
+        rays[row] = rays_of(camera, np.column_stack([column, np.full(width, row)]))
     rays.flags.writeable = False
-    return rays.reshape(height, width, 2)
+    return rays
 
 
 def unproject(camera: Camera, xy: NDArray[np.floating], depth: NDArray[np.floating]) -> Floats:
@@ -140,30 +133,20 @@ def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coeffici
 
 def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats]:
     """Radius before and after the lens, without its tangential parts."""
-    model = LENS_MODELS[lens]
-    if model.by_angle:
+    if lens == "fisheye":
         radius = np.tan(np.linspace(0, _WIDEST_ANGLE, _SAMPLES))
     else:
         radius = np.linspace(0, _WIDEST_PLANE, _SAMPLES)
-    kept = range(len(coefficients)) if model.radial is None else model.radial
-    radial_only = tuple(c if i in kept else 0.0 for i, c in enumerate(coefficients))
+        coefficients = tuple(c if i in _RADIAL else 0.0 for i, c in enumerate(coefficients))
     with np.errstate(all="ignore"):
-        seen = _distorted(np.column_stack([radius, 0 * radius]), lens, radial_only)
+        seen = _distorted(np.column_stack([radius, 0 * radius]), lens, coefficients)
     return radius, seen[:, 0]
 
 
 def _distorted(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
     """The points (N, 2) by the lens model, also beyond where it turns back."""
-    return LENS_MODELS[lens].shown(plane, coefficients) if len(plane) else plane.copy()
-
-
-class LensModel(NamedTuple):
-    """A lens distortion."""
-
-    shown: Callable[[Floats, Coefficients], Floats]
-    """Function from (N, 2) directions and the coefficients to (N, 2) points on the image plane."""
-    by_angle: bool  # whether it is defined by the angle to the axis, not by the tangent of it
-    radial: tuple[int, ...] | None = None  # which coefficients are radial. None: all.
+    shown = _fisheye if lens == "fisheye" else _radial_tangential
+    return shown(plane, coefficients) if len(plane) else plane.copy()
 
 
 def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
@@ -193,10 +176,3 @@ def _fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
     """OpenCV's equidistant k1 k2 k3 k4; without them the angle is the distance to the centre."""
     padded = np.array((*coefficients, *[0.0] * 4)[:4])
     return np.asarray(cv2.fisheye.distortPoints(plane[:, None], np.eye(3), padded)[:, 0])
-
-
-LENS_MODELS = {
-    "radial-tangential": LensModel(_radial_tangential, False, (0, 1, 4, 5, 6, 7)),
-    "fisheye": LensModel(_fisheye, True),
-}
-"""Lens models by name, as in `choices.LENSES`."""

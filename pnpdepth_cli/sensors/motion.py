@@ -98,24 +98,19 @@ def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
 
 
 def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
-    """Depth (M,) on the plane through the points around each pixel, and where it is known.
+    """Depth (M,) of the points around each pixel, and where it is known.
 
-    Inverse depth is linear in the pixel coordinates on a plane.
+    Inverse depth is the mean of theirs, weighted by nearness.
     """
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import QhullError, cKDTree
+    from scipy.spatial import cKDTree
 
-    nothing = np.zeros(len(xy)), np.zeros(len(xy), bool)
     if len(points) < _MIN_INLIERS or not len(xy):
-        return nothing
+        return np.zeros(len(xy)), np.zeros(len(xy), bool)
     height, width = points.size
     spacing = np.sqrt(height * width / len(points))
     distance, near = cKDTree(points.xy).query(xy, k=4)
-    around = points.depth[near]
+    around = points.depth[near].astype(np.float64)
     smooth = around.max(axis=1) < _JUMP * around.min(axis=1)
-    try:
-        inverse = LinearNDInterpolator(points.xy, 1 / points.depth.astype(np.float64))(xy)
-    except QhullError:  # all on one line
-        return nothing
-    known = smooth & (distance[:, 0] < _REACH * spacing) & np.isfinite(inverse)
-    return np.divide(1, inverse, where=known, out=np.zeros(len(xy))), known
+    weights = 1 / np.maximum(distance, 1e-3)
+    depth = weights.sum(axis=1) / (weights / around).sum(axis=1)
+    return depth, smooth & (distance[:, 0] < _REACH * spacing)
