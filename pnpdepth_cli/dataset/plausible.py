@@ -100,11 +100,10 @@ def scan_returns(
         raise NoPointsError(f"{path}: none of its {len(xyz):,} points is a return")
     dropped = {why: count for why, count in counts.items() if count}
     notes = [f"sparse: dropped {n:,} of {len(xyz):,} points {why}" for why, n in dropped.items()]
-    points, name = np.ascontiguousarray(xyz[keep], np.float32), f"{path}: range"
     divisor, lines = divisor_to_metres(
-        range_m[keep], Reading("scan"), name, "--depth-scale", scale, SCANS
+        range_m[keep], Reading("scan"), f"{path}: range", "--depth-scale", scale, SCANS
     )
-    points = points if divisor == 1 else (points / np.float32(divisor)).astype(np.float32)
+    points = np.ascontiguousarray(xyz[keep], np.float32) / np.float32(divisor)
     return points, dropped, [*notes, *lines]
 
 
@@ -174,14 +173,13 @@ def plausible_map(
     """
     known = values > 0
     far, notes = far_values(values[known])
-    if far.any():
-        values = values.copy()
-        values[known] = np.where(far, np.float32(0), values[known])
+    values = values.copy()
+    values[known] = np.where(far, np.float32(0), values[known])
     # a scale of integers that is assumed is compared with the other file of the frame instead
     stated = scale or reading.scale
     divisor, lines = divisor_to_metres(values[values > 0], reading, what, option, stated)
-    values = values if divisor == 1 else (values / np.float32(divisor)).astype(np.float32)
-    return values, [*(f"{what}: {note}" for note in notes), *lines]
+    notes = [*(f"{what}: {note}" for note in notes), *lines]
+    return values / np.float32(divisor), notes
 
 
 def divisor_to_metres(
