@@ -110,9 +110,8 @@ def test_any_texts_and_numbers_are_read_as_they_were_written(
 
 def test_numbers_that_are_none_are_unknown() -> None:
     errors = {"used": {"after": {"mae": float("nan"), "rmse": float("inf")}}}
-    assert read_again(FrameRecord(errors=errors)).errors == {
-        "used": {"after": {"mae": None, "rmse": None}}
-    }
+    (stages,) = read_again(FrameRecord(errors=errors)).errors.values()
+    assert stages == {"after": {"mae": None, "rmse": None}}
 
 
 def test_the_camera_is_kept_exactly() -> None:
@@ -121,8 +120,6 @@ def test_the_camera_is_kept_exactly() -> None:
     again, pose = camera.read()
     assert CameraRecord.of(again, pose) == RECORD.camera
     assert (again.intrinsics == CAMERA.intrinsics).all()
-    assert pose is not None
-    assert (pose == POSE).all()
 
 
 @pytest.mark.parametrize(
@@ -144,19 +141,14 @@ def test_numbers_of_no_camera_are_refused(change: dict[str, Any]) -> None:
     [
         [],
         None,
-        "text",
         {"name": 1},
         {"status": "unknown"},
-        {"notes": "text"},
-        {"seconds": 0.5},
         {"points": {"farthest": 4.5}},
-        {"size": [64, 1.5]},
         {"size": [64]},
         {"errors": {"used": {"before": {"mae": 1.0}}}},
+        {"inputs": {"sparse": {"path": "s.png", "sampled": {"kind": "none", "count": 1}}}},
         {"camera": {"intrinsics": [1, 2]}},
         {"inputs": {"sparse": {"path": "s.png", "unit_scale": "x"}}},
-        {"inputs": {"sparse": {"path": "s.png", "image": 7}}},
-        {"inputs": {"sparse": "s.png"}},
     ],
 )
 def test_what_is_no_record_is_refused_with_the_name_of_its_file(entry: object) -> None:

@@ -74,7 +74,7 @@ def test_both_sides_of_a_jump_are_left_out_and_nothing_else() -> None:
     assert len(whole(depth, CAMERA, edge=0).xyz) == HEIGHT * WIDTH
 
 
-def test_unknown_and_excluded_pixels_have_no_point() -> None:
+def test_unknown_and_excluded_pixels_have_no_point_and_a_pose_moves_the_others() -> None:
     depth = np.full((HEIGHT, WIDTH), 3, np.float32)
     depth[8, 4], depth[5, 6] = 0, np.inf
     keep = np.ones(depth.shape, bool)
@@ -82,18 +82,13 @@ def test_unknown_and_excluded_pixels_have_no_point() -> None:
     cloud = whole(depth, CAMERA, keep=keep)
     assert len(cloud.xyz) == HEIGHT * WIDTH - 2 * WIDTH - 2
     assert (cloud.xyz[:, 2] == 3).all()
-    assert np.linalg.norm(cloud.normals, axis=1) == pytest.approx(np.ones(len(cloud.xyz)), abs=1e-5)
-
-
-def test_a_pose_moves_points_and_turns_normals() -> None:
-    cloud = whole(np.full((HEIGHT, WIDTH), 3, np.float32), CAMERA)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     moved = cloud.transform(np.column_stack([turn, [1.0, 2, 3]]))
     assert moved.xyz == pytest.approx(cloud.xyz @ turn.T + [1, 2, 3], abs=1e-5)
     assert moved.normals == pytest.approx(np.tile([-1.0, 0, 0], (len(cloud.xyz), 1)), abs=1e-5)
 
 
-def test_merged_clouds_have_one_mean_point_per_voxel_in_any_order() -> None:
+def test_merged_clouds_have_one_mean_point_per_voxel() -> None:
     rng = np.random.default_rng(2)
     clouds = [
         PointCloud(
@@ -103,15 +98,12 @@ def test_merged_clouds_have_one_mean_point_per_voxel_in_any_order() -> None:
         )
         for _ in range(3)
     ]
-    grids = VoxelGrid(0.5), VoxelGrid(0.5)
-    for grid, order in zip(grids, (clouds, clouds[::-1]), strict=True):
-        for cloud in order:
-            grid.add(cloud)
-    merged, other = (grid.cloud(coloured=True) for grid in grids)
-    every = joined(clouds)
+    grid, every = VoxelGrid(0.5), joined(clouds)
+    for cloud in clouds:
+        grid.add(cloud)
+    merged = grid.cloud(coloured=True)
     cells = np.floor(every.xyz / 0.5)
     assert len(merged.xyz) == len(np.unique(cells, axis=0))
-    assert merged.xyz == pytest.approx(other.xyz, abs=1e-6)
     first = (cells == np.floor(merged.xyz[0] / 0.5)).all(axis=1)
     assert merged.xyz[0] == pytest.approx(every.xyz[first].mean(axis=0), abs=1e-6)
     assert merged.rgb is not None
@@ -131,15 +123,6 @@ def view_of_a_wall(x: float, scale: float = 1.0) -> View:
     return View(depth=(scale * depth).astype(np.float32), camera=WALL_CAMERA, pose=pose)
 
 
-def test_views_of_one_surface_keep_the_depth_where_they_overlap() -> None:
-    here, other = view_of_a_wall(0.0), view_of_a_wall(0.5)
-    kept = consistent_depth(here, [other], 2)
-    assert (kept[:, :2] == 0).all()  # the other camera stands to the right
-    assert (kept[:, 6:] > 0).all()
-    known = kept > 0
-    np.testing.assert_allclose(kept[known], here.depth[known], rtol=0.005)
-
-
 def test_a_wrong_view_is_outvoted_and_does_not_move_the_mean() -> None:
     here, right, wrong = view_of_a_wall(0.0), view_of_a_wall(0.4), view_of_a_wall(0.2, 1.2)
     kept = consistent_depth(here, [right, wrong], 2)
@@ -150,13 +133,16 @@ def test_a_wrong_view_is_outvoted_and_does_not_move_the_mean() -> None:
     assert not consistent_depth(here, [right, wrong], 3).any()
 
 
-def test_a_pixel_that_is_unknown_or_occluded_elsewhere_is_left_out() -> None:
+def test_a_pixel_that_is_unknown_occluded_or_outside_elsewhere_is_left_out() -> None:
     here, other = view_of_a_wall(0.0), view_of_a_wall(0.0)
     depth = other.depth.copy()
     depth[:10], depth[10:20], depth[20:25] = 0, 1.0, np.inf
     kept = consistent_depth(here, [replace(other, depth=depth)], 2)
     assert not kept[:25].any()
     np.testing.assert_allclose(kept[25:], here.depth[25:], rtol=1e-6)
+    aside = consistent_depth(here, [view_of_a_wall(0.5)], 2)
+    assert (aside[:, :2] == 0).all()  # the other camera stands to the right
+    assert (aside[:, 6:] > 0).all()
 
 
 def test_neighbours_are_the_nearest_that_look_the_same_way() -> None:

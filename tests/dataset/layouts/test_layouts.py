@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from pathlib import Path
 
@@ -59,29 +58,21 @@ def test_a_layout_is_guessed_from_its_folder_and_no_other_takes_it(
     assert [other for other, layout in LAYOUTS.items() if layout.matches(root)] == [name]
 
 
-def test_pairs_may_lack_truth_and_calibration(tmp_path: Path) -> None:
+def test_pairs_may_lack_truth_and_calibration_and_what_is_in_no_frame_is_listed(
+    tmp_path: Path,
+) -> None:
     tree(tmp_path, TREES["pairs"][0])
     a, b = read_frames(tmp_path)
     assert (a.gt, a.calib) == (tmp_path / "gt/a.exr", tmp_path / "calib/a.json")
     assert (b.gt, b.calib) == (None, None)
-    touch(tmp_path / "calib.txt")
-    assert [frame.calib for frame in read_frames(tmp_path)] == [a.calib, tmp_path / "calib.txt"]
-
-
-def test_a_listing_has_the_files_of_no_frame(tmp_path: Path) -> None:
-    tree(tmp_path, TREES["pairs"][0])
-    touch(tmp_path / "rgb/c.png", tmp_path / "sparse/d.png", tmp_path / "gt/e.exr")
+    touch(tmp_path / "calib.txt", tmp_path / "rgb/c.png", tmp_path / "sparse/d.png")
     touch(tmp_path / "calib/f.txt", tmp_path / "rgb/.hidden.png", tmp_path / "rgb/notes.txt")
     touch(tmp_path / "rgb/a.jpg")
-    layout, frames, unmatched = list_frames(tmp_path)
-    assert layout == "pairs"
-    assert [frame.name for frame in frames] == ["b"]
-    alone = ("sparse/a.png", "sparse/d.png", "gt/a.exr", "gt/e.exr", "calib/a.json", "calib/f.txt")
-    assert [str(lost).replace(f"{tmp_path}/", "") for lost in unmatched] == [
-        "rgb/a.png and a.jpg are one frame; keep one",
-        "rgb/c.png has no partner c.* in sparse; add or remove one",
-        *(f"{f} has no partner {Path(f).stem}.* in rgb; add or remove one" for f in alone),
-    ]
+    layout, (b,), unmatched = list_frames(tmp_path)
+    assert (layout, b.name, b.calib) == ("pairs", "b", tmp_path / "calib.txt")
+    alone = ("sparse/a.png", "sparse/d.png", "gt/a.exr", "calib/a.json", "calib/f.txt")
+    lost = [str(each).replace(f"{tmp_path}/", "").split(" has ")[0] for each in unmatched]
+    assert lost == ["rgb/a.png and a.jpg are one frame; keep one", "rgb/c.png", *alone]
 
 
 def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
@@ -92,19 +83,6 @@ def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
         (root / part).symlink_to(tmp_path / "real" / part)
     (tmp_path / "real/rgb/again").symlink_to(tmp_path / "real/rgb")
     assert [frame.name for frame in read_frames(root)] == ["a", "b"]
-
-
-def test_a_folder_that_may_not_be_read_is_an_input_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tree(tmp_path, TREES["7scenes"][0])
-
-    def locked(path: Path) -> bool:
-        raise PermissionError(13, "Permission denied", str(path))
-
-    monkeypatch.setattr(Path, "is_dir", locked)
-    with pytest.raises(InputError, match=r"cannot be read \(permission denied\)"):
-        list_frames(tmp_path)
 
 
 def test_kittis_selection_pairs_its_long_names(tmp_path: Path) -> None:
@@ -129,7 +107,7 @@ def test_kittis_tree_finds_its_images_in_the_raw_data(tmp_path: Path) -> None:
     assert right.image == tmp_path / "2011_09_26" / DRIVE / "image_03/data/0000000005.png"
     assert right.calib == tmp_path / "2011_09_26"
     shutil.rmtree(tmp_path / "2011_09_26")
-    with pytest.raises(InputError, match=f"has no .*/{DRIVE}/image_02/data; add it"):
+    with pytest.raises(InputError, match=f"{DRIVE}/image_02/data"):
         read_frames(tmp_path)
 
 
@@ -198,26 +176,22 @@ def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
         read_frames(tmp_path)
 
 
-def test_tum_pairs_each_image_with_the_nearest_depth_once(tmp_path: Path) -> None:
+def test_tum_pairs_images_and_depth_that_are_nearest_within_two_hundredths_of_a_second(
+    tmp_path: Path,
+) -> None:
     tum(tmp_path)
     with (tmp_path / "rgb.txt").open("a") as file:
-        file.write("1.04 rgb/1.04.png\n")  # nearest to the depth of 1.033 s
+        file.write("1.04 rgb/1.04.png\n5 rgb/5.png\n6 rgb/6.png\n")  # 1.033 s is nearer to 1.030 s
+    with (tmp_path / "depth.txt").open("a") as file:
+        file.write("5.02 depth/5.png\n5.979 depth/6.png\n")
     (tmp_path / "groundtruth.txt").write_text("1 5 0 0 0 0 0 1\n1.02 7 0 0 0 0 0 1\n")
     _, frames, unmatched = list_frames(tmp_path)
-    assert [frame.gt for frame in frames] == [
-        tmp_path / "depth/1.015.png",
-        tmp_path / "depth/1.030.png",
-    ]
+    depths = [frame.gt.name for frame in frames if frame.gt is not None]
+    assert depths == ["1.015.png", "1.030.png", "5.png"]
     # 1.033 s is after the last pose
-    assert [(f.gt_scale, f.pose) for f in frames] == [(5000, at_x(5)), (5000, None)]
-    assert [lost.path.name for lost in unmatched] == ["1.04.png", "2.png"]
-
-
-def test_tum_pairs_files_two_hundredths_of_a_second_apart_and_no_further(tmp_path: Path) -> None:
-    tum(tmp_path)
-    (tmp_path / "rgb.txt").write_text("0 rgb/a.png\n1 rgb/b.png\n")
-    (tmp_path / "depth.txt").write_text("0.02 depth/a.png\n0.979 depth/b.png\n")
-    assert [frame.gt for frame in read_frames(tmp_path)] == [tmp_path / "depth/a.png"]
+    assert [(f.gt_scale, f.pose) for f in frames] == [(5000, at_x(5)), (5000, None), (5000, None)]
+    lost = ["rgb/1.04.png", "rgb/2.png", "rgb/6.png", "depth/6.png"]
+    assert [each.path.relative_to(tmp_path).as_posix() for each in unmatched] == lost
 
 
 @pytest.mark.parametrize(
@@ -226,36 +200,26 @@ def test_tum_pairs_files_two_hundredths_of_a_second_apart_and_no_further(tmp_pat
 def test_associations_pair_images_and_depth(line: str, tmp_path: Path) -> None:
     (tmp_path / "associations.txt").write_text(f"# comment\n{line}\n")
     (tmp_path / "groundtruth.txt").write_text("1 5 0 0 0 0 0 1\n1.5 7 0 0 0 0 0 1\n")
-    assert read_frames(tmp_path) == [
-        FrameFiles(
-            name="0",
-            image=tmp_path / "rgb/0.png",
-            gt=tmp_path / "depth/0.png",
-            gt_scale=5000,
-            one_view=True,
-            pose=at_x(7),
-        )
-    ]
+    (frame,) = read_frames(tmp_path)
+    assert (frame.name, frame.gt_scale, frame.pose) == ("0", 5000, at_x(7))
+    assert (frame.image, frame.gt) == (tmp_path / "rgb/0.png", tmp_path / "depth/0.png")
 
 
 @pytest.mark.parametrize(
-    ("file", "line", "message"),
+    ("file", "line"),
     [
-        ("rgb.txt", "nan rgb/a.png", "line 1: .* is not a time and a path"),
-        ("depth.txt", "soon depth/1.png", "line 1: .* is not a time and a path"),
-        ("rgb.txt", "1.0", "line 1: .* is not a time and a path"),
-        ("associations.txt", "0 rgb/0.png 0", "line 1: .* is not a time and a path of rgb"),
-        ("associations.txt", "0 rgb/0.png 0 rgb/1.png", "is not a time and a path of rgb"),
-        ("rgb.txt", "1.0 rgb/a\0.png", r"rgb/a\\x00\.png"),
-        ("rgb.txt", "9.0 rgb/a\0.png", r"rgb/a\\x00\.png"),
+        ("rgb.txt", "nan rgb/a.png"),
+        ("depth.txt", "soon depth/1.png"),
+        ("rgb.txt", "1.0"),
+        ("rgb.txt", "1.0 rgb/a\0.png"),
+        ("associations.txt", "0 rgb/0.png 0"),
+        ("associations.txt", "0 rgb/0.png 0 rgb/1.png"),
     ],
 )
-def test_a_line_of_tum_that_means_nothing_is_named(
-    tmp_path: Path, file: str, line: str, message: str
-) -> None:
+def test_a_line_of_tum_that_means_nothing_is_named(tmp_path: Path, file: str, line: str) -> None:
     tum(tmp_path)
     (tmp_path / file).write_text(f"{line}\n")
-    with pytest.raises(FileFormatError, match=message):
+    with pytest.raises(FileFormatError, match=r"line 1|rgb/a\\x00\.png"):
         read_frames(tmp_path)
 
 
@@ -356,18 +320,13 @@ def test_the_parent_of_data_sets_of_one_layout_has_their_frames(tmp_path: Path) 
     assert [frame.name for frame in read_frames(tmp_path, "pairs")] == ["mine/a"]
 
 
-def test_a_near_layout_is_proposed_for_an_unknown_one(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="unknown layout 'kitty-raw'; did you mean"):
-        read_frames(tmp_path, "kitty-raw")
-
-
 @pytest.mark.parametrize(
     ("files", "nearest", "lacking"),
     [
-        ("image_2/0.png calib/0.txt", "'kitti-object', which needs image_2, velodyne", "velodyne"),
+        ("image_2/0.png calib/0.txt", "kitti-object", "velodyne"),
         (
             f"2011_09_26/{DRIVE}/image_02/data/0.png 2011_09_26/calib_cam_to_cam.txt",
-            "'kitti-raw', which needs velodyne_points/data, image_0[23]/data",
+            "kitti-raw",
             "velodyne_points/data",
         ),
     ],
@@ -376,8 +335,10 @@ def test_an_unknown_folder_names_the_nearest_layout_and_what_it_lacks(
     files: str, nearest: str, lacking: str, tmp_path: Path
 ) -> None:
     tree(tmp_path, files)
-    with pytest.raises(InputError, match=rf"nearest is {re.escape(nearest)}.* lacks {lacking}$"):
+    with pytest.raises(InputError, match=rf"'{nearest}', which needs .* lacks {lacking}$"):
         list_frames(tmp_path)
+    with pytest.raises(UsageError, match=nearest):
+        read_frames(tmp_path, f"{nearest}s")
 
 
 def test_a_protocol_that_is_none_or_that_a_frame_is_too_small_for_is_refused() -> None:
