@@ -37,14 +37,6 @@ class Keypoints(NamedTuple):
     descriptors: NDArray[np.float32]
 
 
-class MotionEstimate(NamedTuple):
-    """An estimated motion, or why it is refused."""
-
-    motion: Floats | None
-    """(3, 4) from the other camera's coordinates to this one's, metres. None: refused."""
-    basis: str  # what supports it, or why it is refused; for a person
-
-
 def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
     """Returns the keypoints of an image (H, W, 3) in 0…1."""
     grey = cv2.cvtColor((rgb * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
@@ -57,16 +49,17 @@ def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
 
 def motion_of_images(
     here: Keypoints, there: Keypoints, points: Points, camera: Camera
-) -> MotionEstimate:
+) -> tuple[Floats | None, str]:
     """Returns the motion from the other frame's camera to this one's, from matched keypoints.
 
-    The points are the sparse depth of the other frame; both have the same camera.
+    The points are the sparse depth of the other frame; both have the same camera. The motion is
+    (3, 4) in metres, and None if it is refused. The text says what supports it, or why it is.
     """
     at, to = _matches(here, there)
     depth, known = _depth_at(points, at)
     at, to, depth = at[known], to[known], depth[known]
     if len(at) < _MIN_INLIERS:
-        return MotionEstimate(None, f"{len(at)} matches with depth, at least {_MIN_INLIERS} needed")
+        return None, f"{len(at)} matches with depth, at least {_MIN_INLIERS} needed"
     focal_px = float(camera.intrinsics[0, 0])
     rays = rays_of(camera, to)
     solved, turn, shift, index = cv2.solvePnPRansac(
@@ -77,15 +70,14 @@ def motion_of_images(
     inliers = np.empty(0, np.intp) if not solved or index is None else index.ravel()
     basis = f"{len(inliers)} of {len(at)} matches of the images"
     if len(inliers) < max(_MIN_INLIERS, _MIN_FRACTION * len(at)):
-        return MotionEstimate(None, f"{basis} agree")
+        return None, f"{basis} agree"
     xyz = unproject(camera, at[inliers], depth[inliers])
     turn, shift = cv2.solvePnPRefineLM(xyz, rays[inliers], np.eye(3), None, turn, shift)
     motion = np.column_stack([cv2.Rodrigues(turn)[0], shift])
     length, median = float(np.linalg.norm(motion[:, 3])), float(np.median(points.depth))
     if not length <= median:
-        basis = f"{length:.1f} m of motion at a median depth of {median:.1f} m"
-        return MotionEstimate(None, basis)
-    return MotionEstimate(motion, basis)
+        return None, f"{length:.1f} m of motion at a median depth of {median:.1f} m"
+    return motion, basis
 
 
 def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:

@@ -33,11 +33,6 @@ _RAW = ("", "raw/", "kitti_raw/")
 """Folders of the raw data's dates."""
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 """Names of the selection, without the kind of file in the middle."""
-_AS_PUBLISHED: dict[str, Any] = {
-    "sparse_scale": 256.0,
-    "gt_scale": 256.0,
-    "one_view": True,
-}
 
 
 def _of_sequence(place: Path) -> Callable[[FrameFiles], FrameFiles]:
@@ -86,11 +81,6 @@ def _calibration_of(drive: Path) -> Path | None:
     return next((p for p in (drive.parent, drive) if (p / _CALIBRATION).is_file()), None)
 
 
-def _of_selection(place: Path) -> Callable[[FrameFiles], FrameFiles]:
-    whole = place if (place / _CALIBRATION).is_file() else None
-    return lambda frame: replace(frame, calib=frame.calib or whole)
-
-
 _SELECTION = row(
     {
         "image": f"image/{_STEM}.IMAGE",
@@ -99,8 +89,10 @@ _SELECTION = row(
         "calib": f"intrinsics/{_STEM}.txt?",
     },
     marks=("velodyne_raw",),
-    more=_of_selection,
-    **_AS_PUBLISHED,
+    calib=_CALIBRATION,
+    sparse_scale=256.0,
+    gt_scale=256.0,
+    one_view=True,
 )
 
 
@@ -128,8 +120,9 @@ def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
             "image": Part(images, "*.IMAGE"),
             "gt": Part(_truth_of(drive, camera), "*.png?"),
         }
+        fields = {"sparse_scale": 256.0, "gt_scale": 256.0, "one_view": True}
         calib = _calibration_of(images.parents[1])
-        yield from _frames_of_camera(drive, camera, parts, calib=calib, **_AS_PUBLISHED)
+        yield from _frames_of_camera(drive, camera, parts, calib=calib, **fields)
 
 
 DEPTH = Layout(matches=_is_depth, frames=_frames_of_depth, needs=_SELECTION.needs)
