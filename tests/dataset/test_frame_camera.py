@@ -19,8 +19,6 @@ from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 from tests.commands.batches import batch, done, pairs_on_disk
 from tests.commands.frames import FrameOnDisk, frame_on_disk, run
-from tests.commands.scan_frames import FOCAL_PX, scan_on_disk
-from tests.kitti_drives import write_calibrations
 
 CALIB = "K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\n"
 
@@ -41,14 +39,6 @@ def test_a_calibration_beside_a_depth_map_is_that_of_the_camera(frame: FrameOnDi
         run(frame, scan=ScanOptions(calib=calib), overwrite=True)
 
 
-def test_kittis_camera_is_known_without_a_calibration_of_the_scanner(frame: FrameOnDisk) -> None:
-    write_calibrations(frame.folder / "calib", size=frame.depth.shape)
-    (frame.folder / "calib/calib_velo_to_cam.txt").unlink()
-    calib = frame.folder / "calib/calib_cam_to_cam.txt"
-    record = run(frame, scan=ScanOptions(calib=calib))
-    assert camera_of(record).intrinsics[0][0] == 60
-
-
 def test_exif_is_used_where_nothing_else_gives_the_camera_of_a_view(frame: FrameOnDisk) -> None:
     image = Image.open(frame.image)
     exif = image.getexif()
@@ -66,13 +56,6 @@ def test_a_colmap_model_gives_camera_and_pose(tmp_path: Path) -> None:
     record = run(frame, sparse=tmp_path / "sparse")
     assert camera_of(record).distortion == [-0.1, 0, 0, 0]
     assert camera_of(record).pose == [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0]]
-
-
-def test_a_scan_gives_the_camera_of_its_calibration(tmp_path: Path) -> None:
-    frame, scan = frame_on_disk(tmp_path), scan_on_disk(tmp_path)
-    changes = {"image": scan.image, "sparse": scan.scan, "scan": ScanOptions(calib=scan.calib)}
-    record = run(frame, **changes)
-    assert camera_of(record).intrinsics == [[FOCAL_PX, 0, 31.5], [0, FOCAL_PX, 23.5], [0, 0, 1]]
 
 
 def test_the_camera_of_a_part_sees_the_same_directions(tmp_path: Path) -> None:

@@ -158,13 +158,7 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 
 @pytest.mark.parametrize(
     ("text", "named"),
-    [
-        ("\n", "00.txt"),
-        (_ROW, "000001.png"),
-        (_ROW[2:], "00.txt"),
-        (_ROW + "\n" + _ROW.replace("1", "nan"), "00.txt"),
-        (_ROW.replace("1", "one"), "00.txt"),
-    ],
+    [("\n", "00.txt"), (_ROW, "000001.png"), (_ROW[2:], "00.txt"), ("nan" + _ROW[1:], "00.txt")],
 )
 def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
     tmp_path: Path, text: str, named: str
