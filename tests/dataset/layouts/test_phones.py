@@ -55,8 +55,11 @@ def test_what_is_no_video_or_cannot_be_read_is_refused(tmp_path: Path) -> None:
     stray_scanner(tmp_path)
     frames = read_frames(tmp_path)
     (tmp_path / "rgb.mp4").write_text("#EXTM3U\nhttp://localhost/video.ts\n")
-    with pytest.raises(InputError, match="is not an MP4"):
+    with pytest.raises(InputError, match=r"rgb\.mp4"):
         read_frame(frames[0], ReadOptions())
+    (tmp_path / "odometry.csv").write_text("header\n0, 0, x, 0, 0, 0, 0, 0, 1\n")
+    with pytest.raises(InputError, match=r"odometry\.csv"):
+        list_frames(tmp_path)
     touch(tmp_path / "a.r3d")
     with pytest.raises(InputError, match="LZFSE"):
         list_frames(tmp_path / "a.r3d")
