@@ -22,7 +22,6 @@ from pnpdepth_cli.errors import (
     StorageError,
     UsageError,
 )
-from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import load_network
