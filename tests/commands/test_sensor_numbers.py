@@ -185,8 +185,8 @@ def test_a_far_plane_of_ground_truth_is_neither_scored_nor_sampled(
     assert result.pixels == np.count_nonzero(truth)
     assert any(f"{np.count_nonzero(truth == 0):,} of" in note for note in result.notes)
     target = SparseTarget(output=tmp_path / "sparse.npy")
-    record = sample_depth(tmp_path / "gt.npy", target, SamplePattern(count=3000))
-    assert record["points"]["farthest"] <= truth.max()
+    drawn = sample_depth(tmp_path / "gt.npy", target, SamplePattern(count=3000)).points
+    assert drawn.depth.max() <= truth.max()
 
 
 def test_a_far_plane_of_sparse_depth_is_no_point(tmp_path: Path) -> None:
