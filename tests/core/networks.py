@@ -218,7 +218,6 @@ class Frozen:
 
 
 MAKES: dict[str, Callable[[Tensor, Tensor], Any]] = {
-    "tuple": lambda a, b: (a, b),
     "dict": lambda a, b: {"deep": a, "shallow": b},
     "dataclass": Frozen,
     "nested": lambda a, b: {"out": [(a, 3), {"x": b}], 5: "text"},
@@ -236,7 +235,7 @@ def structured(kind: str) -> nn.Module:
         elif kind == "dict":
             deep, shallow = out.pop("deep"), out.pop("shallow")
         else:
-            deep, shallow = out if kind == "tuple" else (out.deep, out.shallow)
+            deep, shallow = out.deep, out.shallow
         shallow += 1
         shallow.relu_()
         return net.head(deep * shallow).abs() + 1
@@ -431,18 +430,6 @@ def catches() -> nn.Module:
     return Net(run, enter=conv(3, 4), inner=inner, plain=plain, head=conv(4, 1))
 
 
-def in_data_parallel() -> nn.Module:
-    def run(part: Any, x: Tensor) -> Tensor:
-        y = part.a(x)
-        y += x
-        return part.b(y.relu_()).abs() + 1
-
-    tail = Net(run, a=conv(4, 4), b=conv(4, 1))
-    network = nn.DataParallel(nn.Sequential(nn.Sequential(conv(3, 4), nn.ReLU(True)), tail))
-    network.device_ids = []  # on the CPU, also where there are GPUs
-    return network.cpu()
-
-
 NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "unet": UNet,
     "vit": vit,
@@ -460,7 +447,6 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "half inference": half_inference,
     "native": native,
     "catches": catches,
-    "wrapped": in_data_parallel,
 }
 
 

@@ -31,10 +31,9 @@ CUTS = {
     "midas": ("backbone.2", "backbone.3", "unit1", "unit2.relu#1", "unit1.conv1"),
     "branching": ("a", "cut"),
     "repeated": ("norm#1", "same#1", "same#2", "same#3", "enter"),
-    "tuple output": ("cut[0]", "cut.a"),
     "dict output": ("cut[deep]", "cut[shallow]"),
     "dataclass output": ("cut[shallow]",),
-    "nested output": ("cut[out][1][x]",),
+    "nested output": ("cut[out][1][x]", "cut.a"),
     "two branches": ("cut", "guide", "front.inner"),
     "side effects": ("cut", "one.conv", "enter"),
     "updating": ("enter", "cut"),
@@ -42,7 +41,6 @@ CUTS = {
     "scripted": ("cut",),
     "checkpointed": ("cut", "enter#1", "a"),
     "native": ("enter", "cut", "native"),
-    "wrapped": ("module.0.0", "module.0", "module.1.a"),
 }
 
 
@@ -71,10 +69,10 @@ def test_five_updates_are_those_of_running_the_whole_network_every_time(
     assert list(result.losses) == losses
     assert not torch.equal(result.after, result.before)
     whole = depth_of(plain(network, image()))
-    if name == "vit":  # torch's attention takes another kernel where no gradient is wanted
-        torch.testing.assert_close(result.before, whole)
-    else:
-        assert torch.equal(result.before, whole)
+    # torch's attention takes another kernel where no gradient is wanted
+    assert torch.equal(result.before, whole) or (
+        name == "vit" and torch.allclose(result.before, whole)
+    )
     none = refined(network, layer, replace(settings, iterations=0))
     assert torch.equal(none.after, whole)
     assert none.before is none.after
