@@ -143,11 +143,6 @@ class Measure:
         """Returns all but the formula."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Measure:
-        """Returns a measure without formula. Raises TypeError for an entry of something else."""
-        return cls(**entry)
-
 
 class FrameMeans:
     """The means of values over frames, each over the frames that have the value.

@@ -290,7 +290,7 @@ def read_run(text: str) -> Run:
         scores = [frame.errors[GT][stage] for frame in frames.values()]
         if not scores:
             raise ValueError("no frame has scores")
-        measures = [Measure.from_json(entry) for entry in content.get("measures", ())] or MEASURES
+        measures = [Measure(**entry) for entry in content.get("measures", ())] or MEASURES
         return Run(
             name=f"{name}:before" if stage == BEFORE else name,
             path=text,

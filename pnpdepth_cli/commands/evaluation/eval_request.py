@@ -71,7 +71,7 @@ class EvalRequest:
     gt_scale: float | None = option(None, "Integer ground truth holds metres × S.", metavar="S")
     columns: tuple[str, ...] | None = option(
         None,
-        "Measures of the tables, in this order, such as rmse,mae,delta1. Only here, for dense"
+        "Measures of the tables, in this order, such as rmse,mae,delta1. Only if named, for dense"
         f" ground truth: {', '.join(choices.MEASURES)}.",
         metavar="KEY,…",
         parse=parse_keys,
