@@ -226,7 +226,7 @@ NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mea
 
 # Files and sensors
 REGISTRATIONS = ("auto", "off")  # whether the image is moved to the points
-PATTERNS = ("uniform", "shuffle", "grid", "lines")
+PATTERNS = ("uniform", "shuffle", "grid", "lines", "features")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
 
 SENSORS = (

@@ -56,6 +56,7 @@ def project(
     metavar="[PATTERN:]N|P%",
     help="Number of points (of lines for `lines`), or % of known pixels.",
 )
+@click.option("--image", type=options.FILE, help="Image for `features`.")
 @options.seed
 @options.depth_scale
 @options.sparse_output
@@ -65,13 +66,14 @@ def sample(depth: Path, count: str, output: Path, overwrite: bool, **values: Any
 
     \b
     pnpdepth sample gt.png --count 500 --seed 1 -o sparse.png
-    pnpdepth sample gt.png --count lines:16 -o sparse.png
+    pnpdepth sample gt.png --count features:300 --image rgb.png -o sparse.png
 
     \b
     uniform    N random known pixels; the default pattern
     shuffle    the first N known pixels as numpy's legacy generator shuffles them
     grid       square grid with N nodes on a full map
     lines      all known pixels of N evenly spaced rows
+    features   the N strongest ORB corners, as in structure from motion
 
     A JSON file beside the output records the settings.
     """

@@ -70,7 +70,7 @@ def read_frame(
     size = None if image is None else image.size
     # The sparse depth, from a file or sampled from the ground truth.
     if files.sparse is None:
-        sparse = _sample_sparse(files, options, truth, seed)
+        sparse = _sample_sparse(files, options, image, truth, seed)
     else:
         sparse = _read_sparse(files, options, size)
     given = sparse.points.tensors()
@@ -183,7 +183,11 @@ def _pixels(
 
 
 def _sample_sparse(
-    files: FrameFiles, options: ReadOptions, truth: _Pixels | None, seed: int
+    files: FrameFiles,
+    options: ReadOptions,
+    image: _Pixels | None,
+    truth: _Pixels | None,
+    seed: int,
 ) -> SparseDepth:
     """Points sampled from the ground truth."""
     if options.sparse_range:
@@ -193,8 +197,9 @@ def _sample_sparse(
     if truth is None:
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
     seed = seed if options.sample_seed is None else options.sample_seed
+    rgb = None if image is None else image.values
     try:
-        points = sample_points(truth.values, options.sample, seed)
+        points = sample_points(truth.values, options.sample, seed, image=rgb)
     except UsageError as error:  # the pattern itself is good, this frame is too poor for it
         raise InputError(f"{files.gt}: {error}") from error
     how = f"{options.sample.kind} of the ground truth, seed {seed}"
@@ -246,8 +251,8 @@ def _points_of(files: FrameFiles, options: ReadOptions, size: tuple[int, int], s
     """The points of another frame of the sequence, read or sampled as it does itself."""
     if files.sparse is not None:
         return _read_sparse(files, options, size).points
-    _, truth = _read_pixels(files, options, size)
-    return _sample_sparse(files, options, truth, seed).points
+    image, truth = _read_pixels(files, options, size)
+    return _sample_sparse(files, options, image, truth, seed).points
 
 
 def _hold_out(

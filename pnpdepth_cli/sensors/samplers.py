@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.sensors.pixels import Points
 
+Image = NDArray[np.float32]
 Pixels = NDArray[np.intp]
 
 
@@ -19,6 +21,7 @@ class _Scene(NamedTuple):
 
     known: Pixels  # row-major indices of the pixels with known depth
     size: tuple[int, int]
+    image: Image | None
     pattern: SamplePattern
     seed: int
 
@@ -28,23 +31,35 @@ class _Scene(NamedTuple):
         return self.pattern.wanted(self.known.size)
 
 
-def sample_points(depth: NDArray[np.float32], pattern: SamplePattern, seed: int) -> Points:
+def sample_points(
+    depth: NDArray[np.float32],
+    pattern: SamplePattern,
+    seed: int,
+    *,
+    image: Image | None = None,
+) -> Points:
     """Returns points sampled from a dense depth map; the same seed gives the same points.
 
     Args:
         depth: (H, W) metres, 0 = unknown.
         pattern: Pattern of the pixels that are sampled.
         seed: Random seed of the pattern.
+        image: (H, W, 3) in 0..1 of the same view, for `features`.
 
     Raises:
         NoPointsError: The depth map or the pattern leaves no point.
         UsageError: More points are asked for than are known.
+        SizeError: Image and depth differ in size.
     """
     size = (depth.shape[0], depth.shape[1])
+    if image is not None and image.shape[:2] != size:
+        raise SizeError(
+            f"the image is {image.shape[1]}×{image.shape[0]} but the depth is {size[1]}×{size[0]}"
+        )
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
     if not known.size:
         raise NoPointsError("the depth map has no pixel with known depth to sample from")
-    chosen = np.sort(SAMPLERS[pattern.kind](_Scene(known, size, pattern, seed)))
+    chosen = np.sort(SAMPLERS[pattern.kind](_Scene(known, size, image, pattern, seed)))
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, size[1])
@@ -92,5 +107,21 @@ def _lines(scene: _Scene) -> Pixels:
     return scene.known[np.isin(scene.known // width, rows)]
 
 
-SAMPLERS = {"uniform": _uniform, "shuffle": _shuffle, "grid": _grid, "lines": _lines}
+def _features(scene: _Scene) -> Pixels:
+    """The strongest ORB corners with known depth, as structure from motion has its points."""
+    if scene.image is None:
+        raise UsageError("pattern 'features' needs the image that the depth belongs to")
+    grey = cv2.cvtColor(scene.image.clip(0, 1), cv2.COLOR_RGB2GRAY)
+    # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
+    wanted = scene.wanted
+    detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
+    corners = detector.detect(np.rint(255 * grey).astype(np.uint8))
+    xy = np.array([c.pt for c in sorted(corners, key=lambda corner: -corner.response)])
+    column, row = np.rint(xy.reshape(-1, 2)).astype(np.intp).T
+    pixels = list(dict.fromkeys((row * scene.size[1] + column).tolist()))
+    return np.array(pixels, np.intp)[np.isin(pixels, scene.known)][:wanted]
+
+
+_FUNCTIONS = (_uniform, _shuffle, _grid, _lines, _features)
+SAMPLERS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
 """What returns row-major indices of pixels, by a name of `choices.PATTERNS`."""

@@ -60,8 +60,8 @@ def _pixels(depth: np.ndarray, pixels: np.ndarray) -> dict[str, str]:
         commands[f"depth.{suffix}"] = f"sample depth.{suffix} --count 20 {OUT}"
     for suffix in ("png", "jpg", "webp", "tif"):
         cv2.imwrite(f"image.{suffix}", pixels)
-        scan = f"project kitti.bin --calib calib.txt {OUT}"
-        commands[f"image.{suffix}"] = f"{scan} --image image.{suffix}"
+        features = f"sample depth.npy --count features:5 {OUT}"
+        commands[f"image.{suffix}"] = f"{features} --image image.{suffix}"
     return commands
 
 

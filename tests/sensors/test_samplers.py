@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.choices import PATTERNS
-from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.sensors.samplers import sample_points
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)
 HOLES = np.where(np.random.default_rng(8).random((60, 80)) < 0.3, 0, DEPTH).astype(np.float32)
+
+
+def checkerboard() -> np.ndarray:
+    y, x = np.mgrid[:60, :80]
+    board = (((y // 12) + (x // 12)) % 2).astype(np.float32)
+    return np.repeat(board[:, :, None], 3, axis=2)
 
 
 def pattern(kind: str) -> SamplePattern:
@@ -18,7 +24,7 @@ def pattern(kind: str) -> SamplePattern:
 
 @pytest.mark.parametrize("kind", PATTERNS)
 def test_every_pattern_gives_known_pixels_once_with_their_own_depth(kind: str) -> None:
-    got = sample_points(HOLES, pattern(kind), 1)
+    got = sample_points(HOLES, pattern(kind), 1, image=checkerboard())
     column, row = got.xy.astype(int).T
     assert np.array_equal(got.xy, np.column_stack([column, row]))
     assert np.array_equal(got.depth, HOLES[row, column])
@@ -55,8 +61,29 @@ def test_lines_keeps_whole_rows() -> None:
         sample_points(DEPTH, SamplePattern(kind="lines", count=61), 0)
 
 
+def test_features_lie_at_the_corners_of_the_image() -> None:
+    image = np.full((160, 200, 3), 0.2, np.float32)
+    image[40:120, 20:150] = 0.9
+    image[10:30, 170:190] = 0.3  # its corners are weaker
+    depth = np.full((160, 200), 3, np.float32)
+    got = sample_points(depth, SamplePattern(kind="features", count=8), 0, image=image)
+    corners = np.array([[20, 40], [149, 40], [20, 119], [149, 119]])
+    away = np.abs(got.xy[:, None] - corners).max(axis=2)
+    assert away.min(axis=1).max() <= 6
+    assert len(got.depth) == 8
+    assert (away.min(axis=0) <= 6).all()
+
+
 def test_what_the_depth_map_cannot_give_is_refused() -> None:
     with pytest.raises(NoPointsError):
         sample_points(np.zeros((5, 5), np.float32), SamplePattern(count=1), 0)
+    plain = np.full((60, 80, 3), 0.5, np.float32)
+    with pytest.raises(NoPointsError):
+        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=plain)
+    with pytest.raises(UsageError):
+        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0)
     with pytest.raises(UsageError):
         sample_points(DEPTH, SamplePattern(count=4801), 0)
+    image = np.zeros((30, 40, 3), np.float32)
+    with pytest.raises(SizeError, match=r"\b40×30"):
+        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=image)

@@ -17,7 +17,7 @@ from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
-from pnpdepth_cli.dataset.arrays import apply_masks, raw_depth
+from pnpdepth_cli.dataset.arrays import apply_masks, raw_depth, read_image
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
@@ -194,7 +194,10 @@ def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
     drawn = None if sparse is None else sparse.sampled
     try:
         if drawn is not None and pair.record.size == size[::-1]:
-            xy = sample_points(gt, drawn, drawn.seed).xy
+            image = None
+            if drawn.kind == "features" and frame.image is not None:
+                image = frame.part.apply(read_image(frame.image))
+            xy = sample_points(gt, drawn, drawn.seed, image=image).xy
         elif frame.sparse is not None:
             points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
             xy = points.xy

@@ -146,6 +146,7 @@ def sample_depth(
     target: SparseTarget,
     pattern: SamplePattern,
     *,
+    image: Path | None = None,
     seed: int = 0,
     scale: float | None = None,
 ) -> SparseSummary:
@@ -155,15 +156,22 @@ def sample_depth(
         depth: The file of the map.
         target: Files to write.
         pattern: Pattern of the pixels that are sampled.
+        image: Image whose features `features` samples.
         seed: Random seed of the pattern.
         scale: Codes per metre of an integer map.
     """
-    target.check((depth,))
+    target.check((depth, image))
     dense, notes = _dense(depth, scale)
-    points = sample_points(dense, pattern, seed)
+    rgb, inputs = None, {"depth": record_of(depth)}
+    if image is not None:
+        rgb, inputs["image"] = read_rgb(image).values, record_of(image)
+    points = sample_points(dense, pattern, seed, image=rgb)
+    wanted = pattern.wanted(int(np.count_nonzero(dense)))
+    if pattern.kind == "features" and len(points) < wanted:
+        notes.append(f"warning: the image has {len(points):,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
     settings = {"pattern": asdict(pattern), "seed": seed}
-    return target.write("sample", points, settings, {"depth": record_of(depth)}, notes)
+    return target.write("sample", points, settings, inputs, notes)
 
 
 def simulate_scan(

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -132,6 +133,15 @@ def test_the_seed_is_in_the_record_and_decides_every_byte(frame: ScanOnDisk) -> 
     written = read_depth(frame.folder / "a.png")
     assert (np.count_nonzero(written.values), written.reading.scale) == (100, 256)
     assert json.loads((frame.folder / "a.json").read_text())["seed"] == 11
+
+
+def test_fewer_features_than_requested_are_reported(frame: ScanOnDisk) -> None:
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[12:36, 16:48] = 255
+    cv2.imwrite(str(frame.image), image)
+    record = sampled(frame, "e.png", kind="features", count=3000, image=frame.image)
+    assert record["points"]["count"] < 3000
+    assert any("of the 3,000 points asked for" in note for note in record["notes"])
 
 
 def simulated(frame: ScanOnDisk, output: str, sensor: Lidar, **more: Any) -> dict[str, Any]:
