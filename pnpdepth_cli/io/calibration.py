@@ -144,11 +144,9 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         fields = _Fields(path, _bare_intrinsics(text))
     if any(re.fullmatch(r"P\d", str(name)) for name in fields.values):
         return _kitti(fields, camera)
-    unknown = sorted(set(fields.values) - set(_PLAIN))
-    if unknown:
-        raise FileFormatError(
-            f"{path}: {unknown[0]!r} is not part of a calibration; use {', '.join(_PLAIN)}"
-        )
+    if unknown := sorted(set(fields.values) - set(_PLAIN)):
+        fact = f"{unknown[0]!r} is not part of a calibration"
+        raise FileFormatError(f"{path}: {fact}; use {', '.join(_PLAIN)}")
     return _single(fields, camera, source)
 
 
@@ -282,10 +280,8 @@ def _rectified_calibration(
 def _kalibr(fields: _Fields, name: str) -> Calibration:
     model, values = fields.text("camera_model", "pinhole"), fields.numbers("intrinsics")
     if model != "pinhole" or len(values) != 4:
-        raise FileFormatError(
-            f"{fields.path}: {name} is a {one_line(model)[:20]} camera with {len(values)}"
-            " intrinsics; only pinhole (4) is known, so calibrate it as one"
-        )
+        fact = f"a {one_line(model)[:20]} camera with {len(values)} intrinsics"
+        raise FileFormatError(f"{fields.path}: {name} is {fact}; calibrate it as a pinhole one (4)")
     plain = {key: fields.values[key] for key in _POSES if key in fields.values}
     plain |= {"K": _by_rows(*values), "lens": fields.text("distortion_model", "none")}
     plain["distortion"] = fields.values.get("distortion_coeffs", [])
@@ -334,10 +330,8 @@ def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
     if lens == "radial-tangential" and not any(coefficients):
         coefficients = ()
     if len(coefficients) not in _COEFFICIENTS[lens]:
-        wanted = " or ".join(str(count) for count in _COEFFICIENTS[lens])
-        raise FileFormatError(
-            f"{fields.path}: {len(coefficients)} coefficients of {lens} distortion, not {wanted}"
-        )
+        fact = f"{len(coefficients)} coefficients of {lens} distortion"
+        raise FileFormatError(f"{fields.path}: {fact}, which has {_COEFFICIENTS[lens]}")
     return lens, coefficients
 
 

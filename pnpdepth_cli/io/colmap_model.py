@@ -112,10 +112,8 @@ def find_model(path: Path) -> Path:
     for folder in (path, path / "0", path / "sparse" / "0", path / "sparse"):
         if model_files(folder):
             return folder
-    raise InputError(
-        f"{path} is a folder without a COLMAP model; give the one with cameras, images and"
-        " points3D as .bin or .txt, usually sparse/0"
-    )
+    parts = ", ".join(MODEL_PARTS)
+    raise InputError(f"{path} has no COLMAP model ({parts} as .bin or .txt), usually in sparse/0")
 
 
 def read_model(path: Path) -> ColmapModel:

@@ -233,10 +233,8 @@ def _from_rows(
     if rows.dtype.kind != "f":
         raise FileFormatError(f"{path} is a list of {rows.dtype}; save x, y, depth as floats")
     if rows.shape[1] != 3:
-        raise FileFormatError(
-            f"{path}: {rows.shape[1]} numbers a row are not x, y and depth; if they are x y z of a"
-            " scan, give --calib"
-        )
+        fact = f"{rows.shape[1]} numbers a row are not x, y and depth"
+        raise FileFormatError(f"{path}: {fact}; if they are x y z of a scan, give --calib")
     depth = known_metres(rows[:, 2])
     known = (depth > 0) & np.isfinite(rows[:, :2]).all(axis=1)
     if not known.any():

@@ -41,8 +41,7 @@ def read_extrinsics(path: Path) -> Extrinsics:
         return pose_of_quaternion(path, numbers[:3], numbers[3:])
     if len(numbers) in (12, 16):
         return pose_of_matrix(path, "the matrix", numbers)
-    kinds = "12 or 16 of a matrix by rows, or tx ty tz qx qy qz qw"
-    raise FileFormatError(f"{path} holds {len(numbers)} numbers; extrinsics are {kinds}")
+    raise FileFormatError(f"{path} holds {len(numbers)} numbers; a pose has 7, 12 or 16")
 
 
 def numbers_in(value: object) -> list[float] | None:
@@ -126,5 +125,4 @@ def _pose_of_transform(path: Path, content: object) -> Extrinsics:
             numbers = numbers_in([x, y, z, qx, qy, qz, qw])
             if numbers is not None and len(numbers) == 7:
                 return pose_of_quaternion(path, numbers[:3], numbers[3:])
-    kinds = "a matrix, tx ty tz qx qy qz qw, or a transform of ROS"
-    raise FileFormatError(f"{path} holds no extrinsics; give {kinds}")
+    raise FileFormatError(f"{path} holds no matrix, no tx ty tz qx qy qz qw, no ROS transform")

@@ -21,7 +21,7 @@ from markupsafe import Markup
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import InputError, OutputError
-from pnpdepth_cli.io.atomic import atomic_folder, atomic_path, cannot_write
+from pnpdepth_cli.io.atomic import atomic_folder, cannot_write
 from pnpdepth_cli.io.figure import LOGARITHMIC_FROM, DepthScale, hex_colours, signed_bar
 from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.measures import Measure
@@ -138,7 +138,8 @@ def _write_page(
     with (folder / PAGE).open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(parts)
     if viewer:
-        _write_text(folder / VIEWER, _source("../three/three.min.js") + "\n" + _source(VIEWER))
+        scripts = _source("../three/three.min.js") + "\n" + _source(VIEWER)
+        (folder / VIEWER).write_text(scripts, encoding="utf-8", newline="\n")
 
 
 def link_image(source: Path, target: Path) -> None:
@@ -156,13 +157,8 @@ def save_view_3d(source: Path, target: Path) -> float:
         Its size in MB, rounded to 0.1 and at least that.
     """
     text = json.dumps(read_json(source), allow_nan=False, separators=(",", ":"))
-    _write_text(target, f"pnpdepthView({text});\n")
+    target.write_text(f"pnpdepthView({text});\n", encoding="utf-8", newline="\n")
     return max(0.1, round(target.stat().st_size / 1e6, 1))
-
-
-def _write_text(path: Path, text: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def _environment() -> jinja2.Environment:

@@ -141,9 +141,8 @@ def cloud_points(message: Message, topic: str) -> NDArray[np.float32]:
     """
     # The fields of x, y and z.
     fields = {str(field.name): field for field in message.fields}
-    for name in "xyz":
-        if name not in fields or int(fields[name].datatype) not in _NUMBERS:
-            raise FileFormatError(f"{topic}: a cloud without numbers {name}; name another topic")
+    if any(name not in fields or int(fields[name].datatype) not in _NUMBERS for name in "xyz"):
+        raise FileFormatError(f"{topic}: a cloud without numbers x y z; name another topic")
     # Where they lie in a point.
     order = ">" if message.is_bigendian else "<"
     formats = [order + _NUMBERS[int(fields[name].datatype)] for name in "xyz"]

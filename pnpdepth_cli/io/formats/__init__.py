@@ -98,10 +98,8 @@ def kind_of(data: bytes) -> str | None:
 
 def eight_bits(path: Path, kind: str) -> FileFormatError:
     """Returns the error for an 8-bit image given as depth."""
-    return FileFormatError(
-        f"{path} is an 8-bit {kind}; 8 bits cannot hold depth and it is probably an image of a "
-        "depth map, give the 16-bit PNG, EXR or NPY"
-    )
+    way_out = "give the 16-bit PNG, EXR or NPY that it is an image of"
+    return FileFormatError(f"{path} is an 8-bit {kind}, which cannot hold depth; {way_out}")
 
 
 def check_scale(scale: float | None) -> None:

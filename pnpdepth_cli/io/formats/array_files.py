@@ -36,8 +36,7 @@ _ARCHIVE_ERRORS = (
     RuntimeError,  # encrypted, or of another version
 )
 """What zipfile raises on damaged archives."""
-_MOST_AXES = 32
-"""Most axes of an array of NumPy 1."""
+_MOST_AXES = 32  # of an array of NumPy 1
 _LOCK = threading.Lock()
 """NumPy evaluates a header as Python, and threads of CPython 3.11 that do so at once may fail."""
 

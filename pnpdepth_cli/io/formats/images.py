@@ -214,8 +214,7 @@ TIFF = DepthFormat(
 _DEPTH_NAMES = frozenset({"z", "depth"})
 _CHANNEL_LIST = re.compile(rb"channels\0chlist\0(.{4})", re.DOTALL)
 _MOST_CHANNEL_BYTES = 1 << 19  # 20,000 channels; OpenEXR's time grows with the square
-_EXR_LOCK = threading.Lock()
-"""Standard output is redirected, by one thread at a time."""
+_EXR_LOCK = threading.Lock()  # standard output is redirected, by one thread at a time
 
 
 def _read_exr(path: Path, data: bytes) -> DepthFile:
@@ -285,9 +284,8 @@ def _depth_channel(path: Path, channels: Mapping[str, NDArray[np.generic]]) -> s
         red, green, blue = (channels[name] for name in "RGB")
         if np.array_equal(red, green, equal_nan=True) and np.array_equal(red, blue, equal_nan=True):
             return "R"
-    raise FileFormatError(
-        f"{path} has several channels ({', '.join(channels)}); export the depth alone"
-    )
+    listing = ", ".join(channels)
+    raise FileFormatError(f"{path} has several channels ({listing}); export the depth alone")
 
 
 EXR = DepthFormat(
