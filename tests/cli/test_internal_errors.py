@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from safetensors.torch import save_file
 from torch import nn
 
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.text_files import parse_yaml
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
 
@@ -57,13 +55,8 @@ READERS: list[tuple[str, str, Callable[[Path], object], Callable[[Path], object]
     ("d.npz", "zipfile.ZipFile", depth, read_depth),
     ("i.jpg", "PIL.Image.open", lambda path: Image.new("RGB", (5, 4)).save(path), read_rgb),
     ("d.mcap", "rosbags.rosbag2.Reader.open", bag, lambda path: open_bag(path).__enter__()),
-    ("c.yaml", "yaml.load_all", Path.touch, lambda path: parse_yaml(path, "a: 1")),
     ("n.onnx", "onnx.load", onnx, lambda path: load_network(str(path), None)),
     ("n.pt2", "json.loads", program, lambda path: load_network(str(path), None)),
-    (
-        "w.safetensors", "safetensors.torch.safe_open",
-        lambda path: save_file({"w": torch.ones(2)}, path), read_checkpoint,
-    ),
     (
         "w.pt", "pickletools.genops",
         lambda path: torch.save({"w": torch.ones(2)}, path), read_checkpoint,

@@ -129,14 +129,6 @@ def test_of_a_result_that_cannot_be_written_whole_nothing_stays(
     assert not list((frame.folder / "out").iterdir())
 
 
-def test_the_record_has_every_setting_that_changes_the_depth(frame: FrameOnDisk) -> None:
-    plain = run(frame, iterations=0).settings
-    for name, value in (("propagate", "gp"), ("normalise", "bytes")):
-        other = run(frame, iterations=0, overwrite=True, **{name: value}).settings
-        assert {key for key in other if other[key] != plain[key]} == {name}
-        assert other[name] == value
-
-
 def test_a_point_between_pixels_is_enough_and_points_outside_are_counted(
     frame: FrameOnDisk,
 ) -> None:

@@ -23,7 +23,6 @@ from pnpdepth_cli.errors import (
     OutputError,
     PnpDepthError,
     SizeError,
-    UsageError,
 )
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
@@ -107,17 +106,6 @@ def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     refused(frame, OutputError, "cannot be written (file exists)", target=below)
     refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))
     assert (frame.folder / "sparse_overlay.png").is_file()
-
-
-def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> None:
-    assert ScanOptions(calib=frame.calib).describes(frame.scan)
-    assert ScanOptions().describes(frame.scan)
-    np.save(frame.folder / "scan.npy", [[1.0, -2, 3], [-4, 5, 6]])
-    assert ScanOptions(calib=frame.calib).describes(frame.folder / "scan.npy")
-    assert not ScanOptions().describes(frame.folder / "scan.npy")
-    with pytest.raises(UsageError, match="is no scan"):
-        ScanOptions(extrinsics=frame.calib).describes(frame.gt)
-    assert not ScanOptions(keep_occluded=True).describes(frame.gt)
 
 
 def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
