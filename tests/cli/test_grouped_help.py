@@ -56,11 +56,6 @@ def test_the_longer_help_is_printed_before_anything_is_checked() -> None:
     assert help_of("refine", "missing.png", "--iterations", "x", "--help-all").startswith("Usage")
 
 
-@pytest.mark.parametrize("arguments", [("refine",), ("models", "check")])
-def test_the_help_states_that_a_python_file_is_run(arguments: tuple[str, ...]) -> None:
-    assert "is Python code and is run" in " ".join(help_of(*arguments, "--help").split())
-
-
 def commands_of(group: click.Group) -> Iterator[click.Command]:
     for name in group.list_commands(click.Context(group)):
         each = group.get_command(click.Context(group), name)

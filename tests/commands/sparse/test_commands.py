@@ -23,6 +23,7 @@ from pnpdepth_cli.errors import (
     OutputError,
     PnpDepthError,
     SizeError,
+    UsageError,
 )
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
@@ -106,6 +107,15 @@ def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     refused(frame, OutputError, "cannot be written (file exists)", target=below)
     refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))
     assert (frame.folder / "sparse_overlay.png").is_file()
+
+
+def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> None:
+    np.save(frame.folder / "scan.npy", [[1.0, -2, 3], [-4, 5, 6]])
+    for path in (frame.scan, frame.folder / "scan.npy"):
+        assert ScanOptions(calib=frame.calib).describes(path)
+    assert not ScanOptions().describes(frame.folder / "scan.npy")
+    with pytest.raises(UsageError):
+        ScanOptions(extrinsics=frame.calib).describes(frame.gt)
 
 
 def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
