@@ -47,11 +47,10 @@ def test_better_weights_are_used_for_every_frame_and_found_again(
 
 
 def test_weights_that_are_not_better_are_neither_kept_nor_used(
-    drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    drive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(adapting.Learnt, "is_better", False)
     assert batch(drive) == 0
-    assert "the network's own weights are used: " in capsys.readouterr().err
     assert [path.name for path in (drive.parent / "out/adapted").iterdir()] == ["drive.json"]
     record = json.loads((drive.parent / "out/drive_000.json").read_text())
     assert record["model"]["checkpoint"] != str(drive.parent / "out/adapted/drive.safetensors")
@@ -77,13 +76,10 @@ def test_learning_can_be_stopped(drive: Path) -> None:
     assert not (drive.parent / "out/adapted").exists()
 
 
-def test_a_frame_that_cannot_be_read_leaves_the_networks_own_weights(
-    drive: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_frame_that_cannot_be_read_leaves_the_networks_own_weights(drive: Path) -> None:
     (drive / "rgb/drive_000.png").write_bytes(b"")
     assert batch(drive) == 7
-    assert "own weights are used: " in (printed := capsys.readouterr().err)
-    assert "7 of 8 frames done, 1 failed" in printed
+    assert len(list((drive.parent / "out").glob("drive_*_depth.png"))) == 7
     assert not (drive.parent / "out/adapted").exists()
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +17,6 @@ from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.figure import paint_signed
 from tests.commands.batches import NAMES, batch, done, pairs_on_disk, refinement
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
 
@@ -98,14 +97,6 @@ def test_a_frame_that_is_redone_has_new_images_and_one_that_is_gone_has_none(
     assert {name.partition("_")[0] for name in before.keys() - after.keys()} == {key["d"]}
 
 
-def test_a_report_may_be_of_failed_frames_alone(root: Path, report: Path) -> None:
-    for name in NAMES:
-        (root / f"rgb/{name}.png").write_bytes(b"no image")
-    batch(root, html=report)
-    assert frames_of(report) == {}
-    assert len(page_data(report)["without"]) == 4
-
-
 def test_without_ground_truth_changes_are_those_at_held_out_points_and_settings_are_stated(
     root: Path, report: Path
 ) -> None:
@@ -125,15 +116,13 @@ def test_without_ground_truth_changes_are_those_at_held_out_points_and_settings_
 def test_weights_of_all_experts_are_shown_for_each_frame_and_in_the_mean(
     root: Path, report: Path
 ) -> None:
-    batch(root, html=report, refine={"propagate": None})
-    weights = json.loads((root / "out/summary.json").read_text())["weights"]
+    batch(root, html=report, limit=2, refine={"propagate": None})
     shown = dict(page_data(report)["facts"])["mean weights"]
-    for name, each in weights.items():
-        assert f"{name} {each['mean']:.0%} ({each['least']:.0%} to {each['largest']:.0%})" in shown
-    record = json.loads((root / "out/a.json").read_text())
-    largest = max(record["weights"], key=record["weights"].get)
+    weights = FrameRecord.read(root / "out/a.json").weights
+    assert all(name in shown for name in weights)
+    largest = max(weights, key=weights.__getitem__)
     notes = " ".join(frames_of(report)["a"]["notes"])
-    assert f"{largest} {record['weights'][largest]:.0%}" in notes
+    assert f"{largest} {weights[largest]:.0%}" in notes
 
 
 def test_with_neither_ground_truth_nor_held_out_points_there_is_no_change(
@@ -150,26 +139,21 @@ def test_with_neither_ground_truth_nor_held_out_points_there_is_no_change(
     assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
 
 
-def test_frames_without_ground_truth_have_no_figures_beside_those_with_it(
+def test_frames_without_the_scores_of_others_have_no_figures_beside_them(
     root: Path, report: Path
 ) -> None:
-    for name in "bcd":
-        (root / f"gt/{name}.png").unlink()
-    batch(root, html=report)
+    (root / "gt/b.png").unlink()
+    (root / "rgb/d.png").write_bytes(b"no image")
+    summary = batch(root, html=report)
     frames = frames_of(report)
     assert frames["a"]["values"]["rmse_change"] is not None
-    assert set(frames["b"]["values"].values()) == {None}
+    assert {*frames["b"]["values"].values()} == {None}
     assert (frames["a"]["tag"], frames["b"]["tag"]) == ("", "at points used")
-
-
-def test_a_frame_without_depth_at_any_point_has_no_figures(root: Path, report: Path) -> None:
-    summary = batch(root)
-    records = [FrameRecord.read(root / f"out/{name}.json") for name in NAMES]
-    records[1] = replace(records[1], errors={})
+    assert [name for name, why in page_data(report)["without"]] == ["d"]
+    records = [replace(FrameRecord.read(root / f"out/{name}.json"), errors={}) for name in "abc"]
     request = BatchRequest(source=root, output=root / "out", html=report, refine=refinement(root))
     report_batch.write_batch_report(request, report, summary, records)
-    assert {*frames_of(report)["b"]["values"].values()} == {None}
-    assert None not in frames_of(report)["a"]["values"].values()
+    assert {*frames_of(report)["a"]["values"].values()} == {None}
 
 
 def test_the_report_may_lie_in_the_results_and_the_results_among_the_frames(root: Path) -> None:
@@ -179,16 +163,10 @@ def test_the_report_may_lie_in_the_results_and_the_results_among_the_frames(root
         assert tuple(frames_of(report)) == NAMES
 
 
-def refused(root: Path, output: Path, **changes: Any) -> str:
-    with pytest.raises(OutputError) as error:
-        batch(root, html=output, refine=changes)
-    return str(error.value)
-
-
 def test_outputs_inside_the_inputs_or_around_them_are_refused(root: Path, tmp_path: Path) -> None:
-    assert str(root / "rgb") in refused(root, root / "rgb", overwrite=True)
-    for output in (root, root / "out", tmp_path):
-        assert "holds the results" in refused(root, output, overwrite=True)
+    for folder in (root / "rgb", root, root / "out", tmp_path):
+        with pytest.raises(OutputError, match=re.escape(str(folder))):
+            batch(root, html=folder, refine={"overwrite": True})
     assert not (root / "out").exists()
 
 
@@ -212,10 +190,3 @@ def test_an_image_that_was_deleted_is_not_made_again_and_the_report_does_without
     assert frames["b"]["key"] is None
     assert all(frames[name]["key"] for name in "acd")
     assert frames["b"]["values"]["rmse_change"] is not None
-
-
-def test_the_legend_has_the_colours_of_the_improvement_maps(root: Path, report: Path) -> None:
-    batch(root, html=report)
-    worse, better = (paint_signed(np.array(s), np.array(0.88), "gain") for s in (-1.0, 1.0))
-    shown = page_data(report)["map_colours"]
-    assert [shown[0], shown[-1]] == ["#" + bytes(each).hex() for each in (worse, better)]
