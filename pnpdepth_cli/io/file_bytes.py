@@ -165,7 +165,7 @@ def _size_and_times(path: Path) -> tuple[int, int, int]:
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
-# Several frames may share one file: a calibration, or gigabytes of HDF5.
+# Several frames may share one file: a calibration, a list, or a video.
 @functools.lru_cache(maxsize=64)
 def _digest(path: Path, size: int, mtime_ns: int, ctime_ns: int) -> str:
     return sha256_of(path)
