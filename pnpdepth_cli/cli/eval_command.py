@@ -25,7 +25,7 @@ _OUTPUT = ("--csv", "--columns", "--overwrite", "--json")
     ),
     groups={
         "Protocol": (EvalRequest,),
-        "Input": ("--pred-scale", "--gt-scale"),
+        "Input": ("--pred-scale", "--gt-scale", "--gt-range"),
         "Output": _OUTPUT,
     },
 )

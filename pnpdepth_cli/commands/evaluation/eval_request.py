@@ -69,6 +69,9 @@ class EvalRequest:
 
     pred_scale: float | None = option(None, "Integer predictions hold metres × S.", metavar="S")
     gt_scale: float | None = option(None, "Integer ground truth holds metres × S.", metavar="S")
+    gt_range: bool = option(
+        False, "Ground truth is the distance from the camera, not depth z; needs the camera."
+    )
     columns: tuple[str, ...] | None = option(
         None,
         "Measures of the tables, in this order, such as rmse,mae,delta1. Only if named, for dense"

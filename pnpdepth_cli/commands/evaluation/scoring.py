@@ -18,6 +18,7 @@ from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
 from pnpdepth_cli.dataset.arrays import apply_masks, raw_depth, read_image
+from pnpdepth_cli.dataset.frame_camera import camera_of_file
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
@@ -27,6 +28,7 @@ from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.measures import OF_SIGMA
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.protocols import Protocol
+from pnpdepth_cli.sensors.lens import rays_of_image
 from pnpdepth_cli.sensors.pixels import pixel_index
 from pnpdepth_cli.sensors.samplers import sample_points
 from pnpdepth_cli.stages import AFTER, GT
@@ -133,7 +135,28 @@ def _read_truth(pair: FramePair, request: EvalRequest) -> tuple[Depth, Reading, 
         values, reading = _read(frame.gt, scale, request)
     values = apply_masks(values, frame.masks)
     values, notes = plausible_map(values, reading, "gt", "--gt-scale", scale)
-    return np.ascontiguousarray(frame.part.apply(values)), reading, notes
+    gt = np.ascontiguousarray(frame.part.apply(values))
+    if request.gt_range:
+        gt = _depth_of_distances(gt, pair, (values.shape[0], values.shape[1]))
+        reading = reading._replace(source=f"{reading.source}, distances")
+    return gt, reading, notes
+
+
+def _depth_of_distances(gt: Depth, pair: FramePair, whole: tuple[int, int]) -> Depth:
+    """Depth z of distances from the camera of the data set, else of the prediction's record."""
+    files, size, camera = pair.files, (gt.shape[0], gt.shape[1]), None
+    if files.calib is not None:
+        found, _ = camera_of_file(files.calib, files.camera, whole, files.image_file)
+        camera = files.part.camera_in_crop(found, whole)
+    elif pair.result is not None and pair.record.size == size[::-1]:
+        camera, _ = pair.result.camera_and_pose
+    if camera is None:
+        raise InputError(
+            f"--gt-range needs the camera of frame {files.name}, which neither the data set nor the"
+            " record beside the prediction has; add the column calib to a list"
+        )
+    rays = rays_of_image(camera, size)
+    return known_metres(gt / np.sqrt(1 + (rays**2).sum(axis=2)))
 
 
 def _where_scored(gt: Depth, given: Mask | None, rules: Protocol) -> Mask:

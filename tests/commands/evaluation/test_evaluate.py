@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate, means_table
 from pnpdepth_cli.commands.evaluation.scoring import scores_of
-from pnpdepth_cli.dataset.frame_record import FrameRecord
+from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.file_record import FileRecord, SamplePattern, Sampling
 from pnpdepth_cli.io.depth import write_depth
@@ -298,3 +299,29 @@ def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
     assert more.mean["rmse_far"] == pytest.approx((first + third) / 2)
     assert scores_of(more.frames[1])["boundary_f1"] == 0
     assert [measure.key for measure in more.shown] == ["mae", "boundary_f1"]
+
+
+@pytest.mark.parametrize("of", ["list", "record", "nothing"])
+def test_distances_of_a_wide_camera_are_scored_as_depth(of: str, tmp_path: Path) -> None:
+    depth = np.random.default_rng(0).uniform(2, 4, (48, 64)).astype(np.float32)
+    x, y = (np.arange(64) - 31.5) / 32, (np.arange(48) - 23.5) / 32  # 90° across
+    depth_file(tmp_path / "gt.npy", depth * np.sqrt(1 + x**2 + y[:, None] ** 2))
+    depth_file(tmp_path / "out" / "a_depth.npy", depth + 1)
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((48, 64, 3), np.uint8))
+    intrinsics = [[32.0, 0.0, 31.5], [0.0, 32.0, 23.5], [0.0, 0.0, 1.0]]
+    (tmp_path / "calib.txt").write_text(f"K: {np.ravel(intrinsics).tolist()}")
+    calib = "calib.txt" if of == "list" else ""
+    (tmp_path / "list.csv").write_text(f"image,gt,calib,name,group\na.png,gt.npy,{calib},a,b")
+    camera = CameraRecord.of(Camera(intrinsics=np.array(intrinsics)), None)
+    record = FrameRecord(size=(64, 48), camera=camera if of == "record" else None)
+    record.write(tmp_path / "out" / "a.json")
+    request = EvalRequest(
+        prediction=tmp_path / "out", ground_truth=tmp_path / "list.csv", gt_range=True
+    )
+    if of == "nothing":
+        with pytest.raises(InputError, match="calib"):
+            evaluate(request)
+    else:
+        found = evaluate(request)
+        assert found.mean["mae"] == pytest.approx(1, abs=1e-6)
+        assert found.frames[0].inputs["gt"].read_as == "float32 NPY, distances"
