@@ -101,6 +101,8 @@ _FAMILIES: dict[str, tuple[OutputKind, OutputScale, int]] = {
     "dpt": ("unknown", "affine", 16),
     "zoedepth": ("depth", "metric", 32),
     "glpn": ("depth", "metric", 32),
+    # Inverse depth for a canonical camera: a factor away from metres.
+    "depth_pro": ("inverse", "scale", 1),
 }
 """What the networks of a model type predict, and what sides of images are multiples of."""
 

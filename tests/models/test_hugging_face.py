@@ -82,11 +82,27 @@ def glpn() -> Any:
     return transformers.GLPNForDepthEstimation(config)
 
 
+def depth_pro() -> Any:
+    dino = {"hidden_size": 24, "num_hidden_layers": 4, "num_attention_heads": 2, "patch_size": 8,
+            "image_size": 32}  # fmt: skip
+    config = transformers.DepthProConfig(
+        patch_size=32, fusion_hidden_size=8, intermediate_hook_ids=[2, 1],
+        intermediate_feature_dims=[8, 8], scaled_images_ratios=[0.5, 1.0],
+        scaled_images_overlap_ratios=[0.0, 0.25], scaled_images_feature_dims=[8, 8],
+        use_fov_model=False,
+        image_model_config=transformers.Dinov2Config(**dino),
+        patch_model_config=transformers.Dinov2Config(**dino),
+        fov_model_config=transformers.Dinov2Config(**dino),
+    )  # fmt: skip
+    return transformers.DepthProForDepthEstimation(config)
+
+
 MAKERS = {
     "depth_anything": depth_anything,
     "dpt": dpt,
     "zoedepth": zoedepth,
     "glpn": glpn,
+    "depth_pro": depth_pro,
 }
 
 

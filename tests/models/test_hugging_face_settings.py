@@ -27,6 +27,7 @@ PROCESSING: dict[str, dict[str, Any]] = {
         "ensure_multiple_of": 32,
     },
     "glpn": {"size_divisor": 32, "do_rescale": True},
+    "depth_pro": {**HALF, "size": {"height": 64, "width": 64}},
 }
 """A preprocessor_config.json by the type of the network."""
 
