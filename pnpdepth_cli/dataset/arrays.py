@@ -16,10 +16,11 @@ from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import (
     check_value_count,
     fingerprint,
+    read_bytes,
     size_of_regular_file,
 )
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.rgb import read_rgb, read_video_frame, sizes_of
+from pnpdepth_cli.io.rgb import read_exr_colour, read_rgb, read_video_frame, sizes_of
 
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
@@ -65,6 +66,8 @@ def read_levels(path: Path) -> NDArray[np.floating | np.integer]:
     Raises:
         InputError: The file holds no such numbers.
     """
+    if path.suffix.lower() == ".exr":
+        return np.asarray(read_exr_colour(path, read_bytes(path)).max(axis=2))
     if path.suffix.lower() in IMAGE_SUFFIXES:
         image = read_rgb(path)
         return np.asarray(np.rint(image.values.max(axis=2) * image.white))

@@ -1,4 +1,4 @@
-"""RGB images of PNG, JPEG, TIFF, WebP, HEIC and videos, and the focal length in EXIF."""
+"""RGB images of PNG, JPEG, TIFF, WebP, HEIC, EXR and videos, and the focal length in EXIF."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from pnpdepth_cli.io.formats.images import (
     open_image,
     orientation_of,
     raw_mode,
+    read_exr_channels,
 )
 
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
@@ -45,7 +46,7 @@ class RgbImage:
 
     values: NDArray[np.float32]  # (H, W, 3) in 0..1, sRGB-encoded
     note: str | None  # what was assumed or changed, for a person; None if nothing was
-    white: float = 255.0  # the stored number that is 1
+    white: float = 255.0  # the stored number that is 1; that of an EXR is unknown
 
 
 def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
@@ -58,13 +59,15 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     """
     data = read_bytes(path)
     kind = kind_of(data)
+    if kind == "EXR":
+        return _from_linear_light(path, data)
     if data[4:8] == b"ftyp":
         if data[8:12] in (b"avif", b"avis") or not _reads_heic():
             hint = "pip install 'pnpdepth[heic]' reads HEIC, or save it as JPEG"
             raise FileFormatError(f"{path} is a HEIC or AVIF photo; {hint}")
         kind = "HEIF"
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF"):
-        raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF or WebP file")
+        raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
     note, white = None, 255.0
     with open_image(path, data, kind) as image:
         if kind == "TIFF" and image.mode in ("I", "F"):
@@ -115,7 +118,7 @@ def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
             width, height = image.size
             upright = (width, height) if orientation_of(image) >= 5 else (height, width)
             return upright, (height, width)
-    except (OSError, Image.DecompressionBombError):  # a HEIC, or no image
+    except (OSError, Image.DecompressionBombError):  # an EXR, say
         height, width, _ = read_rgb(path).values.shape
         return (height, width), (height, width)
 
@@ -127,13 +130,16 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
     """
     import cv2
 
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise damaged(path, kind, "cannot be decoded")
-    white = 255 if 1 < pixels.max() <= 255 else 65535
-    rgb = np.divide(pixels[:, :, ::-1], np.float32(white), dtype=np.float32)  # it has blue first
-    return np.asarray(rgb), float(white)
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.shape[2] in (1, 2):
+        pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
+    rgb = pixels[:, :, 2::-1]  # OpenCV has blue first
+    white = 255 if 1 < rgb.max() <= 255 else 65535
+    return np.asarray(np.divide(rgb, np.float32(white), dtype=np.float32)), float(white)
 
 
 def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:
@@ -143,6 +149,45 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
     if orientation in (3, 4, 7, 8):
         values = values[::-1]
     return values[:, ::-1] if orientation in (2, 3, 6, 7) else values
+
+
+def _from_linear_light(path: Path, data: bytes) -> RgbImage:
+    linear = read_exr_colour(path, data).astype(np.float32)
+    np.nan_to_num(linear, copy=False, nan=0.0, posinf=1e9, neginf=0.0)
+    outside = float(((linear > 1) | (linear < 0)).any(axis=2).mean())
+    note = "EXR linear light, converted with the sRGB curve"
+    if outside > 0:
+        note += f"; {100 * outside:.2g} % of pixels lay outside 0..1 and were clipped"
+    return RgbImage(values=srgb_from_linear(linear.clip(0, 1, out=linear)), note=note)
+
+
+def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns linear light in 0..1 of any shape, sRGB-encoded (IEC 61966-2-1)."""
+    encoded = np.empty(linear.shape, np.float32)
+    for row, light in zip(encoded, linear.astype(np.float64), strict=True):
+        # In float32 white would come out just below 1.
+        curve = 1.055 * np.power(light, 1 / 2.4) - 0.055
+        row[:] = np.where(light <= 0.0031308, 12.92 * light, curve)
+    return encoded
+
+
+def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
+    """Returns R, G and B (H, W, 3) as an EXR stores them; its only channel is repeated.
+
+    Raises:
+        FileFormatError: It is damaged, beyond the budget, or holds no single image.
+    """
+    channels = read_exr_channels(path, data)
+    reds = [name for name in channels if name.rpartition(".")[2] == "R"]
+    layer = reds[0][:-1] if len(reds) == 1 else ""
+    names = [layer + letter for letter in "RGB"]
+    grey = [name for name in channels if name != "A"]
+    if len(grey) == 1:
+        names = grey * 3
+    if not channels.keys() >= {*names}:
+        listing = ", ".join(channels)
+        raise FileFormatError(f"{path} has no one image in ({listing}); export R, G and B")
+    return np.stack([channels[name] for name in names], axis=2)
 
 
 def read_focal_length(path: Path, size: tuple[int, int]) -> tuple[float, str] | None:

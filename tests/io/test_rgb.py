@@ -13,7 +13,8 @@ from PIL import Image
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io import rgb
-from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, sizes_of
+from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, sizes_of, srgb_from_linear
+from tests.exr_files import write_exr
 
 COLOURS = np.random.default_rng(1).integers(0, 256, (7, 11, 3)).astype(np.uint8)
 COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.uint16)
@@ -123,3 +124,18 @@ def test_the_focal_length_is_that_of_film_if_a_camera_can_have_it(
     image.save(tmp_path / "a.jpg", exif=exif)
     focal = read_focal_length(tmp_path / "a.jpg", (300, 400))
     assert (focal[0] if focal else None) == (pixels and pytest.approx(pixels))
+
+
+def test_linear_exr_gets_the_srgb_curve_and_what_is_clipped_a_note(tmp_path: Path) -> None:
+    linear = np.array([[0.0, 0.001, 0.2140411], [0.5, 1.0, 0.0031308]], np.float32)
+    write_exr(tmp_path / "a.exr", {"R": linear, "G": linear, "B": np.zeros_like(linear)})
+    values = read_rgb(tmp_path / "a.exr").values
+    assert np.array_equal(values[:, :, 0], srgb_from_linear(linear))
+    assert values[0, 2].tolist() == pytest.approx([0.5, 0.5, 0], abs=1e-6)
+    bright = np.array([[0.5, 4.0], [np.nan, np.inf]], np.float16)
+    write_exr(tmp_path / "b.exr", {"Y": bright, "A": bright})
+    image = read_rgb(tmp_path / "b.exr")
+    assert image.values[:, 1].tolist() == [[1, 1, 1], [1, 1, 1]]
+    assert image.values[1, 0].tolist() == [0, 0, 0]
+    assert "50 %" in str(image.note)
+    assert sizes_of(tmp_path / "b.exr") == ((2, 2), (2, 2))

@@ -91,6 +91,7 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
     """
     from PIL import Image
 
+    Image.MAX_IMAGE_PIXELS = None  # the budget limits them, which a user can raise
     stream = io.BytesIO(data)
     try:
         if kind == "TIFF":
@@ -109,7 +110,7 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
                 file_bytes=len(data),
             )  # fmt: skip
             yield image
-    except (*IMAGE_ERRORS, Image.DecompressionBombError) as error:
+    except IMAGE_ERRORS as error:
         # Pillow names the in-memory buffer, which means nothing to a reader
         reason = "unknown content or type of pixels" if "BytesIO" in str(error) else error
         raise damaged(path, kind, f"cannot be decoded ({reason})") from error
@@ -217,8 +218,13 @@ _MOST_CHANNEL_BYTES = 1 << 19  # 20,000 channels; OpenEXR's time grows with the 
 _EXR_LOCK = threading.Lock()  # standard output is redirected, by one thread at a time
 
 
-def _read_exr(path: Path, data: bytes) -> DepthFile:
-    """Depth of float16, float32 or uint32 in a channel of one flat image."""
+def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]:
+    """Returns the channels by name: (H, W) arrays of float16, float32 or uint32.
+
+    Raises:
+        FileFormatError: The file is damaged, or exceeds the budget; or it has several parts, or
+            pixels that are deep, subsampled or cropped.
+    """
     import OpenEXR
 
     # The size that the channels will have is checked before they are decoded.
@@ -240,8 +246,7 @@ def _read_exr(path: Path, data: bytes) -> DepthFile:
         raise damaged(path, "EXR", f"cannot be read ({error})") from error
     if not decoded:
         raise damaged(path, "EXR", "cannot be decoded")
-    name = _depth_channel(path, decoded)
-    return DepthFile(values=decoded[name], reading=Reading(f"EXR channel {name}"))
+    return decoded
 
 
 def _check_exr(path: Path, header: Mapping[str, Any], parts: int, file_bytes: int) -> None:
@@ -270,6 +275,12 @@ def _write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str])
             image.write(str(file))
     except RuntimeError as error:  # how the binding reports a full disk, say
         raise OSError(str(error)) from error
+
+
+def _read_exr(path: Path, data: bytes) -> DepthFile:
+    channels = read_exr_channels(path, data)
+    name = _depth_channel(path, channels)
+    return DepthFile(values=channels[name], reading=Reading(f"EXR channel {name}"))
 
 
 def _depth_channel(path: Path, channels: Mapping[str, NDArray[np.generic]]) -> str:
