@@ -21,15 +21,11 @@ from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import families
 
-DEFAULT_SIZE = (240, 320)
-"""Rows and columns of the synthetic frame of a network without a size of its own."""
+DEFAULT_SIZE = (240, 320)  # rows and columns of the synthetic frame
 
 
 def list_models() -> list[dict[str, object]]:
-    """Returns every network that can be named, in the order of `registry.names`.
-
-    The values are those of `ModelDefinition`, and the number of parameters.
-    """
+    """Returns every network that can be named: values of `ModelDefinition`, and parameters."""
     by_name = dict[str, ModelDefinition]()
     for definitions in families().values():
         for definition in definitions.values():
@@ -65,13 +61,6 @@ def _parameters_of(module: torch.nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def _synthetic_map(network: Network) -> FrameMap:
-    """The map of an image of the network's own size."""
-    size = network.definition.size
-    own = (size.height, size.width) if isinstance(size, Fixed) else DEFAULT_SIZE
-    return FrameMap.fit(size, *own)
-
-
 def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict[str, object]:
     """Loads a network, runs it once, and cuts it at every layer of its definition.
 
@@ -96,18 +85,15 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         InputError: The image cannot be read.
     """
     network = load_network(model, checkpoint)
-    definition, frame, rgb = network.definition, _synthetic_map(network), None
+    definition, rgb = network.definition, None
     if image is not None:
         rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1).contiguous()[None]
-        frame = FrameMap.fit(definition.size, *rgb.shape[-2:])
+    frame = FrameMap.fit(definition.size, *(DEFAULT_SIZE if rgb is None else rgb.shape[-2:]))
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame, rgb)
         notes = [*network.notes, *network.verify(arguments)]
         if "rgb" in definition.input_kind and definition.normalisation is None:
-            notes.append(
-                "input: rgb range 'unit' is assumed; refine compares the ranges at the points, and"
-                " --normalise states one"
-            )
+            notes.append("input: rgb range 'unit' is assumed; --normalise of refine states one")
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
         known = raw[raw.isfinite()]
@@ -138,9 +124,8 @@ def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], who
             gradient = gradient_at(z, raw.sum())
     except ModelError as error:
         return str(error)
-    if gradient is None:
-        return "no gradient comes back from the prediction"
-    return "ok" if bool(gradient.isfinite().all()) else "the gradient is not finite"
+    reached = gradient is not None and bool(gradient.isfinite().all())
+    return "ok" if reached else "no finite gradient comes back from the prediction"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +173,7 @@ def list_layers(
         raise UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
-    frame, measured = _synthetic_map(network), []
+    frame, measured = FrameMap.fit(network.definition.size, *DEFAULT_SIZE), []
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame)
         with torch.no_grad(), FlopCounterMode(display=False) as whole:

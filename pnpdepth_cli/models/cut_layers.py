@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import torch
@@ -33,9 +34,6 @@ several for FastDepth on even frames of ICL-NUIM, 7-Scenes and KITTI, 100 points
 
 _SIMILAR_ASPECT = 1.3
 """A feature map's aspect ratio is at most this factor away from the image's."""
-
-Maps = dict[str, Tensor]
-"""What submodules returned, by name in the order in which they ran: maps (1, c, h, w)."""
 
 
 def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
@@ -74,28 +72,18 @@ def best_layer(
         return None
     # No field is wider than the image, and of equally wide ones the last layer is taken.
     enough = min(wanted_field(size, point_count), *size)
-    layers, widths = list(network.definition.layers), dict[str, int]()
-    # The more of the network lies behind a layer, the wider is its field: bisection finds the last
-    # layer that reaches far enough, which is the one of least cost.
-    first, end = 0, len(layers)
-    while first < end:
-        middle = (first + end) // 2
-        try:
-            with Split(network.module, layers[middle]) as split, torch.no_grad():
-                z = split.front(*arguments)
-                width = min(influential_field(split, z, network.known_of, enough).in_output)
-        except ModelError:
-            del layers[middle]
-            end -= 1
-            continue
-        widths[layers[middle]] = width
-        if width >= enough:
-            first = middle + 1
-        else:
-            end = middle
-    last_first = [name for name in reversed(layers) if name in widths]
-    wide = [name for name in last_first if widths[name] >= enough]
-    return wide[0] if wide else max(last_first, key=widths.__getitem__, default=None)
+    widths = dict[str, int]()
+    for name in reversed(network.definition.layers):
+        with (
+            suppress(ModelError),  # it cannot be cut there
+            Split(network.module, name) as split,
+            torch.no_grad(),
+        ):
+            z = split.front(*arguments)
+            widths[name] = min(influential_field(split, z, network.known_of, enough).in_output)
+            if widths[name] >= enough:
+                return name
+    return max(widths, key=widths.__getitem__, default=None)
 
 
 def wanted_field(size: tuple[int, int], point_count: int) -> float:
@@ -179,9 +167,9 @@ def _last_of_each_resolution(areas: Mapping[str, int]) -> list[str]:
 
 def _observe(
     module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[object], Tensor]
-) -> tuple[Tensor, Maps]:
-    """One pass: the prediction, and the maps that gradients reach of submodules that ran once."""
-    maps: Maps = {}
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """One pass: the prediction, and by name the maps of submodules that ran once, in that order."""
+    maps: dict[str, Tensor] = {}
     ran: Counter[str] = Counter()
 
     def keep(name: str, output: object) -> None:

@@ -161,9 +161,6 @@ def _run(file: Path) -> ModuleType:
     try:
         with importing_beside(str(file)):
             spec.loader.exec_module(module)
-    except PnpDepthError as error:
-        reason = describe(error, file).removeprefix(f"{type(error).__name__}: ")
-        raise ModelError(f"model file {file}: {reason}") from error
     except (Exception, SystemExit) as error:
         raise ModelError(f"model file {file} raises {describe(error, file)}") from error
     return module

@@ -22,9 +22,8 @@ from pnpdepth_cli.errors import ModelError
 _ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH = 1 << 28, 64
 """One activation may have so many elements (1 GB), or so many times those of input and weights."""
 
-_BY_VALUES = ("nonzero", "masked_select", "index", "item", "_local_scalar_dense", "equal")
-"""Operators of torch whose result has as many elements as their tensors' values say, at most as
-many coordinates as the tensors have."""
+_NUMBERS = ("item", "_local_scalar_dense", "equal")
+"""Operators of torch whose result is a Python number."""
 
 
 class Unsupported(Exception):
@@ -179,10 +178,9 @@ def _shaped_result(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     try:
         return func(*args, **kwargs | without)
     except NotImplementedError:
-        if func._opname not in _BY_VALUES:
+        if func._opname not in _NUMBERS:
             raise Unsupported("a result of a size that only its values tell") from None
-        count = sum(each.numel() * max(1, each.ndim) for each in _tensors_in((args, kwargs)))
-        return torch.empty(count, device="meta")
+        return None
     except (RuntimeError, ValueError, TypeError, IndexError):  # running it says what is wrong
         return None
 

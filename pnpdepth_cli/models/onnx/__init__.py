@@ -33,7 +33,6 @@ ONLY: dict[str, int | str] = {
     "keep_aspect_ratio_policy": "stretch",
     "noop_with_empty_axes": 0,
     "reduction": "none",
-    "select_last_index": 0,
     "training_mode": 0,
 }
 """Attributes that must have this value, the standard's default, if they are there."""

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
-_HALF = ("float16", "bfloat16")
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
 """Such as `training`, which torch itself sets; no submodule can have such a name."""
 
@@ -91,8 +90,6 @@ class OnnxNode(nn.Module):
 class OnnxGraph(nn.Module):
     """An ONNX model as a module: called with the graph's inputs, it returns its output.
 
-    Everything is computed in float32; weights in half precision are widened.
-
     Args:
         model: The onnx.ModelProto with one output, its nodes in order.
         path: File of the model, for messages.
@@ -107,7 +104,6 @@ class OnnxGraph(nn.Module):
         _check_operators(graph.node, path)
         opset = max((o.version for o in model.opset_import if o.domain in _STANDARD), default=1)
         constants = {t.name: _tensor(t, path) for t in graph.initializer}
-        self.is_half = any(t.data_type == t.FLOAT16 for t in graph.initializer)
         self.input_names = tuple(i.name for i in graph.input if i.name not in constants)
         (self.output_name,) = (output.name for output in graph.output)
         self._stored = sum(constant.numel() for constant in constants.values())
@@ -141,7 +137,7 @@ class OnnxGraph(nn.Module):
             handed_in = tuple(n for n in inputs if isinstance(n, str) and n)
             if not given.issuperset(handed_in):
                 raise ModelError(
-                    f"ONNX file {path}: node {name!r} reads a value that nothing gives"
+                    f"ONNX file {path}: node {name!r} reads a value that nothing before it gives"
                 )
             given.update(proto.output)
             if not handed_in:
@@ -253,11 +249,10 @@ def _attribute(proto: AttributeProto, path: Path) -> Any:
 def _tensor(proto: TensorProto, path: Path) -> Tensor:
     from onnx import numpy_helper
 
+    if proto.data_type in (proto.FLOAT16, proto.BFLOAT16):
+        raise ModelError(f"ONNX file {path} is in half precision; export the network in float32")
     try:
-        array = numpy_helper.to_array(proto)
-        if array.dtype.name in _HALF:
-            array = array.astype("float32")
-        return torch.tensor(array)
+        return torch.tensor(numpy_helper.to_array(proto))
     except (ValueError, TypeError, KeyError, RuntimeError) as error:
         raise ModelError(
             f"ONNX file {path}: tensor {proto.name!r} cannot be read ({error})"

@@ -15,14 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.onnx import (
-    Inputs,
-    Node,
-    operator,
-    optional,
-    register,
-    whole_numbers,
-)
+from pnpdepth_cli.models.onnx import Inputs, Node, operator, optional, register, whole_numbers
 from pnpdepth_cli.models.steps import Unsupported
 
 _CONV = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}

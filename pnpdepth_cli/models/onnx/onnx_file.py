@@ -6,7 +6,6 @@ pnpdepth[onnx]`.
 
 from __future__ import annotations
 
-import graphlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ from pnpdepth_cli.models.definition import (
 from pnpdepth_cli.models.onnx.graph import OnnxGraph
 
 if TYPE_CHECKING:
-    from onnx import ModelProto, NodeProto, ValueInfoProto
+    from onnx import ModelProto, ValueInfoProto
 
 _OPSETS = range(7, 25)  # onnxruntime runs none that is older
 _MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
@@ -35,8 +34,6 @@ _SHARED = 2  # tensors that may have the same bytes of a file beside the model
 
 MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
-
-_HALF_MISMATCH = 1e-2  # half precision itself is no better
 
 
 def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> ModelDefinition:
@@ -54,16 +51,14 @@ def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> Mod
     model = _read(file)
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
-    is_part = _prune(model, _choose_output(model, output, file), file)
-    # From the file, onnxruntime reads weights that lie beside it.
-    source = model.SerializeToString() if is_part else str(file)
+    _prune(model, _choose_output(model, output, file))
     return graph_definition(
         list(inputs.values()), file, stated,
         size=Multiple(_patch_size(model) or ASSUMED_MULTIPLE),
         build=lambda: OnnxGraph(model, file),
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'an unknown program'}",
         output=_as_map,
-        verify=FirstImageCheck(source, file),
+        verify=FirstImageCheck(file),
     )  # fmt: skip
 
 
@@ -152,33 +147,19 @@ def _choose_output(model: ModelProto, wanted: str | None, file: Path) -> str:
     )
 
 
-def _prune(model: ModelProto, output: str, file: Path) -> bool:
-    """Leaves in the model one output and the nodes that it needs. True if others were there."""
+def _prune(model: ModelProto, output: str) -> None:
+    """Leaves in the model one output and the nodes that it needs."""
     graph, needed, nodes = model.graph, {output}, []
-    for node in reversed(_in_order(graph.node, file)):
+    for node in reversed(graph.node):
         if not needed.isdisjoint(node.output):
             nodes.append(node)
             needed.update(filter(None, node.input))
-    is_part = len(nodes) < len(graph.node) or len(graph.output) > 1
     kept = type(graph)()
     kept.node.extend(reversed(nodes))
     kept.output.extend(o for o in graph.output if o.name == output)
     graph.ClearField("node")
     graph.ClearField("output")
     graph.MergeFrom(kept)
-    return is_part
-
-
-def _in_order(nodes: Sequence[NodeProto], file: Path) -> list[NodeProto]:
-    """The nodes, each after those it reads; files converted to half precision are not in order."""
-    producer = {name: n for n, node in enumerate(nodes) for name in node.output if name}
-    reads = {n: {producer[i] for i in nodes[n].input if i in producer} for n in range(len(nodes))}
-    if all(before < n for n, befores in reads.items() for before in befores):
-        return list(nodes)
-    try:
-        return [nodes[n] for n in graphlib.TopologicalSorter(reads).static_order()]
-    except graphlib.CycleError:
-        raise ModelError(f"ONNX file {file}: its nodes read each other in a circle") from None
 
 
 def _as_map(output: Tensor) -> Tensor:
@@ -201,12 +182,11 @@ class FirstImageCheck:
     """Compares the network with onnxruntime on the first image.
 
     Args:
-        source: File that onnxruntime reads, or the content of one.
-        file: The network's file, for messages.
+        file: The network's file, from which onnxruntime also reads weights that lie beside it.
     """
 
-    def __init__(self, source: str | bytes, file: Path) -> None:
-        self._source, self._file, self._note = source, file, ""
+    def __init__(self, file: Path) -> None:
+        self._file, self._note = file, ""
 
     def __call__(self, module: nn.Module, arguments: Sequence[Tensor]) -> str:
         """Returns how well they agree; compares only once. ModelError if they differ."""
@@ -216,8 +196,8 @@ class FirstImageCheck:
         inputs = {n: a.detach() for n, a in zip(module.input_names, arguments, strict=True)}
         with torch.no_grad():
             actual = module(*arguments).cpu()  # first, since it allocates no more than it should
-        deviation = _deviation(actual, self._expected(inputs))
-        if not deviation <= (_HALF_MISMATCH if module.is_half else MISMATCH):
+        deviation = _deviation(actual, self._expected(module.output_name, inputs))
+        if not deviation <= MISMATCH:
             raise ModelError(
                 f"ONNX file {self._file}: its reading by torch differs from onnxruntime's by"
                 f" {deviation:.2g} of the output's range"
@@ -225,8 +205,8 @@ class FirstImageCheck:
         self._note = f"ONNX: agrees with onnxruntime on this image to {deviation:.1g} of its range"
         return self._note
 
-    def _expected(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        """The output of onnxruntime on the CPU, in float32. ModelError if it does not run."""
+    def _expected(self, output: str, inputs: Mapping[str, Tensor]) -> Tensor:
+        """The output of onnxruntime on the CPU. ModelError if it does not run."""
         import onnxruntime as ort
         from onnxruntime.capi import onnxruntime_pybind11_state as binding
 
@@ -239,14 +219,10 @@ class FirstImageCheck:
         raised: tuple[type[Exception], ...] = (*own, RuntimeError, ValueError)
         try:
             session = ort.InferenceSession(
-                self._source, options, providers=["CPUExecutionProvider"]
+                str(self._file), options, providers=["CPUExecutionProvider"]
             )
-            halves = {i.name for i in session.get_inputs() if i.type == "tensor(float16)"}
-            feed = {
-                name: (value.half() if name in halves else value.float()).cpu().numpy()
-                for name, value in inputs.items()
-            }
-            return torch.from_numpy(session.run(None, feed)[0]).float()
+            feed = {name: value.float().cpu().numpy() for name, value in inputs.items()}
+            return torch.from_numpy(session.run([output], feed)[0]).float()
         except raised as error:
             reason = describe(error)
             raise ModelError(

@@ -125,19 +125,13 @@ def reduce(node: Node, inputs: Inputs) -> Tensor:
     return _REDUCTIONS[node.op](inputs[0], axes, bool(node.get("keepdims", 1)))
 
 
-@operator("ArgMax", "ArgMin")
-def arg_extreme(node: Node, inputs: Inputs) -> Tensor:
-    function = torch.argmax if node.op == "ArgMax" else torch.argmin
-    return function(inputs[0], node.get("axis", 0), keepdim=bool(node.get("keepdims", 1)))
-
-
 # ------------------------------------------------------------------ shapes and parts
 
 TYPES = {
     1: torch.float32, 2: torch.uint8, 3: torch.int8, 5: torch.int16, 6: torch.int32,
-    7: torch.int64, 9: torch.bool, 10: torch.float32, 11: torch.float64, 16: torch.float32,
+    7: torch.int64, 9: torch.bool, 11: torch.float64,
 }  # fmt: skip
-"""TensorProto.DataType; half precision is computed in float32."""
+"""TensorProto.DataType."""
 
 
 register(

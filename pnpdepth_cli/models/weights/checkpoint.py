@@ -31,11 +31,10 @@ _PREFIXES = ("module.", "_orig_mod.", "model.")
 """Prefixes of torch's DataParallel, of torch.compile, and of modules that hold the network."""
 
 _WRAPPED = re.compile(f"^(?:{'|'.join(map(re.escape, _PREFIXES))})+")
-_INDEX = ".index"  # of a TensorFlow checkpoint
 _READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     ".safetensors": ("safetensors file", load_file),
     ".npy": ("numpy file", read_numpy_file),
-    _INDEX: ("TensorFlow checkpoint", read_tensor_bundle),
+    ".index": ("TensorFlow checkpoint", read_tensor_bundle),
 }
 """Kind and reader by suffix; any other file is one of torch."""
 
@@ -87,9 +86,7 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
 def _check_file(path: Path) -> None:
     """CheckpointError unless the file is there itself, no larger than memory holds."""
     if not path.is_file():
-        index = path.with_name(path.name + _INDEX)
-        hint = f"; {index.name} does, name that" if index.is_file() else ""
-        raise CheckpointError(f"checkpoint {path} does not exist{hint}")
+        raise CheckpointError(f"checkpoint {path} does not exist")
     check_network_file(path, "checkpoint", CheckpointError)
 
 
@@ -190,8 +187,7 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
     stored = _without_prefixes(read_checkpoint(path, notes), path, notes, own)
     state = _renamed(definition, stored, path)
-    misfit = f"checkpoint {path} does not fit network {definition.name!r}"
-    _check_fit(own, state, misfit)
+    _check_fit(own, state, f"checkpoint {path} does not fit network {definition.name!r}")
     # A sum shows a value that is not finite, without a copy of the tensor.
     broken = [
         name
@@ -203,10 +199,7 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
             f"checkpoint {path}: {len(broken)} of its weights are NaN or infinite"
             f" ({_some(broken)}); was its training broken off?"
         )
-    try:
-        network.load_state_dict({**own, **state})
-    except RuntimeError as error:
-        raise CheckpointError(f"{misfit}: {describe(error)}") from None
+    network.load_state_dict(state, strict=False)
     return notes
 
 

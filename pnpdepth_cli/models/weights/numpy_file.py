@@ -41,12 +41,9 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
     if not (isinstance(objects, list) and len(objects) == 1 and isinstance(objects[0], Mapping)):
         raise BrokenFileError("it holds no dict of arrays")
     tensors: dict[str, Tensor] = {}
-    made: dict[int, Tensor] = {}
     for name, value in _entries(objects[0]):
-        if id(value) not in made:
-            made[id(value)] = _unpickle(value, name, left)
-            left -= made[id(value)].nbytes
-        tensors[name] = made[id(value)]
+        tensors[name] = _unpickle(value, name, left)
+        left -= tensors[name].nbytes
         count = len(tensors)
         check_claim(f"it has {count:,} arrays", count, _MAX_ENTRIES, error=BrokenFileError)
     return tensors

@@ -149,10 +149,6 @@ class _Machine:
                     stack[-1].state = state
             case "BINPERSID":
                 stack.append(self._persistent(stack.pop()))
-            case "POP":
-                stack.pop()
-            case "POP_MARK":
-                self._to_mark()
             case "PROTO" | "FRAME" | "STOP":
                 pass
             case _ if opcode in _LITERALS:

@@ -166,23 +166,12 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
     assert network.verify((image(1, 3, 32, 48),))
 
 
-# ------------------------------------------------------------------ half precision
-
-
-@pytest.mark.parametrize("keep_io_types", [True, False])
-def test_a_network_in_half_precision_is_run_though_its_nodes_are_not_in_order(
-    tmp_path: Path, keep_io_types: bool
-) -> None:
+def test_a_network_in_half_precision_is_refused(tmp_path: Path) -> None:
     from onnxruntime.transformers.float16 import convert_float_to_float16
 
     whole = onnx.load(write_network(tmp_path / "net.onnx"))
-    half = convert_float_to_float16(whole, keep_io_types=keep_io_types)
-    onnx.save(half, tmp_path / "half.onnx")
-    network = load_network(str(tmp_path / "half.onnx"), None)
-    x = image(1, 3, 32, 48)
-    assert "agrees with onnxruntime" in network.verify((x,))[0]
-    expected = load_network(str(tmp_path / "net.onnx"), None).module(x)
-    assert torch.allclose(network.module(x), expected, atol=1e-2)
+    onnx.save(convert_float_to_float16(whole, keep_io_types=True), tmp_path / "half.onnx")
+    assert "float32" in refused(tmp_path / "half.onnx")
 
 
 # ------------------------------------------------------------------ files that mean harm

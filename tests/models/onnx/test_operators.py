@@ -25,7 +25,7 @@ from pnpdepth_cli.models.onnx.graph import OnnxGraph  # noqa: E402
 F32, I64 = np.float32, np.int64
 KINDS = {np.dtype(kind) for kind in ("f4", "f8", "i1", "i4", "i8", "u1", "?")}
 WITHOUT_CASES = {"Cast", "Constant", "LayerNormalization"}
-PARTLY_COVERED = {"ArgMax", "ArgMin", "AveragePool", "Dropout", "GatherND", "IsInf", "MaxPool"}
+PARTLY_COVERED = {"AveragePool", "Dropout", "GatherND", "IsInf", "MaxPool"}
 PARTLY_COVERED |= {"Pad", "ReduceSum", "Resize", "ScatterND"}
 """Operators some of whose attributes are refused."""
 OTHERWISE = {
