@@ -134,45 +134,25 @@ class Measure:
             return f"{value:.{self.decimals}%}"
         return f"{value * self.shown_factor:,.{self.decimals}f} {unit}".rstrip()
 
-    def value(self, *inputs: Any) -> float:
-        """Returns the value by the function of images."""
-        assert self.formula is not None
-        return self.formula(*inputs)
-
     def to_json(self) -> dict[str, Any]:
         """Returns all but the formula."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
 
-class FrameMeans:
-    """The means of values over frames, each over the frames that have the value.
-
-    The frames are not kept.
+def frame_means(frames: Iterable[Mapping[str, float | None]]) -> dict[str, float | None]:
+    """Returns the mean of each value over the frames that have it; None where no frame does.
 
     Args:
         frames: Values of each frame by their key; None and NaN where a frame has none.
     """
-
-    def __init__(self, frames: Iterable[Mapping[str, float | None]] = ()) -> None:
-        self._sums: dict[str, tuple[float, int]] = {}
-        for values in frames:
-            self.add(values)
-
-    def add(self, values: Mapping[str, float | None]) -> None:
-        """Adds a frame."""
+    sums: dict[str, tuple[float, int]] = {}
+    for values in frames:
         for key, value in values.items():
-            total, count = self._sums.setdefault(key, (0.0, 0))
+            total, count = sums.get(key, (0.0, 0))
             if value is not None and math.isfinite(value):
-                self._sums[key] = total + value, count + 1
-
-    @property
-    def frames(self) -> int:
-        """The number of frames that have any of the values."""
-        return max((count for _, count in self._sums.values()), default=0)
-
-    def means(self) -> dict[str, float | None]:
-        """Returns the means by their key; None where no frame has the value."""
-        return {key: total / count if count else None for key, (total, count) in self._sums.items()}
+                total, count = total + value, count + 1
+            sums[key] = total, count
+    return {key: total / count if count else None for key, (total, count) in sums.items()}
 
 
 MEASURES = (

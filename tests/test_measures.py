@@ -11,7 +11,7 @@ from scipy.integrate import trapezoid
 
 from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.measures import DELTA_THRESHOLDS, OF_SIGMA, TABLE, FrameMeans, by_depth
+from pnpdepth_cli.measures import DELTA_THRESHOLDS, OF_SIGMA, TABLE, by_depth, frame_means
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 MAIN = ("rmse", "mae", "mre", "delta1")
@@ -78,12 +78,18 @@ def frames() -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
+def of(key: str, depth: np.ndarray, truth: np.ndarray) -> float:
+    formula = TABLE[key].formula
+    assert formula is not None
+    return formula(depth, truth)
+
+
 def test_boundary_f1_is_that_of_depth_pro_and_of_moge() -> None:
     for depth, truth in frames():
         wide = depth.astype(np.float64), truth.astype(np.float64)
-        assert TABLE["boundary_f1"].value(depth, truth) == pytest.approx(depth_pro(*wide), abs=1e-9)
+        assert of("boundary_f1", depth, truth) == pytest.approx(depth_pro(*wide), abs=1e-9)
         for radius in (1, 2, 3):
-            found = TABLE[f"boundary_f1_{radius}px"].value(depth, truth)
+            found = of(f"boundary_f1_{radius}px", depth, truth)
             assert found == pytest.approx(moge(*wide, radius), abs=1e-9)
             assert 0 <= found < 1
 
@@ -91,11 +97,11 @@ def test_boundary_f1_is_that_of_depth_pro_and_of_moge() -> None:
 def test_a_step_in_its_place_scores_one_and_a_shifted_or_a_missing_one_nothing() -> None:
     step = np.where(np.arange(20) < 10, np.float32(2), np.float32(3)) + np.zeros((9, 1), np.float32)
     # Depth Pro: the step is seen in one of four directions, and the others count as missed
-    assert [measure.value(step, step) for measure in TABLE.values()] == [0.25, 1, 1, 1]
-    assert TABLE["boundary_f1_1px"].value(np.roll(step, 1, axis=1)[:, 1:], step[:, 1:]) == 0
-    assert TABLE["boundary_f1_1px"].value(np.ones_like(step), step) == 0
+    assert [of(key, step, step) for key in TABLE] == [0.25, 1, 1, 1]
+    assert of("boundary_f1_1px", np.roll(step, 1, axis=1)[:, 1:], step[:, 1:]) == 0
+    assert of("boundary_f1_1px", np.ones_like(step), step) == 0
     lone = np.where(np.arange(20) % 5 == 0, step, 0)
-    assert np.isnan(TABLE["boundary_f1"].value(step, np.where(np.arange(9)[:, None] % 5, 0, lone)))
+    assert np.isnan(of("boundary_f1", step, np.where(np.arange(9)[:, None] % 5, 0, lone)))
 
 
 def test_errors_by_depth_are_those_of_the_pixels_of_each_part() -> None:
@@ -118,16 +124,15 @@ def test_errors_by_depth_are_those_of_the_pixels_of_each_part() -> None:
 
 
 def test_a_mean_is_over_the_frames_that_have_the_value() -> None:
-    means = FrameMeans([{"mae": 1.0, "rmse": 4.0}, {"mae": 2.0, "rmse": np.nan}])
-    means.add({"mae": None, "rmse": None, "mre": None})
-    assert means.means() == {"mae": 1.5, "rmse": 4.0, "mre": None}
-    assert (means.frames, FrameMeans().frames) == (2, 0)
+    frames = [{"mae": 1.0, "rmse": 4.0}, {"mae": 2.0, "rmse": np.nan}, {"mae": None, "mre": None}]
+    assert frame_means(frames) == {"mae": 1.5, "rmse": 4.0, "mre": None}
+    assert frame_means([]) == {}
 
 
 def sigma_measures(depth: np.ndarray, gt: np.ndarray, sigma: np.ndarray) -> list[float]:
     """The fractions within one and two standard deviations, and AUSE."""
     images = [np.asarray(each, np.float32) for each in (depth, gt, sigma)]
-    return [measure.value(*images) for measure in OF_SIGMA]
+    return [measure.formula(*images) for measure in OF_SIGMA if measure.formula]
 
 
 def test_a_right_deviation_is_calibrated_and_one_of_half_the_size_is_not() -> None:

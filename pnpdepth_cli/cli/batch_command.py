@@ -120,10 +120,7 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
 
 
 def _request_of(values: dict[str, Any], combination: Combination) -> BatchRequest:
-    """Returns the request of these options, with the frames of a bag unpacked.
-
-    The results of a combination of varied options lie in a folder of its own.
-    """
+    """Returns the request of these options and varied ones, with the frames of a bag unpacked."""
     from pnpdepth_cli.commands.batch.find_frames import unpack
 
     own = options.take_options(BatchRequest, values)

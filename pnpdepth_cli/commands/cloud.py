@@ -153,7 +153,7 @@ def _merge(
 def _depth(request: CloudRequest, frame: ResultFrame, notes: list[str]) -> NDArray[np.float32]:
     """The depth of a frame (H, W), 0 where it is excluded. What is no depth is told in `notes`."""
     depth, keep = frame.read(request.depth_scale)
-    far, lines = far_values(depth[keep], frame.unit)
+    far, lines = far_values(depth[keep], frame.record.unit)
     keep[keep] = ~far
     notes.extend(f"{frame.depth}: {line}" for line in lines)
     keep &= depth <= request.max_depth

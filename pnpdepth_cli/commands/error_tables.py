@@ -86,10 +86,7 @@ def _table(
     titles: Mapping[str, str],
     keys: Sequence[str] | None = None,
 ) -> Table:
-    """A row for each stage in the order of the titles: its errors, and those against linear ones.
-
-    The last stage of the method is in bold.
-    """
+    """A row for each stage in the order of the titles: its errors, also against linear ones."""
     shown = [stage for stage in titles if stage in stages]
     last = AFTER if AFTER in stages else PROPAGATED
     scores = stages[last]

@@ -39,11 +39,6 @@ class ResultFrame:
         image = None if entry is None else source_of(entry.path)
         return image if image is not None and file_of(image).is_file() else None
 
-    @property
-    def unit(self) -> str:
-        """The unit of the depth."""
-        return self.record.unit
-
     @functools.cached_property
     def camera_and_pose(self) -> tuple[Camera | None, Pose | None]:
         """The camera that the record holds, and its pose. Raises FileFormatError if damaged."""

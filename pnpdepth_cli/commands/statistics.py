@@ -112,10 +112,7 @@ def block_length(series: Floats) -> int:
 
 
 def _sums(values: Sequence[Floats], clusters: Clusters) -> tuple[Floats, Floats]:
-    """(R, G) sums of R runs (N,) in each cluster that has any, and (G,) how many frames they have.
-
-    Frames count that all runs have.
-    """
+    """(R, G) sums of R runs (N,) in each cluster, and (G,) its frames, of those all runs have."""
     known = np.isfinite(values).all(axis=0)
     ids = np.unique(clusters.ids[known], return_inverse=True)[1]
     counts = np.bincount(ids).astype(np.float64)

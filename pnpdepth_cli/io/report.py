@@ -54,23 +54,18 @@ class Head:
 
 
 def check_report_folder(
-    folder: Path, inputs: Sequence[Path], *, made_of: Mapping[str, object] | None, overwrite: bool
+    folder: Path, *, made_of: Mapping[str, object] | None, overwrite: bool
 ) -> None:
-    """Raises OutputError for a folder that holds inputs, lies in one, or is not this report's.
+    """Raises OutputError for a folder that holds anything but this report.
 
     Args:
         folder: The report's folder.
-        inputs: Files and folders that are read.
         made_of: Sources of an earlier report in it, as given to `write_report`.
         overwrite: Whether another report may be replaced.
     """
     there = next((path for path in (folder, *folder.parents) if path.exists()), folder)
     if there.is_file():
         raise OutputError(f"{there} is a file; name a folder for the report")
-    resolved = folder.resolve()
-    for source in inputs:
-        if resolved.is_relative_to(source.resolve()):
-            raise OutputError(f"{folder} lies in {source}, which is read; name another folder")
     try:
         names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     except OSError as error:

@@ -83,18 +83,13 @@ def test_a_page_that_fails_midway_leaves_the_old_one(tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {"index.html", "images", "report.json"}
 
 
-@pytest.mark.parametrize(
-    "folder", ["in", "in/deep/report", ".", "file", "file/deep", "full", "link"]
-)
-def test_inputs_and_other_files_are_safe(
-    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("folder", [".", "file", "file/deep", "full", "link"])
+def test_other_files_are_safe(folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("in", "full"):
-        Path(name).mkdir()
+    Path("full").mkdir()
     Path("file").write_text("mine")
     Path("full/notes.txt").write_text("mine")
-    Path("link").symlink_to("in")
-    for overwrite in (False, folder != "full"):
+    Path("link").symlink_to("full")
+    for overwrite in (False, True):
         with pytest.raises(OutputError):
-            check_report_folder(Path(folder), [Path("in")], made_of=None, overwrite=overwrite)
+            check_report_folder(Path(folder), made_of=None, overwrite=overwrite)

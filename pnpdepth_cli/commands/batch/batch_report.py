@@ -8,7 +8,7 @@ where their panels are. So a report also has the frames of earlier runs.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,13 +50,12 @@ _SETTINGS = (
 )
 
 
-def check_batch_report(request: BatchRequest, folder: Path, files: Iterable[Path]) -> None:
+def check_batch_report(request: BatchRequest, folder: Path) -> None:
     """Raises OutputError for a folder that the report cannot or may not be written to.
 
     Args:
         request: Request of the batch.
         folder: Folder of the report.
-        files: Files that the batch reads.
     """
     inside, output = folder.resolve(), request.output.resolve()
     if output.is_relative_to(inside):
@@ -64,10 +63,8 @@ def check_batch_report(request: BatchRequest, folder: Path, files: Iterable[Path
             f"{folder} holds the results; name a folder of its own for the report, such as"
             f" {request.output / 'report'}"
         )
-    lists = [request.source] if request.source.is_file() else []
-    inputs = [*lists, *files] if folder.exists() else []
     overwrite = request.refine.outputs.overwrite
-    check_report_folder(folder, inputs, made_of=_source(request, folder), overwrite=overwrite)
+    check_report_folder(folder, made_of=_source(request, folder), overwrite=overwrite)
 
 
 def write_batch_report(

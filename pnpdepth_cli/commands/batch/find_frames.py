@@ -8,20 +8,20 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.sequence import (
-    ESTIMATED,
-    with_neighbours,
-    with_poses,
-)
 from pnpdepth_cli.commands.refinement.output_files import outputs_in
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import FramesRequest
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
+    Neighbour,
     Unmatched,
+    as_pose,
     file_of,
+    groups_by_name,
     name_problem,
 )
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
@@ -29,10 +29,12 @@ from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.poses import POSES_FILE
+from pnpdepth_cli.io.poses import POSES_FILE, poses_of_frames
 from pnpdepth_cli.protocols import find_protocol
 
 CSV, JSON = "summary.csv", "summary.json"
+ESTIMATED = "estimated from the images"
+"""Where the motion of frames without poses is from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +82,8 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
     layout, frames, lost = list_frames(source, request.layout)
-    folders = {source, *(path.parent for frame in frames for path in source_files(frame))}
+    parts = (part for frame in frames for part in (frame.image, frame.sparse, frame.gt))
+    folders = {source, *(file_of(part).parent for part in parts if part is not None)}
     if any(folder.is_dir() and _is_inside(folder, output) for folder in folders):
         raise OutputError(
             f"{output} holds the frames themselves; name a folder of its own, such as"
@@ -121,15 +124,22 @@ def _with_poses(
     request: BatchRequest, frames: list[FrameFiles]
 ) -> tuple[list[FrameFiles], str | None]:
     """The frames with their poses and neighbours, and where the poses are from, as a line."""
+    # Poses of a file, or the frames' own.
     path, beside = request.poses, request.source / POSES_FILE  # as `pnpdepth frames` writes it
     if path is None and not any(f.pose for f in frames) and beside.is_file():
         path = beside
-    try:
-        frames, source = with_poses(frames, path, request.pose_kind)
-    except InputError as error:
-        if request.poses is not None or request.accumulate:
-            raise
-        return frames, f"note: {error}; records get no poses"
+    source = "the layout's"
+    if path is not None:
+        if any(frame.sparse is not None and frame.sparse.is_dir() for frame in frames):
+            raise UsageError("--poses: the COLMAP model has those of its images; leave it out")
+        try:
+            rows, how = poses_of_frames(path, [frame.name for frame in frames], request.pose_kind)
+        except InputError as error:
+            if request.poses is not None or request.accumulate:
+                raise
+            return frames, f"note: {error}; records get no poses"
+        frames = [replace(f, pose=as_pose(row)) for f, row in zip(frames, rows, strict=True)]
+        source = f"{path}, {how}"
     if request.accumulate:
         frames = with_neighbours(frames, request.accumulate, source)
     # Poses of some frames, all, or none.
@@ -138,6 +148,65 @@ def _with_poses(
         return frames, f"poses: {ESTIMATED}" if request.accumulate else None
     some = "" if count == len(frames) else f" ({count:,} of {len(frames):,} frames)"
     return frames, f"poses: {source}{some}"
+
+
+def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
+    """Returns the indices of the frames of each sequence, which one camera took, in order."""
+    by_name = groups_by_name([frame.name for frame in frames])
+    sequences: dict[tuple[str, int | None], list[int]] = {}
+    for index, (frame, name) in enumerate(zip(frames, by_name, strict=True)):
+        group = name if frame.group is None else frame.group
+        sequences.setdefault((group, frame.camera), []).append(index)
+    return {
+        group if camera is None else f"{group}_{camera}": indices
+        for (group, camera), indices in sequences.items()
+    }
+
+
+def with_neighbours(
+    frames: Sequence[FrameFiles], reach: int, source: str = "the layout's"
+) -> list[FrameFiles]:
+    """Returns the frames, each with those at most `reach` before and after it in its sequence.
+
+    Args:
+        frames: All frames of the data set. The motion of those without pose is to be estimated.
+        reach: Number of frames to each side.
+        source: Where the poses are from, for a person.
+
+    Raises:
+        UsageError: A frame has no points, or its points are those of all images already;
+            or neither its pose nor its image is known.
+    """
+    result = list(frames)
+    for sequence in sequences_of(frames).values():
+        for number, index in enumerate(sequence):
+            near = range(max(0, number - reach), min(len(sequence), number + reach + 1))
+            neighbours = (
+                _neighbour(frames[index], frames[sequence[other]], abs(other - number), source)
+                for other in near
+                if other != number
+            )
+            result[index] = replace(frames[index], neighbours=tuple(neighbours))
+    return result
+
+
+def _neighbour(frame: FrameFiles, other: FrameFiles, apart: int, source: str) -> Neighbour:
+    if (other.sparse or other.gt) is None or (other.sparse is not None and other.sparse.is_dir()):
+        raise UsageError(
+            f"{other.name}: --accumulate takes depth maps or scans of single frames, not"
+            f" {'images alone' if other.sparse is None else 'a COLMAP model'}"
+        )
+    if frame.pose is None or other.pose is None:
+        if other.image is None:
+            raise UsageError(
+                f"{other.name}: --accumulate needs the poses of frames without images; give --poses"
+            )
+        return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
+    pose, other_pose = np.array(frame.pose), np.array(other.pose)
+    turn = pose[:, :3].T @ other_pose[:, :3]
+    shift = pose[:, :3].T @ (other_pose[:, 3] - pose[:, 3])
+    motion = as_pose(np.column_stack([turn, shift]))
+    return Neighbour(files=other, motion=motion, poses=source, apart=apart)
 
 
 def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
@@ -161,12 +230,6 @@ def _files_to_read(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
     scan = frame.sparse
     is_scan = scan is not None and scan.suffix.lower() in SCAN_ONLY_SUFFIXES
     return replace(files, sparse=None, gt=scan if frame.gt is None and is_scan else frame.gt)
-
-
-def source_files(frame: FrameFiles) -> list[Path]:
-    """Returns the files of the frame's image, sparse depth and ground truth."""
-    parts = [frame.image, frame.sparse, frame.gt]
-    return [file_of(part) for part in parts if part is not None]
 
 
 def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
@@ -202,12 +265,10 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
 
 
 def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
-    """Raises InputError for a frame whose results have no files of their own.
-
-    Names that differ in Unicode normalisation only are one file on macOS.
-    """
+    """Raises InputError for a frame whose results have no files of their own."""
     endings = [path.name for path in outputs_in(Path(), "", refine).values()]
     owners = dict.fromkeys((CSV, JSON), "the batch")  # by the file
+    # names that differ in Unicode normalisation only are one file on macOS
     names = {frame.name: unicodedata.normalize("NFC", frame.name) for frame in frames}
     for own, name in names.items():
         files = [name + ending for ending in endings]

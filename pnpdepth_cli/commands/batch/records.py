@@ -123,10 +123,7 @@ class Records:
 
 
 def _settings_of(request: RefineRequest, *groups: str) -> dict[str, object]:
-    """The settings of these groups, or all, that decide a frame's result, in JSON's own types.
-
-    The files of the frame, its calibration among them, are compared by their content elsewhere.
-    """
+    """The settings of these groups, or all, that decide a frame's result, in JSON's own types."""
     values = request.settings(*groups)
     values.pop("more_models", None)
     if neighbours := values.pop("neighbours", None):
@@ -134,16 +131,13 @@ def _settings_of(request: RefineRequest, *groups: str) -> dict[str, object]:
     if "device" in values:  # devices of one kind give equal results, so shards may use one each
         values["device"] = values["device"].split(":")[0]
     settings: dict[str, Any] = plain(values)
-    for name in ("calib", "extrinsics"):
+    for name in ("calib", "extrinsics"):  # files are compared by their content elsewhere
         settings.get("scan", {}).pop(name, None)
     return settings
 
 
 def _code_of(request: RefineRequest) -> dict[str, object]:
-    """The program's version, and the digests of the network's files and of the user's code.
-
-    A file's name with its :ATTRIBUTE, :OUTPUT or :KEY counts; its folder does not.
-    """
+    """The program's version, and the digests of the network's files and of the user's code."""
     network, method = request.network, request.method
     identity = {"version": __version__, **_identity(network.model), "checkpoint": None}
     if network.checkpoint is not None:
@@ -160,6 +154,7 @@ def _code_of(request: RefineRequest) -> dict[str, object]:
 
 
 def _identity(spec: str) -> dict[str, object]:
+    """A network's name with its :ATTRIBUTE, :OUTPUT or :KEY, without the folder of a file."""
     path, part = file_and_part(Path(spec))
     files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
     return {

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from typing import Protocol
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames, source_files
+from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames, sequences_of
 from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
-from pnpdepth_cli.commands.batch.sequence import sequences_of
 from pnpdepth_cli.commands.batch.summary import BatchSummary, write_summary
 from pnpdepth_cli.commands.error_tables import names_of_depths
 from pnpdepth_cli.commands.ordered_pool import in_order
@@ -64,8 +63,7 @@ def run_batch(
     if request.html is not None:
         from pnpdepth_cli.commands.batch.batch_report import check_batch_report
 
-        files = (path for frame in found.frames for path in source_files(frame))
-        check_batch_report(request, request.html, files)
+        check_batch_report(request, request.html)
     for note in _notes(request, found):
         listener.say(note)
     if not refine.outputs.overwrite:
@@ -74,14 +72,9 @@ def run_batch(
     with lock_folder(request.output, request.shard):
         if request.shard is None and (leftovers := remove_all_leftovers(request.output)):
             listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
-        # The frames of a sequence may have adapted weights.
-        adapted = _adapt(own, found.frames, listener, stopped) if request.adapt else {}
-
-        def records_of(frame: FrameFiles) -> Records:
-            return adapted.get(frame.name, own)
-
-        # Those that are not done are refined.
-        reasons = in_order(lambda f: records_of(f).reason_to_refine(f), found.chosen, _READERS)
+        # Those that are not done are refined; the frames of a sequence may have adapted weights.
+        of_frame = _records_of_frames(own, found.frames, listener, stopped)
+        reasons = in_order(lambda f: of_frame[f.name].reason_to_refine(f), found.chosen, _READERS)
         why = {frame.name: reason for frame, reason in zip(found.chosen, reasons, strict=True)}
         to_do = [frame for frame in found.chosen if why[frame.name]]
         listener.say(_plan([*why.values()]))
@@ -89,34 +82,36 @@ def run_batch(
             listener.begin(len(to_do))
             worked = len(to_do) < len(found.chosen)
             with closing(
-                _refine(to_do, found.frames, records_of, worked, listener, stopped)
+                _refine(to_do, found.frames, of_frame, worked, listener, stopped)
             ) as records:
                 _follow(records, listener)
         # All that are done are summed up; the summary of the shard that ends last stays.
-        known = in_order(lambda f: records_of(f).record_of(f), found.frames, _READERS)
+        known = in_order(lambda f: of_frame[f.name].record_of(f), found.frames, _READERS)
         with in_turn(request.output):
             return write_summary(request, found, own.settings, [*filter(None, known)])
 
 
-def _adapt(
+def _records_of_frames(
     own: Records, frames: Sequence[FrameFiles], listener: Listener, stopped: Callable[[], bool]
 ) -> dict[str, Records]:
-    """Lets weights learn from the points of each sequence; the records of frames that get them."""
+    """The records that each frame belongs to, by its name: of the batch, or of adapted weights."""
     from pnpdepth_cli.commands.batch.adapted import with_adapted_weights
 
-    adapted: dict[str, Records] = {}
+    records = dict.fromkeys([frame.name for frame in frames], own)
+    if not own.request.adapt:
+        return records
     for name, indices in sequences_of(frames).items():
         sequence = [frames[index] for index in indices]
         request = with_adapted_weights(own, name, sequence, listener.say, stopped)
         if request is not own.request:
-            adapted |= dict.fromkeys([frame.name for frame in sequence], Records(request))
-    return adapted
+            records |= dict.fromkeys([frame.name for frame in sequence], Records(request))
+    return records
 
 
 def _refine(
     to_do: Sequence[FrameFiles],
     frames: Sequence[FrameFiles],
-    records_of: Callable[[FrameFiles], Records],
+    of_frame: Mapping[str, Records],
     worked: bool,
     listener: Listener,
     stopped: Callable[[], bool],
@@ -126,12 +121,12 @@ def _refine(
     from pnpdepth_cli.commands.batch.ray_workers import refine_on_workers
     from pnpdepth_cli.commands.batch.running import open_method, refine_frames, spread
 
-    for number, records in enumerate(dict.fromkeys(map(records_of, to_do))):
+    for number, records in enumerate(dict.fromkeys(of_frame[frame.name] for frame in to_do)):
         if number and stopped():
             return
         # The frames that are refined alike. Some of all decide for every run and shard.
-        wanted = [frame for frame in to_do if records_of(frame) is records]
-        alike = [frame for frame in frames if records_of(frame) is records]
+        wanted = [frame for frame in to_do if of_frame[frame.name] is records]
+        alike = [frame for frame in frames if of_frame[frame.name] is records]
         deciding = [alike[number] for number in spread(len(alike))]
         if records.request.ray is not None:
             yield from refine_on_workers(

@@ -131,7 +131,9 @@ def refine_frames(
                 return
             if work.frame is not None:
                 with work.step("refine"):
-                    work.refined = _refine(method, work.frame)
+                    if method is None:
+                        raise InputError("no frame could be read when the batch began; try again")
+                    work.refined = method.refine(work.frame)
             worked |= work.refined is not None
             fatal = StorageError if worked else (StorageError, ModelError, UsageError)
             if isinstance(work.error, fatal):
@@ -146,12 +148,6 @@ def refine_frames(
         closing(in_order(write, refine(reading), THREADS)) as done,
     ):
         yield from done
-
-
-def _refine(method: Method | None, frame: Frame) -> Refined:
-    if method is None:
-        raise InputError("no frame could be read when the batch began; run it again")
-    return method.refine(frame)
 
 
 def _write(work: _Work, method: Method | None, records: Records) -> FrameRecord:

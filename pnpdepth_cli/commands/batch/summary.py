@@ -16,7 +16,7 @@ from pnpdepth_cli.commands.tables import Table, write_text
 from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.io.text_files import write_json
-from pnpdepth_cli.measures import COVERAGE, MEASURES, FrameMeans
+from pnpdepth_cli.measures import COVERAGE, MEASURES, frame_means
 from pnpdepth_cli.stages import AFTER, BASES, GT
 
 _MEASURED = (*(measure.key for measure in MEASURES), COVERAGE.key)
@@ -81,14 +81,7 @@ def summarise(
     settings: Mapping[str, object],
     records: Sequence[FrameRecord],
 ) -> BatchSummary:
-    """Returns the summary of a batch.
-
-    Args:
-        request: The batch.
-        found: Its frames.
-        settings: What decides the results.
-        records: The record of each frame that has one.
-    """
+    """Returns the summary of a batch, from the record of each frame that has one."""
     # Counts of frames.
     results = [record for record in records if record.status != "failed"]
     statuses = Counter[str](record.status for record in records)
@@ -143,15 +136,17 @@ def _noted(records: Iterable[FrameRecord]) -> list[Noted]:
 
 def _means(records: Iterable[FrameRecord]) -> dict[str, dict[str, Scores]]:
     """The mean errors over frames, by basis and stage, with their number."""
-    totals = defaultdict[str, defaultdict[str, FrameMeans]](lambda: defaultdict(FrameMeans))
+    of_stages = defaultdict[tuple[str, str], list[Scores]](list)
     for record in records:
         for basis, stages in record.errors.items():
             for stage, scores in stages.items():
-                totals[basis][stage].add({k: v for k, v in scores.items() if k in _MEASURED})
-    return {
-        basis: {stage: {"frames": of.frames, **of.means()} for stage, of in stages.items()}
-        for basis, stages in totals.items()
-    }
+                own = {key: value for key, value in scores.items() if key in _MEASURED}
+                of_stages[basis, stage].append(own)
+    means: dict[str, dict[str, Scores]] = {}
+    for (basis, stage), frames in of_stages.items():
+        count = sum(any(value is not None for value in own.values()) for own in frames)
+        means.setdefault(basis, {})[stage] = {"frames": count, **frame_means(frames)}
+    return means
 
 
 def _notes(records: Sequence[FrameRecord]) -> list[str]:
@@ -170,10 +165,7 @@ def write_summary(
     settings: Mapping[str, object],
     records: Sequence[FrameRecord],
 ) -> BatchSummary:
-    """Writes `summary.json`, with the records as its list `frames`, `summary.csv` and the report.
-
-    Arguments are those of `summarise`.
-    """
+    """Writes `summary.json`, with the records as its `frames`, `summary.csv` and the report."""
     summary = summarise(request, found, settings, records)
     frames = [record.to_json() for record in records]
     write_json(request.output / JSON, {**asdict(summary), "frames": frames})

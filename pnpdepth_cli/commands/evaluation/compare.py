@@ -28,7 +28,7 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.text_files import plain, read_json
-from pnpdepth_cli.measures import COVERAGE, MEASURES, FrameMeans, Measure, choose_measures
+from pnpdepth_cli.measures import COVERAGE, MEASURES, Measure, choose_measures, frame_means
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.stages import AFTER, BEFORE, GT
 
@@ -63,7 +63,7 @@ class Run:
     def means(self, frames: Sequence[str], keys: Sequence[str], stage: str = "") -> Means:
         """Returns the means of these values over these frames at that stage, else its own."""
         scores = (self.scores(frame, stage) for frame in frames)
-        return FrameMeans({key: own.get(key) for key in keys} for own in scores).means()
+        return frame_means({key: own.get(key) for key in keys} for own in scores)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +142,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     groups = [runs[0].frames[name].group or group for name, group in by_name]
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     means = [
-        FrameMeans(dict(zip(keys, row, strict=True)) for row in of_run).means()
+        frame_means(dict(zip(keys, row, strict=True)) for row in of_run)
         for of_run in values.tolist()
     ]
     gains = _gains(values, means, measures, clusters)
@@ -167,7 +167,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
             for run, name, mean, of_first in compared
         ),
         clusters=clusters,
-        notes=[*_notes_on_frames(runs, names), *_notes_on_tests(measures, known, clusters, runs)],
+        notes=[*_notes(runs, names, measures, known, clusters)],
     )
 
 
@@ -199,10 +199,7 @@ def _gains(
     measures: Sequence[Measure],
     clusters: Clusters,
 ) -> list[dict[str, Gain]]:
-    """The gain of each run but the first by measure.
-
-    The values are (runs, frames, measures), NaN where a frame lacks a measure in any run.
-    """
+    """The gain of each run but the first by measure, of values (runs, frames, measures)."""
     first, *others = values.transpose(0, 2, 1)
     p_values = [
         [swap_p_value(*pair, clusters) for pair in zip(first, other, strict=True)]
@@ -225,8 +222,15 @@ def _gains(
     return gains
 
 
-def _notes_on_frames(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]:
-    """Warnings of frames and pixels that not all runs scored."""
+def _notes(
+    runs: Sequence[Run],
+    names: Sequence[str],
+    measures: Sequence[Measure],
+    known: NDArray[np.bool_],
+    clusters: Clusters,
+) -> Iterator[str]:
+    """What not all runs scored, and whether frames are too dependent or too few to conclude."""
+    # Frames, pixels and measures that not all runs have.
     for run in runs:
         if unshared := [name for name in run.frames if name not in names]:
             yield (
@@ -242,19 +246,11 @@ def _notes_on_frames(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]
             f" (coverage: {shares}), and a run that leaves hard pixels empty looks better; this is"
             " no ranking"
         )
-
-
-def _notes_on_tests(
-    measures: Sequence[Measure],
-    known: NDArray[np.bool_],
-    clusters: Clusters,
-    runs: Sequence[Run],
-) -> Iterator[str]:
-    """Measures that frames lack, and whether frames are too dependent or too few to conclude."""
     for measure, has in zip(measures, known.T, strict=True):
         if not has.all():
             of = f"{has.sum():,} of {len(has):,} frames"
             yield f"{measure.title}: over {of}; the others lack it in a run"
+    # The frames that count as independent.
     yield from clusters.notes()
     smallest, tests = 2.0 ** (1 - clusters.count), len(measures) * (len(runs) - 1)
     if len(known) > 1 and tests * smallest >= ALPHA:

@@ -28,7 +28,7 @@ from pnpdepth_cli.io.depth import scale_warning
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.text_files import plain
-from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, FrameMeans, Measure
+from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, Measure, frame_means
 from pnpdepth_cli.points import METRES
 
 _LISTED = 3
@@ -127,7 +127,7 @@ def evaluate(
     measures = (*request.measures, *of_sigma)
     keys = [measure.key for measure in measures]
     values = np.array([[each.get(key) for key in keys] for each in scores], np.float64)
-    mean = FrameMeans({key: each.get(key) for key in keys} for each in scores).means()
+    mean = frame_means({key: each.get(key) for key in keys} for each in scores)
     clusters = find_clusters([row.group or "" for row in scored], values)
     if request.is_devkit:
         exact = devkit_mean(values[:, : len(request.measures)]).tolist()
@@ -211,11 +211,7 @@ def _notes_on_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
 
 
 def _notes_on_scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
-    """How predictions were scaled, and what looks like a wrong scale.
-
-    Raises:
-        InputError: If a scale that was assumed is wrong by a factor between those in use.
-    """
+    """How predictions were scaled, and what looks like a wrong scale."""
     if factors := _numbers(scored, "factor"):
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan

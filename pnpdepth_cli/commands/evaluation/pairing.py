@@ -7,11 +7,9 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_by_name
-from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
@@ -25,20 +23,11 @@ _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 _LISTED = 5
 
 
-class FramePair(NamedTuple):
-    """The files of one frame to score."""
+FramePair = tuple[FrameFiles, ResultFrame | None]
+"""The files of one frame to score: the ground truth's frame, and the prediction, if there is one.
 
-    files: FrameFiles
-    """The ground truth's frame, with `gt`; sparse depth and image by the record of the prediction.
-
-    Sparse depth is None where its file does not say which points the network saw."""
-    result: ResultFrame | None
-    """The prediction, and what lies beside it; None without."""
-
-    @property
-    def record(self) -> FrameRecord:
-        """The record beside the prediction; an empty one where there is none."""
-        return FrameRecord() if self.result is None else self.result.record
+Sparse depth and image are those of the record of the prediction. Sparse depth is None where its
+file does not say which points the network saw."""
 
 
 def pair_frames(
@@ -66,10 +55,7 @@ def pair_frames(
         )
     # The predictions by name, and the frames with ground truth.
     notes: list[str] = []
-    predictions = {frame_name(prediction.stem): prediction}
-    truths = dict.fromkeys(predictions, ground_truth)
-    if prediction.is_dir():
-        predictions = depth_files(prediction)
+    predictions = depth_files(prediction)
     if layout is not None:
         frames = [replace(f, part=part or f.part) for f in frames if f.gt is not None]
         if not frames:
@@ -80,7 +66,9 @@ def pair_frames(
         note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
         notes.append(note + (f", of which {cuts} is used" if cuts else ""))
     else:
-        truths = depth_files(ground_truth) if ground_truth.is_dir() else truths
+        truths = dict.fromkeys(predictions, ground_truth)
+        if ground_truth.is_dir():
+            truths = depth_files(ground_truth)
         frames = [FrameFiles(name=name, gt=path) for name, path in truths.items()]
     # At least one name must be common to both.
     names = {frame.name: None for frame in frames}
@@ -103,10 +91,7 @@ def pair_frames(
 
 
 def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFiles]]:
-    """The layout and the frames of a data set: as the batch read it, else recognised anew.
-
-    None and none of files and folders of files.
-    """
+    """The layout and the frames of a data set: as the batch read it, else recognised anew."""
     summary = prediction / "summary.json"
     stated = read_json(summary).get("layout") if summary.is_file() else None
     for layout in (stated if stated in LAYOUTS else None, None):
@@ -120,16 +105,16 @@ def _pair(files: FrameFiles, prediction: Path | None) -> FramePair:
     if files.sparse is not None and files.sparse.suffix.lower() not in DEPTH_SUFFIXES:
         files = replace(files, sparse=None)  # a scan
     if prediction is None:
-        return FramePair(files, None)
+        return files, None
     try:
         (result,) = result_frames(prediction)
     except PnpDepthError:  # the record is damaged
-        return FramePair(files, ResultFrame(name=files.name, depth=prediction))
+        return files, ResultFrame(name=files.name, depth=prediction)
     sparse = result.record.inputs.get("sparse")
     if sparse is not None and not (sparse.sampled or sparse.calibration):
         path = Path(sparse.path)
         files = replace(files, sparse=path if path.is_file() else files.sparse)
-    return FramePair(replace(files, image=result.image or files.image), result)
+    return replace(files, image=result.image or files.image), result
 
 
 def frame_name(stem: str) -> str:
@@ -138,13 +123,15 @@ def frame_name(stem: str) -> str:
 
 
 def depth_files(folder: Path) -> dict[str, Path]:
-    """Returns the depth files below a folder by frame name, sorted.
+    """Returns the depth files below a folder, or a single one, by frame name, sorted.
 
     A frame in a subfolder has it in its name. Where files `x_depth` are, all others are no depth.
 
     Raises:
         InputError: If there is none, or two are one frame, or a folder cannot be read.
     """
+    if not folder.is_dir():
+        return {frame_name(folder.stem): folder}
     found, problems = find_files(folder, DEPTH_SUFFIXES)
     if problems:
         raise InputError(str(problems[0]))

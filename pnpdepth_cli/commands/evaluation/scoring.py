@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
+from pnpdepth_cli.commands.results import ResultFrame
 from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
 from pnpdepth_cli.dataset.arrays import apply_masks, raw_depth, read_image
 from pnpdepth_cli.dataset.frame_camera import camera_of_file
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
@@ -65,21 +67,20 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
     paths = (result and result.depth, files.gt, files.sparse, files.image)
     named = zip(FILES, paths, strict=True)
     inputs = {name: FileRecord(path=str(path)) for name, path in named if path is not None}
-    record = FrameRecord(
-        name=files.name, group=files.group, unit=pair.record.unit, inputs=inputs, status="failed"
-    )
+    record = FrameRecord(name=files.name, group=files.group, inputs=inputs, status="failed")
     if result is None:
         return replace(record, message="there is no prediction")
+    record = replace(record, unit=result.record.unit)
     try:
         # The ground truth that is scored, and the prediction as the protocol changes it.
-        gt, of_gt, notes = _read_truth(pair, request)
-        given = _given_points(pair, gt, required=request.rules.exclude_sparse)
+        gt, of_gt, notes = _read_truth(files, result, request)
+        given = _given_points(files, result.record, gt, required=request.rules.exclude_sparse)
         truth = np.where(_where_scored(gt, given, request.rules), gt, np.float32(0))
         if not truth.any():
             raise InputError(
                 f"{files.gt} has no known depth where protocol {request.protocol} scores"
             )
-        values, of_prediction = _read_prediction(pair, truth.shape, request)
+        values, of_prediction = _read_prediction(result.depth, truth.shape, request)
         depth, fit = scale_prediction(values, truth, request.scale_by)
         depth = _within_bounds(depth, request.rules)
         both, known = (truth > 0) & (depth > 0), int((truth > 0).sum())
@@ -89,7 +90,7 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
         scores = _measure(depth, truth, request)
         if result.sigma is not None and fit is None:
             sigma = result.of_size(result.sigma, depth)
-            scores |= {m.key: m.value(depth, truth, sigma) for m in OF_SIGMA}
+            scores |= {m.key: m.formula(depth, truth, sigma) for m in OF_SIGMA if m.formula}
     except PnpDepthError as error:
         return replace(record, message=str(error))
     predicted = int(((values > 0) & (truth > 0)).sum())
@@ -121,12 +122,13 @@ def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
     depths = torch.from_numpy(depth), torch.from_numpy(truth)
     pixels = scored_pixels(*depths, request.rules.thresholds)
     values: Scores = {**measure_pixels(pixels, request.measures)}
-    return values | {m.key: m.value(depth, truth) for m in request.measures if m.key not in values}
+    return values | {m.key: m.formula(depth, truth) for m in request.measures if m.formula}
 
 
-def _read_truth(pair: FramePair, request: EvalRequest) -> tuple[Depth, Reading, list[str]]:
+def _read_truth(
+    frame: FrameFiles, result: ResultFrame, request: EvalRequest
+) -> tuple[Depth, Reading, list[str]]:
     """The ground truth in the part of the frame that is kept, how it was read, and notes."""
-    frame = pair.files
     scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
     assert frame.gt is not None
     if (raw := raw_depth(frame.gt, frame.image)) is not None:
@@ -137,19 +139,21 @@ def _read_truth(pair: FramePair, request: EvalRequest) -> tuple[Depth, Reading, 
     values, notes = plausible_map(values, reading, "gt", "--gt-scale", scale)
     gt = np.ascontiguousarray(frame.part.apply(values))
     if request.gt_range:
-        gt = _depth_of_distances(gt, pair, (values.shape[0], values.shape[1]))
+        gt = _depth_of_distances(gt, frame, result, (values.shape[0], values.shape[1]))
         reading = reading._replace(source=f"{reading.source}, distances")
     return gt, reading, notes
 
 
-def _depth_of_distances(gt: Depth, pair: FramePair, whole: tuple[int, int]) -> Depth:
+def _depth_of_distances(
+    gt: Depth, files: FrameFiles, result: ResultFrame, whole: tuple[int, int]
+) -> Depth:
     """Depth z of distances from the camera of the data set, else of the prediction's record."""
-    files, size, camera = pair.files, (gt.shape[0], gt.shape[1]), None
+    size, camera = (gt.shape[0], gt.shape[1]), None
     if files.calib is not None:
         found, _ = camera_of_file(files.calib, files.camera, whole, files.image_file)
         camera = files.part.camera_in_crop(found, whole)
-    elif pair.result is not None and pair.record.size == size[::-1]:
-        camera, _ = pair.result.camera_and_pose
+    elif result.record.size == size[::-1]:
+        camera, _ = result.camera_and_pose
     if camera is None:
         raise InputError(
             f"--gt-range needs the camera of frame {files.name}, which neither the data set nor the"
@@ -170,13 +174,12 @@ def _where_scored(gt: Depth, given: Mask | None, rules: Protocol) -> Mask:
     return scored
 
 
-def _read_prediction(pair: FramePair, size: Size, request: EvalRequest) -> tuple[Depth, Reading]:
+def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Depth, Reading]:
     """The prediction at the ground truth's size, and how it was read."""
-    assert pair.result is not None
-    values, reading = _read(pair.result.depth, request.pred_scale, request)
+    values, reading = _read(path, request.pred_scale, request)
     if values.shape != size and not request.resize:
         advice = "; --resize scales predictions if both show the same view"
-        raise _different(pair, f"prediction {pair.result.depth}", values.shape, size, advice)
+        raise _different(f"prediction {path}", values.shape, size, advice)
     if values.shape != size:
         known = (values > 0).astype(np.float32)
         total, weight = (cv2.resize(part, (size[1], size[0])) for part in (values, known))
@@ -207,16 +210,15 @@ def _read(path: Path, scale: float | None, request: EvalRequest) -> tuple[Depth,
     return values, image.reading._replace(assumed=assumed)
 
 
-def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
-    """(H, W) true at the network's sparse points; None where they are not known or unusable.
-
-    Points that were drawn from the ground truth (H, W) are drawn again.
-    """
-    frame, size = pair.files, (gt.shape[0], gt.shape[1])
-    sparse = pair.record.inputs.get("sparse")
+def _given_points(
+    frame: FrameFiles, record: FrameRecord, gt: Depth, *, required: bool
+) -> Mask | None:
+    """(H, W) true at the network's sparse points; None where they are not known or unusable."""
+    size, sparse = (gt.shape[0], gt.shape[1]), record.inputs.get("sparse")
     drawn = None if sparse is None else sparse.sampled
     try:
-        if drawn is not None and pair.record.size == size[::-1]:
+        # Points that were drawn from the ground truth are drawn again.
+        if drawn is not None and record.size == size[::-1]:
             image = None
             if drawn.kind == "features" and frame.image is not None:
                 image = frame.part.apply(read_image(frame.image))
@@ -227,7 +229,7 @@ def _given_points(pair: FramePair, gt: Depth, *, required: bool) -> Mask | None:
             if points.size != size:
                 xy = frame.part.in_crop(xy, points.size)
                 if frame.part.apply(np.zeros(points.size, bool)).shape != size:
-                    raise _different(pair, f"sparse depth {frame.sparse}", points.size, size)
+                    raise _different(f"sparse depth {frame.sparse}", points.size, size)
         else:
             raise InputError(
                 f"frame {frame.name} has no sparse depth file to exclude: neither the record beside"
@@ -259,11 +261,9 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     return slice(*map(int, rows)), slice(*map(int, columns))
 
 
-def _different(pair: FramePair, what: str, shape: Size, size: Size, advice: str = "") -> SizeError:
-    return SizeError(
-        f"{what} is {shape[1]}×{shape[0]} but the ground truth {pair.files.gt} is"
-        f" {size[1]}×{size[0]}{advice}"
-    )
+def _different(what: str, shape: Size, size: Size, advice: str = "") -> SizeError:
+    other = f"the ground truth is {size[1]}×{size[0]}"
+    return SizeError(f"{what} is {shape[1]}×{shape[0]} but {other}{advice}")
 
 
 def scale_prediction(values: Depth, gt: Depth, scale_by: str) -> tuple[Depth, Fit | None]:

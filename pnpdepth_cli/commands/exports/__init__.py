@@ -156,7 +156,7 @@ def export_results(
         raise OutputError(f"{output} is a file; name a folder")
     # The results, all in one unit.
     frames = [_frame(result, export) for result in result_frames(results)]
-    units = sorted({f"{f.result.unit} (unit-scale {f.unit_scale:g})" for f in frames})
+    units = sorted({f"{f.result.record.unit} (unit-scale {f.unit_scale:g})" for f in frames})
     if len(units) > 1:
         raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
     # Files of different names, none of which is there.
@@ -174,7 +174,7 @@ def export_results(
     with all_or_none(written):
         notes = export.write(output, frames, lambda: show(next(numbers), len(frames)))
     of_model = export.in_model_units and frames[0].unit_scale != 1
-    unit = MODEL_UNITS if of_model else frames[0].result.unit
+    unit = MODEL_UNITS if of_model else frames[0].result.record.unit
     return ExportSummary(written, len(frames), unit, notes)
 
 

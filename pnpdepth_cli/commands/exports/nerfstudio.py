@@ -71,7 +71,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     write_json(folder / "transforms.json", content)
     if not clipped:
         return []
-    limit = f"{LARGEST_CODE / _CODES_PER_UNIT:.4g} {frames[0].result.unit}"
+    limit = f"{LARGEST_CODE / _CODES_PER_UNIT:.4g} {frames[0].result.record.unit}"
     return [f"depth: {clipped:,} pixels beyond {limit}, the largest of 16 bits, are unknown"]
 
 

@@ -12,8 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import find_frames
-from pnpdepth_cli.commands.batch.sequence import with_neighbours
+from pnpdepth_cli.commands.batch.find_frames import find_frames, with_neighbours
 from pnpdepth_cli.commands.cloud import write_depth_cloud
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import CloudRequest

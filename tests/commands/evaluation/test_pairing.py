@@ -126,13 +126,13 @@ def test_a_folder_of_data_sets_is_read_as_a_batch_reads_it(tmp_path: Path) -> No
         depth_at(tmp_path / f"out/{place}/0_depth.png")
     (tmp_path / "out/summary.json").write_text(json.dumps({"layout": "image-depth"}))
     pairs, _ = pair_frames(tmp_path / "out", tmp_path / "sets")
-    assert [pair.files.name for pair in pairs] == ["north/0", "south/0"]
-    assert all(pair.result is not None for pair in pairs)
+    assert [files.name for files, _ in pairs] == ["north/0", "south/0"]
+    assert all(result is not None for _, result in pairs)
 
 
 def test_two_files_are_one_frame_whatever_they_are_called(tmp_path: Path) -> None:
-    (pair,), _ = pair_frames(depth_at(tmp_path / "p_depth.png"), depth_at(tmp_path / "g.npy"))
-    assert (pair.files.name, pair.files.gt) == ("p", tmp_path / "g.npy")
+    ((files, _),), _ = pair_frames(depth_at(tmp_path / "p_depth.png"), depth_at(tmp_path / "g.npy"))
+    assert (files.name, files.gt) == ("p", tmp_path / "g.npy")
 
 
 def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -> None:
