@@ -212,16 +212,13 @@ def _neighbour(frame: FrameFiles, other: FrameFiles, apart: int, source: str) ->
 def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
     """Returns how a frame is refined; options of the user go before what the data set states."""
     files = _files_to_read(request, frame)
-    neighbours = (
-        replace(each, files=_files_to_read(request, each.files)) for each in frame.neighbours
-    )
-    files = replace(files, neighbours=tuple(neighbours))
     return replace(request.refine, files=files, reading=request.reading)
 
 
 def _files_to_read(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
-    """The files of a frame that are read for it, without its neighbours."""
-    files = replace(frame, neighbours=())
+    """The files that are read for a frame, those of its neighbours among them."""
+    neighbours = [replace(n, files=_files_to_read(request, n.files)) for n in frame.neighbours]
+    files = replace(frame, neighbours=tuple(neighbours))
     if request.protocol is not None:
         files = replace(files, part=find_protocol(request.protocol).part or files.part)
     if request.reading.sample is None:

@@ -43,8 +43,6 @@ class Worker:
     """The frames that decide what is open for all."""
     folder: Path
     """The folder that relative paths start from."""
-    shared: Sequence[Path]
-    """Files and folders that every node must see."""
     max_pixels: int | None
     threads: int
     method: Method | None = None
@@ -73,7 +71,8 @@ class Worker:
         import cv2
         import torch
 
-        for path in self.shared:
+        request = self.records.request
+        for path in (self.folder / request.source, self.folder / request.output):
             if not path.exists():
                 node = socket.gethostname()
                 raise ClusterError(f"node {node} does not see {path}; all nodes must share it")
@@ -166,13 +165,11 @@ def _plan(
         num_cpus=cores, num_gpus=int(gpus), scheduling_strategy="SPREAD"
     )
     # All workers have the same job.
-    folder, request = Path.cwd(), records.request
     return devices, functools.partial(
         actor.remote,
         records=records,
         deciding=deciding,
-        folder=folder,
-        shared=[folder / request.source, folder / request.output],
+        folder=Path.cwd(),
         max_pixels=max_pixels_given(),
         threads=cores,
     )

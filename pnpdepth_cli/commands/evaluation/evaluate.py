@@ -145,8 +145,7 @@ def evaluate(
             f" {MIN_CLUSTERS} are needed"
         )
     notes += _notes_on_files(rows)
-    notes += _notes_on_pixels(scored, request)
-    notes += _notes_on_scales(scored, request)
+    notes += _notes_on_depths(scored, request)
     return Evaluation(
         request=request,
         frames=rows,
@@ -194,8 +193,9 @@ def _notes_on_files(rows: Sequence[FrameRecord]) -> Iterator[str]:
             yield f"{count_of(more, 'more frame')} like that; --csv or --json has all"
 
 
-def _notes_on_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
-    """Pixels of the ground truth without prediction, and those that the network was given."""
+def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
+    """Pixels without prediction or given to the network, and how predictions are scaled."""
+    # The pixels.
     known = sum(_numbers(scored, "known"))
     if empty := known - sum(_numbers(scored, "predicted")):
         yield (
@@ -208,10 +208,7 @@ def _notes_on_pixels(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
             f"{given:,} of the scored pixels have a point of the sparse input; --exclude-sparse"
             " leaves them out"
         )
-
-
-def _notes_on_scales(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
-    """How predictions were scaled, and what looks like a wrong scale."""
+    # How predictions were scaled, and what looks like a wrong scale.
     if factors := _numbers(scored, "factor"):
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan
