@@ -46,7 +46,7 @@ def option(default: Any, help: str, **details: Any) -> Any:
     """Returns a dataclass field that the user can set.
 
     Args:
-        default: Default of the field.
+        default: Default of the field. `MISSING`: the user has to give it.
         help: Help text of the command line.
         **details: Other fields of `Option`.
     """

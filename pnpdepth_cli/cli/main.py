@@ -47,7 +47,7 @@ COMMANDS = {
     "export": "result_commands:export",
     "eval": "eval_command:evaluate",
     "compare": "compare_command:compare",
-    "doctor": "doctor_command:doctor",
+    "doctor": "models_command:doctor",
 }
 """The subcommands in the order of the help, as `module:function` in `pnpdepth_cli.cli`."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,13 @@ def click_option(declared: Option) -> Decorator:
         details = {"is_flag": True}
     elif declared.value_if_bare is not None:
         details |= {"is_flag": False, "flag_value": declared.value_if_bare}
+    if declared.default is MISSING:
+        details["required"] = True
+    else:
+        details["default"] = declared.default
     return click.option(
         declared.flag,
         declared.name,
-        default=declared.default,
         metavar=declared.metavar,
         help=declared.help,
         show_default=declared.show_default,

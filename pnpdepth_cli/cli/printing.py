@@ -19,6 +19,7 @@ from pnpdepth_cli.commands.error_tables import (
     means_tables,
     refinement_tables,
 )
+from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.tables import Cell, Table, count_of, write_text
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, UsageError
@@ -55,11 +56,8 @@ class TableFiles:
             raise UsageError("only one of --json, --csv - and --latex - can go to stdout")
         if len({path.resolve() for path in files}) < len(files):
             raise UsageError(f"--csv and --latex are the same file {files[0]}; name two files")
+        check_outputs(files, inputs, overwrite=self.overwrite)
         for path in files:
-            if path.resolve() in {source.resolve() for source in inputs}:
-                raise OutputError(f"{path} is one of the inputs; name another output")
-            if path.exists() and not self.overwrite:
-                raise OutputError(f"{path} exists; --overwrite replaces it")
             if not path.parent.is_dir():
                 raise OutputError(f"{path}: its folder does not exist; create it first")
 

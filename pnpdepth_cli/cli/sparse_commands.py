@@ -7,29 +7,24 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.choices import SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import say
-from pnpdepth_cli.commands.refinement.refine_request import parse_sample
-from pnpdepth_cli.commands.requests import FramesRequest
+from pnpdepth_cli.commands.requests import (
+    FramesRequest,
+    ProjectRequest,
+    SampleRequest,
+    SimulateRequest,
+)
 from pnpdepth_cli.dataset.read_options import ScanOptions
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
 @click.argument("scan", type=options.FILE)
-@options.options_of_groups(ScanOptions)
-@click.option(
-    "--image",
-    type=options.FILE,
-    required=True,
-    help="Camera image: gives the size, and is drawn on.",
-)
+@options.options_of_groups(ScanOptions, ProjectRequest)
 @options.depth_scale
 @options.sparse_output
 @options.overwrite
-def project(
-    scan: Path, image: Path, depth_scale: float | None, output: Path, overwrite: bool, **values: Any
-) -> None:
+def project(**values: Any) -> None:
     """Project a LiDAR SCAN (KITTI's BIN, NPY, PCD or PLY) to a sparse depth map.
 
     \b
@@ -41,27 +36,20 @@ def project(
     the points, and a JSON file records the settings.
     """
     from pnpdepth_cli.cli.printing import print_sparse
-    from pnpdepth_cli.commands.sparse.make import SparseTarget, project_scan
+    from pnpdepth_cli.commands.sparse.make import project_scan
 
-    target = SparseTarget(output=output, overwrite=overwrite)
-    of_scan = ScanOptions(**options.take_options(ScanOptions, values))
-    print_sparse(project_scan(scan, of_scan, target, image, scale=depth_scale))
+    scan_options = ScanOptions(**options.take_options(ScanOptions, values))
+    print_sparse(project_scan(ProjectRequest(options=scan_options, **values)))
 
 
 @click.command(short_help="Sample sparse depth from dense depth.")
 @click.argument("depth", type=options.FILE)
-@click.option(
-    "--count",
-    required=True,
-    metavar="[PATTERN:]N|P%",
-    help="Number of points (of lines for `lines`), or % of known pixels.",
-)
-@click.option("--image", type=options.FILE, help="Image for `features`.")
+@options.options_of_groups(SampleRequest)
 @options.seed
 @options.depth_scale
 @options.sparse_output
 @options.overwrite
-def sample(depth: Path, count: str, output: Path, overwrite: bool, **values: Any) -> None:
+def sample(**values: Any) -> None:
     """Sample sparse depth from the dense DEPTH.
 
     \b
@@ -78,52 +66,19 @@ def sample(depth: Path, count: str, output: Path, overwrite: bool, **values: Any
     A JSON file beside the output records the settings.
     """
     from pnpdepth_cli.cli.printing import print_sparse
-    from pnpdepth_cli.commands.sparse import make
+    from pnpdepth_cli.commands.sparse.make import sample_depth
 
-    values["scale"] = values.pop("depth_scale")
-    target = make.SparseTarget(output=output, overwrite=overwrite)
-    print_sparse(make.sample_depth(depth, target, parse_sample(count), **values))
+    print_sparse(sample_depth(SampleRequest(**values)))
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
 @click.argument("depth", type=options.FILE)
-@click.option(
-    "--sensor", type=click.Choice(SENSORS), help="LiDAR by its data sheet, or as the paper has it."
-)
-@click.option(
-    "--beams",
-    type=click.IntRange(1, 4096),
-    metavar="N",
-    help="Beams of another LiDAR, evenly spaced, without noise.",
-)
-@click.option(
-    "--vertical-fov",
-    type=float,
-    nargs=2,
-    metavar="TOP BOTTOM",
-    help="Elevations of its uppermost and lowest beam, degrees.",
-)
-@click.option(
-    "--calib",
-    type=options.FILE,
-    required=True,
-    metavar="FILE|FOLDER",
-    help="Intrinsics: a file with nine numbers or K, or a KITTI calibration.",
-)
+@options.options_of_groups(SimulateRequest)
 @options.seed
 @options.depth_scale
 @options.sparse_output
 @options.overwrite
-def simulate(
-    depth: Path,
-    sensor: str | None,
-    beams: int | None,
-    vertical_fov: tuple[float, float] | None,
-    calib: Path,
-    output: Path,
-    overwrite: bool,
-    **values: Any,
-) -> None:
+def simulate(**values: Any) -> None:
     """Simulate the sparse depth of a LiDAR in the scene of the dense DEPTH.
 
     \b
@@ -132,12 +87,9 @@ def simulate(
     pnpdepth simulate gt.png --beams 40 --vertical-fov 15 -25 --calib calib.txt -o sparse.exr
     """
     from pnpdepth_cli.cli.printing import print_sparse
-    from pnpdepth_cli.commands.sparse.make import SparseTarget, find_sensor, simulate_scan
+    from pnpdepth_cli.commands.sparse.make import simulate_scan
 
-    scanner = find_sensor(sensor, beams, vertical_fov)
-    values["scale"] = values.pop("depth_scale")
-    target = SparseTarget(output=output, overwrite=overwrite)
-    print_sparse(simulate_scan(depth, target, scanner, calib, **values))
+    print_sparse(simulate_scan(SimulateRequest(**values)))
 
 
 @click.command(short_help="Write the frames of a ROS bag as files.")

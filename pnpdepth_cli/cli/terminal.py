@@ -76,10 +76,7 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
 
 
 class BatchProgress:
-    """Progress of a run over frames on stderr.
-
-    `done`, `failed` and `to_do` are numbers of frames.
-    """
+    """Progress of a run over frames on stderr; its counts are numbers of frames."""
 
     def __init__(self, show: Callable[..., None]) -> None:
         self.done = self.to_do = self.failed = 0

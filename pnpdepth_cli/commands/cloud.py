@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.requests import CloudRequest
+from pnpdepth_cli.commands.requests import CloudRequest, check_outputs
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import image_of_size
 from pnpdepth_cli.dataset.frame_camera import (
@@ -21,7 +21,7 @@ from pnpdepth_cli.dataset.frame_camera import (
 )
 from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.dataset.plausible import far_values
-from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.poses import poses_of_frames
 from pnpdepth_cli.io.scans import write_cloud
@@ -60,8 +60,7 @@ def write_depth_cloud(
         PnpDepthError: An input or output is at fault; then nothing is written.
     """
     # The frames, with poses where views must agree.
-    if request.output.exists() and not request.overwrite:
-        raise OutputError(f"{request.output} exists; --overwrite replaces it, -o names another")
+    check_outputs([request.output], overwrite=request.overwrite)
     frames = result_frames(request.depth)
     notes: list[str] = []
     poses = _poses(request, frames, notes)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from pnpdepth_cli.commands.evaluation.compare import ComparedRun, Comparison
+from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.statistics import gain
-from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 
 _CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
@@ -33,8 +34,7 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
     """
     if path.suffix not in _CHANGING:
         raise UsageError(f"--plot {path}: name a file that ends in {', '.join(_CHANGING)}")
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path} exists; --overwrite replaces it")
+    check_outputs([path], overwrite=overwrite)
     try:
         import matplotlib as mpl
         from matplotlib.figure import Figure

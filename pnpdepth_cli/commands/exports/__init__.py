@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import EXPORTS
+from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import image_of_size, read_image
 from pnpdepth_cli.dataset.frame_files import ImageSource
@@ -163,9 +164,7 @@ def export_results(
     written = export.files(output, frames)
     if len(set(written)) < len(written):
         raise InputError(f"{results}: two frames have one image name; refine them again")
-    for path in written:
-        if path.exists() and not overwrite:
-            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another folder")
+    check_outputs(written, overwrite=overwrite)
     # All files, or none.
     for folder in {path.parent for path in written}:
         make_folder(folder)

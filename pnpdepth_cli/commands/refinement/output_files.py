@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.io.atomic import cannot_write
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
@@ -81,10 +82,5 @@ def plan_outputs(request: RefineRequest) -> dict[str, Path]:
     else:
         outputs = outputs_in(output, inputs[0].stem, request)
     # No input is replaced, and no result unless it may be.
-    resolved = {path.resolve() for path in inputs}
-    for path in outputs.values():
-        if path.resolve() in resolved:
-            raise OutputError(f"{path} is one of the inputs; name another output with -o")
-        if path.exists() and not options.overwrite:
-            raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
+    check_outputs(outputs.values(), inputs, overwrite=options.overwrite)
     return outputs

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,13 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
+from pnpdepth_cli.commands.requests import (
+    ProjectRequest,
+    SampleRequest,
+    SimulateRequest,
+    SparseRequest,
+    check_outputs,
+)
 from pnpdepth_cli.dataset.arrays import record_of
 from pnpdepth_cli.dataset.frame_camera import check_size
 from pnpdepth_cli.dataset.plausible import plausible_map
-from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.file_record import FileRecord, SamplePattern
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import SPARSE_SUFFIXES, describe_range, read_depth, write_sparse
@@ -39,129 +45,78 @@ class SparseSummary(NamedTuple):
     files: Sequence[Path]
 
 
-@dataclass(frozen=True, kw_only=True)
-class SparseTarget:
-    """Where sparse depth is written, with a JSON beside it that says what it was made from."""
-
-    output: Path
-    """File of the sparse depth; the suffix is one of `SPARSE_SUFFIXES`."""
-    overwrite: bool = False
-
-    @property
-    def overlay(self) -> Path:
-        """The image with the points, of a scan that is projected."""
-        return self.output.with_name(f"{self.output.stem}_overlay.png")
-
-    def check(self, inputs: Iterable[Path | None], *, drawn: bool = False) -> None:
-        """Raises OutputError for files that cannot be written, or that replace an input."""
-        if self.output.suffix.lower() not in SPARSE_SUFFIXES:
-            raise OutputError(
-                f"{self.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
-            )
-        taken = {p.resolve() for p in inputs if p is not None}
-        for path in (self.output, self.output.with_suffix(".json"), *[self.overlay] * drawn):
-            if path.resolve() in taken:
-                raise OutputError(f"{path} is an input or named twice; give another output")
-            if path.exists() and not self.overwrite:
-                raise OutputError(f"{path} exists; --overwrite replaces it, -o names another path")
-            taken.add(path.resolve())
-
-    def write(
-        self,
-        command: str,
-        points: Points,
-        settings: Mapping[str, object],
-        inputs: Mapping[str, FileRecord],
-        notes: Sequence[str],
-        *,
-        rgb: NDArray[np.float32] | None = None,
-    ) -> SparseSummary:
-        """Writes the sparse depth, its record and the overlay; returns what was written.
-
-        Args:
-            command: Name of the command that made the points.
-            points: The sparse depth.
-            settings: Settings of the command.
-            inputs: What a record keeps of each file, by its part.
-            notes: Lines for a person.
-            rgb: (H, W, 3) in 0..1, the image of the overlay. None: there is none.
-        """
-        # The points, as a map or a list, and over the image.
-        make_folder(self.output.parent)
-        image, record = as_depth_image(points), self.output.with_suffix(".json")
-        write_sparse(self.output, points.xy, points.depth, image)
-        if rgb is not None:
-            overlay(rgb, points.xy, points.depth, self.overlay)
-        drawn = None if rgb is None else self.overlay
-        outputs = {"sparse": self.output, "overlay": drawn, "record": record}
-        # The record.
-        content = {
-            "command": command,
-            "version": __version__,
-            **settings,
-            "inputs": {name: part.to_json() for name, part in inputs.items()},
-            "points": {
-                "count": len(points),
-                "fraction_of_pixels": len(points) / image.size,
-                "nearest": float(points.depth.min()),
-                "farthest": float(points.depth.max()),
-                "dropped": dict(points.dropped),
-            },
-            "size": [points.size[1], points.size[0]],
-            "notes": list(notes),
-            "outputs": plain(outputs),
-        }
-        write_json(record, content)
-        return SparseSummary(points, notes, [path for path in outputs.values() if path])
+def _overlay(request: SparseRequest) -> Path:
+    """The image with the points, of a scan that is projected."""
+    return request.output.with_name(f"{request.output.stem}_overlay.png")
 
 
-def project_scan(
-    scan: Path,
-    options: ScanOptions,
-    target: SparseTarget,
-    image: Path,
+def _check(request: SparseRequest, inputs: Iterable[Path | None], *, drawn: bool = False) -> None:
+    """Raises OutputError for files that cannot be written, or that replace an input."""
+    if request.output.suffix.lower() not in SPARSE_SUFFIXES:
+        raise OutputError(
+            f"{request.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
+        )
+    written = [request.output, request.output.with_suffix(".json"), *[_overlay(request)] * drawn]
+    check_outputs(written, [path for path in inputs if path], overwrite=request.overwrite)
+
+
+def _write(
+    command: str,
+    request: SparseRequest,
+    points: Points,
+    settings: Mapping[str, object],
+    inputs: Mapping[str, FileRecord],
+    notes: Sequence[str],
     *,
-    scale: float | None = None,
+    rgb: NDArray[np.float32] | None = None,
 ) -> SparseSummary:
-    """Writes the scan's points that the camera sees; returns what was written.
+    """Writes the sparse depth, its record, and with an image (H, W, 3) in 0..1 the overlay."""
+    # The points, as a map or a list, and over the image.
+    make_folder(request.output.parent)
+    image, record = as_depth_image(points), request.output.with_suffix(".json")
+    write_sparse(request.output, points.xy, points.depth, image)
+    if rgb is not None:
+        overlay(rgb, points.xy, points.depth, _overlay(request))
+    drawn = None if rgb is None else _overlay(request)
+    outputs = {"sparse": request.output, "overlay": drawn, "record": record}
+    # The record.
+    content = {
+        "command": command,
+        "version": __version__,
+        **settings,
+        "inputs": {name: part.to_json() for name, part in inputs.items()},
+        "points": {
+            "count": len(points),
+            "fraction_of_pixels": len(points) / image.size,
+            "nearest": float(points.depth.min()),
+            "farthest": float(points.depth.max()),
+            "dropped": dict(points.dropped),
+        },
+        "size": [points.size[1], points.size[0]],
+        "notes": list(notes),
+        "outputs": plain(outputs),
+    }
+    write_json(record, content)
+    return SparseSummary(points, notes, [path for path in outputs.values() if path])
 
-    Args:
-        scan: File of the scan.
-        options: The calibration.
-        target: Files to write.
-        image: The camera's image, which gives the size and the ground of the overlay.
-        scale: Numbers of the scan per metre.
-    """
-    target.check((scan, image, options.calib, options.extrinsics), drawn=True)
+
+def project_scan(request: ProjectRequest) -> SparseSummary:
+    """Writes the scan's points that the camera sees; returns what was written."""
+    scan, options, image = request.scan, request.options, request.image
+    _check(request, (scan, image, options.calib, options.extrinsics), drawn=True)
     rgb = read_rgb(image).values
     size = (rgb.shape[0], rgb.shape[1])
-    projected = read_scan_points(scan, options, size, image, scale=scale)
+    projected = read_scan_points(scan, options, size, image, scale=request.depth_scale)
     inputs = {"image": record_of(image), "scan": projected.record}
     settings = plain(asdict(options))
-    return target.write("project", projected.points, settings, inputs, projected.notes, rgb=rgb)
+    return _write("project", request, projected.points, settings, inputs, projected.notes, rgb=rgb)
 
 
-def sample_depth(
-    depth: Path,
-    target: SparseTarget,
-    pattern: SamplePattern,
-    *,
-    image: Path | None = None,
-    seed: int = 0,
-    scale: float | None = None,
-) -> SparseSummary:
-    """Writes points of a dense depth map; returns what was written.
-
-    Args:
-        depth: The file of the map.
-        target: Files to write.
-        pattern: Pattern of the pixels that are sampled.
-        image: Image whose features `features` samples.
-        seed: Random seed of the pattern.
-        scale: Codes per metre of an integer map.
-    """
-    target.check((depth, image))
-    dense, notes = _dense(depth, scale)
+def sample_depth(request: SampleRequest) -> SparseSummary:
+    """Writes points of a dense depth map; returns what was written."""
+    depth, image, pattern, seed = request.depth, request.image, request.count, request.seed
+    _check(request, (depth, image))
+    dense, notes = _dense(depth, request.depth_scale)
     rgb, inputs = None, {"depth": record_of(depth)}
     if image is not None:
         rgb, inputs["image"] = read_rgb(image).values, record_of(image)
@@ -171,30 +126,14 @@ def sample_depth(
         notes.append(f"warning: the image has {len(points):,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
     settings = {"pattern": asdict(pattern), "seed": seed}
-    return target.write("sample", points, settings, inputs, notes)
+    return _write("sample", request, points, settings, inputs, notes)
 
 
-def simulate_scan(
-    depth: Path,
-    target: SparseTarget,
-    sensor: Lidar,
-    calib: Path,
-    *,
-    seed: int = 0,
-    scale: float | None = None,
-) -> SparseSummary:
-    """Writes the points of a sensor at the camera's place; returns what was written.
-
-    Args:
-        depth: The file of the map.
-        target: Files to write.
-        sensor: The scanner.
-        calib: Calibration of the camera.
-        seed: Random seed of all noise.
-        scale: Codes per metre of an integer map.
-    """
-    target.check((depth, calib))
-    dense, notes = _dense(depth, scale)
+def simulate_scan(request: SimulateRequest) -> SparseSummary:
+    """Writes the points of a sensor at the camera's place; returns what was written."""
+    depth, calib, seed, sensor = request.depth, request.calib, request.seed, _sensor(request)
+    _check(request, (depth, calib))
+    dense, notes = _dense(depth, request.depth_scale)
     calibration = read_calibration(calib)
     notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
     points = simulate_lidar(dense, calibration.camera, sensor, seed)
@@ -202,7 +141,7 @@ def simulate_scan(
     settings = {"sensor": plain(asdict(sensor)), "seed": seed}
     read_as = FileRecord(path=str(calib), read_as=calibration.camera.source)
     inputs = {"depth": record_of(depth), "calibration": read_as}
-    return target.write("simulate", points, settings, inputs, notes)
+    return _write("simulate", request, points, settings, inputs, notes)
 
 
 def _dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[str]]:
@@ -212,14 +151,9 @@ def _dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[s
     return values, [f"depth: {describe_range(values, dense.reading, noun='pixels')}", *notes]
 
 
-def find_sensor(
-    name: str | None, beams: int | None, vertical_fov: tuple[float, float] | None
-) -> Lidar:
-    """Returns the sensor of this name, or one of so many beams between two elevations, degrees.
-
-    Raises:
-        UsageError: Both are given, or neither, or there is no such sensor.
-    """
+def _sensor(request: SimulateRequest) -> Lidar:
+    """The sensor of this name, or one of so many beams between two elevations, degrees."""
+    name, beams, vertical_fov = request.sensor, request.beams, request.vertical_fov
     if name is not None and beams is None and vertical_fov is None:
         return LIDARS[name]
     if name is not None or beams is None or vertical_fov is None:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pnpdepth_cli.commands.requests import ProjectRequest, SampleRequest, SimulateRequest
 from pnpdepth_cli.commands.sparse.make import (
     SparseSummary,
-    SparseTarget,
     project_scan,
     sample_depth,
     simulate_scan,
@@ -27,7 +27,6 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
-from pnpdepth_cli.sensors.lidar import Lidar, ideal_lidar
 from tests.commands.scan_frames import ScanOnDisk, scan_on_disk
 
 
@@ -43,9 +42,9 @@ def recorded(summary: SparseSummary) -> dict[str, Any]:
 
 
 def projected(frame: ScanOnDisk, output: str = "sparse.csv", **more: Any) -> dict[str, Any]:
-    target = SparseTarget(output=frame.folder / output)
-    standard = {"options": ScanOptions(calib=frame.calib), "target": target, "image": frame.image}
-    return recorded(project_scan(**({"scan": frame.scan} | standard | more)))
+    files = {"scan": frame.scan, "image": frame.image, "output": frame.folder / output}
+    options = {"options": ScanOptions(calib=frame.calib)}
+    return recorded(project_scan(ProjectRequest(**(files | options | more))))
 
 
 @pytest.mark.parametrize("suffix", [".csv", *DEPTH_SUFFIXES])
@@ -90,22 +89,20 @@ def test_an_image_of_another_camera_is_an_error_or_gets_a_warning(frame: ScanOnD
     record = projected(frame, image=wide)
     assert any(note.startswith("warning: the principal point") for note in record["notes"])
     frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
-    target = SparseTarget(output=frame.folder / "b.csv")
-    refused(frame, SizeError, "is for images of 64×48", image=wide, target=target)
+    refused(frame, SizeError, "is for images of 64×48", image=wide, output="b.csv")
 
 
 def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     projected(frame)
     refused(frame, OutputError, "exists; --overwrite")
-    target = SparseTarget(output=frame.folder / "sparse.csv", overwrite=True)
-    projected(frame, target=target)
-    into = SparseTarget(output=frame.folder / "calib.csv", overwrite=True)
+    projected(frame, overwrite=True)
     calib = frame.folder / "calib.json"
     calib.write_text('{"K": [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}')
-    refused(frame, OutputError, "is an input", target=into, options=ScanOptions(calib=calib))
-    below = SparseTarget(output=frame.gt / "s.png")
-    refused(frame, OutputError, "cannot be written (file exists)", target=below)
-    refused(frame, OutputError, ".jpg", target=SparseTarget(output=frame.folder / "s.jpg"))
+    into = {"output": "calib.csv", "overwrite": True, "options": ScanOptions(calib=calib)}
+    refused(frame, OutputError, "calib.json is one of the inputs", **into)
+    below = f"{frame.gt.name}/s.png"
+    refused(frame, OutputError, "cannot be written (file exists)", output=below)
+    refused(frame, OutputError, ".jpg", output="s.jpg")
     assert (frame.folder / "sparse_overlay.png").is_file()
 
 
@@ -120,8 +117,8 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
 
 def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
     pattern = {name: more.pop(name) for name in ("kind", "count", "fraction") if name in more}
-    target = SparseTarget(output=frame.folder / output)
-    return recorded(sample_depth(frame.gt, target, SamplePattern(**pattern), **more))
+    files = {"depth": frame.gt, "output": frame.folder / output}
+    return recorded(sample_depth(SampleRequest(count=SamplePattern(**pattern), **files, **more)))
 
 
 def test_the_seed_is_in_the_record_and_decides_every_byte(frame: ScanOnDisk) -> None:
@@ -142,14 +139,15 @@ def test_fewer_features_than_requested_are_reported(frame: ScanOnDisk) -> None:
     assert any("of the 3,000 points asked for" in note for note in record["notes"])
 
 
-def simulated(frame: ScanOnDisk, output: str, sensor: Lidar, **more: Any) -> dict[str, Any]:
-    target = SparseTarget(output=frame.folder / output)
-    return recorded(simulate_scan(frame.gt, target, sensor, frame.calib, **more))
-
-
 def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
-    sensor = ideal_lidar(21, 20, -20)
-    record = simulated(frame, "out.csv", sensor)
+    request = SimulateRequest(
+        depth=frame.gt,
+        calib=frame.calib,
+        output=frame.folder / "out.csv",
+        beams=21,
+        vertical_fov=(20, -20),
+    )
+    record = recorded(simulate_scan(request))
     got = read_sparse(frame.folder / "out.csv", size=(60, 100))[0]
     np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
     assert record["sensor"]["name"] == "21 beams"
