@@ -14,10 +14,15 @@ from pnpdepth_cli.measures import parse_keys
 
 @click.command(short_help="Compare runs that eval or batch scored.")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN RUN…")
-@options.table_files(
-    csv="Write the table as CSV.",
-    latex="Write a tabular of runs × measures: the best in bold, * where p < 0.05.",
+@click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write the table as CSV.")
+@click.option(
+    "--latex",
+    type=options.FILE,
+    metavar="FILE|-",
+    help="Write a tabular of runs × measures: the best in bold, * where p < 0.05.",
 )
+@options.overwrite
+@options.as_json
 @click.option(
     "--columns",
     type=parse_keys,

@@ -32,7 +32,9 @@ _OUTPUT = ("--csv", "--columns", "--overwrite", "--json")
 @click.argument("prediction", type=options.FILE, metavar="PRED")
 @click.argument("ground_truth", type=options.FILE, metavar="GT")
 @options.options_of_groups(EvalRequest)
-@options.table_files(csv="Write a row per frame.")
+@click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write a row per frame.")
+@options.overwrite
+@options.as_json
 def evaluate(prediction: Path, ground_truth: Path, **values: Any) -> None:
     """Score the depth in PRED against the ground truth in GT: two files, or two folders.
 

@@ -129,24 +129,6 @@ sparse_output = click.option(
 )
 
 
-def table_files(*, csv: str, latex: str | None = None) -> Decorator:
-    """Returns a decorator that adds the options of `tables.TableFiles`.
-
-    Args:
-        csv: Help text of `--csv`.
-        latex: Help text of `--latex`. None: the command has no such option.
-    """
-
-    def decorate(command: Command) -> Command:
-        command = overwrite(as_json(command))
-        for flag, help in (("--latex", latex), ("--csv", csv)):
-            if help is not None:
-                command = click.option(flag, type=FILE, metavar="FILE|-", help=help)(command)
-        return command
-
-    return decorate
-
-
 def take_options(group: type, values: dict[str, Any]) -> dict[str, Any]:
     """Returns the options of this group by name; they are removed from `values`."""
     names = [each.name for each in options_of(group)]
@@ -163,4 +145,4 @@ def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
     scan = ScanOptions(**take_options(ScanOptions, values))
     first, *more = values.pop("model")
     models = {"model": first, "more_models": tuple(more)}
-    return RefineRequest.from_fields(scan=scan, **models, **values, **others)
+    return RefineRequest().with_fields(scan=scan, **models, **values, **others)

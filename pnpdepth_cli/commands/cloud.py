@@ -169,10 +169,7 @@ def _depth(request: CloudRequest, frame: ResultFrame, notes: list[str]) -> NDArr
 def _camera(
     request: CloudRequest, frame: ResultFrame, size: tuple[int, int]
 ) -> tuple[Camera, list[str]]:
-    """The camera of a depth map (H, W), and lines for a person.
-
-    It is the one that is given, else that of the record, else that of EXIF.
-    """
+    """The camera that is given, else of the record, else of EXIF; and lines for a person."""
     if request.calib is not None:
         return camera_of_file(request.calib, None, size, frame.depth)
     of_record, _ = frame.camera_and_pose

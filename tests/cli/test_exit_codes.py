@@ -32,6 +32,7 @@ COMMANDS = {
         ("batch", "--poses one_pose.txt", 3, "has 1 poses for 2 frames"),
         ("batch", "--accumulate -1", 2, "-1 is not in the range x>=0"),
         ("batch", "--adapt --shard 1/2", 2, "--adapt does not go with --shard"),
+        ("sample", "", 2, "Missing option '--count'"),
         ("sample", "--count many", 2, "neither a number such as 500 nor 5%"),
         ("project", "--image img.png --camera 1", 2, "leave out --camera"),
         ("project", "--image missing.png", 3, "missing.png"),

@@ -73,7 +73,7 @@ def refinement(root: Path, **changes: Any) -> RefineRequest:
         "model": str(root / "net" / "my_net.py"),
         "checkpoint": root / "net" / "my_net.safetensors",
     }
-    return RefineRequest.from_fields(**fields | changes)
+    return RefineRequest().with_fields(**fields | changes)
 
 
 def batch(

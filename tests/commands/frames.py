@@ -90,4 +90,4 @@ def run(frame: FrameOnDisk, **changes: Any) -> FrameRecord:
         "checkpoint": frame.checkpoint,
         "propagate": None if "method" in changes else "none",
     }
-    return refine_image(RefineRequest.from_fields(**(request | changes)))
+    return refine_image(RefineRequest().with_fields(**(request | changes)))

@@ -213,10 +213,7 @@ def _record_of(
 
 
 def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[str, Stages]:
-    """The errors of each stage, and of linear interpolation of all points, by basis.
-
-    With baselines, these are stages as well. A basis without such pixels or points is left out.
-    """
+    """The errors of each stage and of linear interpolation, by each basis that the frame has."""
     maps = {BEFORE: refined.before, AFTER: refined.after}
     beside: dict[str, DepthMap] = {}
     if frame.gt is not None or len(refined.held_out):

@@ -104,11 +104,6 @@ class RefineRequest:
     hold_out: HoldOut = field(default_factory=HoldOut)
     outputs: OutputOptions = field(default_factory=OutputOptions)
 
-    @classmethod
-    def from_fields(cls, **values: Any) -> RefineRequest:
-        """Returns the request with these fields of its groups, whichever group each is in."""
-        return cls().with_fields(**values)
-
     @property
     def read_options(self) -> ReadOptions:
         """How the frame's files are read. The paper's setting moves and drops nothing."""

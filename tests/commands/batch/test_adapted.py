@@ -68,7 +68,7 @@ def test_learning_can_be_stopped(drive: Path) -> None:
     request = BatchRequest(
         source=drive,
         output=drive.parent / "out",
-        refine=RefineRequest.from_fields(model="sparse2dense-tiny", iterations=0),
+        refine=RefineRequest().with_fields(model="sparse2dense-tiny", iterations=0),
         adapt=True,
     )
     with pytest.raises(KeyboardInterrupt):

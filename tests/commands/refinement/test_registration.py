@@ -53,7 +53,7 @@ def test_off_and_the_papers_method_leave_the_image_and_numbers_are_recorded(
 ) -> None:
     assert refined(tmp_path / "a", frame, method="paper").registration is None
     assert refined(tmp_path / "a", frame, registration="off").registration is None
-    request = RefineRequest.from_fields(**write_frame(tmp_path, 0, 500), registration="off")
+    request = RefineRequest().with_fields(**write_frame(tmp_path, 0, 500), registration="off")
     assert read_requested(request).one_view
     record = refined(tmp_path / "a", frame, registration=(0.9, -5.0, 3.0))
     assert record.registration == {"zoom": 0.9, "right": -5.0, "down": 3.0}
@@ -79,7 +79,7 @@ def test_a_moved_image_gives_what_the_same_image_moved_on_disk_gives(
 
 def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> None:
     files = write_frame(tmp_path, 0, 800)
-    inputs = read_requested(RefineRequest.from_fields(**files))
+    inputs = read_requested(RefineRequest().with_fields(**files))
     record = refined(tmp_path, frame, count=800, holdout=0.5, seed=3)
     assert inputs.image is not None
     all_points = evidence(inputs.image, inputs.points)

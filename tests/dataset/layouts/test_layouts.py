@@ -220,7 +220,7 @@ def test_a_line_of_tum_that_means_nothing_is_named(tmp_path: Path, file: str, li
 def inputs_of(frame: FrameFiles, root: Path) -> Frame:
     """The frame as a batch reads it; points are sampled where it has none."""
     pattern = None if frame.sparse is not None else parse_sample("20")
-    refine = RefineRequest.from_fields(sample=pattern)
+    refine = RefineRequest().with_fields(sample=pattern)
     request = BatchRequest(source=root, output=root / "out", refine=refine)
     return read_requested(request_of(request, frame))
 
