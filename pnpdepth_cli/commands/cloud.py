@@ -14,11 +14,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.requests import CloudRequest, check_outputs
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import image_of_size
-from pnpdepth_cli.dataset.frame_camera import (
-    camera_of_exif,
-    camera_of_file,
-    describe_pinhole,
-)
+from pnpdepth_cli.dataset.frame_camera import camera_of_exif, camera_of_file
 from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.dataset.plausible import far_values
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
@@ -186,4 +182,4 @@ def _camera(
         raise UsageError(
             f"neither a record nor EXIF gives the camera of {frame.depth}; give --calib"
         )
-    return of_exif, [describe_pinhole(of_exif)]
+    return of_exif

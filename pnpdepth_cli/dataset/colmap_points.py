@@ -106,10 +106,7 @@ def read_colmap_points(
 
 
 def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points, list[str]]:
-    """The points of an image that pass the filters, in its camera's size; and lines for a person.
-
-    They are the points of its tracks. Without tracks they are all points that are not occluded.
-    """
+    """The points of an image, in its camera's size, that pass the filters; lines for a person."""
     image, points = model.images[name], model.points
     camera = image.camera
     assert camera.size is not None
@@ -142,18 +139,12 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
         seen, xy = seen[visible], xy[visible]
         notes = [f"sparse: {name} has no tracks; all {total:,} points of the model are projected"]
     # What is left must be some.
-    depth = seen[:, 2] * unit_scale
-    if not len(depth):
+    if not len(xy):
         raise NoPointsError(
             f"none of the {total:,} points of {name!r} in {model.folder} is left ({drops});"
             " register it with more matches"
         )
-    return Points(
-        xy=xy.astype(np.float32),
-        depth=depth.astype(np.float32),
-        size=camera.size,
-        dropped=drops.dropped,
-    ), notes
+    return drops.points(seen * unit_scale, xy, camera.size), notes
 
 
 def _output_scale(model: ColmapModel) -> float:

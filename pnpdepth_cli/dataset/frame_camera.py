@@ -45,13 +45,12 @@ def camera_of_frame(
     if known is None and scan.calib is not None:
         known, notes = camera_of_file(scan.calib, scan.camera, size, image)
     if known is None and needs_camera:
-        known = None if image is None else camera_of_exif(image, size)
-        if known is None:
+        if image is None or (of_exif := camera_of_exif(image, size)) is None:
             raise UsageError(
                 f"--html-3d needs the camera, and {image or files.sparse} has neither a calibration"
                 " nor a focal length in EXIF; give --calib"
             )
-        notes = [describe_pinhole(known)]
+        known, notes = of_exif
     return None if known is None else files.part.camera_in_crop(known, size), notes
 
 
@@ -98,18 +97,13 @@ def check_size(
     return []
 
 
-def camera_of_exif(image: Path, size: tuple[int, int]) -> Camera | None:
-    """Returns the camera of an image's EXIF, without distortion; None if EXIF does not give it."""
+def camera_of_exif(image: Path, size: tuple[int, int]) -> tuple[Camera, list[str]] | None:
+    """Returns the camera of EXIF, without distortion, and a line for a person; None for none."""
     if (focal := read_focal_length(image, size)) is None:
         return None
     (focal_px, source), (height, width) = focal, size
     intrinsics = np.array(
         [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
     )
-    return Camera(intrinsics=intrinsics, size=size, source=source)
-
-
-def describe_pinhole(camera: Camera) -> str:
-    """Returns a line on a camera of EXIF, for a person."""
-    focal_px = camera.intrinsics[0, 0]
-    return f"camera: {focal_px:.1f} pixels of focal length, no distortion ({camera.source})"
+    note = f"camera: {focal_px:.1f} pixels of focal length, no distortion ({source})"
+    return Camera(intrinsics=intrinsics, size=size, source=source), [note]

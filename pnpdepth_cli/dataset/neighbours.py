@@ -17,9 +17,14 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart
-from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulate
+from pnpdepth_cli.sensors.accumulation import (
+    Keypoints,
+    NeighbourScan,
+    accumulate,
+    keypoints_of,
+    motion_of_images,
+)
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.motion import Keypoints, keypoints_of, motion_of_images
 from pnpdepth_cli.sensors.pixels import Floats, Points
 
 _IN_MEMORY = 16

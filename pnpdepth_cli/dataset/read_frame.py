@@ -30,7 +30,9 @@ from pnpdepth_cli.sensors.pixels import Points, as_depth_image
 from pnpdepth_cli.sensors.samplers import sample_points
 from pnpdepth_cli.settings import Settings
 
-_LEAK_FRACTION = 0.5  # of the ground truth's pixels equal to the sparse depth gives a warning
+# Of the ground truth's pixels equal to the sparse depth gives a warning. KITTI's ground truth holds
+# the points of its own scan by design, which is less than half of it.
+_LEAK_FRACTION = 0.5
 
 
 class _Pixels(NamedTuple):
@@ -274,10 +276,7 @@ def _hold_out(
 def _compare(
     files: FrameFiles, truth: _Pixels, sparse: SparseDepth, points: SparsePoints
 ) -> list[str]:
-    """Warnings on ground truth and sparse depth that seem to be of two scales, or one.
-
-    KITTI's ground truth holds the points of its own scan by design, which is less than half of it.
-    """
+    """Warnings on ground truth and sparse depth that seem to be of two scales, or one."""
     gt = truth.values
     if sparse.unit != METRES:
         raise UsageError(

@@ -205,10 +205,8 @@ def _agreements(
     own: Calibration,
     others: Mapping[str, Calibration],
 ) -> dict[str, float]:
-    """The edge agreement by each calibration; −1 where it puts few of the points into the image.
-
-    The points that are seen by their own calibration, with its jumps of depth, are projected anew.
-    """
+    """The edge agreement by each calibration; −1 where it puts few of the points into the image."""
+    # Points that are seen by their own calibration, with its jumps of depth, are projected anew.
     assert own.scanner is not None
     ranks, jumps = edge_ranks(rgb), near_jumps(points)
     xyz = own.scanner.inverse().apply(unproject(own.camera, points.xy, points.depth))

@@ -10,29 +10,34 @@ two of the nearest four, have about the same depth, and where none close by cont
 kinds of points are dropped: of something that has moved since, occluded in the frame, and seen
 through by the frame's own scanner. Scans nearer in time count more. A point is dropped where a
 point of the frame, or of a scan nearer in time, lies within as many pixels as frames are between.
+
+Where no pose is known, the motion is estimated. SIFT keypoints of both images are matched (Lowe,
+"Distinctive image features from scale-invariant keypoints", 2004). Those of the other frame get
+depth from its sparse points. The perspective-n-point problem is solved in RANSAC (Fischler and
+Bolles, 1981). The frame's own depth takes no part in it. An estimate that few matches support is
+refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors.lens import pixels_of, unproject
+from pnpdepth_cli.sensors.lens import pixels_of, rays_of, unproject
 from pnpdepth_cli.sensors.pixels import Floats, Mask, Points
 
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
-_TOLERANCE = 0.05
-"""Difference of log depth to a measured point; chosen on frames 2 and 4 of a KITTI drive."""
-_CONTRADICTION = 0.1
-"""Difference of log depth that contradicts; chosen, as `_CLOSE`, on frames 0, 2, 4, 6 of it."""
+# Differences of log depth to a measured point that agree and that contradict. The first was chosen
+# on frames 2 and 4 of a KITTI drive, the second and `_CLOSE` on its frames 0, 2, 4 and 6.
+_TOLERANCE, _CONTRADICTION = 0.05, 0.1
 _CLOSE = (0.55, 0.37)
 """Distance across and down within which a measured point contradicts, in mean spacings. Down it is
 less, as the next scan line of a LiDAR lies at another depth."""
@@ -48,6 +53,13 @@ _FLAT = 0.02  # and whose smallest variance is below this fraction of the next
 _REACH = 1.2  # mean spacings of the points, between a point and the one it is compared with
 _LEAST_ERROR = 2e-4  # typical distance, fraction of the depth
 _NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
+
+# Matches that agree with an estimated motion, and their fraction of all; fewer support none.
+_MIN_INLIERS, _MIN_FRACTION = 30, 0.25
+_KEYPOINTS = 3000
+_RATIO = 0.8  # Lowe's, of the distances to the nearest and the next descriptor
+_REPROJECTION_PX = 2.0
+_JUMP = 1.1  # ratio of depths of the points around a keypoint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,11 +81,10 @@ class Surface:
     flat: Mask  # (N,) where the neighbours lie on a plane
     tree: cKDTree  # of the pixel coordinates
 
-    @property
-    def spacing_px(self) -> float:
-        """Side of the square that each point has in the mean, in pixels."""
-        height, width = self.points.size
-        return float(np.sqrt(height * width / len(self.points)))
+
+def _spacing_px(points: Points) -> float:
+    """Side of the square that each point has in the mean, in pixels."""
+    return float(np.sqrt(points.size[0] * points.size[1] / len(points)))
 
 
 def accumulate(points: Points, neighbours: Sequence[NeighbourScan], camera: Camera) -> Points:
@@ -92,8 +103,6 @@ def accumulate(points: Points, neighbours: Sequence[NeighbourScan], camera: Came
 
 def _add(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: int) -> Points:
     """The points known so far, joined by those of `xyz` (M, 3) that agree with measured ones."""
-    from scipy.spatial import cKDTree
-
     xyz, xy = _in_image(xyz, camera, known.size)
     depth = xyz[:, 2]
     agrees = _agrees(xy, depth, surface)
@@ -121,7 +130,7 @@ def _agrees(xy: Floats, depth: Floats, surface: Surface) -> Mask:
     near = near.reshape(len(xy), -1)
     apart = np.abs(np.log(depth[:, None] / measured.depth[near]))
     alike = apart[:, :_COMPARED] <= _TOLERANCE
-    offset = np.abs(measured.xy[near] - xy[:, None]) / surface.spacing_px
+    offset = np.abs(measured.xy[near] - xy[:, None]) / _spacing_px(measured)
     contradicted = ((offset <= _CLOSE).all(axis=2) & (apart > _CONTRADICTION)).any(axis=1)
     agrees: Mask = (alike[:, 0] | (alike.sum(axis=1) >= _AGREEING)) & ~contradicted
     return agrees
@@ -129,8 +138,6 @@ def _agrees(xy: Floats, depth: Floats, surface: Surface) -> Mask:
 
 def surface_of(points: Points, camera: Camera) -> Surface:
     """Returns the points with a plane through the neighbours of each."""
-    from scipy.spatial import cKDTree
-
     tree = cKDTree(points.xy)
     _, near = tree.query(points.xy, k=min(_NEIGHBOURS, len(points)))
     near = near.reshape(len(points), -1)
@@ -147,8 +154,6 @@ def refine_motion(surface: Surface, xyz: Floats, motion: Floats, camera: Camera)
 
     Points are in the other camera's coordinates. The motion leads from there to the surface's.
     """
-    from scipy.spatial.transform import Rotation
-
     given = motion
     for _ in range(_STEPS):
         # Pairs of a moved point and a plane, and how far apart they are.
@@ -171,7 +176,79 @@ def refine_motion(surface: Surface, xyz: Floats, motion: Floats, camera: Camera)
 def _pairs(surface: Surface, moved: Floats, camera: Camera) -> tuple[Floats, NDArray[np.intp]]:
     """The points in the image with a plane beside them, and the index of that plane."""
     moved, xy = _in_image(moved, camera, surface.points.size)
-    distance, index = surface.tree.query(xy, distance_upper_bound=_REACH * surface.spacing_px)
+    reach = _REACH * _spacing_px(surface.points)
+    distance, index = surface.tree.query(xy, distance_upper_bound=reach)
     near = np.isfinite(distance)
     near[near] &= surface.flat[index[near]]
     return moved[near], index[near]
+
+
+class Keypoints(NamedTuple):
+    """SIFT keypoints of an image: (K, 2) pixel coordinates and (K, 128) descriptors."""
+
+    xy: Floats
+    descriptors: NDArray[np.float32]
+
+
+def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
+    """Returns the keypoints of an image (H, W, 3) in 0…1."""
+    grey = cv2.cvtColor((rgb * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    # OpenCV's annotations lack SIFT
+    keypoints, descriptors = cv2.SIFT_create(nfeatures=_KEYPOINTS).detectAndCompute(grey, None)  # type: ignore[attr-defined, unused-ignore]
+    if descriptors is None:
+        return Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
+    return Keypoints(np.array([each.pt for each in keypoints], np.float64), descriptors)
+
+
+def motion_of_images(
+    here: Keypoints, there: Keypoints, points: Points, camera: Camera
+) -> tuple[Floats | None, str]:
+    """Returns the motion from the other frame's camera to this one's, from matched keypoints.
+
+    The points are the sparse depth of the other frame; both have the same camera. The motion is
+    (3, 4) in metres, and None if it is refused. The text says what supports it, or why it is.
+    """
+    at, to = _matches(here, there)
+    depth, known = _depth_at(points, at)
+    at, to, depth = at[known], to[known], depth[known]
+    if len(at) < _MIN_INLIERS:
+        return None, f"{len(at)} matches with depth, at least {_MIN_INLIERS} needed"
+    focal_px = float(camera.intrinsics[0, 0])
+    rays = rays_of(camera, to)
+    solved, turn, shift, index = cv2.solvePnPRansac(
+        unproject(camera, at, depth), rays, np.eye(3), None, iterationsCount=1000,
+        reprojectionError=_REPROJECTION_PX / focal_px, confidence=0.9999,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )  # fmt: skip
+    inliers = np.empty(0, np.intp) if not solved or index is None else index.ravel()
+    basis = f"{len(inliers)} of {len(at)} matches of the images"
+    if len(inliers) < max(_MIN_INLIERS, _MIN_FRACTION * len(at)):
+        return None, f"{basis} agree"
+    xyz = unproject(camera, at[inliers], depth[inliers])
+    turn, shift = cv2.solvePnPRefineLM(xyz, rays[inliers], np.eye(3), None, turn, shift)
+    motion = np.column_stack([cv2.Rodrigues(turn)[0], shift])
+    length, median = float(np.linalg.norm(motion[:, 3])), float(np.median(points.depth))
+    if not length <= median:
+        return None, f"{length:.1f} m of motion at a median depth of {median:.1f} m"
+    return motion, basis
+
+
+def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
+    """(M, 2) keypoints of the other image, and (M, 2) their partners in this one."""
+    if min(len(here.xy), len(there.xy)) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(there.descriptors, here.descriptors, k=2)
+    clear = [best for best, second in pairs if best.distance < _RATIO * second.distance]
+    return there.xy[[m.queryIdx for m in clear]], here.xy[[m.trainIdx for m in clear]]
+
+
+def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
+    """Depth (M,) at pixels, a mean of the inverses of points around, and where it is known."""
+    if len(points) < _MIN_INLIERS or not len(xy):
+        return np.zeros(len(xy)), np.zeros(len(xy), bool)
+    distance, near = cKDTree(points.xy).query(xy, k=4)
+    around = points.depth[near].astype(np.float64)
+    smooth = around.max(axis=1) < _JUMP * around.min(axis=1)
+    weights = 1 / np.maximum(distance, 1e-3)
+    depth = weights.sum(axis=1) / (weights / around).sum(axis=1)
+    return depth, smooth & (distance[:, 0] < _REACH * _spacing_px(points))

@@ -159,9 +159,4 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
             f"no beam of {sensor.name} gives a point in the image ({drops}); check depth and"
             " intrinsics"
         )
-    return Points(
-        xy=xy.astype(np.float32),
-        depth=points[:, 2].astype(np.float32),
-        size=size,
-        dropped=drops.dropped,
-    )
+    return drops.points(points, xy, size)

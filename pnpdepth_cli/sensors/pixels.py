@@ -56,6 +56,11 @@ class DropCounter:
         self.keep(nearest, "behind another in their pixel")
         return xyz[nearest], xy[nearest]
 
+    def points(self, xyz: Floats, xy: Floats, size: tuple[int, int]) -> Points:
+        """Returns what is left, `xyz` in the camera's coordinates, as points of an image (H, W)."""
+        pixels, depth = xy.astype(np.float32), xyz[:, 2].astype(np.float32)
+        return Points(xy=pixels, depth=depth, size=size, dropped=self.dropped)
+
     def __str__(self) -> str:
         return describe_dropped(self.dropped)
 

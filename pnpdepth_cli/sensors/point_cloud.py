@@ -235,10 +235,7 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
 
 
 def _project_back(world: Floats, here: View, other: View) -> tuple[NDArray[np.intp], Floats]:
-    """Indices of the points that another view has a depth of, and its own points there.
-
-    The latter are in the coordinates of `here`.
-    """
+    """Indices of points that another view has depth of, and its points there, seen from here."""
     seen = _apply_inverse(world, other.pose)
     index = np.flatnonzero(seen[:, 2] > 0)
     xy = pixels_of(other.camera, seen[index])

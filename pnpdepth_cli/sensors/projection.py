@@ -17,6 +17,7 @@ import itertools
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import NoPointsError
@@ -94,12 +95,7 @@ def project_velodyne(
             " scan and calibration belong to this camera, the scanner's translation is in metres,"
             " and a quaternion has w last"
         )
-    return Points(
-        xy=xy.astype(np.float32),
-        depth=seen[:, 2].astype(np.float32),
-        size=size,
-        dropped=drops.dropped,
-    )
+    return drops.points(seen, xy, size)
 
 
 def edge_agreement(ranks: NDArray[np.float64], xy: NDArray[np.floating], jumps: Mask) -> float:
@@ -128,8 +124,6 @@ def edge_ranks(rgb: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def near_jumps(points: Points) -> Mask:
     """Returns (N,) true for points at the near side of a jump of depth; none of a few points."""
-    from scipy.spatial import cKDTree
-
     if len(points) <= _JUMP_NEIGHBOURS:
         return np.zeros(len(points), bool)
     _, near = cKDTree(points.xy).query(points.xy, k=_JUMP_NEIGHBOURS)
@@ -148,8 +142,6 @@ def hidden_points(
         focal_px: Focal length in pixels.
         scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z.
     """
-    from scipy.spatial import cKDTree
-
     reach = max(1, round(np.radians(_REACH_DEG) * focal_px))
     margin = np.radians(_MARGIN_DEG) * focal_px
     # Suspects are points with something nearer within reach.
@@ -180,10 +172,7 @@ def hidden_points(
 
 
 def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:
-    """(M, 2) pixel coordinates at which the beam to each point passes the depth `near` (M,).
-
-    They are the point's own where the beam starts beyond that depth.
-    """
+    """(M, 2) pixels where the beam to each point passes the depth `near` (M,), else the point's."""
     with np.errstate(divide="ignore", invalid="ignore"):
         fraction = (near - scanner[2]) / (depth - scanner[2])
         passed = (fraction > 0) & (fraction < 1)
@@ -204,8 +193,6 @@ def hidden_among(xy: Floats, depth: Floats, size: tuple[int, int]) -> Mask:
         depth: (N,) z.
         size: (H, W) of the image.
     """
-    from scipy.spatial import cKDTree
-
     if len(xy) < 2:
         return np.zeros(len(xy), bool)
     margin = 2 * float(np.median(cKDTree(xy).query(xy, k=2)[0][:, 1]))

@@ -11,9 +11,16 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors.accumulation import NeighbourScan, accumulate, refine_motion, surface_of
+from pnpdepth_cli.sensors.accumulation import (
+    Keypoints,
+    NeighbourScan,
+    accumulate,
+    keypoints_of,
+    motion_of_images,
+    refine_motion,
+    surface_of,
+)
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.motion import Keypoints, keypoints_of, motion_of_images
 from pnpdepth_cli.sensors.pixels import Points
 
 SIZE = (120, 160)
