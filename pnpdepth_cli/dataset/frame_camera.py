@@ -1,4 +1,4 @@
-"""The camera of a frame: from the sparse depth, a calibration, or EXIF."""
+"""The camera of an image, from a calibration or from EXIF."""
 
 from __future__ import annotations
 
@@ -8,50 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.dataset.frame_files import FrameFiles
-from pnpdepth_cli.dataset.read_options import ReadOptions
-from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.errors import SizeError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.rgb import read_focal_length
 
 _OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
-
-
-def camera_of_frame(
-    files: FrameFiles,
-    options: ReadOptions,
-    known: Camera | None,
-    size: tuple[int, int],
-    *,
-    needs_camera: bool,
-) -> tuple[Camera | None, list[str]]:
-    """Returns the camera of the part of the frame that its protocol keeps, and lines for a person.
-
-    The camera is None if it is unknown.
-
-    Args:
-        files: The files of the frame.
-        options: Options of reading, such as the calibration.
-        known: The camera of the whole image that came with the sparse depth. None: it had none.
-        size: (H, W) of the whole image.
-        needs_camera: Whether it must be known; only then it is taken from EXIF.
-
-    Raises:
-        UsageError: The camera is needed, and nothing gives it.
-        SizeError: The calibration is of another image.
-    """
-    image, scan = files.image_file, options.scan.over(files)
-    notes = list[str]()
-    if known is None and scan.calib is not None:
-        known, notes = camera_of_file(scan.calib, scan.camera, size, image)
-    if known is None and needs_camera:
-        if image is None or (of_exif := camera_of_exif(image, size)) is None:
-            raise UsageError(
-                f"--html-3d needs the camera, and {image or files.sparse} has neither a calibration"
-                " nor a focal length in EXIF; give --calib"
-            )
-        known, notes = of_exif
-    return None if known is None else files.part.camera_in_crop(known, size), notes
 
 
 def camera_of_file(

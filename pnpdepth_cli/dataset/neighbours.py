@@ -27,8 +27,6 @@ from pnpdepth_cli.sensors.accumulation import (
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.pixels import Floats, Points
 
-_IN_MEMORY = 16
-"""Number of images whose keypoints are kept."""
 _CONTRADICTION = 0.0075
 """Fraction of the image's width by which contradicting poses move points off what images show. On a
 KITTI drive the inertial system is off by 0.0006 to 0.0021, poses of another drive by 0.010 to
@@ -147,7 +145,7 @@ def _keypoints_of(files: FrameFiles) -> Keypoints:
     return _keypoints(files.image, files.part, fingerprint(file_of(files.image)).sha256)
 
 
-@functools.lru_cache(maxsize=_IN_MEMORY)
+@functools.lru_cache(maxsize=16)  # images
 def _keypoints(image: ImageSource, part: FramePart, digest: str) -> Keypoints:
     """The keypoints of an image whose file has this digest."""
     return keypoints_of(np.ascontiguousarray(part.apply(read_image(image))))

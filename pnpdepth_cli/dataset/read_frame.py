@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.arrays import apply_masks, move_depth, raw_depth, read_image, record_of
 from pnpdepth_cli.dataset.colmap_points import read_colmap_points
-from pnpdepth_cli.dataset.frame_camera import camera_of_frame
+from pnpdepth_cli.dataset.frame_camera import camera_of_exif, camera_of_file
 from pnpdepth_cli.dataset.frame_files import SCAN_ONLY_SUFFIXES, FrameFiles, ImageSource
 from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
@@ -79,9 +80,7 @@ def read_frame(
     compared = [] if truth is None else _compare(files, truth, sparse, given)
     size = size or (given.size if truth is None else truth.size)
     # The camera, and with it the points of neighbouring frames.
-    camera, of_camera = camera_of_frame(
-        files, options, sparse.camera, size, needs_camera=needs_camera
-    )
+    camera, of_camera = _camera_of(files, options, sparse.camera, size, needs_camera)
     used, held_out = _hold_out(given, holdout, seed)
     points, neighbours, lost = read_neighbours(
         files, used, camera, lambda other: _points_of(other, options, size, seed)
@@ -247,6 +246,28 @@ def _read_sparse(
     if files.sparse_mask is not None:
         sparse = sparse.confident(files.sparse_mask, files.min_confidence)
     return sparse.in_part(files.part)
+
+
+def _camera_of(
+    files: FrameFiles,
+    options: ReadOptions,
+    known: Camera | None,
+    size: tuple[int, int],
+    is_needed: bool,
+) -> tuple[Camera | None, list[str]]:
+    """The camera of a frame's part, None if unknown; it is from EXIF only where it is needed."""
+    image, scan = files.image_file, options.scan.over(files)
+    notes = list[str]()
+    if known is None and scan.calib is not None:
+        known, notes = camera_of_file(scan.calib, scan.camera, size, image)
+    if known is None and is_needed:
+        if image is None or (of_exif := camera_of_exif(image, size)) is None:
+            raise UsageError(
+                f"--html-3d needs the camera, and {image or files.sparse} has neither a calibration"
+                " nor a focal length in EXIF; give --calib"
+            )
+        known, notes = of_exif
+    return None if known is None else files.part.camera_in_crop(known, size), notes
 
 
 def _points_of(files: FrameFiles, options: ReadOptions, size: tuple[int, int], seed: int) -> Points:

@@ -86,13 +86,9 @@ _PAPER_FOV = {
 
 LIDARS = {
     name: Lidar(
-        name=name,
-        elevations_deg=elevations_deg,
-        azimuth_step_deg=step_deg,
-        max_range=max_range,
-        range_noise=range_noise,
+        name=name, elevations_deg=beams, azimuth_step_deg=step, max_range=reach, range_noise=noise
     )
-    for name, (elevations_deg, step_deg, max_range, range_noise) in _SHEETS.items()
+    for name, (beams, step, reach, noise) in _SHEETS.items()
 } | {
     f"paper-{name}": Lidar(
         name=f"paper-{name}",

@@ -23,12 +23,8 @@ class _Scene(NamedTuple):
     size: tuple[int, int]
     image: Image | None
     pattern: SamplePattern
+    wanted: int  # number of points to sample
     seed: int
-
-    @property
-    def wanted(self) -> int:
-        """The number of points to sample."""
-        return self.pattern.wanted(self.known.size)
 
 
 def sample_points(
@@ -59,7 +55,8 @@ def sample_points(
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
     if not known.size:
         raise NoPointsError("the depth map has no pixel with known depth to sample from")
-    chosen = np.sort(SAMPLERS[pattern.kind](_Scene(known, size, image, pattern, seed)))
+    scene = _Scene(known, size, image, pattern, pattern.wanted(known.size), seed)
+    chosen = np.sort(SAMPLERS[pattern.kind](scene))
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, size[1])

@@ -39,23 +39,6 @@ def _match(root: Path, name: str | None) -> str | None:
     return next((layout for layout in names if LAYOUTS[layout].matches(root)), None)
 
 
-def _nearest(root: Path) -> str:
-    """What the nearest layout lacks; how to make the simplest, if no layout is near."""
-    needs = {name: layout.needs for name, layout in LAYOUTS.items() if layout.needs}
-    lacking = {
-        name: [p for p in patterns if not any(any(root.glob(s + p)) for s in ("", "*/", "*/*/"))]
-        for name, patterns in needs.items()
-    }
-    best = min(needs, key=lambda name: len(lacking[name]) / len(needs[name]))
-    if len(lacking[best]) < len(needs[best]):
-        fact = ", ".join(lacking[best]) or "nothing, but has them in several places"
-        return f"nearest is {best!r}, which needs {', '.join(needs[best])}; the folder lacks {fact}"
-    return (
-        "put images into rgb/ and their sparse depth into sparse/, with equal names, or give a"
-        f" CSV list with the columns image and sparse; known layouts: {', '.join(LAYOUTS)}"
-    )
-
-
 def list_frames(
     root: Path, name: str | None = None
 ) -> tuple[str, list[FrameFiles], list[Unmatched]]:
@@ -108,7 +91,11 @@ def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
             " RGB' in Record3D, and give the folder EXR_RGBD"
         )
     if name is None:
-        raise InputError(f"{root} does not look like any layout; {_nearest(root)}")
+        raise InputError(
+            f"{root} does not look like any layout ({', '.join(LAYOUTS)}); name one to see what it"
+            " needs, or put images into rgb/ and their sparse depth into sparse/, with equal names,"
+            " or give a CSV list with the columns image and sparse"
+        )
     needed = ", ".join(LAYOUTS[name].needs)
     raise InputError(
         f"{root} does not look like {name!r}" + (f", which needs {needed}" if needed else "")

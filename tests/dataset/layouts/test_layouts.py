@@ -314,25 +314,14 @@ def test_the_parent_of_data_sets_of_one_layout_has_their_frames(tmp_path: Path) 
     assert [frame.name for frame in read_frames(tmp_path, "pairs")] == ["mine/a"]
 
 
-@pytest.mark.parametrize(
-    ("files", "nearest", "lacking"),
-    [
-        ("image_2/0.png calib/0.txt", "kitti-object", "velodyne"),
-        (
-            f"2011_09_26/{DRIVE}/image_02/data/0.png 2011_09_26/calib_cam_to_cam.txt",
-            "kitti-raw",
-            "velodyne_points/data",
-        ),
-    ],
-)
-def test_an_unknown_folder_names_the_nearest_layout_and_what_it_lacks(
-    files: str, nearest: str, lacking: str, tmp_path: Path
-) -> None:
-    tree(tmp_path, files)
-    with pytest.raises(InputError, match=rf"'{nearest}', which needs .* lacks {lacking}$"):
+def test_an_unknown_folder_names_the_layouts_and_a_named_one_what_it_needs(tmp_path: Path) -> None:
+    tree(tmp_path, "image_2/0.png calib/0.txt")
+    with pytest.raises(InputError, match="kitti-object"):
         list_frames(tmp_path)
-    with pytest.raises(UsageError, match=nearest):
-        read_frames(tmp_path, f"{nearest}s")
+    with pytest.raises(InputError, match=r"kitti-object.*velodyne"):
+        list_frames(tmp_path, "kitti-object")
+    with pytest.raises(UsageError, match="kitti-object"):
+        list_frames(tmp_path, "kitti-objects")
 
 
 def test_a_protocol_that_is_none_or_that_a_frame_is_too_small_for_is_refused() -> None:
