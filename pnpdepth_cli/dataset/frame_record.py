@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -211,8 +212,6 @@ class FrameRecord:
         Raises:
             FileFormatError: It is none.
         """
-        import msgspec
-
         try:
             with _CONVERTING:
                 return msgspec.convert(entry, cls)

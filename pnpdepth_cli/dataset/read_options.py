@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pnpdepth_cli import choices
+from pnpdepth_cli.dataset.frame_files import SCAN_ONLY_SUFFIXES, FrameFiles
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.protocols import ForegroundFilter
 from pnpdepth_cli.settings import option
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.dataset.frame_files import FrameFiles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +43,6 @@ class ScanOptions:
             InputError: A list of points cannot be read.
             UsageError: It is not, and an option is given that only a scan has.
         """
-        from pnpdepth_cli.dataset.frame_files import SCAN_ONLY_SUFFIXES
-
         suffix = sparse.suffix.lower()
         if suffix in SCAN_ONLY_SUFFIXES:
             return True
@@ -70,9 +65,8 @@ class ScanOptions:
         """
         if (calib := self.calib or files.calib) is None:
             return self
-        return replace(
-            self, calib=calib, camera=files.camera if self.camera is None else self.camera
-        )
+        camera = files.camera if self.camera is None else self.camera
+        return replace(self, calib=calib, camera=camera)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,8 +23,6 @@ from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.pixels import Points, pixel_index
 from pnpdepth_cli.sensors.projection import behind_foreground, occluded_in_map
 
-_FEW_LEVELS = 4  # of confidence; their counts are listed
-
 
 @dataclass(frozen=True, kw_only=True)
 class SparseDepth:
@@ -57,12 +55,10 @@ class SparseDepth:
         pixel = pixel_index(self.points.resized(*size).xy, (size[0], size[1]))
         own = levels.ravel()[pixel.clip(0, levels.size - 1)]
         kept = own > 0 if least is None else own >= least
-        values, counts = np.unique(own, return_counts=True)
-        listing = ", ".join(f"{n:,} of {v:g}" for v, n in zip(values, counts, strict=True))
         fact = (
             f"{np.count_nonzero(kept):,} of {len(own):,} points have a confidence"
-            f" {'above 0' if least is None else f'of {least:g} or more'} in {path}"
-            + (f" ({listing})" if len(values) <= _FEW_LEVELS else "")
+            f" {'above 0' if least is None else f'of {least:g} or more'} in {path},"
+            f" which gives them {own.min():g} to {own.max():g}"
         )
         if not kept.any():
             raise NoPointsError(f"{fact}; lower --min-confidence")
