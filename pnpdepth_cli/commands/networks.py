@@ -166,9 +166,8 @@ def list_layers(
         ModelError, CheckpointError, DeviceError: As in loading.
     """
     network = load_network(choice.model, choice.checkpoint, choice.device)
-    names = list(network.definition.layers)
-    if every:
-        names = [name for name, _ in network.module.named_modules() if name]
+    submodules = [name for name, _ in network.module.named_modules() if name]
+    names = submodules if every else list(network.definition.layers)
     if not names:
         raise UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"

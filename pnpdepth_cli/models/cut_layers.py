@@ -74,11 +74,8 @@ def best_layer(
     enough = min(wanted_field(size, point_count), *size)
     widths = dict[str, int]()
     for name in reversed(network.definition.layers):
-        with (
-            suppress(ModelError),  # it cannot be cut there
-            Split(network.module, name) as split,
-            torch.no_grad(),
-        ):
+        # A layer that the network cannot be cut at is left out.
+        with suppress(ModelError), Split(network.module, name) as split, torch.no_grad():
             z = split.front(*arguments)
             widths[name] = min(influential_field(split, z, network.known_of, enough).in_output)
             if widths[name] >= enough:
@@ -146,10 +143,8 @@ def _area(output: Tensor) -> int:
 
 def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:
     height, width = output.shape[2:4]
-    if min(height, width) < 2:
-        return False
-    ratio = (height / width) / (sides[0] / sides[1])
-    return 1 / _SIMILAR_ASPECT < ratio < _SIMILAR_ASPECT
+    ratio = (height / max(1, width)) / (sides[0] / sides[1])
+    return min(height, width) > 1 and 1 / _SIMILAR_ASPECT < ratio < _SIMILAR_ASPECT
 
 
 def _last_of_each_resolution(areas: Mapping[str, int]) -> list[str]:

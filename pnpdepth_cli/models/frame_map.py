@@ -105,8 +105,11 @@ def _resize(depth: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(depth, size, mode="bilinear", align_corners=False)
 
 
-def synthetic_frame(size: tuple[int, int]) -> tuple[Tensor, SparsePoints]:
-    """A smooth random rgb image (1, 3, H, W), and points on a slanted plane; the seed is fixed."""
+def synthetic_frame(size: tuple[int, int]) -> tuple[Tensor, SparsePoints, Camera]:
+    """A smooth random rgb image (1, 3, H, W), points on a slanted plane, and a camera.
+
+    The seed is fixed; the focal length is the width of the image.
+    """
     height, width = size
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)
@@ -118,12 +121,5 @@ def synthetic_frame(size: tuple[int, int]) -> tuple[Tensor, SparsePoints]:
         depth=2 + 3 * y.float() / height + torch.rand(len(pixels), generator=generator),
         size=size,
     )
-    return rgb, points
-
-
-def synthetic_camera(size: tuple[int, int]) -> Camera:
-    """A camera whose focal length is the width of its images, (H, W)."""
-    height, width = size
-    center_x, center_y = (width - 1) / 2, (height - 1) / 2
-    matrix = np.array([[width, 0, center_x], [0, width, center_y], [0, 0, 1.0]])
-    return Camera(intrinsics=matrix, size=size)
+    matrix = np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1.0]])
+    return rgb, points, Camera(intrinsics=matrix, size=size)

@@ -17,7 +17,7 @@ from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_us
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
 from pnpdepth_cli.models.cut_layers import suggest_layers
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, file_and_part
-from pnpdepth_cli.models.frame_map import FrameMap, synthetic_camera, synthetic_frame
+from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.registry import find_definition, importing_beside
 from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
 from pnpdepth_cli.points import SparsePoints
@@ -116,11 +116,11 @@ class Network:
             frame: Map from pixels of the image to those of the network.
             rgb: (1, 3, H, W) in 0…1, an image instead of the synthetic one.
         """
-        synthetic, points = synthetic_frame(frame.image)
+        synthetic, points, camera = synthetic_frame(frame.image)
         return self.arguments_of(
             self.image_of(frame, synthetic if rgb is None else rgb),
             frame.points_to_network(points),
-            intrinsics=frame.intrinsics_to_network(synthetic_camera(frame.image)),
+            intrinsics=frame.intrinsics_to_network(camera),
         )
 
     def verify(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
@@ -209,9 +209,7 @@ def _read_nan_gradients_as_zero(tensor: Tensor) -> None:
 
 
 def load_network(
-    spec: str | ModelDefinition,
-    checkpoint: Path | None,
-    device: str = "cpu",
+    spec: str | ModelDefinition, checkpoint: Path | None, device: str = "cpu"
 ) -> Network:
     """Returns a network, built, with its weights, on its device.
 

@@ -24,11 +24,9 @@ from types import ModuleType
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.core.user_code import describe
-from pnpdepth_cli.errors import ModelError, PnpDepthError
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, assume_definition
 from pnpdepth_cli.models.weights.checkpoint import WEIGHT_SUFFIXES
-
-_TORCHSCRIPT = (".ts", ".torchscript")
 
 
 def names() -> list[str]:
@@ -53,8 +51,6 @@ def _definitions_of(family: str) -> Mapping[str, ModelDefinition]:
     """The definitions of one family. ModelError if it cannot be loaded, or holds none."""
     try:
         entry = choices.NETWORKS[family]
-    except PnpDepthError:
-        raise
     except Exception as error:  # the code of another package
         raise ModelError(f"network family {family!r} cannot be loaded: {describe(error)}") from None
     if isinstance(entry, ModuleType):
@@ -113,7 +109,7 @@ def _from_file(spec: str) -> ModelDefinition | None:
         from pnpdepth_cli.models.torch_export import exported_definition
 
         return exported_definition(Path(spec))
-    if spec.endswith((*WEIGHT_SUFFIXES, *_TORCHSCRIPT)):
+    if spec.endswith((*WEIGHT_SUFFIXES, ".ts", ".torchscript")):
         raise ModelError(
             f"model {spec} is a file of weights, a pickled module or a TorchScript archive, which"
             " is not run; name the network's Python file as the model and the weights as the"
@@ -135,9 +131,7 @@ def _python_definition(file: Path, attribute: str | None) -> ModelDefinition:
     if isinstance(value, ModelDefinition):
         return value
     if not callable(value):
-        raise ModelError(
-            f"{named!r} in model file {file} is a {type(value).__name__}, not a ModelDefinition"
-        )
+        raise ModelError(f"{named!r} in model file {file} is not a ModelDefinition")
     return assume_definition(
         name=f"{file.stem}.{named}",
         summary=f"{named} of {file.name}",

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +32,7 @@ _DTYPES = {
     1: torch.uint8, 2: torch.int8, 3: torch.int16, 4: torch.int32, 5: torch.int64,
     6: torch.float16, 7: torch.float32, 8: torch.float64, 12: torch.bool, 13: torch.bfloat16,
 }  # fmt: skip
-_MEMORY_FORMATS = {
-    1: torch.contiguous_format, 2: torch.channels_last, 3: torch.channels_last_3d,
-    4: torch.preserve_format,
-}  # fmt: skip
+_MEMORY_FORMATS = {1: torch.contiguous_format, 2: torch.channels_last, 4: torch.preserve_format}
 _STRIDED = 7
 
 
@@ -72,7 +69,8 @@ class ExportedGraph(nn.Module):
             if kind == "user_input":
                 self.inputs.append(value["arg"]["as_tensor"]["name"])
             elif kind in ("parameter", "buffer", "tensor_constant"):
-                self._hold(value["arg"]["name"], tensors[value[f"{kind}_name"]])
+                self.held[value["arg"]["name"]] = attribute = f"tensor{len(self.held)}"
+                hold(self, attribute, tensors[value[f"{kind}_name"]])
             else:
                 raise BrokenFileError(f"its input is a {str(kind)[:40]!r}")
         self._outputs = [
@@ -80,7 +78,11 @@ class ExportedGraph(nn.Module):
             for spec in module["signature"]["output_specs"]
             if "user_output" in spec
         ]
-        steps = list(self._steps_of(module["graph"]))
+        steps = [
+            self._step(node["target"], node["inputs"], node["outputs"])
+            for node in module["graph"]["nodes"]
+            if node["outputs"]  # the others only check what the exporter saw
+        ]
         self._steps = Steps(steps, self._outputs, kind="operation")
 
     def forward(self, *inputs: Tensor) -> object:
@@ -90,15 +92,6 @@ class ExportedGraph(nn.Module):
         self._steps.run(values, tuple(each.shape for each in inputs))
         outputs = tuple(values[name] for name in self._outputs)
         return outputs if len(outputs) > 1 else outputs[0]
-
-    def _hold(self, name: str, value: Tensor) -> None:
-        self.held[name] = f"tensor{len(self.held)}"
-        hold(self, self.held[name], value)
-
-    def _steps_of(self, graph: Mapping[str, Any]) -> Iterator[Step]:
-        for node in graph["nodes"]:
-            if node["outputs"]:  # the others only check what the exporter saw
-                yield self._step(node["target"], node["inputs"], node["outputs"])
 
     def _step(self, target: str, inputs: list[Any], outputs: list[Any]) -> Step:
         run, inputs = ExportedOperation(_function(target)), [dict(one) for one in inputs]

@@ -120,8 +120,7 @@ _REDUCTIONS: dict[str, Callable[[Tensor, list[int], bool], Tensor]] = {
 
 @operator(*_REDUCTIONS, host=(1,))
 def reduce(node: Node, inputs: Inputs) -> Tensor:
-    axes = stated(node, "axes", inputs, 1)
-    axes = axes or list(range(inputs[0].ndim))
+    axes = stated(node, "axes", inputs, 1) or list(range(inputs[0].ndim))
     return _REDUCTIONS[node.op](inputs[0], axes, bool(node.get("keepdims", 1)))
 
 

@@ -62,7 +62,9 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
     path, key = file_and_part(path)
     if path.is_dir():
         return _read_folder(path, notes)
-    _check_file(path)
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint {path} does not exist")
+    check_network_file(path, "checkpoint", CheckpointError)
     # Its reader gives named tensors, or what a torch file holds.
     kind, read = _READERS.get(path.suffix, ("torch file", read_torch_file))
     try:
@@ -78,16 +80,8 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
     # The state dict in that.
     content, names = content
     if names:
-        fact = f"its pickle names {_some(names)}; nothing of it was run"
-        notes.append(f"checkpoint {path.name}: {fact}")
+        notes.append(f"checkpoint {path.name}: its pickle names {_some(names)}; none of it was run")
     return _state_in(content, path, key, notes)
-
-
-def _check_file(path: Path) -> None:
-    """CheckpointError unless the file is there itself, no larger than memory holds."""
-    if not path.is_file():
-        raise CheckpointError(f"checkpoint {path} does not exist")
-    check_network_file(path, "checkpoint", CheckpointError)
 
 
 def _read_folder(folder: Path, notes: list[str]) -> dict[str, Tensor]:

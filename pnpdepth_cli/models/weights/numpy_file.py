@@ -51,8 +51,7 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
 
 def _state_of_array(value: object) -> tuple[Any, ...]:
     """(version, shape, type, order, data) of a pickled numpy array; nothing for anything else."""
-    found = value if isinstance(value, StandIn) and value.path in _RECONSTRUCT else None
-    state = found.state if found else None
+    state = value.state if isinstance(value, StandIn) and value.path in _RECONSTRUCT else None
     return state if isinstance(state, tuple) and len(state) == 5 else (None,) * 5
 
 

@@ -139,9 +139,8 @@ def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
     content, named = read_pickle(file, storages.load)
     # The bytes of each storage.
     keys, _ = read_pickle(file)
-    names = (
-        [str(key) for key in keys if isinstance(key, str | int)] if isinstance(keys, list) else []
-    )
+    keys = keys if isinstance(keys, list) else []
+    names = [str(key) for key in keys if isinstance(key, str | int)]
     if {*names} != storages.contents.keys():
         raise BrokenFileError("its storages are not those that its pickle names")
     for key in names:
@@ -166,7 +165,10 @@ class _Storages:
         """The storage for ("storage", type, key, location, elements, view) as a flat tensor."""
         if not isinstance(pid[2], str | int):
             raise BrokenFileError("a storage without a key")
-        key, dtype, count = str(pid[2]), _dtype(pid[1]), int(pid[4])
+        kind = pid[1].path.rpartition(".")[2] if isinstance(pid[1], Name) else ""
+        if kind not in _DTYPES:
+            raise BrokenFileError(f"a storage of type {kind[:40] or '?'}")
+        key, dtype, count = str(pid[2]), _DTYPES[kind], int(pid[4])
         if key not in self.contents:
             self.contents[key] = self._make(key, count * dtype.itemsize)
             self.dtypes[key] = dtype
@@ -178,10 +180,3 @@ class _Storages:
         if not count:
             return torch.empty(0, dtype=dtype)
         return torch.frombuffer(data, dtype=dtype, count=count, offset=start * dtype.itemsize)
-
-
-def _dtype(kind: object) -> torch.dtype:
-    name = kind.path.rpartition(".")[2] if isinstance(kind, Name) else ""
-    if name not in _DTYPES:
-        raise BrokenFileError(f"a storage of type {name[:40] or '?'}")
-    return _DTYPES[name]
