@@ -23,7 +23,7 @@ from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.tables import Cell, Table, count_of, write_text
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.stages import GT, HELD_OUT
+from pnpdepth_cli.stages import GT
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.summary import BatchSummary
@@ -119,8 +119,7 @@ def print_refinement(record: FrameRecord) -> None:
     if record.worse_than_linear:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
     if record.improved_fraction is not None:
-        where = "held-out points" if HELD_OUT in record.errors else "points used"
-        where = "scored pixels" if GT in record.errors else where
+        where = "scored pixels" if GT in record.errors else "held-out points"
         say(f"improved: {record.improved_fraction:.1%} of the {where}")
     # Updates, times and files.
     parts = [", ".join(f"{stage} {spent:.2f} s" for stage, spent in record.seconds.items())]

@@ -158,7 +158,7 @@ class FrameRecord:
     errors: dict[str, dict[str, Scores]] = field(default_factory=dict)
     """Errors by basis (`BASES`), then by stage: before, after, linear, and those of the method."""
     improved_fraction: float | None = None
-    """Fraction of the scored pixels, else of the points, whose error fell."""
+    """Fraction of the scored pixels, else of the held-out points, whose error fell."""
     notes: list[str] = field(default_factory=list)
     """Lines for a person; a warning begins with "warning"."""
     figures: dict[str, FigureRecord] = field(default_factory=dict)

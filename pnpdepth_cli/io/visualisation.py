@@ -72,7 +72,7 @@ def preview(
                 ("Depth before", "Depth after"), (before, after), made_by, strict=True
             )
         ),
-        _change_panel(before, after, grey, factor),
+        _change_panel(before, after, grey, factor, unit),
     ]
     if rgb is not None:
         image = np.rint(255 * np.clip(np.nan_to_num(rgb), 0, 1)).astype(np.uint8)
@@ -104,7 +104,8 @@ def _paint(
     values: NDArray[np.float64], where: NDArray[np.bool_], grey: NDArray[np.float32], colors: str
 ) -> tuple[Pixels, float]:
     """A map of signed values in colours on the dark grey image, and the value of full colour."""
-    pixels, strongest = dim(np.asarray(0.6 * grey, np.float32)), _strongest(values)
+    pixels, changed = dim(np.asarray(0.6 * grey, np.float32)), np.abs(values[values != 0])
+    strongest = float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
     pixels[where] = paint_signed(values / strongest, 0.66 + 0.3 * grey[where], colors)
     return pixels, strongest
 
@@ -123,83 +124,68 @@ def _points_panel(
     return Panel(title="Sparse depth", pixels=discs, remark=count)
 
 
-def _change_panel(before: Depth, after: Depth, grey: NDArray[np.float32], factor: float) -> Panel:
-    """The signed change in metres."""
+def _change_panel(
+    before: Depth, after: Depth, grey: NDArray[np.float32], factor: float, unit: str
+) -> Panel:
+    """The signed change."""
     both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
     change = (after[both] - before[both]).astype(np.float64)
     pixels, strongest = _paint(change, both, grey, "change")
-    remark = f"after - before: teal farther, purple nearer, full at {strongest:.3g}"
+    remark = f"after - before: teal farther, purple nearer, full at {strongest:.3g} {unit}"
     return Panel(title="Change", pixels=resized(pixels, factor), remark=remark)
 
 
 def improvement(
+    rgb: NDArray[np.float32] | None,
     before: Depth,
     after: Depth,
     truth: Depth,
     path: Path,
-    *,
-    image: NDArray[np.float32] | None,
-    size: tuple[int, int],
-    xy: NDArray[np.float32] | None = None,
-    held_out: bool = False,
     unit: str = "m",
-) -> tuple[float, FigureRecord]:
+) -> FigureRecord:
     """Writes a PNG of where |depth - truth| fell and rose, as figure 4(d) of the paper.
 
-    Equal errors are neither better nor worse. The map has a pixel for each one where the truth and
-    the refined depth are known, or a disc for each point.
+    Equal errors are neither better nor worse. A pixel is dark where the truth or the refined depth
+    is unknown.
 
     Args:
-        before: (H, W), or (N,) at the points, before refinement.
-        after: The same after refinement.
-        truth: The same as measured, some of it known.
+        rgb: (H, W, 3) in 0..1, the ground of the map; None for a network without image.
+        before: (H, W) before refinement.
+        after: (H, W) after refinement.
+        truth: (H, W) as measured, some of it known.
         path: The PNG.
-        image: (H, W, 3) in 0..1, the ground of the map, if there is one.
-        size: (H, W) of the map.
-        xy: (N, 2) pixel coordinates of the points; None for maps.
-        held_out: Whether the points were held out of the refinement, which the PNG says.
         unit: Name of the unit of depth.
-
-    Returns:
-        The fraction of pixels or points whose error fell, and what the figure shows.
 
     Raises:
         OutputError: The file cannot be written.
     """
-    has_truth = np.isfinite(truth) & (truth > 0)
-    known = has_truth & (after > 0)
-    gain = _gain(before[known], after[known], truth[known])
-    grey, factor = grey_of(image, size), magnification(size)
-    # A map, or the points with the largest changes on top.
-    if xy is None:
-        painted, strongest = _paint(gain, known, grey, "gain")
-        pixels, noun = resized(painted, factor), "pixels"
-    else:
-        strongest, noun = _strongest(gain), "held-out points" if held_out else "points used"
-        colours = paint_signed(gain / strongest, np.full(len(gain), 0.92), "gain")
-        weakest_first = np.argsort(np.abs(gain), kind="stable")
-        pixels = draw_discs(0.8 * grey, xy[known], colours, factor, weakest_first)
+    # The map.
+    gains = gain(before, after, truth)
+    known = np.isfinite(gains)
+    gains = gains[known]
+    pixels, strongest = _paint(gains, known, grey_of(rgb, truth.shape), "gain")
+    pixels = resized(pixels, magnification(truth.shape))
     # The figure, and its texts for a report.
-    improved, worse = float((gain > 0).mean()), 100 * float((gain < 0).mean())
-    footer = f"{100 * improved:.1f} % of {gain.size:,} {noun} improved, {worse:.1f} % worse"
-    unknown = None if known.all() else "unknown" if (has_truth > known).any() else "no ground truth"
+    improved, worse = (100 * float(part.mean()) for part in (gains > 0, gains < 0))
+    footer = f"{improved:.1f} % of {gains.size:,} pixels improved, {worse:.1f} % worse"
+    unknown = None
+    if not known.all():
+        unknown = "unknown" if (truth[~known] > 0).any() else "no ground truth"
     remark = footer + (f"; dark: {unknown}" if unknown else "")
     panel = Panel(title="Change of error", pixels=pixels, remark=remark)
     labels = [f"{share * strongest:+.3g}" for share in (-1, -0.5, 0, 0.5, 1)]
     figure = save_figure(path, [panel], signed_bar("gain", 256), labels, f"gain, {unit}")
     amount = f"by {strongest:.3g} {unit} or more"
     ends = f"worse {amount}", f"better {amount}"
-    return improved, replace(figure, ends=ends, unknown=unknown, footer=footer)
+    return replace(figure, ends=ends, unknown=unknown, footer=footer)
 
 
-def _gain(before: Depth, after: Depth, gt: Depth) -> NDArray[np.float64]:
-    """Metres by which the error fell; a depth that is not finite counts as an error of 1e9."""
-    errors = (np.abs(depth.astype(np.float64) - gt.astype(np.float64)) for depth in (before, after))
+def gain(before: Depth, after: Depth, truth: Depth) -> NDArray[np.float64]:
+    """Returns by how much |depth - truth| fell; NaN where the truth or the depth after is unknown.
+
+    A depth that is not finite counts as an error of 1e9.
+    """
+    known = np.isfinite(truth) & (truth > 0) & (after > 0)
+    errors = (np.abs(depth.astype(np.float64) - truth) for depth in (before, after))
     was, now = (np.nan_to_num(error, nan=1e9, posinf=1e9) for error in errors)
-    return np.asarray(was - now, dtype=np.float64)
-
-
-def _strongest(gain: NDArray[np.float64]) -> float:
-    """The change in metres that has full colour."""
-    changed = np.abs(gain[gain != 0])
-    return float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
+    return np.where(known, was - now, np.nan)

@@ -80,6 +80,7 @@ def test_depth_that_no_points_support_is_said_and_written_as_zero_if_asked(
     assert f"of {known.sum():,} pixels improved" in zero["figures"]["improvement"]["footer"]
     # Without a mask, a note gives the part that lies outside of the scan.
     plain = result(capsys, f"refine {scan}")
+    assert {*plain["outputs"]} == {"depth", "preview", "record"}  # no map without ground truth
     assert any("--unknown zero" in note for note in plain["notes"])
     assert plain["points"]["used"] == pytest.approx(16007, abs=5)
 

@@ -79,27 +79,12 @@ def test_better_worse_equal_and_unknown_have_their_own_colours(tmp_path: Path) -
     # |6 - 5| = |4 - 5|: unchanged
     rows = ([6, 5, 6, 6], [5, 6, 4, 5], [5, 5, 5, 0])
     maps = (np.array([row], np.float32) for row in rows)
-    share, content = improvement(*maps, tmp_path / "i.png", image=None, size=(1, 4))
+    content = improvement(None, *maps, tmp_path / "i.png", "inches")
     shown = panels_of(tmp_path / "i.png", content)["Change of error"]
     colours = shown[0, :: shown.shape[1] // 4].tolist()
-    assert share == 1 / 3
     assert colours[:2] == [BLUE, ORANGE]
     assert len(set(colours[2])) == len(set(colours[3])) == 1
     assert colours[3][0] < 80 < 150 < colours[2][0]
-    assert content.ends == ("worse by 1 m or more", "better by 1 m or more")
+    assert content.ends == ("worse by 1 inches or more", "better by 1 inches or more")
     assert content.footer == "33.3 % of 3 pixels improved, 33.3 % worse"
     assert content.unknown == "no ground truth"
-
-
-def test_points_are_coloured_discs_where_they_lie(tmp_path: Path) -> None:
-    xy, truth = np.array([[5, 5], [30, 20]], np.float32), np.array([2, 3], np.float32)
-    before, after = (truth + np.array(error, np.float32) for error in ([1, 0], [0, 1]))
-    for image in (None, np.full((30, 40, 3), 0.5, np.float32)):
-        path, options = tmp_path / "i.png", {"image": image, "size": (30, 40), "held_out": True}
-        share, content = improvement(before, after, truth, path, xy=xy, **options)
-        panel = panels_of(path, content)["Change of error"]
-        factor = panel.shape[1] // 40
-        colours = panel[factor // 2 :: factor, factor // 2 :: factor]
-        assert (colours[5, 5].tolist(), colours[20, 30].tolist()) == (BLUE, ORANGE)
-        assert len(set(colours[12, 17].tolist())) == 1
-    assert (share, "held-out" in str(content.footer)) == (0.5, True)

@@ -1,8 +1,8 @@
-"""`pnpdepth batch --html`: each frame before and after refinement, with a map of the change.
+"""`pnpdepth batch --html`: each frame before and after refinement.
 
 Everything is read from the results on disk: scores from the rows of the summary, images from the
-previews and the improvement maps, which the report links as they were written. The records say
-where their panels are. So a report also has the frames of earlier runs.
+previews and, with ground truth, the improvement maps, which the report links as they were written.
+The records say where their panels are. So a report also has the frames of earlier runs.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str
     """
     files = {kind: request.output / path for kind, path in record.outputs.items()}
     key, views, figures = image_key(record.name), dict[str, object](), record.figures
-    shown = ("preview", "improvement")
-    if not all(kind in figures and kind in files and files[kind].exists() for kind in shown):
+    there = all(kind in files and files[kind].exists() for kind in figures)
+    if "preview" not in figures or not there:
         return {"key": None}
     for kind, figure in figures.items():
         name = f"{key}_{kind}.png"
@@ -132,13 +132,13 @@ def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str
     view_mb = None
     if request.html_3d and "view" in files:
         view_mb = save_view_3d(files["view"], images / f"{key}_view.js")
-    gains = figures["improvement"]
+    gains = figures.get("improvement")
     return {
         "key": key,
         "views": views,
         "view_mb": view_mb,
         "scale_m": figures["preview"].scale_m,
-        "map": {"ends": gains.ends, "unknown": gains.unknown, "footer": gains.footer},
+        "map": gains and {"ends": gains.ends, "unknown": gains.unknown, "footer": gains.footer},
     }
 
 

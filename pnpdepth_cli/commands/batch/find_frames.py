@@ -263,7 +263,7 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
 
 def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
     """Raises InputError for a frame whose results have no files of their own."""
-    endings = [path.name for path in outputs_in(Path(), "", refine).values()]
+    endings = [path.name for path in outputs_in(Path(), "", refine, with_gt=True).values()]
     owners = dict.fromkeys((CSV, JSON), "the batch")  # by the file
     # names that differ in Unicode normalisation only are one file on macOS
     names = {frame.name: unicodedata.normalize("NFC", frame.name) for frame in frames}

@@ -46,7 +46,8 @@ class Records:
 
     def outputs_of(self, frame: FrameFiles) -> Outputs:
         """Returns the files of a frame's result."""
-        return outputs_in(self.request.output, frame.name, self.request.refine)
+        output, refine = self.request.output, self.request.refine
+        return outputs_in(output, frame.name, refine, with_gt=frame.gt is not None)
 
     def check_new(self, frames: Iterable[FrameFiles]) -> None:
         """Raises OutputError if no batch has written to the folder, and a result exists there."""

@@ -17,10 +17,13 @@ IMAGES = frozenset({"preview", "improvement"})
 """Kinds for a person, which may be deleted."""
 
 
-def outputs_in(folder: Path, name: str, request: RefineRequest) -> dict[str, Path]:
+def outputs_in(
+    folder: Path, name: str, request: RefineRequest, *, with_gt: bool
+) -> dict[str, Path]:
     """Returns the files of a result in a folder; slashes in the name are subfolders."""
     without = set() if request.hold_out.uncertainty else {"sigma", "valid"}
     without |= set() if request.outputs.view_3d else {"view"}
+    without |= set() if with_gt else {"improvement"}
     endings = _endings(f".{request.outputs.format}")
     return {kind: folder / f"{name}{end}" for kind, end in endings.items() if kind not in without}
 
@@ -80,7 +83,7 @@ def plan_outputs(request: RefineRequest) -> dict[str, Path]:
     elif output.is_file():
         raise OutputError(f"{output} is a file; name a folder, or a depth file ({formats})")
     else:
-        outputs = outputs_in(output, inputs[0].stem, request)
+        outputs = outputs_in(output, inputs[0].stem, request, with_gt=files.gt is not None)
     # No input is replaced, and no result unless it may be.
     check_outputs(outputs.values(), inputs, overwrite=options.overwrite)
     return outputs

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
@@ -109,17 +108,14 @@ def _power_of_ten(largest: float) -> float:
 
 def write_outputs(
     outputs: Outputs, inputs: Frame, frame: Refined, made_by: tuple[str, str]
-) -> tuple[float | None, dict[str, FigureRecord]]:
-    """Writes the depth and its images.
+) -> dict[str, FigureRecord]:
+    """Writes the depth and its images; returns the figures by kind.
 
     Args:
         outputs: The files by kind.
         inputs: The frame as it was read.
         frame: The refined frame.
         made_by: Names of what made the depth before and the depth after, for the preview.
-
-    Returns:
-        The fraction of pixels or points whose error fell, where that was drawn, and the figures.
     """
     # The image as it was refined.
     image = replace(inputs, register=frame.registration).registered().image
@@ -129,19 +125,19 @@ def write_outputs(
         _write_sigma(outputs["sigma"], frame.sigma)
         write_mask(outputs["valid"], frame.valid)
     # Images for a person.
-    improved, figures = None, {}
+    figures = {}
     if "preview" in outputs:
         xy, depth = inputs.own.xy.numpy(), inputs.own.depth.numpy()
         figures["preview"] = preview(
             image, xy, depth, frame.before, frame.after, outputs["preview"], inputs.unit, made_by
         )
-    if "improvement" in outputs:
-        improved, figures["improvement"] = _write_improvement(
-            outputs["improvement"], image, inputs, frame
+    if "improvement" in outputs and inputs.gt is not None:
+        figures["improvement"] = improvement(
+            image, frame.before, frame.after, inputs.gt, outputs["improvement"], inputs.unit
         )
     if "view" in outputs:
         _write_view(outputs["view"], image, inputs, frame)
-    return improved, figures
+    return figures
 
 
 def _write_sigma(path: Path, sigma: Image) -> None:
@@ -151,30 +147,6 @@ def _write_sigma(path: Path, sigma: Image) -> None:
     if depth_format is not None and depth_format.integer:
         sigma = np.where(sigma > 0, np.maximum(sigma, np.float32(1 / scale)), np.float32(0))
     write_depth(path, sigma, scale=scale)
-
-
-def _write_improvement(
-    path: Path, image: Image | None, inputs: Frame, frame: Refined
-) -> tuple[float, FigureRecord]:
-    size = frame.after.shape
-    if inputs.gt is not None:
-        return improvement(frame.before, frame.after, inputs.gt, path, image=image, size=size)
-    points = frame.held_out if len(frame.held_out) else frame.used
-    points = points.select(points.known_in(torch.from_numpy(frame.after)))
-    before, after = (
-        points.sample(torch.from_numpy(depth)).numpy() for depth in (frame.before, frame.after)
-    )
-    return improvement(
-        before,
-        after,
-        points.depth.numpy(),
-        path,
-        image=image,
-        size=size,
-        xy=points.xy.numpy(),
-        held_out=bool(len(frame.held_out)),
-        unit=inputs.unit,
-    )
 
 
 def _write_view(path: Path, image: Image | None, inputs: Frame, frame: Refined) -> None:

@@ -37,6 +37,7 @@ from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import normalisation_name, with_input_range
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.file_bytes import fingerprint
+from pnpdepth_cli.io.visualisation import gain
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION
@@ -134,11 +135,10 @@ def write_refined(
     remove_outdated(outputs)
     with all_or_none(outputs.values()):
         with watch("write"):
-            improved, figures = write_outputs(outputs, inputs, frame, names_of_depths(record))
+            figures = write_outputs(outputs, inputs, frame, names_of_depths(record))
         record = replace(
             record,
             batch=batch,
-            improved_fraction=improved,
             figures=figures,
             outputs={
                 kind: path.relative_to(folder).as_posix() if folder else str(path)
@@ -208,6 +208,7 @@ def _record_of(
         weights=dict(refined.weights),
         loss=list(refined.losses),
         errors=_errors_of(refined, frame, with_baselines=request.hold_out.baselines),
+        improved_fraction=_improved_fraction(refined, frame.gt),
         notes=[note for note in (*frame.notes, *of_networks, *refined.notes) if note],
     )
 
@@ -249,6 +250,19 @@ def _against_truth(
         name: _scores(depth, gt if name == AFTER else known)
         for name, depth in (maps | stages | beside).items()
     }
+
+
+def _improved_fraction(refined: Refined, gt: DepthMap | None) -> float | None:
+    """The fraction of the pixels with ground truth, else of held-out points, whose error fell."""
+    before, after = refined.before, refined.after
+    if gt is None:
+        maps = torch.from_numpy(before), torch.from_numpy(after)
+        points = refined.held_out.select(refined.held_out.known_in(maps[1]))
+        before, after = (points.sample(depth).numpy() for depth in maps)
+        gt = points.depth.numpy()
+    gains = gain(before, after, gt)
+    known = gains[np.isfinite(gains)]
+    return float((known > 0).mean()) if known.size else None
 
 
 def _each_baseline(predict: Callable[[Baseline], Tensor]) -> Iterator[tuple[str, Tensor]]:

@@ -210,7 +210,8 @@ function makeRow(index) {
   const frame = frames[index];
   const name = visible(frame.name);
   const thumbs = make("span", { class: "thumbs" });
-  for (const view of frame.key ? ["image" in frame.views ? "image" : "second", "map"] : []) {
+  const views = ["image", "map", "second"].filter((view) => frame.key && view in frame.views);
+  for (const view of views.slice(0, 2)) {
     thumbs.append(picture(frame, view, { loading: "lazy", decoding: "async", alt: "" }, 4 / 3));
   }
   const button = make("button", { type: "button", class: "open", text: name,
@@ -305,7 +306,7 @@ function openFrame(position) {
 
 function viewsOf(frame) {
   if (!frame.key) return [make("p", { text: "There are no images of this frame." })];
-  const views = [slider(frame), mapView(frame)];
+  const views = [slider(frame), ...(frame.map ? [mapView(frame)] : [])];
   for (const view of ["image", "sparse"]) {
     if (view in frame.views) views.push(plainView(frame, view));
   }

@@ -136,7 +136,10 @@ def test_with_neither_ground_truth_nor_held_out_points_there_is_no_change(
     assert "proves nothing" in data["tables"][0]["title"]
     assert {row[3] for row in data["tables"][0]["rows"]} == {"–"}  # no change
     assert "no error is measured" in data["notes"][0]
-    assert any("proves nothing" in note for note in frames_of(report)["a"]["notes"])
+    frame = frames_of(report)["a"]
+    assert any("proves nothing" in note for note in frame["notes"])
+    assert {*frame["views"]} == {"first", "second", "image", "sparse"}  # no map of gains
+    assert (frame["map"], (root / "out/a_improvement.png").exists()) == (None, False)
 
 
 def test_frames_without_the_scores_of_others_have_no_figures_beside_them(

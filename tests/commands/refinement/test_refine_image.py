@@ -104,6 +104,23 @@ def test_held_out_points_are_a_seeded_share_that_the_loss_never_sees(frame: Fram
         assert path.read_bytes() == (frame.folder / "b" / path.name).read_bytes()
 
 
+def test_the_part_that_improved_is_of_the_ground_truth_else_of_held_out_points(
+    frame: FrameOnDisk,
+) -> None:
+    before, after = (
+        run(frame, iterations=count, gt=frame.gt, output=frame.folder / f"{count}.npy")
+        for count in (0, 5)
+    )
+    truth = read_depth(frame.gt).values
+    errors = [np.abs(np.load(frame.folder / f"{count}.npy") - truth) for count in (0, 5)]
+    fell = (errors[1] < errors[0])[truth > 0].mean()
+    assert (before.improved_fraction, after.improved_fraction) == (0, pytest.approx(fell, abs=1e-3))
+    assert 0 < fell < 1
+    of_points = run(frame, holdout=0.25, output=frame.folder / "held").improved_fraction
+    assert of_points in [n / 15 for n in range(16)]
+    assert run(frame).improved_fraction is None
+
+
 def test_existing_results_are_replaced_only_on_request_and_inputs_never(frame: FrameOnDisk) -> None:
     run(frame)
     depth = frame.folder / "out" / "img_depth.png"
