@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -58,6 +59,46 @@ def test_20_percent_gross_outliers_move_the_fit_by_less_than_2_percent(
     assert float((moved / clean - 1).abs().max()) < 0.02
 
 
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("kind", ["median", "scale", "affine"])
+def test_the_fit_is_its_own_biweight_least_squares_and_its_errors_are_those_of_its_depth(
+    space: str, kind: str
+) -> None:
+    rng = np.random.default_rng(7)
+    true = scene(61).double().numpy()
+    points = points_of(spoiled(scene(61)) * torch.from_numpy(np.exp(0.05 * rng.normal(size=61))))
+    d = points.depth.double().numpy()
+    to_space = {"depth": lambda v: v, "inverse": np.reciprocal, "log": np.log}[space]
+    x = to_space(true) * (1 if space == "log" else 2.5) + (0.3 if kind == "affine" else 0.0)
+    fit = align(torch.from_numpy(x), points, (space,), kind)
+    y = to_space(d)
+    # 4.685 and 1.4826 give 95 % efficiency, and the standard deviation, of normal errors.
+    off = np.abs(y - fit.scale * x - fit.shift)
+    root = np.clip(1 - (off / (4.685 * 1.4826 * np.median(off))) ** 2, 0, None)
+    if kind == "affine":
+        expected = np.polyfit(x, y, 1, w=root)
+    elif space == "log":
+        shift = np.median(y - x) if kind == "median" else np.average(y - x, weights=root**2)
+        expected = (1.0, shift)
+    else:
+        ratio = np.median(y / x) if kind == "median" else root**2 * x @ y / (root**2 * x @ x)
+        expected = (ratio, 0.0)
+    assert (fit.scale, fit.shift) == pytest.approx(tuple(expected), rel=1e-5, abs=1e-6)
+    # The reading, clamped to ten times beyond the points, and its errors.
+    bounds = d.min() / 10, d.max() * 10
+    x = np.concatenate([x, x.mean() + 40 * np.ptp(x) * rng.normal(size=30)])
+    line = fit.scale * x + fit.shift
+    low, high = sorted(to_space(np.array(bounds)))
+    from_space = {"depth": lambda v: v, "inverse": np.reciprocal, "log": np.exp}[space]
+    depth = from_space(np.clip(line, low, high))
+    assert np.allclose(fit.depth(torch.from_numpy(x)), depth, rtol=1e-5)
+    assert fit.beyond(torch.from_numpy(x)) == np.mean((line < low) | (line > high)) > 0.1
+    error = np.abs(np.log(depth[:61] / d))
+    assert fit.error == pytest.approx(np.sort(error)[:43].mean(), rel=1e-4)  # the best 70 %
+    assert fit.misfit == pytest.approx(np.minimum(error, 1).mean(), rel=1e-4)
+    assert fit.outliers == np.mean(error > max(3 * 1.4826 * np.median(error), 0.05))
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("seed", range(3))
 def test_auto_aligns_a_disparity_network_from_30_points_with_20_percent_outliers(
@@ -95,13 +136,20 @@ def test_auto_takes_the_simplest_reading_that_explains_the_points(
         assert (alignment.space, alignment.kind) == wanted
 
 
-def test_depth_at_or_behind_infinity_reads_as_ten_times_the_farthest_point() -> None:
-    d = scene(50)
-    x = 1 / d
-    alignment = align(x, points_of(d), ("inverse",), "affine")
-    sky = torch.tensor([-5.0, 0.0])
-    assert torch.allclose(alignment.depth(sky), torch.full((2,), 10 * float(d.max())), rtol=1e-5)
-    assert alignment.beyond(torch.cat([sky, x[:8]])) == pytest.approx(0.2)
+def test_auto_pays_twice_the_price_of_a_parameter_in_bic() -> None:
+    d = scene(40)
+    noise = torch.randn(40, generator=torch.Generator().manual_seed(8))
+    chosen = []
+    for factor in torch.linspace(1, 1.04, 40).tolist():
+        x = (d + 2 * (factor - 1)) * factor * (1 + 0.01 * noise)
+        fits = [align(x, points_of(d), ("depth",), kind) for kind in ("none", "scale", "affine")]
+        bic = [
+            2 * 40 * math.log(fit.misfit) + 2 * parameters * math.log(40)
+            for parameters, fit in enumerate(fits)
+        ]
+        chosen += [align(x, points_of(d), ("depth",), "auto")]
+        assert chosen[-1] == fits[int(np.argmin(bic))]
+    assert len({fit.kind for fit in chosen}) > 1
 
 
 def test_a_value_held_at_a_bound_still_has_a_gradient() -> None:

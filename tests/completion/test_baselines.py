@@ -10,7 +10,6 @@ from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.completion.alignment import BEYOND, align_prediction
 from pnpdepth_cli.completion.baselines import align_locally
 from pnpdepth_cli.completion.outliers import inlier_weights
-from pnpdepth_cli.completion.propagation import RIDGE
 from tests.completion.scenes import random_points, scene_depth
 
 
@@ -67,7 +66,7 @@ def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve
         weight = np.maximum(distance[near], 0.5) ** -3.0 * (inlier[near] + 1e-6)
         root = np.sqrt(weight / weight.sum())
         z = (at_points[near] - mean) / std
-        lines = np.vstack([np.column_stack([root, root * z]), [0, RIDGE**0.5]])
+        lines = np.vstack([np.column_stack([root, root * z]), [0, 0.03**0.5]])
         values = np.append(root * (y - at_points)[near], 0)
         shift, slope = np.linalg.lstsq(lines, values)[0]
         here = float(x[row, column])

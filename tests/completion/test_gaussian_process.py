@@ -1,14 +1,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.distance import cdist
 
-from pnpdepth_cli.completion import gaussian_process as gp
-from pnpdepth_cli.completion.gaussian_process import fit, leave_one_out, predict, predict_at
-from pnpdepth_cli.completion.residual_field import ResidualField, features_of
+from pnpdepth_cli.completion.gaussian_process import (
+    fit,
+    leave_one_out,
+    neighbourhoods,
+    predict,
+    predict_at,
+)
+from pnpdepth_cli.completion.residual_field import Kernel, ResidualField, features_of
 from pnpdepth_cli.points import SparsePoints
 
 SIZE = (20, 30)
@@ -32,19 +39,27 @@ def field(
     return ResidualField(features=features, points=points, at=at, residual=residual)
 
 
+def covariance(kernel: Kernel, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Of β₀ + β₁·u + f at features p and q; β₀ has variance 100 and β₁ has variance 1."""
+    lengths = np.array([1, 1, kernel.depth, *[kernel.colour] * 3])[: p.shape[1]]
+    return np.asarray(np.exp(-cdist(p / lengths, q / lengths)) + 100 + np.outer(p[:, 2], q[:, 2]))
+
+
+def reference(
+    field: ResidualField, near: np.ndarray, queries: np.ndarray, noise: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance at features (M, 6) by the textbook, from the points with these numbers."""
+    a = field.at.double().numpy()[near]
+    k = covariance(field.kernel, queries, a)
+    inverse = np.linalg.inv(covariance(field.kernel, a, a) + noise * np.eye(len(a)))
+    variance = 1 + 100 + queries[:, 2] ** 2 - np.sum(k @ inverse * k, axis=1)
+    return k @ inverse @ field.residual.numpy()[near], variance
+
+
 def dense_reference(field: ResidualField) -> np.ndarray:
-    """The mean by the textbook, with one inverse of everything."""
-    lengths = np.array([1, 1, field.kernel.depth, *[field.kernel.colour] * 3])
-    lengths = lengths[: field.at.shape[1]]
-    a = field.at.double().numpy()
-    b = torch.stack(field.features, dim=-1).double().numpy().reshape(-1, a.shape[1])
-
-    def covariance(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        apart = np.linalg.norm((p[:, None] - q[None]) / lengths, axis=2)
-        return np.exp(-apart) + gp.CONSTANT + gp.SLOPE * p[:, None, 2] * q[None, :, 2]
-
-    inverse = np.linalg.inv(covariance(a, a) + field.kernel.noise * np.eye(len(a)))
-    mean: np.ndarray = covariance(b, a) @ inverse @ field.residual.numpy()
+    """The mean (H, W) from all points."""
+    queries = torch.stack(field.features, dim=-1).double().numpy().reshape(-1, field.at.shape[1])
+    mean, _ = reference(field, np.arange(len(field.points)), queries, field.kernel.noise)
     return mean.reshape(field.points.size)
 
 
@@ -55,39 +70,78 @@ def test_the_mean_is_that_of_the_textbook(count: int, colour: bool) -> None:
     assert np.allclose(predict(residuals).numpy(), dense_reference(residuals), atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    ("count", "size", "atol"), [(3, SIZE, 1e-5), (40, SIZE, 1e-5), (900, (60, 80), 0.02)]
-)
-def test_prediction_at_positions_equals_the_dense_one_and_is_near_it_with_many_points(
-    count: int, size: tuple[int, int], atol: float
+@pytest.mark.parametrize("size", [(60, 80), (40, 100)])
+@pytest.mark.parametrize("count", [300, 900])
+def test_the_mean_from_the_points_nearest_to_a_block_is_near_that_from_all(
+    count: int, size: tuple[int, int]
 ) -> None:
-    residuals = fit(field(count, size=size))
-    positions = torch.tensor([[3.0, 4.0], [size[1] - 1.0, size[0] - 1.0], [0.0, 0.0], [7.0, 8.0]])
-    queries = SparsePoints(xy=positions, depth=torch.ones(4), size=size)
+    residuals = field(count, size=size)
+    off = np.abs(predict(residuals).numpy() - dense_reference(residuals))
+    assert off.max() < 0.02
+    assert off.mean() < 0.0025  # of residuals from 0.2 to 0.5
+
+
+@pytest.mark.parametrize("count", [3, 40])
+def test_prediction_at_positions_equals_the_dense_one(count: int) -> None:
+    residuals = fit(field(count))
+    positions = torch.tensor([[3.0, 4.0], [29.0, 19.0], [0.0, 0.0], [7.0, 8.0]])
+    queries = SparsePoints(xy=positions, depth=torch.ones(4), size=SIZE)
     at = predict_at(residuals, positions, residuals.features_at(queries))
-    assert torch.allclose(at, queries.sample(predict(residuals)), atol=atol)
+    assert torch.allclose(at, queries.sample(predict(residuals)), atol=1e-5)
 
 
-def left_out_by_hand(residuals: ResidualField, index: int) -> float:
-    others = torch.arange(len(residuals.points)) != index
-    mean = predict(residuals.select(others))
-    return float(residuals.residual[index] - residuals.points.sample(mean)[index])
+def test_among_many_points_a_pixel_is_predicted_from_its_48_nearest() -> None:
+    residuals = field(400, size=(60, 80))
+    positions = torch.rand(20, 2, generator=torch.Generator().manual_seed(4)) * 59
+    queries = SparsePoints(xy=positions, depth=torch.ones(20), size=(60, 80))
+    features = residuals.features_at(queries)
+    expected = []
+    for xy, one in zip(positions.numpy(), features.double().numpy(), strict=True):
+        near = np.hypot(*(residuals.points.xy.numpy() - xy).T).argsort()[:48]
+        expected += [reference(residuals, near, one[None], residuals.kernel.noise)[0].item()]
+    assert np.allclose(predict_at(residuals, positions, features), expected, atol=2e-4)
 
 
-def test_errors_of_left_out_points_are_those_of_leaving_them_out() -> None:
-    residuals = field(12)
-    error, _ = leave_one_out(residuals, torch.arange(12)[None])
-    by_hand = [left_out_by_hand(residuals, index) for index in range(12)]
-    assert torch.allclose(error[0], torch.tensor(by_hand).double(), atol=1e-4)
-
-
-def test_a_point_of_zero_weight_does_not_change_the_others() -> None:
-    residuals = field(12)
-    weight = torch.ones(12).double()
+@pytest.mark.parametrize("count", [12, 300])
+def test_errors_and_variances_of_left_out_points_are_those_of_leaving_them_out(count: int) -> None:
+    residuals = field(count)
+    weight = torch.rand(count, generator=torch.Generator().manual_seed(5)).double()
     weight[5] = 0
-    spoiled = replace(residuals, residual=residuals.residual.index_fill(0, torch.tensor([5]), 9.0))
-    near = torch.arange(12)[None]
-    clean, _ = leave_one_out(residuals, near, weight)
-    with_outlier, _ = leave_one_out(spoiled, near, weight)
-    others = torch.arange(12) != 5
-    assert torch.allclose(with_outlier[0, others], clean[0, others], atol=1e-4)
+    near = neighbourhoods(residuals, 128)
+    error, variance = leave_one_out(residuals, near, weight)
+    at, xy = residuals.at.double().numpy(), residuals.points.xy.numpy()
+    noise = residuals.kernel.noise / weight.clamp_min(1e-6).numpy() ** 2
+    for row, numbers in enumerate(near.numpy()):
+        apart = np.hypot(*(xy - xy[numbers[0]]).T)
+        assert count == 12 or np.allclose(apart[numbers], np.sort(apart)[:48])
+        for column in range(error.shape[1]):
+            here, others = numbers[column], np.delete(numbers, column)
+            mean, spread = reference(residuals, others, at[here][None], noise[others])
+            expected = float(residuals.residual[here]) - mean, spread + residuals.kernel.noise
+            assert np.allclose(expected[0], error[row, column], atol=1e-4)
+            assert np.allclose(expected[1], variance[row, column], atol=1e-4)
+
+
+@pytest.mark.parametrize("colour", [True, False])
+def test_the_fit_has_the_smallest_error_of_all_length_scales_and_then_of_all_noises(
+    colour: bool,
+) -> None:
+    chosen = set()
+    for seed in range(12):
+        drawn = Kernel(depth=(1.0, 2.5, 8.0, 25.0)[seed % 4], colour=2.5, noise=1e-4)
+        residuals = field(60, colour=colour, seed=seed)
+        at = residuals.at.double().numpy()
+        root = np.linalg.cholesky(covariance(drawn, at, at) + drawn.noise * np.eye(60))
+        residual = root @ np.random.default_rng(seed).normal(size=60)
+
+        def error(kernel: Kernel, at: np.ndarray = at, r: np.ndarray = residual) -> float:
+            inverse = np.linalg.inv(covariance(kernel, at, at) + kernel.noise * np.eye(60))
+            return float(np.abs(inverse @ r / np.diag(inverse)).mean())
+
+        colours = (2.5, 8.0, 25.0) if colour else (2.5,)
+        lengths = product((1.0, 2.5, 8.0, 25.0), colours)
+        best = min((Kernel(depth=d, colour=c) for d, c in lengths), key=error)
+        best = min((replace(best, noise=n) for n in (1e-4, 1e-3, 1e-2, 1.0)), key=error)
+        assert fit(replace(residuals, residual=torch.from_numpy(residual))).kernel == best
+        chosen.add(best.depth)
+    assert len(chosen) >= 3

@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
+from scipy.spatial import Delaunay
 
 from pnpdepth_cli.completion.image_registration import (
     Evidence,
@@ -10,6 +14,7 @@ from pnpdepth_cli.completion.image_registration import (
     estimate_registration,
     evidence,
 )
+from pnpdepth_cli.completion.residual_field import cielab
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.unregistered import SIZE, UNREGISTERED, frame
 
@@ -119,3 +124,75 @@ def test_the_colour_of_a_pixel_is_where_the_registration_says() -> None:
     moved = ImageRegistration(zoom=0.5, right=4.0, down=-2.0).apply_to(ramp)
     assert moved[30, 40, 0] == pytest.approx(30 + 0.5 * (40 - 30) + 4)
     assert moved[30, 40, 1] == pytest.approx(20 + 0.5 * (30 - 20) - 2)
+
+
+@pytest.mark.parametrize("count", [200, 1500])
+def test_the_evidence_is_how_edges_and_changes_of_depth_stand_out_from_the_rest(count: int) -> None:
+    rgb, points = frame(1, count=count)
+    moved = np.random.default_rng(3).uniform(-0.3, 0.3, (count, 2)).astype(np.float32)
+    points = replace(points, xy=points.xy + torch.from_numpy(moved))
+    known = evidence(rgb, points)
+    assert known is not None
+    # Edges of the lightness and colour, over those within 8 pixels, less those within 6.
+    lab = cielab(torch.from_numpy(rgb).permute(2, 0, 1)).double().numpy() / 100
+    smooth = [ndimage.gaussian_filter(one, 1.0, mode="mirror") for one in lab]
+    slopes = [ndimage.sobel(one, axis, mode="reflect") / 8 for one in smooth for axis in (0, 1)]
+    strength = np.sqrt(np.square(slopes).sum(axis=0))
+    relative = strength / (ndimage.gaussian_filter(strength, 8.0, mode="mirror") + 0.01)
+    edges = relative - ndimage.gaussian_filter(relative, 6.0, mode="mirror")
+    assert np.allclose(known.edges, edges / edges.std(), atol=2e-3)
+    # Pairs of neighbouring points without the 5 % that are farthest apart.
+    at, depth = points.xy.double().numpy() + 0.5, points.depth.double().numpy()
+    first, near = Delaunay(at).vertex_neighbor_vertices
+    pairs = np.column_stack([np.repeat(np.arange(count), np.diff(first)), near])
+    pairs = np.array(sorted(map(tuple, pairs[pairs[:, 0] < pairs[:, 1]])))
+    length = np.hypot(*(at[pairs[:, 0]] - at[pairs[:, 1]]).T)
+    pairs, length = (each[length <= np.quantile(length, 0.95)] for each in (pairs, length))
+    change = np.abs(np.log(depth[pairs[:, 0]] / depth[pairs[:, 1]]))
+    of_length = np.polyfit(np.log(length + 0.1), np.log(change + 0.03), 1)
+    rest = np.log(change + 0.03) - np.polyval(of_length, np.log(length + 0.1))
+    weight = (rest / rest.std()).clip(-2.5, 2.5)
+    weight -= weight.mean()
+    between = known.between.reshape(len(pairs), 12, 2)
+    assert np.allclose(between.mean(axis=1), at[pairs].mean(axis=1))
+    assert np.allclose(np.ptp(between, axis=1), np.ptp(at[pairs], axis=1) * 11 / 12)
+    assert np.allclose(known.weight, np.repeat(weight, 12) / 12)
+    assert known.factor == pytest.approx(0.1 * min(1, 37 / np.linalg.norm(weight)))
+    ordered = np.sort(length)
+    half = ordered[ordered.cumsum() >= ordered.sum() / 2][0]
+    jump = change > 0.15
+    assert (known.jumps, known.short_jumps) == (jump.sum(), (jump & (length < half)).sum())
+    # A frame of twice the size is reduced to the same.
+    twice = SparsePoints(xy=2 * points.xy + 0.5, depth=points.depth, size=(480, 640))
+    larger = evidence(rgb.repeat(2, axis=0).repeat(2, axis=1), twice)
+    assert larger is not None
+    assert np.allclose(larger.between, known.between, atol=1e-3)
+    assert np.allclose(larger.edges, known.edges, atol=1e-3)
+
+
+def test_the_likelihood_is_the_edges_under_the_moved_samples_and_the_answer_its_posterior() -> None:
+    known = evidence_of(0, UNREGISTERED)
+    likelihood = known.log_likelihood(1.1)
+    assert likelihood.shape == (2 * 12 + 1, 2 * 16 + 1)  # shifts of 5 % of the sides
+    height, width = known.edges.shape
+    x, y = np.floor((known.between - (160, 120)) * 1.1 + (160, 120)).astype(int).T
+    for down, right in ((0, 0), (-12, 16), (5, -7)):
+        column, row = x + right, y + down
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        edges = known.edges[row[inside], column[inside]]
+        expected = known.factor * float(known.weight[inside] @ edges)
+        assert likelihood[12 + down, 16 + right] == pytest.approx(expected, abs=0.01)
+    # The prior is exponential in the log of the zoom and normal in the shift.
+    zooms = np.exp(np.linspace(-0.4, 0.4, 81))
+    total = np.stack([known.log_likelihood(zoom) for zoom in zooms])
+    down, right = np.mgrid[-12:13, -16:17]
+    prior = -np.abs(np.log(zooms))[:, None, None] / 0.07 - (
+        (down / height) ** 2 + (right / width) ** 2
+    ) / (2 * 0.025**2)
+    posterior = np.exp(total + prior - (total + prior).max())
+    posterior /= posterior.sum()
+    mean = [(posterior * each).sum() for each in (zooms[:, None, None], right, down)]
+    found = estimate_registration([known])
+    assert isinstance(found, ImageRegistration)
+    assert found.zoom == round(mean[0], 4)
+    assert (found.right, found.down) == (round(mean[1], 2), round(mean[2], 2))

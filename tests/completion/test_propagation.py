@@ -112,3 +112,20 @@ def test_depth_at_positions_equals_the_dense_depth(kind: str) -> None:
     depth = propagate(prediction, points, rgb, kind=kind)
     at_positions = propagate_at(prediction, points, rgb, positions, kind=kind)
     assert torch.allclose(at_positions, queries.sample(depth), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("kind", "rtol"), [("gp", 0.01), ("local", 1e-5)])
+def test_a_large_image_has_at_every_second_pixel_the_depth_of_that_pixel_alone(
+    kind: str, rtol: float
+) -> None:
+    y, x = torch.meshgrid(torch.arange(641.0), torch.arange(801.0), indexing="ij")
+    prediction = 2 + x / 801 + (y / 641).square()
+    points = random_points(prediction * (1 + 0.3 * torch.sin(x / 200)), 30)
+    pixels = torch.rand(200, 2, generator=torch.Generator().manual_seed(6)) * torch.tensor(
+        [400.0, 320.0]
+    )
+    pixels = 2 * pixels.round()
+    depth = propagate(prediction, points, None, kind=kind)
+    alone = propagate_at(prediction, points, None, pixels, kind=kind)
+    column, row = pixels.long().unbind(1)
+    assert torch.allclose(depth[row, column], alone, rtol=rtol)
